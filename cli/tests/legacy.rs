@@ -141,7 +141,7 @@ fn omitted_failure_messages_are_counted_in_the_log() {
     for _ in 0..200 {
         TcpStream::connect(&to).unwrap().write_all(LETTER).unwrap();
     }
-    gateway.wait_for_log(&["left out failure messages", "count="]);
+    gateway.wait_for_log(&["omitted failure messages", "count="]);
 }
 
 #[test]

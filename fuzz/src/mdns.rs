@@ -6,7 +6,7 @@
 use std::net::IpAddr;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_sds::fuzzing::{Ear, announced};
+use fipa_sds::fuzzing::{Listener, announced};
 use fipa_sds::{Entry, Members, Mts, Reach, Role, Source};
 use fipa_transport::Incarnation;
 
@@ -16,14 +16,14 @@ use crate::input::Input;
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let mut now = Instant::now();
-    let mut ear = Ear::new(now);
+    let mut listener = Listener::new(now);
     while !input.is_empty() {
         let how = input.byte();
         let from = IpAddr::from([192, 0, 2, how % 3]);
         match how >> 4 {
             0..=7 => {
                 let packet = input.long_bytes();
-                ear.arrive(now, from, packet);
+                listener.arrive(now, from, packet);
             }
             8..=12 => {
                 let entry = entry(&mut input);
@@ -34,16 +34,16 @@ pub fn play(bytes: &[u8]) {
                         let at = at % packet.len();
                         packet[at] = input.byte();
                     }
-                    ear.arrive(now, from, &packet);
+                    listener.arrive(now, from, &packet);
                 }
             }
             _ => {
                 let time = input.time().min(Duration::from_secs(7200));
-                ear.pass(&mut now, time);
+                listener.pass(&mut now, time);
             }
         }
     }
-    ear.pass(&mut now, Duration::from_secs(600));
+    listener.pass(&mut now, Duration::from_secs(600));
 }
 
 fn text(input: &mut Input<'_>) -> String {

@@ -1,9 +1,9 @@
 //! The hot paths of the delivery core, one at a time, to count their instructions under valgrind:
 //! `.ci/instructions`.
 //!
-//! The name of a path is the argument; without one, all names are listed. What is to be counted
-//! happens inside of `measured`, a thousand times, after everything was made ready: tables are
-//! seeded anew in every run, and one look-up is now cheaper, now dearer.
+//! The argument is the name of a path; without one, all names are listed. The instructions within
+//! `measured` are counted, for a thousand repetitions after the setup: tables have a new seed in
+//! every run, so the cost of a single lookup varies.
 
 #![allow(clippy::unwrap_used, reason = "a bench that cannot go on may panic")]
 
@@ -47,7 +47,7 @@ const PATHS: &[Path] = &[
     }),
 ];
 
-#[allow(clippy::print_stdout, reason = "the names are what is asked for")]
+#[allow(clippy::print_stdout, reason = "the names are the output")]
 fn main() {
     // Cargo's own arguments begin with a hyphen.
     let asked = std::env::args().skip(1).find(|name| !name.starts_with('-'));
@@ -55,7 +55,7 @@ fn main() {
         None => PATHS.iter().for_each(|(name, _)| println!("{name}")),
         Some(asked) => {
             let path = PATHS.iter().find(|(name, _)| *name == asked);
-            let (_, run) = path.unwrap_or_else(|| panic!("there is no path {asked}"));
+            let (_, run) = path.unwrap_or_else(|| panic!("unknown path {asked}"));
             let names = Crowd::names();
             let mut crowd = Crowd::new(&names);
             run(&mut crowd, names.get(..LETTERS).unwrap());
@@ -63,7 +63,7 @@ fn main() {
     }
 }
 
-/// The instructions of what is given are counted.
+/// The instructions of the closure are counted.
 #[inline(never)]
 fn measured(run: impl FnOnce()) {
     run();

@@ -1,16 +1,17 @@
-//! Failure messages: how a sender is told in FIPA's own words that its letter was not delivered.
+//! Failure messages: report to a sender, in a FIPA message, that its letter was not delivered.
 //!
-//! The message is a `failure` with the ontology `fipa-agent-management` (FIPA00067) from the message
-//! transport service to the sender of the letter; `in-reply-to`, `conversation-id` and `protocol`
-//! are taken from the message. There is none about a message that is a failure itself. If the message
-//! cannot be decoded, the sender is the one that the envelope names. The content is what the sender
-//! understands:
+//! The message is a `failure` with the ontology `fipa-agent-management` (FIPA00067) from the
+//! message transport service to the sender of the letter; `in-reply-to`, `conversation-id` and
+//! `protocol` are taken from the failed message. A failure message is never answered with another
+//! one. If the message cannot be decoded, the sender in the envelope is used. The content depends
+//! on the sender's implementation:
 //!
-//! * our own agents and JADE's: language `fipa-sl`, content `((action (agent-identifier :name
-//!   SENDER) (ACLMessage)) (MTS-error (agent-identifier :name RECEIVER) (internal-error "REASON:
-//!   DETAIL")))`;
+//! * agents of this project and of JADE: language `fipa-sl`, content `((action (agent-identifier
+//!   :name SENDER) (ACLMessage)) (MTS-error (agent-identifier :name RECEIVER) (internal-error
+//!   "REASON: DETAIL")))`;
 //! * agents of fipa_services: an `inform` in the string encoding, from the sender to the intended
-//!   receiver, in the language `internal-error`, that tells the services which the letter passed.
+//!   receiver, in the language `internal-error`, with the list of the services that the letter
+//!   passed.
 
 mod read;
 
@@ -26,22 +27,22 @@ use fipa_transport::wire::truncated;
 pub use self::read::DeliveryFailure;
 use crate::letter_for;
 
-/// What there is to tell about a letter that was not delivered to one receiver.
+/// The failed delivery of a letter to one receiver.
 pub(crate) struct Failure<'a> {
-    /// Whom it is told.
+    /// Receiver of the failure message.
     pub(crate) sender: AgentId,
-    /// Whom the letter was for.
+    /// Intended receiver of the letter.
     pub(crate) receiver: &'a str,
-    /// The message, unless it cannot be decoded.
+    /// The failed message, unless it cannot be decoded.
     message: Option<Message>,
     reason: FailureReason,
     detail: &'a str,
-    /// The services that the letter passed, the first one first.
+    /// Services that stamped the letter, in order.
     path: Vec<String>,
 }
 
 impl<'a> Failure<'a> {
-    /// The failure of this letter. None if neither its message nor its envelope names a sender, or
+    /// The failure of this letter. `None` if neither its message nor its envelope names a sender, or
     /// the message is a failure message itself.
     pub(crate) fn of(
         letter: &Letter,
@@ -64,7 +65,7 @@ impl<'a> Failure<'a> {
         })
     }
 
-    /// The failure message of this service, for a sender that understands this dialect.
+    /// Encodes the failure message of this service for a sender that reads this dialect.
     pub(crate) fn written_for(
         &self,
         mts: &str,
@@ -76,15 +77,15 @@ impl<'a> Failure<'a> {
             .receiver(self.sender.clone())
             .ontology("fipa-agent-management");
         failure = match dialect {
-            Dialect::FipaServices => match self.told_by_path(mts) {
+            Dialect::FipaServices => match self.path_content(mts) {
                 Ok(content) => failure.content(content),
-                // Names that its string encoding has no way to say.
+                // The string encoding cannot represent some names.
                 Err(error) => {
-                    tracing::debug!(%error, receiver = self.receiver, "told in the standard's words");
-                    failure.language("fipa-sl").content(self.told_in_sl())
+                    tracing::debug!(%error, receiver = self.receiver, "writing the failure message in FIPA SL");
+                    failure.language("fipa-sl").content(self.sl_content())
                 }
             },
-            _ => failure.language("fipa-sl").content(self.told_in_sl()),
+            _ => failure.language("fipa-sl").content(self.sl_content()),
         };
         if let Some(message) = &self.message {
             if let Some(protocol) = message.protocol() {
@@ -100,7 +101,7 @@ impl<'a> Failure<'a> {
         Ok(letter_for(&failure.build()?, utc)?)
     }
 
-    fn told_in_sl(&self) -> String {
+    fn sl_content(&self) -> String {
         let text = self.text();
         format!(
             "((action (agent-identifier :name {}) (ACLMessage)) \
@@ -119,10 +120,10 @@ impl<'a> Failure<'a> {
         }
     }
 
-    fn told_by_path(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
+    fn path_content(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
         let mut path = self.path.clone();
         path.push(mts.to_owned());
-        let told = Message::builder(Performative::Inform)
+        let report = Message::builder(Performative::Inform)
             .sender(self.sender.clone())
             .receiver(AgentId::new(self.receiver)?)
             .language("internal-error")
@@ -132,13 +133,13 @@ impl<'a> Failure<'a> {
                 path.join(",")
             ))
             .build()?;
-        let told = told.encode(Representation::String, Dialect::FipaServices)?;
-        Ok(told.to_vec())
+        let report = report.encode(Representation::String, Dialect::FipaServices)?;
+        Ok(report.to_vec())
     }
 }
 
-/// The sender of a message, with the addresses that the message gives, else with those that the
-/// envelope gives.
+/// The sender of a message, with the addresses in the message or, without any, those in the
+/// envelope.
 pub(crate) fn sender_of(message: &Message, letter: &Letter) -> Option<AgentId> {
     let sender = message.sender()?;
     if sender.addresses().is_empty()
@@ -162,12 +163,12 @@ fn path(letter: &Letter) -> Vec<String> {
         }
         Err(_) => Vec::new(),
     };
-    // The newest stamp stands in front.
+    // The newest stamp comes first.
     path.reverse();
     path
 }
 
-/// The beginning of a text as one line: fipa_services reads line by line.
+/// The beginning of a text on one line, because fipa_services reads line by line.
 fn one_line(text: &str) -> String {
     let line = escape(truncated(text, 400));
     truncated(&line, 400).to_owned()

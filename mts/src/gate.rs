@@ -1,4 +1,4 @@
-//! Who says which letters are taken.
+//! The access gate: decides which letters are accepted.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Instant;
@@ -6,7 +6,7 @@ use std::time::Instant;
 use fipa_acl::Letter;
 use fipa_transport::{Hop, Incarnation, Kind, Principal};
 
-/// The link on which a letter came.
+/// The link on which a letter arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Link {
     /// The kind of transport.
@@ -18,21 +18,21 @@ pub struct Link {
     pub source: Source,
 }
 
-/// The party at the other end of a link, as far as the link proves it. What a party sends is counted for
-/// it, whatever names the letters have.
+/// The party at the other end of a link, as far as the link proves it. Quotas count letters by
+/// their source, whatever names the letters have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Source {
     /// The service with this incarnation in a process of this user on this host.
     Process(Incarnation),
     /// The services with the key of the certificate with this SHA-256 fingerprint.
     Certificate([u8; 32]),
-    /// The services at this address, which have proved nothing else: of IPv6 the network of 64 bits, and
-    /// of loopback 127.0.0.1. None if the link has no such address.
+    /// The services at this address, without further proof: for IPv6 the /64 network, for loopback
+    /// 127.0.0.1. `None` if the link has no such address.
     Address(Option<IpAddr>),
 }
 
 impl Source {
-    /// The source of what this service hands over.
+    /// Returns the source of letters from this service.
     #[must_use]
     pub fn of(hop: &Hop) -> Self {
         match hop.principal {
@@ -48,14 +48,14 @@ impl Source {
         }
     }
 
-    /// The source of what comes from this address without proof.
+    /// Returns the source of unproved letters from this address.
     #[must_use]
     pub fn at(address: IpAddr) -> Self {
         Self::Address(Some(network_of(address)))
     }
 }
 
-/// The address that stands for all addresses of one host.
+/// The address that represents all addresses of a host.
 fn network_of(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         ip if ip.is_loopback() => IpAddr::V4(Ipv4Addr::LOCALHOST),
@@ -67,14 +67,14 @@ fn network_of(address: IpAddr) -> IpAddr {
     }
 }
 
-/// Who says which letters are taken: by an agent of this service, or into a gateway's custody.
+/// Decides which letters are accepted, for an agent of this service or into a gateway's custody.
 pub trait Gate: Send + Sync {
-    /// Whether a letter to the agent with this name that came on this link is taken. Is asked once for a letter, when there
-    /// is room for it: neither for copies of one that was taken, nor for one that has to wait. Must
-    /// not wait nor call the service back.
+    /// Decides whether a letter for this receiver that arrived on this link is accepted. Called
+    /// once per letter when there is space for it: not for copies of an accepted letter, and not
+    /// for one that must wait. Must not block or call the service back.
     ///
     /// # Errors
-    /// Why not, as its sender is told.
+    /// Returns the reason of the refusal, which the sender is told.
     fn admits(
         &self,
         now: Instant,
@@ -103,7 +103,7 @@ mod tests {
         let at = |ip: &str| Source::at(ip.parse().unwrap());
         assert_eq!(unproved("tcp://192.0.2.1:7"), at("192.0.2.1"));
         assert_eq!(unproved("udp://192.0.2.1:8"), at("192.0.2.1"));
-        // Every host has many addresses of one network.
+        // A host has many addresses in one network.
         assert_eq!(unproved("tcp://[2001:db8::1]:7"), at("2001:db8::ffff"));
         assert_ne!(unproved("tcp://[fe80::1]:7"), at("fe80::2"));
         assert_eq!(unproved("tcp://127.0.0.9:7"), at("::1"));

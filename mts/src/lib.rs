@@ -1,7 +1,8 @@
-//! The message transport service: how letters get to agents, once, in order, or back as failed.
+//! The message transport service: delivers letters to agents once and in order, or reports them as
+//! failed.
 //!
-//! [`core`] decides, without input and output; the runtime drives it with transports, a directory
-//! and a clock. The same service runs in every robot process and, with leave to forward, as the
+//! [`core`] makes the decisions without I/O; the runtime drives it with transports, a directory and
+//! a clock. The same service runs in every robot process and, with permission to forward, as the
 //! gateway between hosts.
 
 pub mod core;
@@ -12,9 +13,8 @@ mod runtime;
 mod stamp;
 pub mod watch;
 
-/// A table that is looked into several times for every letter, by a quick hash that is seeded in
-/// every process. Not for what strangers fill without a closer bound: it does not stand up to
-/// somebody who finds out, by how long things take, which keys collide.
+/// A hash map for several lookups per letter, with a fast hash that is seeded per process. Not for
+/// keys that untrusted peers choose without a close bound: timing can reveal which keys collide.
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
 pub use failure::DeliveryFailure;

@@ -1,4 +1,4 @@
-//! From a message to a letter: the envelope that a sender puts around it.
+//! Converts a message to a letter with an envelope.
 
 use std::time::SystemTime;
 
@@ -7,11 +7,11 @@ use fipa_acl::{
     AclRepresentation, EncodeError, Envelope, Letter, Message, Payload, Time, TimeError,
 };
 
-/// Why a message could not be made into a letter.
+/// Error of [`letter_for`] and [`letter_around`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PostError {
-    /// The clock of this host is beyond what an envelope can say.
+    /// The time is beyond the range of an envelope.
     #[error("cannot date the envelope: {0}")]
     Time(#[from] TimeError),
     /// The message or its envelope cannot be encoded.
@@ -19,22 +19,22 @@ pub enum PostError {
     Encode(#[from] EncodeError),
 }
 
-/// The letter with this message: bit-efficient message in a bit-efficient envelope of the
+/// Encodes a message as a letter: a bit-efficient message in a bit-efficient envelope of the
 /// standard dialect, dated `utc`. The content is shared, not copied.
 ///
 /// # Errors
-/// When the message or its envelope cannot be encoded.
+/// Fails when the message or its envelope cannot be encoded.
 pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostError> {
     let payload = message.to_payload();
     let envelope = envelope_for(message, payload.len(), utc)?;
     Ok(Letter::new(envelope, payload))
 }
 
-/// The letter with this message around content that was filled in before, in memory of its own;
-/// a content of the message itself is not looked at.
+/// Encodes a message as a letter around separate content, which is shared, not copied. The
+/// message's own content is ignored.
 ///
 /// # Errors
-/// When the message or its envelope cannot be encoded.
+/// Fails when the message or its envelope cannot be encoded.
 pub fn letter_around(
     message: &Message,
     content: Bytes,

@@ -1,12 +1,11 @@
 //! The runtime: drives the delivery core with real transports, a directory and the clocks.
 //!
-//! A thin shell. Everything happens under one lock around the core: what comes in is handed to
-//! it, and what it wants done is done before the lock is let go, so that parcels leave in the
-//! order in which the core decided. Transports never call back from within a dispatch, so this
-//! cannot dead-lock.
+//! A thin shell around the core, which one lock protects: inputs are passed to the core, and its
+//! actions are carried out before the lock is released, so that parcels leave in the order in which
+//! the core decided. Transports never call back from within a dispatch, so this cannot deadlock.
 //!
-//! Whoever waits, for an outcome or a letter, first drives the transports for a short while on
-//! its own thread, and then sleeps until it is woken.
+//! A task that waits for an outcome or a letter first drives the transports for a short time on its
+//! own thread, and then sleeps until it is woken.
 
 mod loans;
 mod receiving;
@@ -26,7 +25,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 
-use self::receiving::Receiving;
+use self::receiving::TransportSink;
 use crate::Gate;
 use crate::Map;
 use crate::core::{
@@ -34,27 +33,26 @@ use crate::core::{
     WayState,
 };
 
-/// What the runtime is told at its start, besides the core's configuration.
+/// Configuration of the runtime, in addition to that of the core.
 #[derive(Clone)]
 pub struct RuntimeConfig {
-    /// How long somebody who waits looks for something to do before going to sleep. Zero saves
-    /// the battery.
+    /// Time for which a waiting task polls the transports before it sleeps. Zero saves energy.
     pub spin: Duration,
-    /// The deadline of letters that old peers throw at the gateway: theirs have none. Can be
-    /// [changed](Mts::reorder) later.
+    /// Deadline of letters that legacy peers pass to the gateway: theirs have none.
+    /// [`Mts::reorder`] changes it.
     pub unframed_deadline: Duration,
-    /// Whom to tell of other hosts. Must not call the service back.
+    /// Receiver of news about other hosts. Must not call the service back.
     pub contacts: Option<Arc<dyn Contacts>>,
-    /// Whom to tell of the letters that pass, while the service is [watched](Mts::watch).
+    /// Observer of the letters that pass while the service is [watched](Mts::watch).
     pub tap: Option<Arc<dyn Tap>>,
-    /// Who says which letters are taken; all, without. Is asked with the service locked.
+    /// Decides which letters are accepted; without one, all are. Called with the service locked.
     pub gate: Option<Arc<dyn Gate>>,
 }
 
-/// Who is told of other hosts: of services that connections are open with, and of agents that
-/// nobody has told of before.
+/// Receives news about other hosts: services with an open connection, and agents that are in no
+/// directory.
 pub trait Contacts: Send + Sync {
-    /// An agent has written from behind this location; see [`Action::Heard`].
+    /// A letter from an agent behind this location has arrived; see [`Action::Heard`].
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
 
     /// A service may be gone; see [`Action::Doubtful`].
@@ -68,13 +66,13 @@ pub trait Contacts: Send + Sync {
     fn parted(&self, peer: &Introduction);
 }
 
-/// Routes that are looked up under one lock.
+/// Maximum number of routes that are computed under one lock.
 const ROUTES_AT_ONCE: usize = 64;
 
-/// Who is told of the letters that pass while the service is [watched](Mts::watch).
+/// Observer of the letters that pass while the service is [watched](Mts::watch).
 pub trait Tap: Send + Sync {
-    /// Something has happened to a letter. Is called with the service locked, before anything
-    /// else is done about it, and must not wait nor call the service back.
+    /// Reports an event of a letter. Called with the service locked, before the event is processed
+    /// further; must not block or call the service back.
     fn notice(&self, notice: &Notice);
 }
 
@@ -83,17 +81,17 @@ pub trait Tap: Send + Sync {
 /// Cheap to clone; all clones are the same service. It runs until [`close`](Self::close).
 #[derive(Clone)]
 pub struct Mts {
-    shared: Arc<Running>,
+    shared: Arc<ServiceHandle>,
 }
 
-/// The service as its users hold it. The last of them closes the transports.
+/// The service as its users hold it. Dropping the last of them closes the transports.
 ///
-/// Sinks and tasks hold the inner value, and only while they are called. One of them may be the last
-/// to let go of it, in the middle of a call by a transport; that transport is closed by then, because
-/// `close` waits for such calls.
-struct Running(Arc<Shared>);
+/// Sinks and tasks hold the inner value, but only during a call. One of them may drop it last,
+/// within a call by a transport; that transport is closed by then, because `close` waits for such
+/// calls.
+struct ServiceHandle(Arc<Shared>);
 
-impl std::ops::Deref for Running {
+impl std::ops::Deref for ServiceHandle {
     type Target = Shared;
 
     fn deref(&self) -> &Shared {
@@ -101,7 +99,7 @@ impl std::ops::Deref for Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for ServiceHandle {
     fn drop(&mut self) {
         // In a forked child, closing would end the parent's connections.
         if self.owner.is_this() {
@@ -116,11 +114,11 @@ struct Shared {
     state: Mutex<State>,
     transports: Vec<Arc<dyn Transport>>,
     config: RuntimeConfig,
-    /// Wakes the timer when something is due earlier than it thinks, or the service is gone.
+    /// Wakes the timer when an action is due earlier than its wake-up, or the service is gone.
     timer: Arc<Notify>,
     closed: AtomicBool,
     tasks: Mutex<Vec<JoinHandle<()>>>,
-    /// Where each transport is reached at present, in their order.
+    /// Current locations of each transport, in the order of the transports.
     locations: Mutex<Vec<(Kind, Vec<Location>)>>,
     located: watch::Sender<Arc<[Location]>>,
     owner: OwnerProcess,
@@ -129,61 +127,61 @@ struct Shared {
 struct State {
     core: Core,
     unframed_deadline: Duration,
-    /// Until when the timer sleeps.
+    /// Time at which the timer wakes up.
     armed: Option<Instant>,
     sends: Map<SendId, Arc<Slot>>,
-    agents: Map<Incarnation, Arc<Door>>,
+    agents: Map<Incarnation, Arc<AgentWaiter>>,
 }
 
-/// Where whoever receives for an agent waits. Written under the lock of the state; read without,
-/// by those who look for a letter again and again.
+/// Wakes the tasks that receive for an agent. Written under the lock of the state, and read without
+/// it by polling tasks.
 #[derive(Default)]
-struct Door {
-    /// There is something in the agent's queue.
+struct AgentWaiter {
+    /// Whether the agent's queue has a letter.
     ready: AtomicBool,
-    /// Nothing will come any more.
+    /// Whether no more letters will arrive.
     gone: AtomicBool,
     notify: Notify,
-    /// Told when it is gone, to all.
+    /// Notifies all waiters when `gone` is set.
     over: Notify,
 }
 
-impl Door {
+impl AgentWaiter {
     fn close(&self) {
         self.gone.store(true, Ordering::Release);
         self.over.notify_waiters();
         self.notify.notify_waiters();
-        // Whoever is about to wait.
+        // For a task that is about to wait.
         self.notify.notify_one();
     }
 }
 
-/// Where the outcomes of one letter are gathered.
+/// Collects the outcomes of one letter.
 #[derive(Default)]
 struct Slot {
-    outcomes: Mutex<Gathered>,
+    outcomes: Mutex<Outcomes>,
     complete: Notify,
 }
 
 #[derive(Default)]
-struct Gathered {
+struct Outcomes {
     expected: usize,
     known: Vec<(Arc<str>, Outcome)>,
 }
 
 impl Slot {
     fn taken_if_complete(&self) -> Option<Vec<(Arc<str>, Outcome)>> {
-        let mut gathered = self.outcomes.lock();
-        let complete = gathered.known.len() >= gathered.expected;
-        complete.then(|| std::mem::take(&mut gathered.known))
+        let mut outcomes = self.outcomes.lock();
+        let complete = outcomes.known.len() >= outcomes.expected;
+        complete.then(|| std::mem::take(&mut outcomes.known))
     }
 }
 
-/// A service that has started, and what did not.
+/// A service that has started, and the transports that failed.
 pub struct Started {
     /// The service.
     pub mts: Mts,
-    /// Where it can be reached at its start, in the order of its transports; later see
+    /// Its locations at the start, in the order of its transports; for later ones see
     /// [`Mts::locations`].
     pub locations: Vec<Location>,
     /// Transports that could not be opened; the service runs without them.
@@ -191,8 +189,8 @@ pub struct Started {
 }
 
 impl Mts {
-    /// Starts the service: opens the transports and keeps time. Transports that cannot be opened
-    /// are left out and told.
+    /// Starts the service: opens the transports and starts the timer. Transports that cannot be
+    /// opened are skipped and returned in [`Started::failed`].
     pub fn start(
         core: CoreConfig,
         config: RuntimeConfig,
@@ -228,7 +226,7 @@ impl Mts {
         });
         let mut failed = Vec::new();
         for transport in &transports {
-            let sink = Arc::new(Receiving {
+            let sink = Arc::new(TransportSink {
                 shared: Arc::downgrade(&shared),
                 kind: transport.kind(),
                 answers_at_once: transport.answers_at_once(),
@@ -249,63 +247,62 @@ impl Mts {
         shared.tasks.lock().extend(tasks);
         Started {
             mts: Self {
-                shared: Arc::new(Running(shared)),
+                shared: Arc::new(ServiceHandle(shared)),
             },
             locations,
             failed,
         }
     }
 
-    /// Where the service can be reached, in the order of its transports. The list changes when the
-    /// addresses of this host do.
+    /// Returns the service's locations, in the order of its transports. The list changes with the
+    /// addresses of this host.
     #[must_use]
     pub fn locations(&self) -> watch::Receiver<Arc<[Location]>> {
         self.shared.located.subscribe()
     }
 
-    /// Opens connections to these services, by name and location, so that their hellos say where
-    /// this service is; see [`Core::greet`].
+    /// Opens connections to these services, by name and location, so that their greetings announce
+    /// this service's locations; see [`Core::greet`].
     pub fn greet(&self, services: Vec<(Arc<str>, Location)>) {
         let mut state = self.shared.state.lock();
         state.core.greet(services);
         self.shared.carry_out(state);
     }
 
-    /// Letters for this agent are taken from now on. It must be in the directory, or about to be.
+    /// Starts to accept letters for this agent. It must be in the directory, or be added soon.
     pub fn register(&self, name: Arc<str>, incarnation: Incarnation) {
         let mut state = self.shared.state.lock();
-        let door = Arc::new(Door::default());
+        let waiter = Arc::new(AgentWaiter::default());
         if self.shared.closed.load(Ordering::Acquire) {
-            door.close();
+            waiter.close();
         }
-        state.agents.insert(incarnation, door);
+        state.agents.insert(incarnation, waiter);
         state.core.register(name, incarnation);
     }
 
-    /// The agent goes away; see [`Core::deregister`]. Returns the letters that it has not taken
-    /// out of its queue.
+    /// Removes the agent; see [`Core::deregister`]. Returns the letters that are left in its queue.
     pub fn deregister(&self, incarnation: Incarnation) -> Vec<Received> {
         let mut state = self.shared.state.lock();
         let unread = std::iter::from_fn(|| state.core.take(incarnation)).collect();
         state.core.deregister(Now::read(), incarnation);
-        if let Some(door) = state.agents.remove(&incarnation) {
-            door.close();
+        if let Some(waiter) = state.agents.remove(&incarnation) {
+            waiter.close();
         }
         self.shared.carry_out(state);
         unread
     }
 
-    /// Whether the [`Tap`] is told of every letter from now on. While it is not, watching costs
-    /// nothing but looking at a flag, under the lock that is held anyway.
+    /// Sets whether the [`Tap`] is notified of every letter. While it is off, watching costs only
+    /// the check of a flag under the lock.
     pub fn watch(&self, watched: bool) {
         self.shared.state.lock().core.watch(watched);
     }
 
-    /// Sends a letter. The outcomes, one per receiver, come with the future; the letter is on its
-    /// way when this returns, whether the future is awaited or not.
+    /// Sends a letter. The future returns one outcome per receiver; the letter is submitted when
+    /// this method returns, even if the future is never awaited.
     ///
-    /// Large content for several receivers is first put where all of them can read it, if a
-    /// transport offers that ([`Transport::loan_for_many`]).
+    /// Large content for several receivers is first copied to memory that all of them can read, if
+    /// a transport offers that ([`Transport::loan_for_many`]).
     pub fn send(&self, mut submission: Submission) -> Sending {
         if let Some(content) = self.content_for_many(&submission) {
             submission.letter = loans::with_content(submission.letter, content);
@@ -328,13 +325,13 @@ impl Mts {
         }
     }
 
-    /// Sends a letter to this one life of an agent; see [`Core::send_to`].
+    /// Sends a letter to exactly this incarnation of an agent; see [`Core::send_to`].
     pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
         self.begin(|core| (core.send_to(Now::read(), submission, entry), 1))
     }
 
-    /// Uses these orders of transports and this deadline of old peers' letters from now on; see
-    /// [`Core::reorder`]. No letter is lost by it.
+    /// Replaces the orders of transports and the deadline of legacy peers' letters; see
+    /// [`Core::reorder`]. No letter is lost.
     pub fn reorder(
         &self,
         order: Vec<Kind>,
@@ -347,29 +344,28 @@ impl Mts {
         self.shared.carry_out(state);
     }
 
-    /// The transports that are open.
+    /// Returns the kinds of the open transports.
     pub fn kinds(&self) -> impl Iterator<Item = Kind> {
         self.shared.transports.iter().map(|it| it.kind())
     }
 
-    /// Keeps in touch with these services, and no others, from now on; see
-    /// [`Core::keep_in_touch`].
+    /// Sets the services to keep in touch with; see [`Core::keep_in_touch`].
     pub fn keep_in_touch(&self, peers: Vec<Peer>) {
         let mut state = self.shared.state.lock();
         state.core.keep_in_touch(Now::read(), peers);
         self.shared.carry_out(state);
     }
 
-    /// How it stands with the services to keep in touch with.
+    /// Returns the states of the services to keep in touch with.
     #[must_use]
     pub fn peers(&self) -> Vec<PeerState> {
         self.shared.state.lock().core.peers(Now::read())
     }
 
-    /// How letters from here to these agents would go now.
+    /// Returns the routes that letters from here to these agents would take now.
     #[must_use]
     pub fn routes(&self, to: &[Arc<Entry>]) -> Vec<Route> {
-        // Not all under one lock: letters go on meanwhile.
+        // In several parts, so that letters are not blocked meanwhile.
         let parts = to.chunks(ROUTES_AT_ONCE).flat_map(|part| {
             let state = self.shared.state.lock();
             let now = Now::read();
@@ -379,54 +375,55 @@ impl Mts {
         parts.collect()
     }
 
-    /// What has happened on each way so far; see [`Core::ways`].
+    /// Returns the health and counters of each route; see [`Core::ways`].
     #[must_use]
     pub fn ways(&self) -> Vec<WayState> {
         self.shared.state.lock().core.ways(Now::read())
     }
 
-    /// The next letter for this agent, or none when the agent was deregistered or the service
-    /// closed.
+    /// Waits for the next letter for this agent; `None` when the agent was deregistered or the
+    /// service closed.
     pub async fn receive(&self, agent: Incarnation) -> Option<Received> {
-        let door = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
+        let waiter = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
         self.shared
-            .wait(&door.notify, || {
-                if door.ready.load(Ordering::Acquire)
+            .wait(&waiter.notify, || {
+                if waiter.ready.load(Ordering::Acquire)
                     && let Some(received) = self.try_receive(agent)
                 {
                     return Some(Some(received));
                 }
-                door.gone.load(Ordering::Acquire).then(|| {
-                    // Others may have been about to wait, too, and one is told at a time.
-                    door.notify.notify_one();
+                waiter.gone.load(Ordering::Acquire).then(|| {
+                    // Other tasks may be about to wait too, and each notification wakes one.
+                    waiter.notify.notify_one();
                     None
                 })
             })
             .await
     }
 
-    /// Waits until nothing more will come for this agent: it was deregistered, or the service closed.
+    /// Waits until no more letters can arrive for this agent, because it was deregistered or the
+    /// service closed.
     pub async fn gone(&self, agent: Incarnation) {
-        let Some(door) = self.shared.state.lock().agents.get(&agent).map(Arc::clone) else {
+        let Some(waiter) = self.shared.state.lock().agents.get(&agent).map(Arc::clone) else {
             return;
         };
-        // Before looking, so that what happens afterwards is noticed.
-        let over = door.over.notified();
-        if !door.gone.load(Ordering::Acquire) {
+        // Created before the check, so that a later notification is not missed.
+        let over = waiter.over.notified();
+        if !waiter.gone.load(Ordering::Acquire) {
             over.await;
         }
     }
 
-    /// The next letter for this agent, if there is one now.
+    /// Returns the next letter for this agent if there is one.
     pub fn try_receive(&self, agent: Incarnation) -> Option<Received> {
         let mut state = self.shared.state.lock();
         let received = state.core.take(agent);
         let more = state.core.waiting(agent) > 0;
-        if let Some(door) = state.agents.get(&agent) {
-            door.ready.store(more, Ordering::Release);
+        if let Some(waiter) = state.agents.get(&agent) {
+            waiter.ready.store(more, Ordering::Release);
             if more {
                 // Another task may be waiting for the same agent's letters.
-                door.notify.notify_one();
+                waiter.notify.notify_one();
             }
         }
         let received = received?;
@@ -434,7 +431,7 @@ impl Mts {
         Some(received)
     }
 
-    /// An agent has taken a letter whose message cannot be decoded; see
+    /// Reports that an agent took a letter whose message cannot be decoded; see
     /// [`Core::handle_undecodable`].
     pub fn handle_undecodable(&self, receiver: &Arc<str>, received: &Received, why: String) {
         let mut state = self.shared.state.lock();
@@ -444,13 +441,13 @@ impl Mts {
         self.shared.carry_out(state);
     }
 
-    /// Does what can be done now on the calling thread; see [`Transport::drive`].
+    /// Does pending work on the calling thread; see [`Transport::drive`].
     pub fn drive(&self) -> bool {
         self.shared.drive()
     }
 
-    /// Ends the service: takes no more letters of others, gives what is under way up to `patience`
-    /// to end, then gives it up, and closes the transports.
+    /// Closes the service: accepts no more letters of others, gives letters in transit up to
+    /// `patience` to finish, then abandons them and closes the transports.
     pub async fn close(&self, patience: Duration) {
         let until = Instant::now() + patience;
         self.shared.state.lock().core.refuse_custody();
@@ -462,7 +459,7 @@ impl Mts {
         self.abort();
     }
 
-    /// Ends the service at once: what is under way is given up.
+    /// Closes the service at once and abandons letters in transit.
     pub fn abort(&self) {
         if self.shared.closed.swap(true, Ordering::AcqRel) {
             return;
@@ -472,8 +469,8 @@ impl Mts {
         }
         let mut state = self.shared.state.lock();
         state.core.give_up(Now::read());
-        for door in state.agents.values() {
-            door.close();
+        for waiter in state.agents.values() {
+            waiter.close();
         }
         self.shared.carry_out(state);
         for transport in &self.shared.transports {
@@ -483,9 +480,9 @@ impl Mts {
 }
 
 impl Shared {
-    /// A transport is reached at these locations from now on, unless it has said otherwise
-    /// meanwhile: `moved` is whether this comes from [`Sink::relocated`](fipa_transport::Sink::relocated),
-    /// which may be called before `listen` has returned.
+    /// Sets the locations of a transport. `moved` is whether they come from
+    /// [`Sink::relocated`](fipa_transport::Sink::relocated), which may be called before `listen`
+    /// returns and then takes precedence.
     fn locate(&self, kind: Kind, found: Vec<Location>, moved: bool) {
         let mut locations = self.locations.lock();
         let place = locations.iter_mut().find(|(other, _)| *other == kind);
@@ -512,7 +509,7 @@ impl Shared {
         did_something
     }
 
-    /// Does everything the core wants done, then lets go of the lock.
+    /// Carries out all actions of the core, then releases the lock.
     fn carry_out(&self, mut guard: MutexGuard<'_, State>) {
         let state = &mut *guard;
         while let Some(action) = state.core.poll_action() {
@@ -583,9 +580,9 @@ impl Shared {
                     }
                 }
                 Action::Deliverable { agent } => {
-                    if let Some(door) = state.agents.get(&agent) {
-                        door.ready.store(true, Ordering::Release);
-                        door.notify.notify_one();
+                    if let Some(waiter) = state.agents.get(&agent) {
+                        waiter.ready.store(true, Ordering::Release);
+                        waiter.notify.notify_one();
                     }
                 }
             }
@@ -598,14 +595,14 @@ impl Shared {
         }
     }
 
-    /// Waits until there is something: driving the transports for a while, then asleep.
+    /// Waits until `look` finds something: drives the transports for a while, then sleeps.
     async fn wait<T>(&self, notify: &Notify, mut look: impl FnMut() -> Option<T>) -> T {
         let started = Instant::now();
         loop {
             if let Some(found) = look() {
                 return found;
             }
-            // Who does not spin is called for everything; a look of its own would be in vain.
+            // Without spinning, every event already notifies this task, so polling is redundant.
             if !self.config.spin.is_zero() && self.drive() {
                 continue;
             }
@@ -635,14 +632,14 @@ impl State {
             return;
         };
         let complete = {
-            let mut gathered = slot.outcomes.lock();
+            let mut outcomes = slot.outcomes.lock();
             if outcome.attempts().is_empty() {
                 tracing::trace!(%receiver, %outcome, "letter");
             } else {
                 tracing::info!(%receiver, %outcome, "letter");
             }
-            gathered.known.push((receiver, outcome));
-            gathered.known.len() >= gathered.expected
+            outcomes.known.push((receiver, outcome));
+            outcomes.known.len() >= outcomes.expected
         };
         if complete {
             slot.complete.notify_one();
@@ -652,19 +649,19 @@ impl State {
 }
 
 fn no_such_transport(kind: Kind) -> WayError {
-    let text = format!("this process does not use {kind}");
+    let text = format!("this process has no transport of kind {kind}");
     WayError::new(WayFault::Closed, text)
 }
 
-/// The outcomes of one letter, to be awaited.
-#[must_use = "await it to learn what became of the letter"]
+/// A future with the outcomes of one letter.
+#[must_use = "await it to get the outcomes of the letter"]
 pub struct Sending {
-    shared: Arc<Running>,
+    shared: Arc<ServiceHandle>,
     slot: Arc<Slot>,
 }
 
 impl Sending {
-    /// One outcome per receiver, in the order in which they became known.
+    /// Waits for one outcome per receiver, in the order of arrival.
     pub async fn outcomes(self) -> Vec<(Arc<str>, Outcome)> {
         self.shared
             .wait(&self.slot.complete, || self.slot.taken_if_complete())
@@ -681,7 +678,7 @@ impl IntoFuture for Sending {
     }
 }
 
-/// Calls the core when something is due by the clock.
+/// Calls the core whenever a timeout is due.
 async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
     loop {
         let due = {
@@ -696,14 +693,14 @@ async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
             due
         };
         match due {
-            // Whether it was the time or a call, there is something to look at.
+            // After a timeout as well as a notification, the core is polled.
             Some(due) => drop(tokio::time::timeout_at(due.into(), timer.notified()).await),
             None => timer.notified().await,
         }
     }
 }
 
-/// Tells the core when the directory has changed.
+/// Notifies the core of changes in the directory.
 async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
     let mut watch = directory.watch();
     while let Some(change) = watch.next().await {

@@ -1,8 +1,8 @@
-//! Stamps, and what else a message transport service reads of an envelope.
+//! Stamps, and other parts of an envelope that a message transport service reads.
 //!
-//! A stamp is an extension envelope with a `received` parameter (FIPA00067, FIPA00088): `by` is
-//! the name of the service, `id` its incarnation. Two robots may give their gateways one name, so
-//! a service recognises only a stamp with its own incarnation.
+//! A stamp is an extension envelope with a `received` parameter (FIPA00067, FIPA00088): `by` is the
+//! name of the service, `id` its incarnation. The gateways of two robots may have the same name, so
+//! a service recognizes only a stamp with its own incarnation.
 
 use std::time::SystemTime;
 
@@ -12,11 +12,11 @@ use fipa_acl::{
 };
 use fipa_transport::Incarnation;
 
-/// Why a letter could not be stamped.
+/// Error of [`put`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum StampError {
-    /// The clock of this host is beyond what an envelope can say.
+    /// The time is beyond the range of an envelope.
     #[error("cannot date the stamp: {0}")]
     Time(#[from] TimeError),
     /// The stamp cannot be encoded.
@@ -24,7 +24,7 @@ pub(crate) enum StampError {
     Encode(#[from] EncodeError),
 }
 
-/// Whether the letter carries the stamp of this service.
+/// Whether the letter has the stamp of this service.
 pub(crate) fn carries(
     letter: &Letter,
     name: &str,
@@ -38,13 +38,13 @@ pub(crate) fn carries(
         .any(|stamp| stamp.by().as_str() == name && stamp.id().is_some_and(|it| it.as_str() == id)))
 }
 
-/// How many services have stamped the letter.
+/// Number of stamps in the letter.
 pub(crate) fn count(letter: &Letter) -> Result<usize, DecodeError> {
     let envelope = letter.envelope();
     Ok(EnvelopeView::parse(&envelope)?.stamps().count())
 }
 
-/// The letter with the stamp of this service in front.
+/// Adds the stamp of this service in front of the letter.
 pub(crate) fn put(
     letter: Letter,
     name: &str,
@@ -67,13 +67,13 @@ pub(crate) fn put(
     Ok(letter.stamped(stamp))
 }
 
-/// Bytes that the stamp of a service with this name takes, at most.
-pub(crate) fn room(name: &str) -> usize {
-    // What stands around the name: marks, lengths, date and incarnation.
+/// Maximum length in bytes of the stamp of a service with this name.
+pub(crate) fn max_len(name: &str) -> usize {
+    // The other parts are markers, lengths, date and incarnation.
     name.len().saturating_add(64)
 }
 
-/// The names in the letter's effective intended-receiver parameter, or `to` when it has none.
+/// Returns the names in the letter's effective intended-receiver parameter, or in `to` without one.
 pub(crate) fn receivers(letter: &Letter, most: usize) -> Result<Vec<String>, DecodeError> {
     let envelope = letter.envelope();
     let view = EnvelopeView::parse(&envelope)?;
@@ -84,7 +84,7 @@ pub(crate) fn receivers(letter: &Letter, most: usize) -> Result<Vec<String>, Dec
         .collect())
 }
 
-/// The name in the letter's effective from parameter.
+/// Returns the name in the letter's effective from parameter.
 pub(crate) fn sender(letter: &Letter) -> Option<String> {
     let envelope = letter.envelope();
     let view = EnvelopeView::parse(&envelope).ok()?;
@@ -98,15 +98,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stamp_has_the_room_that_is_said() {
-        // Until the end of the four-digit years.
+    fn a_stamp_fits_the_predicted_length() {
+        // The end of the four-digit years.
         let far = UNIX_EPOCH + Duration::from_secs(250_000_000_000);
         for name in ["m", "gateway-of-a-robot", &"long".repeat(200)] {
             for utc in [UNIX_EPOCH, far] {
                 let incarnation = Incarnation::from_u64(u64::MAX);
                 let stamped = put(Letter::default(), name, incarnation, utc).unwrap();
                 assert!(
-                    stamped.len() <= room(name),
+                    stamped.len() <= max_len(name),
                     "{} {}",
                     stamped.len(),
                     name.len()

@@ -1,5 +1,5 @@
-//! A gateway holds the letters of an agent that has just been registered until a legacy peer, which was
-//! found by mDNS, can have found that agent.
+//! A gateway holds the letters of a newly registered agent until a legacy peer that was found by
+//! mDNS can have found that agent.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -59,7 +59,7 @@ fn entry(name: &str, incarnation: Incarnation, at: &str) -> Entry {
     }
 }
 
-/// The agent `arm`, as the gateway has it.
+/// The agent `arm`, as in the gateway's directory.
 fn arm(at: &str, source: Source) -> Entry {
     Entry {
         source,
@@ -72,7 +72,7 @@ fn arm(at: &str, source: Source) -> Entry {
 
 const LEGACY: &str = "tcp://10.0.0.3:6789;fipa-services";
 
-/// A gateway on virtual time, which begins when the agent `rover` is registered.
+/// A gateway on virtual time, which starts when the agent `rover` is registered.
 struct Gateway {
     core: Core,
     start: Instant,
@@ -106,7 +106,7 @@ impl Gateway {
         }
     }
 
-    /// A letter of the rover to the arm arrives, and is taken into custody.
+    /// A letter from `rover` to `arm` arrives, and is taken into custody.
     fn takes(&mut self, ms: u64, remaining: Duration) {
         let arrival = Arrival {
             parcel: Parcel {
@@ -151,7 +151,7 @@ impl Gateway {
     }
 }
 
-/// The parcel of a letter of the rover to the arm, as the rover's process dispatches it.
+/// The parcel of a letter from `rover` to `arm`, as the process of `rover` dispatches it.
 fn parcel() -> Parcel {
     let at = "shm://7#0000000000000007";
     let remote = arm(at, Source::Mdns);
@@ -214,7 +214,7 @@ fn a_letter_with_a_short_deadline_waits_for_less() {
 }
 
 #[test]
-fn nothing_else_waits() {
+fn letters_to_other_receivers_do_not_wait() {
     let frames = "tcp://10.0.0.3:7788#0000000000000009";
     for arm in [arm(LEGACY, Source::Static), arm(frames, Source::Mdns)] {
         let mut gateway = Gateway::new(arm);
@@ -227,7 +227,7 @@ fn nothing_else_waits() {
 }
 
 #[test]
-fn a_calendar_that_was_set_back_prolongs_no_wait() {
+fn a_clock_that_was_set_back_does_not_prolong_the_wait() {
     let mut gateway = Gateway::new(arm(LEGACY, Source::Mdns));
     gateway.registered -= Duration::from_secs(3600);
     gateway.takes(0, LONG);

@@ -1,5 +1,5 @@
-//! A letter in custody whose report never arrives, or is not believed: the service before the custodian
-//! asks now and then, and a custodian that does not have the letter has lost it.
+//! A letter in custody whose report never arrives or is rejected: the service before the custodian
+//! asks periodically, and a custodian without the letter has lost it.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -19,7 +19,7 @@ const OWN: Incarnation = Incarnation::from_u64(1);
 const ROVER: Incarnation = Incarnation::from_u64(2);
 const ARM: Incarnation = Incarnation::from_u64(3);
 const NEXT: Incarnation = Incarnation::from_u64(9);
-/// Deadline of every letter. No test takes as long.
+/// Deadline of every letter. No test takes that long.
 const DEADLINE: Duration = Duration::from_secs(60);
 
 /// The core of one service, whose directory has one agent `arm`, behind another service.
@@ -65,7 +65,7 @@ impl Service {
         self.core.send(self.at(0), submission);
     }
 
-    /// A letter arrives for `arm`, in this transfer of the service before.
+    /// A letter arrives for `arm`, in this transfer of the previous service.
     fn arrive(&mut self, ms: u64, sequence: u64, transfer: u64) -> Verdict {
         self.receive(ms, Kind::Shm, {
             let body = Body::Letter(letter());
@@ -96,7 +96,7 @@ impl Service {
         self.conclude(ms, attempt, Conclusion::Answered(answer));
     }
 
-    /// Time passes in steps until something is to be dispatched, at most for this long.
+    /// Advances the time in steps until something is dispatched, at most until then.
     fn wait_for_dispatch(&mut self, mut ms: u64, until: u64) -> Option<(u64, AttemptId, Parcel)> {
         loop {
             if let Some((attempt, parcel)) = self.dispatched() {
@@ -189,7 +189,7 @@ fn a_letter_that_its_custodian_does_not_have_is_sent_again() {
 }
 
 #[test]
-fn a_letter_may_have_been_taken_that_its_custodian_does_not_have() {
+fn a_letter_that_its_custodian_does_not_have_may_have_been_taken() {
     let mut sender = Service::new(false);
     in_custody(&mut sender);
     let (ms, ask, _) = sender.wait_for_dispatch(1, 10_000).unwrap();
@@ -222,7 +222,7 @@ fn a_custodian_that_has_the_letter_keeps_it_and_is_asked_again() {
 }
 
 #[test]
-fn a_gateway_says_which_letters_it_has() {
+fn a_gateway_answers_which_letters_it_has() {
     let mut gateway = Service::new(true);
     let asked =
         |gateway: &mut Service, ms, sequence, transfer| match gateway.receive(ms, Kind::Shm, {
@@ -237,7 +237,7 @@ fn a_gateway_says_which_letters_it_has() {
     let (attempt, _) = gateway.dispatched().unwrap();
     assert_eq!(asked(&mut gateway, 1, 5, 70), Answer::Accepted);
     assert_eq!(asked(&mut gateway, 1, 6, 71), without);
-    // A report that names another transfer would not be believed.
+    // A report that names another transfer is ignored.
     assert_eq!(asked(&mut gateway, 1, 5, 72), without);
     gateway.answer(2, attempt, Answer::Accepted);
     // Its report is on the way and tells more.
@@ -280,8 +280,8 @@ fn a_report_that_is_refused_is_repeated() {
     assert_eq!(gateway.wait_for_dispatch(ms, ms + 10_000), None);
 }
 
-/// Letter 2 came back to the gateway because letter 1 is not there. Returns the time for which the
-/// gateway waits for letter 1 until it hands letter 2 back.
+/// Letter 2 came back to the gateway because letter 1 is missing. Returns the time for which the
+/// gateway waits for letter 1 until it returns letter 2.
 fn patience(gateway: &mut Service, began: u64) -> u64 {
     let letter = Parcel {
         after: 100,

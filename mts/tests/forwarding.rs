@@ -17,7 +17,7 @@ use fipa_transport::{
 
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
-/// What an agent of fipa_services sends comes from this address.
+/// The source of a letter from fipa_services at this address.
 fn legacy(address: IpAddr) -> LegacySource {
     LegacySource {
         address,
@@ -34,7 +34,7 @@ struct Gateway {
 }
 
 impl Gateway {
-    /// A gateway whose directory knows one agent, `arm`, in a process of its host.
+    /// A gateway whose directory has one agent, `arm`, in a process of its host.
     fn new(forwards: bool) -> Self {
         let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
         let arm = Registration::new("arm", ARM, vec![shm(0x9)]);
@@ -87,7 +87,7 @@ impl Gateway {
         self.core.handle_timeout(now);
     }
 
-    /// The next thing to do, apart from hearing of the sender.
+    /// The next action except contacts.
     fn next(&mut self) -> Option<Action> {
         match self.core.poll_action() {
             Some(Action::Heard { .. } | Action::Doubtful { .. }) => self.core.poll_action(),
@@ -172,7 +172,7 @@ fn the_answer_to_a_peer_waits_for_the_outcome() {
     assert_eq!((passed_on.sequence, passed_on.after), (1, 0));
     assert!(
         passed_on.remaining < Duration::from_secs(2),
-        "those further down give up earlier"
+        "services further down the route time out earlier"
     );
     gateway.nothing_to_do();
     gateway.conclude(1, attempt, Answer::Accepted);
@@ -181,7 +181,7 @@ fn the_answer_to_a_peer_waits_for_the_outcome() {
 }
 
 #[test]
-fn a_slow_receiver_makes_it_custody_and_a_report() {
+fn a_slow_receiver_causes_custody_and_a_report() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
@@ -220,7 +220,7 @@ fn over_shared_memory_custody_is_answered_at_once() {
         )),
         other => panic!("{other:?}"),
     }
-    // A report that is lost is sent again.
+    // A lost report is sent again.
     let broken = fipa_transport::WayError::new(fipa_transport::WayFault::Broken, "");
     let now = gateway.at(2);
     gateway
@@ -250,7 +250,7 @@ fn a_copy_of_a_letter_in_custody_is_not_a_second_letter() {
 }
 
 #[test]
-fn what_passes_is_stamped_and_what_comes_back_is_a_loop() {
+fn a_forwarded_letter_is_stamped_and_a_returning_one_is_a_loop() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
@@ -269,7 +269,7 @@ fn what_passes_is_stamped_and_what_comes_back_is_a_loop() {
         }) => {}
         other => panic!("{other:?}"),
     }
-    // Another gateway of the same name is another gateway.
+    // A stamp of another gateway with the same name is not a loop.
     let mut namesake = Gateway::new(true);
     let order = vec![Kind::Shm];
     let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
@@ -304,7 +304,7 @@ fn a_malformed_envelope_is_refused() {
 }
 
 #[test]
-fn a_robot_process_passes_nothing_on() {
+fn a_robot_process_forwards_nothing() {
     let mut process = Gateway::new(false);
     match process.arrive(0, Kind::Tcp, parcel(1, letter())) {
         Verdict::Now(Answer::Failed {
@@ -344,7 +344,7 @@ fn a_lane_that_is_full_holds_back_and_gives_credit() {
 }
 
 #[test]
-fn an_old_peers_letter_is_for_whom_its_envelope_names() {
+fn a_legacy_peers_letter_goes_to_the_receiver_in_its_envelope() {
     let mut gateway = Gateway::new(true);
     let now = gateway.at(0);
     gateway.core.handle_unframed(
@@ -364,7 +364,7 @@ fn an_old_peers_letter_is_for_whom_its_envelope_names() {
 }
 
 #[test]
-fn a_way_that_failed_is_left_alone_for_a_while() {
+fn a_failed_route_is_avoided_during_its_backoff() {
     let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
     directory
         .register(Registration::new("arm", ARM, vec![shm(0x9), tcp(0x9)]))
@@ -422,15 +422,15 @@ fn a_way_that_failed_is_left_alone_for_a_while() {
         other => panic!("{other:?}"),
     }
     let (attempt, next) = send(&mut core, 10);
-    assert_eq!(next, Kind::Tcp, "nobody waits for a broken way twice");
+    assert_eq!(next, Kind::Tcp, "a broken route is not tried twice");
     core.handle_conclusion(at(11), attempt, accepted());
     core.poll_action();
     let (_, later) = send(&mut core, 1000);
-    assert_eq!(later, Kind::Shm, "and it is tried again");
+    assert_eq!(later, Kind::Shm, "the route is tried again");
 }
 
 #[test]
-fn a_stranger_that_writes_can_be_answered() {
+fn an_unknown_sender_becomes_a_contact() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
@@ -450,7 +450,7 @@ fn a_stranger_that_writes_can_be_answered() {
         gateway.core.poll_action(),
         Some(Action::Dispatch { .. })
     ));
-    // Whoever writes from this host is in its directory, or is not to be.
+    // Senders of this host are in its directory, or must not be.
     gateway.arrive(0, Kind::Shm, parcel(2, letter()));
     assert!(matches!(
         gateway.core.poll_action(),
@@ -458,7 +458,7 @@ fn a_stranger_that_writes_can_be_answered() {
     ));
 }
 
-/// A letter names a predecessor below itself, and sequences begin at 1.
+/// A predecessor must be below its letter, and sequence numbers begin at 1.
 #[test]
 fn a_letter_whose_predecessor_is_not_below_it_is_refused() {
     let mut gateway = Gateway::new(true);
@@ -481,7 +481,7 @@ fn a_letter_whose_predecessor_is_not_below_it_is_refused() {
     assert_eq!((first.sequence, first.after), (7, 5));
 }
 
-/// A custodian passes the predecessor on as it was told, also when the predecessor failed here.
+/// A custodian forwards the predecessor as received, also when the predecessor failed here.
 #[test]
 fn a_custodian_never_lowers_a_predecessor_by_itself() {
     let mut gateway = Gateway::new(true);
@@ -503,7 +503,7 @@ fn a_custodian_never_lowers_a_predecessor_by_itself() {
     assert_eq!((passed_on.sequence, passed_on.after), (8, 7));
 }
 
-/// A letter whose predecessor does not come is handed back, and waits no longer.
+/// A letter whose predecessor does not arrive is returned, and does not wait any longer.
 #[test]
 fn a_letter_without_its_predecessor_is_returned() {
     let mut gateway = Gateway::new(true);
@@ -522,7 +522,7 @@ fn a_letter_without_its_predecessor_is_returned() {
     gateway.nothing_to_do();
 }
 
-/// The same letter waits for its predecessor when that comes in time.
+/// The same letter waits for its predecessor when that arrives in time.
 #[test]
 fn a_letter_waits_for_a_predecessor_that_comes() {
     let mut gateway = Gateway::new(true);
@@ -534,7 +534,7 @@ fn a_letter_waits_for_a_predecessor_that_comes() {
     let (attempt, ..) = gateway.dispatched();
     gateway.conclude(1, attempt, Answer::OutOfOrder { last: 3 });
     gateway.arrive(20, Kind::Tcp, parcel(7, letter()));
-    // The letter leaves behind its predecessor, on the same way.
+    // The letter leaves behind its predecessor, on the same route.
     let (first, _, parcel) = gateway.dispatched();
     assert_eq!(parcel.sequence, 7);
     let (second, _, parcel) = gateway.dispatched();
@@ -547,7 +547,7 @@ fn a_letter_waits_for_a_predecessor_that_comes() {
     gateway.nothing_to_do();
 }
 
-/// A letter that came back although its predecessor is under way waits for the end of that attempt.
+/// A letter that came back while its predecessor is in transit waits for the end of that attempt.
 #[test]
 fn a_letter_waits_while_its_predecessor_is_under_way() {
     let mut gateway = Gateway::new(true);
@@ -568,8 +568,8 @@ fn a_letter_waits_while_its_predecessor_is_under_way() {
     assert_eq!((again.sequence, again.after), (8, 7));
 }
 
-/// The sender's process tells a custodian that the predecessor of a letter has failed: the letter
-/// goes on without waiting to be handed back.
+/// The sender's process sends a custodian the new predecessor of a letter after the previous one
+/// failed: the letter continues without being returned.
 #[test]
 fn a_note_lowers_the_predecessor_of_a_held_letter() {
     let mut gateway = Gateway::new(true);
@@ -593,7 +593,7 @@ fn a_note_lowers_the_predecessor_of_a_held_letter() {
     assert_eq!((again.sequence, again.after), (8, 3));
 }
 
-/// The letter as it is read for this core.
+/// Parses the letter for this core.
 fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
     Unframed::read(letter, via, legacy(from), &**core.directory()).unwrap()
 }

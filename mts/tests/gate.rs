@@ -1,4 +1,4 @@
-//! Who says which letters are taken: asked once for each, about the agent that gets it.
+//! The access gate: called once for each letter, with the agent that receives it.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -18,7 +18,7 @@ use parking_lot::Mutex;
 const ARM: Incarnation = Incarnation::from_u64(0xa);
 const BRAKE: Incarnation = Incarnation::from_u64(0xb);
 
-/// Nobody may write to the brake. Notes whom it was asked about.
+/// Refuses all letters to `brake`, and records the receivers that it was called for.
 #[derive(Default)]
 struct Guarded(Mutex<Vec<String>>);
 
@@ -42,7 +42,7 @@ fn now() -> Now {
     }
 }
 
-/// A letter to this life of an agent, which the parcel calls so.
+/// A letter to this registration of an agent, with this name in the parcel.
 fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
     let message = Message::builder(Performative::Request)
         .sender(AgentId::new("rover").unwrap())
@@ -85,7 +85,7 @@ fn config(forwards: bool) -> CoreConfig {
 }
 
 #[test]
-fn an_agents_letters_are_judged_once_and_only_when_there_is_room() {
+fn the_gate_is_called_once_per_letter_and_only_when_there_is_room() {
     let gate = Arc::new(Guarded::default());
     let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(7)));
     let mut core = Core::new(config(false), Arc::new(directory)).gated(gate.clone());
@@ -100,14 +100,14 @@ fn an_agents_letters_are_judged_once_and_only_when_there_is_room() {
     assert_eq!(arrive(ARM, "arm", 2), accepted);
     assert_eq!(arrive(ARM, "arm", 3), Verdict::Now(Answer::Busy));
     assert_eq!(*gate.0.lock(), ["arm", "arm"]);
-    // Whatever the parcel calls it, this is the brake.
+    // The registration is that of `brake`, whatever name the parcel has.
     assert_eq!(arrive(BRAKE, "arm", 1), refused());
     assert_eq!(core.waiting(BRAKE), 0);
     assert_eq!(core.waiting(ARM), 2);
 }
 
 #[test]
-fn a_gateway_judges_by_the_agent_that_is_meant() {
+fn a_gateway_calls_the_gate_with_the_registered_name() {
     let gate = Arc::new(Guarded::default());
     let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
     for (name, life) in [("arm", ARM), ("brake", BRAKE)] {
@@ -120,7 +120,7 @@ fn a_gateway_judges_by_the_agent_that_is_meant() {
         let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, called, 1));
         assert_eq!(verdict, refused(), "{called}");
     }
-    assert!(core.poll_action().is_none(), "nothing came of it");
+    assert!(core.poll_action().is_none(), "the refusal caused no action");
     for _ in 0..2 {
         let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(ARM, "arm", 1));
         assert_eq!(verdict, Verdict::Now(Answer::Custody));

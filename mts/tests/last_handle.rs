@@ -19,7 +19,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// A transport that calls its sink with a lock held, and takes this lock when it is closed.
 struct Locked {
     sink: OnceLock<Arc<dyn Sink>>,
-    /// Tells which thread closes it.
+    /// Sends the ID of the thread that closes it.
     closing: Mutex<Sender<ThreadId>>,
     /// Serializes calls of the sink and `close`.
     turn: Mutex<()>,
@@ -68,7 +68,7 @@ impl Transport for Locked {
     }
 }
 
-/// Stops in the middle of a call until the test lets it go on.
+/// Stops in the middle of a call until the test continues it.
 struct Halting {
     called: Mutex<Sender<()>>,
     go_on: Mutex<Receiver<()>>,

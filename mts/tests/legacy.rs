@@ -1,4 +1,5 @@
-//! Letters to and from agents of legacy peers: failures that are certain at once, and their reasons.
+//! Letters to and from agents of legacy peers: failures that are certain at once, and their
+//! reasons.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -28,7 +29,7 @@ impl Bench {
         Self::with_window(locations, 16)
     }
 
-    /// The same, with so many letters under way at a time.
+    /// The same, with this many letters in transit at a time.
     fn with_window(locations: &[&str], window: usize) -> Self {
         let locations: Vec<Location> = locations.iter().map(|it| it.parse().unwrap()).collect();
         let directory: Arc<dyn Directory> =
@@ -116,7 +117,7 @@ fn a_letter_that_the_dialect_cannot_express_fails_at_once() {
     assert_eq!(outcome.attempts().len(), 1);
     assert!(!bench.core.has_open_letters());
 
-    // The route is not at fault: the next letter goes there at once.
+    // The route has not failed: the next letter goes there at once.
     bench.send(2);
     assert_eq!(bench.dispatched().1, "tcp://10.0.0.3:6789;fipa-services");
 }
@@ -177,13 +178,13 @@ fn a_letter_to_an_agent_that_has_unsupported_transports_only_fails_at_once() {
 
 const LEGACY: &str = "tcp://10.0.0.3:6789;fipa-services";
 
-/// What became of all letters, in order.
+/// The outcomes of all letters, in order.
 fn outcomes(bench: &mut Bench) -> Vec<Outcome> {
     std::iter::from_fn(|| bench.outcome()).collect()
 }
 
 #[test]
-fn letters_that_waited_for_a_dead_peer_tell_what_was_tried() {
+fn letters_that_waited_for_a_dead_peer_report_the_attempts() {
     let mut bench = Bench::with_window(&[LEGACY], 1);
     for _ in 0..3 {
         bench.send(0);
@@ -200,14 +201,14 @@ fn letters_that_waited_for_a_dead_peer_tell_what_was_tried() {
         assert_eq!(tried[0].location.to_string(), LEGACY);
         assert_eq!(tried[0].error.fault, WayFault::Unreachable);
     }
-    // Each failure message tells it, too.
+    // Each failure message contains it, too.
     for _ in 0..3 {
         let told = bench.core.take(ROVER).unwrap();
         let told = Message::decode(told.letter.payload()).unwrap();
         let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
         assert!(text.contains("unreachable: tcp://10.0.0.3:6789"), "{text}");
     }
-    // The next letter does not tell what earlier ones met.
+    // The next letter does not report the attempts of earlier ones.
     bench.send(5002);
     bench.dispatched();
     bench.core.handle_timeout(bench.at(10_003));
@@ -215,7 +216,7 @@ fn letters_that_waited_for_a_dead_peer_tell_what_was_tried() {
 }
 
 #[test]
-fn letters_that_waited_behind_a_silent_peer_tell_where() {
+fn letters_that_waited_for_a_silent_peer_report_its_location() {
     let mut bench = Bench::with_window(&[LEGACY], 1);
     for _ in 0..2 {
         bench.send(0);
@@ -229,7 +230,7 @@ fn letters_that_waited_behind_a_silent_peer_tell_where() {
 }
 
 #[test]
-fn the_last_error_of_each_location_is_told() {
+fn the_last_error_of_each_location_is_reported() {
     const FAR: Duration = Duration::from_secs(600);
     let mut bench = Bench::new(&[LEGACY, "tcp://10.0.0.3:6790;jade"]);
     bench.send_within(0, FAR);

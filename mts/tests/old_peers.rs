@@ -1,5 +1,5 @@
-//! Agents of old peers: how letters get to them, and what they are told of letters of theirs that
-//! did not arrive.
+//! Agents of legacy peers: delivery of letters to them, and failure messages about their own
+//! letters.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -21,15 +21,15 @@ use fipa_transport::{
     WayFault,
 };
 
-/// What a fipa_services agent, `cpp-sender`, sent to an agent `echo`.
+/// A recorded letter from a fipa_services agent, `cpp-sender`, to an agent `echo`.
 const LETTER: &[u8] = include_bytes!("../../acl/tests/vectors/tcp_letter.bin");
-/// What the service of fipa_services told `cpp-sender` of a letter that failed.
+/// A recorded failure message of the fipa_services service to `cpp-sender`.
 const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bin");
 
-/// Where that letter came from.
+/// Source address of that letter.
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
-/// What an agent of fipa_services sends comes from this address.
+/// The source of a letter from fipa_services at this address.
 fn legacy(address: IpAddr) -> LegacySource {
     LegacySource {
         address,
@@ -62,7 +62,7 @@ fn now() -> Now {
     }
 }
 
-/// The next letter that the core wants sent.
+/// The next letter that the core dispatches.
 fn dispatched(core: &mut Core) -> Option<(AttemptId, Location, Parcel)> {
     let mut actions = std::iter::from_fn(|| core.poll_action());
     match actions.find(|action| !matches!(action, Action::Heard { .. }))? {
@@ -82,10 +82,10 @@ fn message_of(parcel: &Parcel) -> Message {
     }
 }
 
-/// The recorded letter, as the transport hands it on.
+/// The recorded letter, as the transport passes it on.
 fn recorded(bytes: &'static [u8]) -> Letter {
     let (envelope, letter) = Letter::decode(Bytes::from_static(bytes)).unwrap();
-    // Its extension without a stamp is no part of the standard's.
+    // Its extension without a stamp is not part of the standard.
     let mut envelope = envelope;
     envelope.extensions.retain(|one| one.received.is_some());
     Letter::new(
@@ -104,8 +104,8 @@ fn nested(content: &[u8]) -> Message {
 }
 
 #[test]
-fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
-    // Where it is, only its letter says.
+fn the_sender_of_an_undeliverable_recorded_letter_gets_a_failure_message_in_its_dialect() {
+    // Only the letter itself has the location of its sender.
     let mut core = core(true, &[]);
     core.handle_unframed(
         now(),
@@ -140,7 +140,7 @@ fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
     let written = ours.encode(Representation::BitEfficient, Dialect::FipaServices);
     written.unwrap();
 
-    // It cannot be told: nobody is told of that.
+    // A failure message that cannot be delivered causes no other.
     let error = WayError::new(WayFault::Unreachable, "gone");
     let later = Now {
         instant: now().instant + Duration::from_secs(60),
@@ -153,13 +153,13 @@ fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
 }
 
 #[test]
-fn each_receiver_is_told_of_once_and_failures_never() {
+fn each_failed_receiver_is_reported_once_and_failed_failure_messages_never() {
     let mut core = core(true, &[("old", OLD_PEER)]);
     let message = |performative| {
         Message::builder(performative)
             .sender(AgentId::new("old").unwrap())
-            .receiver(AgentId::new("nobody").unwrap())
-            .receiver(AgentId::new("nobody-else").unwrap())
+            .receiver(AgentId::new("absent").unwrap())
+            .receiver(AgentId::new("absent-else").unwrap())
             .content("x".repeat(600))
             .build()
             .unwrap()
@@ -177,7 +177,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
         let content = message_of(&parcel).content().unwrap().clone();
         told.push(nested(&content).receivers()[0].name().to_owned());
     }
-    assert_eq!(told, ["nobody", "nobody-else"]);
+    assert_eq!(told, ["absent", "absent-else"]);
     core.handle_unframed(
         now(),
         deadline,
@@ -187,7 +187,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
 }
 
 #[test]
-fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
+fn a_location_on_another_host_than_the_source_gets_no_failure_message() {
     let mut core = core(true, &[]);
     let elsewhere = IpAddr::from([10, 0, 0, 66]);
     let deadline = Duration::from_secs(5);
@@ -199,7 +199,7 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
     assert!(core.poll_action().is_none(), "it came from {elsewhere}");
 }
 
-/// Lets nothing through to the agents whose names begin so.
+/// A gate that refuses all letters to agents whose names begin with this prefix.
 struct Refusing(&'static str);
 
 impl Gate for Refusing {
@@ -212,7 +212,7 @@ impl Gate for Refusing {
 }
 
 #[test]
-fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
+fn a_refused_sender_gets_failure_messages_in_its_dialect_at_a_limited_rate() {
     // The receiver of the recorded letter is on this host.
     let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
     let at = "shm://9#0000000000000009".parse().unwrap();
@@ -249,10 +249,10 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
         assert!(text.contains("refused"), "{text}");
         core.handle_conclusion(then, attempt, Conclusion::Handed);
     }
-    assert_eq!(told, 20, "as many as a second has");
+    assert_eq!(told, 20, "the limit per second");
 }
 
-/// The agents that became known, and where.
+/// The agents that became contacts, and their locations.
 fn heard(core: &mut Core) -> Vec<(String, String)> {
     let actions = std::iter::from_fn(|| core.poll_action());
     let heard = actions.filter_map(|action| match action {
@@ -270,7 +270,7 @@ fn heard(core: &mut Core) -> Vec<(String, String)> {
 }
 
 #[test]
-fn the_sender_of_a_recorded_letter_becomes_known_at_the_address_that_it_gives() {
+fn the_sender_of_a_recorded_letter_becomes_a_contact_at_its_stated_address() {
     let host = || {
         let config = CoreConfig {
             forwards: true,
@@ -288,7 +288,7 @@ fn the_sender_of_a_recorded_letter_becomes_known_at_the_address_that_it_gives() 
     let at = "tcp://127.0.0.1:45615;fipa-services";
     assert_eq!(heard(&mut core), known(at));
 
-    // An address of another host is not believed.
+    // An address of another host is ignored.
     let mut core = host();
     arrives(&mut core, recorded(LETTER), IpAddr::from([10, 0, 0, 66]));
     assert_eq!(heard(&mut core), []);
@@ -367,23 +367,23 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_while_it_writes() {
         heard.len()
     };
     assert_eq!(writes(0, HERE, 1000), 1);
-    assert_eq!(writes(1, HERE, 1000), 0, "it is known");
-    assert_eq!(writes(2, elsewhere, 1000), 0, "the name has an owner");
-    assert_eq!(writes(3, HERE, 2000), 1, "it listens elsewhere now");
-    assert_eq!(writes(20, HERE, 2000), 1, "it is remembered for longer");
+    assert_eq!(writes(1, HERE, 1000), 0, "it is a contact already");
+    assert_eq!(writes(2, elsewhere, 1000), 0, "another agent has the name");
+    assert_eq!(writes(3, HERE, 2000), 1, "its location has changed");
+    assert_eq!(writes(20, HERE, 2000), 1, "the contact is renewed");
     assert_eq!(writes(21, elsewhere, 1000), 0);
     let at = contacts.lookup("cpp-sender").unwrap().locations[0].to_string();
     assert_eq!(at, "tcp://127.0.0.1:2000;fipa-services");
 }
 
-/// A letter whose message has lost its end.
+/// A letter with a truncated message.
 fn without_end(letter: &Letter) -> Letter {
     let payload = letter.payload().to_bytes();
     Letter::new(letter.envelope(), payload.slice(..payload.len() - 3))
 }
 
 #[test]
-fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
+fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_gets_a_failure_message() {
     let config = CoreConfig {
         forwards: true,
         ..CoreConfig::new(
@@ -398,7 +398,7 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
     let unframed = read(&core, letter.clone(), Kind::Tcp, HERE);
     core.handle_unframed(now(), deadline, unframed);
     let (_, location, parcel) = dispatched(&mut core).unwrap();
-    // The envelope says where the sender is, as the message of another letter does.
+    // The envelope has the location of the sender, which other letters have in the message.
     assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
     let failure = message_of(&parcel);
     assert_eq!(*failure.performative(), Performative::Failure);
@@ -409,17 +409,17 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
     let expected = "description: message delivery failed: refused: the message cannot be decoded: ";
     assert!(text.starts_with(expected), "{text}");
     assert_eq!(text.lines().count(), 2, "{text}");
-    // The agent does not get it.
+    // The letter is not delivered to the agent.
     assert!(core.poll_action().is_none());
 
-    // An address of another host is not believed.
+    // An address of another host is ignored.
     let unframed = read(&core, letter, Kind::Tcp, IpAddr::from([10, 0, 0, 66]));
     core.handle_unframed(now(), deadline, unframed);
     assert!(core.poll_action().is_none());
 }
 
 #[test]
-fn the_sender_of_a_framed_letter_that_cannot_be_decoded_is_told() {
+fn the_sender_of_a_framed_letter_that_cannot_be_decoded_gets_a_failure_message() {
     let mut core = Core::new(
         CoreConfig::new("process", Incarnation::from_u64(7), vec![Kind::Shm]),
         host_of("rover"),
@@ -449,7 +449,7 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_is_told() {
     let told = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
     assert!(told.contains("refused: the message cannot be decoded: for a test"));
 
-    // Another agent that writes under this name is not believed, and the agent is not told.
+    // A letter of another agent under this name causes no failure message.
     let other = received(Incarnation::from_u64(66));
     core.handle_undecodable(now(), &arm, &other, "for a test".to_owned());
     assert!(core.poll_action().is_none());
@@ -464,7 +464,7 @@ fn host_of(agent: &str) -> Arc<dyn Directory> {
     Arc::new(directory)
 }
 
-/// The recorded letter to an agent with another name, as the C++ library writes it.
+/// The recorded letter to an agent with another name, as the C++ library encodes it.
 fn recorded_to(receiver: &str) -> Letter {
     let (mut envelope, letter) = Letter::decode(Bytes::from_static(LETTER)).unwrap();
     envelope.extensions.clear();
@@ -494,7 +494,7 @@ fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
 }
 
 #[test]
-fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
+fn a_sender_whose_letters_all_fail_does_not_use_up_the_limit_of_another() {
     let mut core = core(true, &[]);
     let deadline = Duration::from_secs(5);
     let letter_of = |name: &str| {
@@ -502,7 +502,7 @@ fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
         let sender = AgentId::new(name).unwrap().with_address(&at).unwrap();
         let message = Message::builder(Performative::Inform)
             .sender(sender)
-            .receiver(AgentId::new("nobody").unwrap())
+            .receiver(AgentId::new("absent").unwrap())
             .build()
             .unwrap();
         letter_for(&message, now().utc).unwrap()
@@ -522,7 +522,7 @@ fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
     assert!(told(&mut core, "quiet"));
 }
 
-/// The names of the receivers that failure messages tell of, when a letter to these has come.
+/// The receivers that failure messages name after a letter to these receivers.
 fn told_of(core: &mut Core, receivers: &[String]) -> Vec<String> {
     let mut message = Message::builder(Performative::Request).sender(AgentId::new("old").unwrap());
     for receiver in receivers {
@@ -542,27 +542,27 @@ fn told_of(core: &mut Core, receivers: &[String]) -> Vec<String> {
 #[test]
 fn a_letter_to_too_many_receivers_or_patterns_is_refused_as_a_whole() {
     let names =
-        |count: usize| -> Vec<String> { (0..count).map(|it| format!("nobody-{it}")).collect() };
+        |count: usize| -> Vec<String> { (0..count).map(|it| format!("absent-{it}")).collect() };
     let patterns =
-        |count: usize| -> Vec<String> { (0..count).map(|it| format!("nobody{{{it}}}")).collect() };
+        |count: usize| -> Vec<String> { (0..count).map(|it| format!("absent{{{it}}}")).collect() };
     for refused in [names(65), names(20_000), patterns(2), patterns(1_000)] {
         let mut core = core(true, &[("old", OLD_PEER)]);
         assert_eq!(told_of(&mut core, &refused), [refused[0].clone()]);
     }
-    let long = format!("nobody-{}.*", "x".repeat(120));
+    let long = format!("absent-{}.*", "x".repeat(120));
     let mut one = core(true, &[("old", OLD_PEER)]);
     assert_eq!(told_of(&mut one, std::slice::from_ref(&long)), [long]);
 
-    // What is allowed reaches who is meant, and the sender is told of the others, but gets no more
-    // bytes than it has sent.
-    let mut core = core(true, &[("old", OLD_PEER), ("nobody.x", OLD_PEER)]);
+    // An allowed letter reaches its receivers. The sender gets failure messages about the others,
+    // but no more bytes than it has sent.
+    let mut core = core(true, &[("old", OLD_PEER), ("other.x", OLD_PEER)]);
     let told = told_of(&mut core, &names(64));
     assert!((1..10).contains(&told.len()), "{told:?}");
 }
 
 #[test]
-fn a_letter_to_an_old_peers_agent_is_sent_not_delivered() {
-    // In the sender's process the way is the gateway's, in the gateway the peer's own.
+fn a_letter_to_a_legacy_peers_agent_is_sent_not_delivered() {
+    // The sender's process uses the gateway's location, and the gateway the peer's own.
     let near = "tcp://10.0.0.1:7788#0000000000000007";
     let (mut process, mut gateway) = (
         core(false, &[("old", near)]),
@@ -629,7 +629,7 @@ fn a_letter_to_an_old_peers_agent_is_sent_not_delivered() {
 }
 
 #[test]
-fn an_old_peer_that_cannot_be_reached_fails_like_anybody() {
+fn letters_to_an_unreachable_legacy_peer_fail_like_others() {
     let mut core = core(false, &[("old", OLD_PEER)]);
     let rover = Incarnation::from_u64(1);
     core.register("rover".into(), rover);
@@ -649,7 +649,7 @@ fn an_old_peer_that_cannot_be_reached_fails_like_anybody() {
         },
     );
     let (attempt, _, _) = dispatched(&mut core).unwrap();
-    let error = WayError::new(WayFault::Unreachable, "nobody listens");
+    let error = WayError::new(WayFault::Unreachable, "connection refused");
     core.handle_conclusion(start, attempt, Conclusion::NotSent(error));
     let over = Now {
         instant: start.instant + Duration::from_secs(1),
@@ -666,14 +666,14 @@ fn an_old_peer_that_cannot_be_reached_fails_like_anybody() {
         }
         other => panic!("{other:?}"),
     }
-    // The agent is told in its own process, in the standard's words.
+    // The agent gets a failure message in its own process, in FIPA SL.
     let told = core.take(rover).unwrap();
     let told = Message::decode(told.letter.payload()).unwrap();
     assert_eq!(*told.performative(), Performative::Failure);
     assert_eq!(told.language(), Some("fipa-sl"));
 }
 
-/// The letter as it is read for this core.
+/// Parses the letter for this core.
 fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
     Unframed::read(letter, via, legacy(from), &**core.directory()).unwrap()
 }

@@ -1,4 +1,4 @@
-//! Static peers: when they are asked whether they are there.
+//! Static peers: times of the checks of contact.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -33,7 +33,7 @@ impl Bench {
         }
     }
 
-    /// The one thing asked since the last time, if anything was.
+    /// The check since the last call, if there was one.
     fn asked(&mut self) -> Option<(AttemptId, String)> {
         match self.core.poll_action()? {
             Action::Dispatch {
@@ -49,7 +49,7 @@ impl Bench {
     }
 
     fn fails(&mut self, attempt: AttemptId) {
-        let error = WayError::new(WayFault::Unreachable, "nobody");
+        let error = WayError::new(WayFault::Unreachable, "no host");
         let conclusion = Conclusion::NotSent(error);
         self.core.handle_conclusion(self.now, attempt, conclusion);
     }
@@ -59,7 +59,7 @@ impl Bench {
         self.core.handle_conclusion(self.now, attempt, conclusion);
     }
 
-    /// Lets time pass until something is due; says how long that was.
+    /// Advances the time to the next timeout; returns the time that passed.
     fn wait(&mut self) -> Duration {
         let due = self.core.poll_timeout().unwrap();
         let waited = due - self.now.instant;
@@ -80,7 +80,7 @@ fn peer(locations: &[&str]) -> Peer {
 #[test]
 fn every_location_is_asked_and_then_again_after_growing_pauses() {
     let mut bench = Bench::new();
-    // In the order of the configuration's transports; what it does not use is left out.
+    // In the order of the configured transports; others are left out.
     let listed = peer(&["quic://a:1", "tcp://a:2", "udp://a:3", "tcp://b:4"]);
     bench.core.keep_in_touch(bench.now, vec![listed]);
     let mut pauses = Vec::new();
@@ -102,7 +102,7 @@ fn every_location_is_asked_and_then_again_after_growing_pauses() {
 }
 
 #[test]
-fn who_answers_is_asked_seldom_and_at_once_when_the_connection_ends() {
+fn a_peer_that_answers_is_checked_seldom_and_after_its_connection_ends() {
     let mut bench = Bench::new();
     let listed = peer(&["tcp://a:2"]);
     bench.core.keep_in_touch(bench.now, vec![listed.clone()]);
@@ -128,7 +128,7 @@ fn who_answers_is_asked_seldom_and_at_once_when_the_connection_ends() {
     assert_eq!(bench.wait(), Duration::ZERO);
     let (attempt, _) = bench.asked().unwrap();
     bench.answers(attempt);
-    // One that comes and goes all the time is not asked all the time.
+    // A connection that ends frequently does not cause frequent checks.
     bench.core.handle_parted(bench.now, &parted);
     assert_eq!(bench.wait(), Duration::from_millis(200));
 }
@@ -151,12 +151,12 @@ fn a_location_that_is_silent_delays_no_other() {
         matches!(abandoned, Some(Action::Abandon { attempt, .. }) if attempt == silent),
         "{abandoned:?}"
     );
-    // While the peer answers at one location, only that one is asked.
+    // While the peer answers at one location, only that one is checked.
     bench.wait();
     let (attempt, at) = bench.asked().unwrap();
     assert_eq!(at, "tcp://b:2");
     assert!(bench.asked().is_none());
-    // It answers there no more: all are asked.
+    // After it stops answering there, all are checked.
     bench.fails(attempt);
     assert_eq!(bench.asked().unwrap().1, "tcp://a:2");
     assert_eq!(bench.wait(), Duration::from_millis(100));
@@ -179,7 +179,7 @@ fn silence_counts_as_a_failure() {
 }
 
 #[test]
-fn other_peers_replace_those_before_and_the_same_stay() {
+fn a_new_list_replaces_peers_and_keeps_the_state_of_common_ones() {
     let mut bench = Bench::new();
     let (first, second) = (peer(&["tcp://a:1"]), peer(&["tcp://b:1"]));
     bench.core.keep_in_touch(bench.now, vec![first.clone()]);
@@ -198,7 +198,7 @@ fn other_peers_replace_those_before_and_the_same_stay() {
 }
 
 #[test]
-fn a_change_of_the_network_has_peers_asked_at_once() {
+fn peers_are_checked_at_once_after_a_network_change() {
     let mut bench = Bench::new();
     bench
         .core
@@ -215,7 +215,7 @@ fn a_change_of_the_network_has_peers_asked_at_once() {
     bench.core.handle_reachable(bench.now, None);
     let (attempt, asked) = bench.asked().unwrap();
     assert_eq!(asked, "tcp://a:2");
-    // The pauses start from the shortest again.
+    // The backoff restarts at its minimum.
     bench.fails(attempt);
     assert_eq!(bench.wait(), Duration::from_millis(100));
 }
@@ -233,7 +233,7 @@ fn a_greeting_opens_a_connection_and_is_not_repeated() {
 }
 
 #[test]
-fn letters_that_wait_go_when_their_receiver_is_reachable_again() {
+fn waiting_letters_leave_when_their_receiver_is_reachable_again() {
     let gateway = Incarnation::from_u64(7);
     let directory = Arc::new(MemoryDirectory::new(Mts::new(
         "mts",
@@ -267,7 +267,7 @@ fn letters_that_wait_go_when_their_receiver_is_reachable_again() {
             _ => {}
         }
     };
-    // Until the pause is a long one.
+    // Until the backoff is long.
     let mut waited = Duration::ZERO;
     while waited < Duration::from_millis(200) {
         let attempt = dispatched(&mut bench);

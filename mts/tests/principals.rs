@@ -15,16 +15,16 @@ use fipa_transport::{
 };
 
 const GATEWAY: Incarnation = Incarnation::from_u64(1);
-/// A process of this host, with the arm.
+/// A process of this host, with the agent `arm`.
 const PROCESS: Incarnation = Incarnation::from_u64(2);
 const ARM: Incarnation = Incarnation::from_u64(3);
-/// A gateway of another host, with the rover.
+/// A gateway of another host, with the agent `rover`.
 const HONEST: Incarnation = Incarnation::from_u64(4);
 const ROVER: Incarnation = Incarnation::from_u64(5);
-/// Another gateway, as trusted as that one.
+/// Another gateway, with an equally trusted certificate.
 const LIAR: Incarnation = Incarnation::from_u64(6);
 
-/// The gateway of a host, which has met both peers.
+/// The gateway of a host that has connections with both peers.
 struct Bench {
     core: Core,
     now: Now,
@@ -36,7 +36,7 @@ fn at(service: Incarnation, address: &str) -> Location {
     location.with_incarnation(service)
 }
 
-/// A link with one of the two peers, which names this service.
+/// A link with one of the two peers that claims this service.
 fn link(service: Incarnation, holder: Incarnation) -> Hop {
     let number = u8::try_from(holder.as_u64()).unwrap();
     Hop {
@@ -133,7 +133,7 @@ fn a_gateway_speaks_for_itself() {
     let mut bench = Bench::new();
     let goodbye = bench.letter(link(LIAR, LIAR), (HONEST, GATEWAY), 1 << 48);
     assert!(is_refused(&goodbye), "{goodbye:?}");
-    // Nor when the liar names the honest one as itself.
+    // Also when the liar introduces itself as the honest gateway.
     let goodbye = bench.letter(link(HONEST, LIAR), (HONEST, GATEWAY), 1 << 48);
     assert!(is_refused(&goodbye), "{goodbye:?}");
     let own = bench.letter(link(HONEST, HONEST), (HONEST, GATEWAY), 1);
@@ -151,13 +151,13 @@ fn letters_in_the_stream_of_another_host_are_refused() {
     }
     let real = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
     assert_eq!(real, Verdict::Later);
-    // Nor does another host speak for an agent of this one.
+    // Another host cannot speak for an agent of this one either.
     let own = bench.letter(link(LIAR, LIAR), (ARM, GATEWAY), 1);
     assert!(is_refused(&own), "{own:?}");
 }
 
 #[test]
-fn a_sender_that_nothing_is_known_of_belongs_to_the_first_link() {
+fn an_unknown_sender_belongs_to_the_first_link() {
     let mut bench = Bench::new();
     let stranger = Incarnation::from_u64(99);
     let first = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
@@ -207,7 +207,7 @@ fn a_connected_service_is_accepted_with_its_own_certificate_only() {
 }
 
 #[test]
-fn only_the_service_that_has_a_letter_reports_of_it() {
+fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
     let mut bench = Bench::new();
     bench
         .core
@@ -255,7 +255,7 @@ fn only_the_service_that_has_a_letter_reports_of_it() {
 }
 
 #[test]
-fn a_process_of_this_host_is_not_believed_to_be_on_another() {
+fn a_report_from_the_network_in_the_name_of_a_local_process_is_ignored() {
     let mut bench = Bench::new();
     let taken = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
     assert_eq!(taken, Verdict::Later);

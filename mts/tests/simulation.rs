@@ -1,11 +1,10 @@
-//! The delivery core on virtual time: hosts with processes and gateways, links that lose, delay
-//! and break, processes that die and come back. The promises of delivery are checked as
-//! invariants in every run; when one breaks, the seed is printed.
+//! The delivery core on virtual time: hosts with processes and gateways, links that lose, delay and
+//! break, processes that die and restart. The delivery guarantees are checked as invariants in
+//! every run; a violation prints the seed.
 //!
-//! The core is the very one that the runtime drives. What is simulated is everything around it:
-//! transports, clocks, the directory.
+//! The core is the one that the runtime drives. Transports, clocks and the directory are simulated.
 
-#![expect(clippy::print_stdout, reason = "a long run tells how far it went")]
+#![expect(clippy::print_stdout, reason = "a long run prints its progress")]
 
 mod world;
 
@@ -16,7 +15,7 @@ use fipa_transport::Kind;
 use world::{Deadlines, Weather, World};
 
 /// `FIPA_SIM_SEEDS=100000 cargo test -p fipa-mts --test simulation` runs more of them, and
-/// `FIPA_SIM_SEED=17` one. With `FIPA_SIM_TRACE=1` it prints what happens.
+/// `FIPA_SIM_SEED=17` one. With `FIPA_SIM_TRACE=1` it prints the events.
 fn seeds(usually: u64) -> Vec<u64> {
     let number = |name: &str| {
         std::env::var(name)
@@ -29,7 +28,7 @@ fn seeds(usually: u64) -> Vec<u64> {
     (0..number("FIPA_SIM_SEEDS").unwrap_or(usually)).collect()
 }
 
-/// Each profile of faults is a test, and so is the same with hostile members.
+/// Each profile of faults is a test, and each profile with hostile members is another.
 macro_rules! profiles {
     ($($(#[$doc:meta])* $name:ident = $weather:expr;)*) => {
         $(
@@ -40,7 +39,8 @@ macro_rules! profiles {
             }
         )*
 
-        /// A gateway of another host and a process of this one lie, at any time and in every field.
+        /// A gateway of another host and a process of this one send false data, at any time and in
+        /// every field.
         mod among_liars {
             use super::*;
 
@@ -55,13 +55,14 @@ macro_rules! profiles {
     };
 }
 
-/// Seeds of each profile, unless the environment says otherwise.
+/// Number of seeds of each profile, unless the environment sets another.
 const SEEDS: u64 = 20;
-/// Seeds of each profile with hostile members.
+/// Number of seeds of each profile with hostile members.
 const FEW_SEEDS: u64 = 2;
 
-/// Runs every seed, and fails with the first breach of each invariant and the number of seeds in
-/// which it was broken. Returns how many letters a later registration of their receiver took.
+/// Runs every seed, and fails with the first violation of each invariant and the number of seeds
+/// that violated it. Returns the number of letters that a later registration of their receiver
+/// took.
 fn run(weather: Weather, usually: u64) -> u64 {
     let (mut letters, mut followed, mut bounded) = (0, 0, 0);
     let mut slowest = Duration::ZERO;
@@ -197,8 +198,8 @@ profiles! {
             ..Weather::calm()
         };
 
-    // Letters that fail, and streams that go on: after each of these letters the ones behind it are
-    // delivered as if it had never been sent.
+    // Letters that fail in streams that continue: the letters behind each of these are delivered as
+    // if it had never been sent.
 
     letters_that_gateways_refuse_hold_up_no_stream = Weather {
             refused_by_gateways: 0.02,
@@ -244,7 +245,7 @@ profiles! {
             ..Weather::busy()
         };
 
-    /// Two gateways hold letters of a stream at once, because the last stretch is slow.
+    /// Two gateways hold letters of a stream at once, because the last hop is slow.
     two_slow_gateways_hold_up_no_stream = Weather {
             local_ms: 80,
             answering_ms: 50,
@@ -271,7 +272,7 @@ profiles! {
             ..Weather::busy()
         };
 
-    // Receivers that are registered again while copies of their letters are still on the way.
+    // Receivers that are registered again while copies of their letters are still in transit.
 
     late_copies_reach_no_agent_that_has_moved = Weather {
             overtaken: 0.2,
@@ -330,7 +331,7 @@ profiles! {
             ..Weather::busy()
         };
 
-    // Bounds.
+    // Limits.
 
     bytes_of_queues_and_lanes_are_bounded = Weather {
         order: &[Kind::Shm, Kind::Tcp],

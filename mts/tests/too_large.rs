@@ -48,7 +48,7 @@ impl Bench {
         }
     }
 
-    /// The arm is reached by these routes from now on.
+    /// Sets the routes to the arm.
     fn reached_by(&mut self, ms: u64, routes: &[&str]) {
         let _ = self.directory.deregister("arm", ARM);
         let locations: Vec<Location> = routes.iter().map(|it| it.parse().unwrap()).collect();

@@ -1,9 +1,9 @@
-//! The worst letters that the limits allow: the steps of the core for each are bounded by its bytes.
-//! In a release, `--nocapture` shows the time that the core takes for it, which is the time under the
-//! runtime's lock.
+//! The most expensive letters within the limits: the steps of the core for each are bounded by its
+//! bytes. In a release build, `--nocapture` shows the time that the core takes, during which the
+//! runtime's lock is held.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
-#![expect(clippy::print_stdout, reason = "it tells the time")]
+#![expect(clippy::print_stdout, reason = "it prints the time")]
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
@@ -63,8 +63,8 @@ fn letter(receivers: &[String], parameters: usize) -> Letter {
     letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap()
 }
 
-/// Does the work of one arrival. Its steps are bounded by its bytes and by its receivers, of which there
-/// are as many as agents of this host for a pattern.
+/// Performs the work of one arrival. Its steps are bounded by its bytes and its receivers; for a
+/// pattern these may be all agents of this host.
 fn bounded<R>(what: &str, bytes: usize, receivers: u64, work: impl FnOnce() -> R) -> R {
     #[cfg(debug_assertions)]
     let _before = work::taken();
@@ -121,7 +121,7 @@ fn unframed(core: &mut Core, directory: &dyn Directory, what: &str, letter: Lett
 }
 
 #[test]
-fn a_letter_of_a_legacy_peer_to_the_most_receivers() {
+fn a_letter_of_a_legacy_peer_to_the_maximum_of_receivers() {
     let names: Vec<String> = (0..64).map(|number| format!("arm_{number}")).collect();
     let unknown: Vec<String> = (0..64).map(|number| format!("nobody_{number}")).collect();
     let pattern = vec!["arm_.*".to_owned()];
@@ -139,7 +139,7 @@ fn a_letter_of_a_legacy_peer_to_the_most_receivers() {
 }
 
 #[test]
-fn a_letter_with_the_most_parameters() {
+fn a_letter_with_the_maximum_of_parameters() {
     for parameters in [0, 1000, 50_000] {
         let (mut core, _) = core();
         let letter = letter(&["arm_0".to_owned()], parameters);
@@ -152,7 +152,7 @@ fn a_letter_with_the_most_parameters() {
 }
 
 #[test]
-fn a_letter_with_the_most_stamps() {
+fn a_letter_with_the_maximum_of_stamps() {
     for stamps in [1, 100, 5000] {
         let (mut core, _) = core();
         let mut letter = letter(&["arm_0".to_owned()], 0);
@@ -177,7 +177,7 @@ fn a_letter_with_the_most_stamps() {
     }
 }
 
-/// A full lane whose letters all wait for the one before them.
+/// A full lane in which every letter waits for the one before it.
 #[test]
 fn a_letter_for_a_full_lane() {
     let (mut core, _) = core();

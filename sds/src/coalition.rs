@@ -1,12 +1,12 @@
-//! Coalitions: names of their own that stand for several agents, such as the agents of modules
-//! that are physically joined.
+//! Coalitions: names that stand for several agents, such as the agents of modules that are
+//! physically joined.
 //!
-//! A coalition is an entry with the role [`Role::Coalition`], which says who its [`Members`] are,
-//! by name: an agent that moves to another host stays a member. It has no queue; a letter to it is
-//! one letter to each member, or to its leader. Members may be coalitions.
+//! A coalition is an entry with the role [`Role::Coalition`], which lists its [`Members`] by name:
+//! an agent that moves to another host stays a member. A coalition has no queue; a letter to it is
+//! sent as one letter to each member, or to its leader. Members may be coalitions.
 //!
-//! What the network says about coalitions may be hostile, so the number of members, how deep
-//! coalitions are nested and how many agents one name can mean are bounded.
+//! Entries from the network may be hostile, so the number of members, the nesting depth of
+//! coalitions and the number of agents that one name stands for are bounded.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -15,34 +15,34 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Directory, Entry, NameError, Role, check_name};
 
-/// Who belongs to a coalition, and who leads it.
+/// Members of a coalition, and its leader if it has one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(try_from = "Said", into = "Said")]
+#[serde(try_from = "CoalitionRecord", into = "CoalitionRecord")]
 pub struct Members {
     names: Arc<[Arc<str>]>,
     leader: Option<Arc<str>>,
 }
 
-/// As it is written: `{"members": [name], "leader": name}`.
+/// Serialized form: `{"members": [name], "leader": name}`.
 #[derive(Serialize, Deserialize)]
-struct Said {
+struct CoalitionRecord {
     members: Vec<Arc<str>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     leader: Option<Arc<str>>,
 }
 
 impl Members {
-    /// Most members of one coalition.
+    /// Maximum number of members of one coalition.
     pub const MAX_MEMBERS: usize = 64;
-    /// Longest names of all members together, in bytes: they have to fit an mDNS record.
+    /// Maximum length of the names of all members together, in bytes: they must fit an mDNS record.
     pub const MAX_BYTES: usize = 2048;
 
-    /// These members, in this order; who is named twice counts once. Letters to the coalition go
-    /// to all of them, or to the leader only when there is one.
+    /// Creates a member list in this order; duplicate names are dropped. Letters to the coalition
+    /// go to all members, or to the leader only when there is one.
     ///
     /// # Errors
-    /// When there are none or too many, one has no name that an agent can have, or the leader is
-    /// no member.
+    /// Fails when there are no members or too many, when a member's name is not valid, or when the
+    /// leader is not a member.
     pub fn new<N: Into<Arc<str>>>(
         names: impl IntoIterator<Item = N>,
         leader: Option<Arc<str>>,
@@ -73,19 +73,19 @@ impl Members {
         })
     }
 
-    /// Their names, at least one.
+    /// Names of the members; at least one.
     #[must_use]
     pub fn names(&self) -> &[Arc<str>] {
         &self.names
     }
 
-    /// Who gets all letters to the coalition, if somebody does.
+    /// The leader, which receives all letters to the coalition, if there is one.
     #[must_use]
     pub fn leader(&self) -> Option<&Arc<str>> {
         self.leader.as_ref()
     }
 
-    /// Those to whom letters to the coalition go.
+    /// Receivers of letters to the coalition.
     fn addressed(&self) -> &[Arc<str>] {
         match &self.leader {
             Some(leader) => std::slice::from_ref(leader),
@@ -94,15 +94,15 @@ impl Members {
     }
 }
 
-impl TryFrom<Said> for Members {
+impl TryFrom<CoalitionRecord> for Members {
     type Error = MembersError;
 
-    fn try_from(said: Said) -> Result<Self, MembersError> {
-        Self::new(said.members, said.leader)
+    fn try_from(record: CoalitionRecord) -> Result<Self, MembersError> {
+        Self::new(record.members, record.leader)
     }
 }
 
-impl From<Members> for Said {
+impl From<Members> for CoalitionRecord {
     fn from(members: Members) -> Self {
         Self {
             members: members.names.to_vec(),
@@ -111,65 +111,65 @@ impl From<Members> for Said {
     }
 }
 
-/// Why these cannot be the members of a coalition.
+/// Error of [`Members::new`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum MembersError {
-    /// There are none.
+    /// The list is empty.
     #[error("a coalition needs a member")]
     None,
-    /// There are too many.
+    /// The list has too many members, or their names are too long.
     #[error(
-        "too many members: at most {max} with names of {bytes} bytes together; form several \
-         coalitions, and one of them",
+        "too many members: at most {max} with names of {bytes} bytes together; split it into several \
+         coalitions and form a coalition of them",
         max = Members::MAX_MEMBERS,
         bytes = Members::MAX_BYTES
     )]
     TooMany,
-    /// A member has no name that an agent can have.
+    /// The name of a member is not valid.
     #[error("member: {0}")]
     Name(#[from] NameError),
-    /// The leader is no member.
-    #[error("the leader {0:?} is no member; name it among the members, too")]
+    /// The leader is not a member.
+    #[error("the leader {0:?} is not a member; add it to the members")]
     Leader(String),
 }
 
-/// How deep coalitions of coalitions are followed.
+/// Maximum nesting depth of coalitions.
 const MAX_DEPTH: usize = 4;
-/// Most agents that one coalition means, its coalitions included.
+/// Maximum number of agents that one coalition stands for, including nested coalitions.
 const MAX_AGENTS: usize = 256;
 
-/// The agents that a letter from `sender` to this coalition goes to, and the names of members that
-/// nobody has, or that are beyond the bounds.
+/// Returns the agents to which a letter from `sender` to this coalition goes, and the names of
+/// members that have no entry or exceed the bounds.
 pub(crate) fn agents_of(
     directory: &dyn Directory,
     coalition: &Entry,
     sender: &str,
 ) -> (Vec<Arc<Entry>>, Vec<Arc<str>>) {
-    let mut gathered = Gathered {
+    let mut resolved = ResolvedMembers {
         seen: HashSet::from([Arc::clone(&coalition.name)]),
-        ..Gathered::default()
+        ..ResolvedMembers::default()
     };
-    gathered.add(directory, coalition, sender, 1);
-    (gathered.agents, gathered.missing)
+    resolved.add(directory, coalition, sender, 1);
+    (resolved.agents, resolved.missing)
 }
 
 #[derive(Default)]
-struct Gathered {
+struct ResolvedMembers {
     seen: HashSet<Arc<str>>,
     agents: Vec<Arc<Entry>>,
     missing: Vec<Arc<str>>,
 }
 
-impl Gathered {
+impl ResolvedMembers {
     fn add(&mut self, directory: &dyn Directory, coalition: &Entry, sender: &str, depth: usize) {
         let Role::Coalition(members) = &coalition.role else {
             return;
         };
         let led = members.leader().is_some();
         for name in members.addressed() {
-            // Its members write to a coalition, not to themselves; its leader is meant, whoever
-            // writes. And who is a member twice gets one letter.
+            // A member's letter to its coalition does not go back to that member; a leader receives
+            // every letter, including its own. An agent that is a member twice gets one letter.
             if (!led && **name == *sender) || !self.seen.insert(Arc::clone(name)) {
                 continue;
             }
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_coalition_means_its_members_but_the_sender_or_its_leader() {
+    fn a_coalition_resolves_to_its_members_without_the_sender_or_to_its_leader() {
         let directory = directory(&["a", "b", "c"]);
         form(&directory, "all", &["a", "b", "gone", "c"], None);
         form(&directory, "led", &["a", "b"], Some("b"));
@@ -259,7 +259,7 @@ mod tests {
         assert_eq!(meant(&directory, "led", "b").0, ["b"]);
         form(&directory, "alone", &["a"], None);
         assert_eq!(resolve(&directory, "alone", "a").unwrap(), Resolution::None);
-        // Patterns mean agents.
+        // Patterns match agents only.
         let Resolution::Multicast(entries) = resolve(&directory, ".*", "a").unwrap() else {
             panic!("a pattern");
         };
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn coalitions_of_coalitions_end() {
+    fn nested_coalitions_are_resolved_within_bounds() {
         let directory = directory(&["a", "b", "z"]);
         form(&directory, "one", &["a", "two"], None);
         form(&directory, "two", &["one", "b", "two", "a"], None);

@@ -1,8 +1,7 @@
-//! The back end of those who have written: agents of other hosts that are known by nothing but a
-//! letter of theirs.
+//! Back end for agents of other hosts that are known only from a letter of theirs.
 //!
-//! A letter may be faster than the news of its sender, and on some networks the news never comes.
-//! Whoever has just written can be answered all the same, for a while.
+//! A letter may arrive before the announcement of its sender, and on some networks the announcement
+//! never arrives. This back end makes it possible to answer such a sender for a limited time.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -14,11 +13,11 @@ use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
 use crate::{Directory, Entry, EntryError, Mts, Reach, Role, Source, Subscriber};
 
-/// Agents of other hosts that have written, each until it is forgotten.
+/// Agents of other hosts that sent a letter, each until its entry expires.
 ///
-/// Bounded: of more than [`ContactDirectory::MAX_CONTACTS`] the one that was heard longest ago is
-/// forgotten. Hearsay never replaces what other back ends know: merge this one last, and let go
-/// of an agent as soon as another back end knows it.
+/// Bounded: beyond [`ContactDirectory::MAX_CONTACTS`] the contact with the oldest last letter is
+/// evicted. A contact must not replace the entries of other back ends: merge this directory last,
+/// and drop a contact as soon as another back end has the agent ([`forget`](Self::forget)).
 #[derive(Debug)]
 pub struct ContactDirectory {
     table: Table<()>,
@@ -26,12 +25,12 @@ pub struct ContactDirectory {
 }
 
 impl ContactDirectory {
-    /// Most agents kept.
+    /// Maximum number of contacts.
     pub const MAX_CONTACTS: usize = 1024;
-    /// How long an agent that is not heard of again is kept.
+    /// Time for which a contact is kept after its last letter.
     pub const MEMORY: Duration = Duration::from_secs(60);
 
-    /// Nobody has written yet.
+    /// Creates an empty directory.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -40,11 +39,12 @@ impl ContactDirectory {
         }
     }
 
-    /// An agent of another host has written, `now`; letters for it go to `location`, which has the
-    /// incarnation of the message transport service there. Says whether it was unknown here.
+    /// Records that an agent of another host sent a letter at `now`; letters to it go to
+    /// `location`, which has the incarnation of the message transport service there. Returns true
+    /// if this incarnation of the agent was not a contact before.
     ///
     /// # Errors
-    /// When the name is none.
+    /// Fails when the name is not valid.
     pub fn heard(
         &self,
         now: Instant,
@@ -79,7 +79,7 @@ impl ContactDirectory {
         Ok(known.is_none_or(|(known, _)| known.incarnation != incarnation))
     }
 
-    /// Forgets those that were heard too long ago, and those that somebody else `knows` by now.
+    /// Drops contacts older than [`MEMORY`](Self::MEMORY), and those that another back end `knows`.
     pub fn forget(&self, now: Instant, knows: impl Fn(&Entry) -> bool) {
         self.heard.lock().retain(|(entry, heard)| {
             let old = now.saturating_duration_since(*heard) >= Self::MEMORY;
@@ -110,22 +110,31 @@ mod tests {
         "tcp://192.0.2.1:7788#00000000000000aa".parse().unwrap()
     }
 
-    fn life(number: u64) -> Incarnation {
+    fn incarnation(number: u64) -> Incarnation {
         Incarnation::from_u64(number)
     }
 
     #[test]
-    fn who_has_written_is_known_until_forgotten() {
+    fn a_sender_is_a_contact_until_it_expires() {
         let contacts = ContactDirectory::new();
         let start = Instant::now();
-        assert_eq!(contacts.heard(start, "arm", life(1), location()), Ok(true));
-        assert_eq!(contacts.heard(start, "arm", life(1), location()), Ok(false));
+        assert_eq!(
+            contacts.heard(start, "arm", incarnation(1), location()),
+            Ok(true)
+        );
+        assert_eq!(
+            contacts.heard(start, "arm", incarnation(1), location()),
+            Ok(false)
+        );
         let entry = contacts.lookup("arm").unwrap();
         assert_eq!(entry.locations, [location()]);
-        assert_eq!(contacts.by_incarnation(life(1)).unwrap(), entry);
-        // Another life of the same name takes its place.
-        assert_eq!(contacts.heard(start, "arm", life(2), location()), Ok(true));
-        assert!(contacts.by_incarnation(life(1)).is_none());
+        assert_eq!(contacts.by_incarnation(incarnation(1)).unwrap(), entry);
+        // Another incarnation of the same name replaces it.
+        assert_eq!(
+            contacts.heard(start, "arm", incarnation(2), location()),
+            Ok(true)
+        );
+        assert!(contacts.by_incarnation(incarnation(1)).is_none());
         contacts.forget(start, |_| false);
         assert!(contacts.lookup("arm").is_some());
         contacts.forget(start + ContactDirectory::MEMORY, |_| false);
@@ -133,11 +142,15 @@ mod tests {
     }
 
     #[test]
-    fn who_is_known_elsewhere_is_let_go() {
+    fn a_contact_that_another_back_end_knows_is_dropped() {
         let contacts = ContactDirectory::new();
         let now = Instant::now();
-        contacts.heard(now, "arm", life(1), location()).unwrap();
-        contacts.heard(now, "leg", life(2), location()).unwrap();
+        contacts
+            .heard(now, "arm", incarnation(1), location())
+            .unwrap();
+        contacts
+            .heard(now, "leg", incarnation(2), location())
+            .unwrap();
         contacts.forget(now, |entry| &*entry.name == "arm");
         assert!(contacts.lookup("arm").is_none());
         assert!(contacts.lookup("leg").is_some());
@@ -150,12 +163,16 @@ mod tests {
         for number in 0..ContactDirectory::MAX_CONTACTS as u64 + 10 {
             let name = format!("agent {number}");
             contacts
-                .heard(now, &name, life(number + 1), location())
+                .heard(now, &name, incarnation(number + 1), location())
                 .unwrap();
         }
         assert_eq!(contacts.entries().len(), ContactDirectory::MAX_CONTACTS);
         assert!(contacts.lookup("agent 0").is_none());
-        assert!(contacts.heard(now, "", life(1), location()).is_err());
-        assert!(contacts.heard(now, "a\nb", life(1), location()).is_err());
+        assert!(contacts.heard(now, "", incarnation(1), location()).is_err());
+        assert!(
+            contacts
+                .heard(now, "a\nb", incarnation(1), location())
+                .is_err()
+        );
     }
 }

@@ -6,22 +6,22 @@ use fipa_transport::{Forked, Incarnation, Mandate};
 
 use crate::{Entry, EntryError, Query, Registration, Subscriber, Watch};
 
-/// A view of who is there.
+/// A view of the known agents.
 ///
-/// Every method is synchronous and cheap. Reading takes no system call as long as what is asked
-/// for is known; a miss makes a back end whose truth lies elsewhere look there first.
+/// Every method is synchronous and cheap. Reading a known entry takes no system call; on a miss, a
+/// back end with external storage reads that storage first.
 pub trait Directory: Send + Sync {
-    /// The entry of this name, as far as is known without looking any further.
+    /// Returns the entry of this name from memory, without [`refresh`](Self::refresh).
     fn known(&self, name: &str) -> Option<Arc<Entry>>;
 
-    /// The entry of this incarnation, as far as is known without looking any further. Always
-    /// none for an unknown incarnation.
+    /// Returns the entry of this incarnation from memory, without [`refresh`](Self::refresh).
+    /// Always `None` for an unknown incarnation.
     fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>>;
 
-    /// Takes in what others have changed until now, where that is not told at once.
+    /// Reads the changes of other processes, in back ends that are not notified of each change.
     fn refresh(&self) {}
 
-    /// The entry of exactly this name, patterns not considered.
+    /// Returns the entry of exactly this name; patterns are not considered.
     fn lookup(&self, name: &str) -> Option<Arc<Entry>> {
         self.known(name).or_else(|| {
             self.refresh();
@@ -29,7 +29,7 @@ pub trait Directory: Send + Sync {
         })
     }
 
-    /// The entry of exactly this incarnation.
+    /// Returns the entry of exactly this incarnation.
     fn by_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         self.known_incarnation(incarnation).or_else(|| {
             self.refresh();
@@ -37,52 +37,53 @@ pub trait Directory: Send + Sync {
         })
     }
 
-    /// All entries known, by name. The same memory as long as nothing changes.
+    /// Returns all known entries, sorted by name. Returns the same allocation until something
+    /// changes.
     fn entries(&self) -> Arc<[Arc<Entry>]>;
 
-    /// The known entries that match, by name. Who needs what others changed a moment ago calls
-    /// [`refresh`](Self::refresh) first.
+    /// Returns the known entries that match, sorted by name. Call [`refresh`](Self::refresh) first
+    /// to include the latest changes of other processes.
     fn search(&self, query: &Query) -> Vec<Arc<Entry>> {
         let entries = self.entries();
         let matching = entries.iter().filter(|entry| query.matches(entry));
         matching.cloned().collect()
     }
 
-    /// A number that differs from an earlier one when something has changed in between.
+    /// Returns a number that changes whenever the directory changes.
     fn generation(&self) -> u64;
 
-    /// Tells this subscriber of every change from now on.
+    /// Sends every later change to this subscriber.
     fn subscribe(&self, subscriber: &Subscriber);
 
-    /// What changes from now on. Who wants the whole picture starts to watch first and reads
-    /// [`entries`](Self::entries) then; what joined in between is told by both.
+    /// Returns a watch of later changes. For a complete picture, start the watch first and then
+    /// read [`entries`](Self::entries); an entry that joined in between appears in both.
     fn watch(&self) -> Watch {
         let (subscriber, watch) = Watch::new();
         self.subscribe(&subscriber);
         watch
     }
 
-    /// Registers an agent, or changes the entry when it has the same name and incarnation.
+    /// Registers an agent, or updates its entry if it has the same name and incarnation.
     ///
     /// # Errors
-    /// When somebody else has the name, the registration is not valid, or the back end cannot be
-    /// written.
+    /// Fails when another agent has the name, the registration is not valid, or the back end cannot
+    /// be written.
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         let _ = registration;
         Err(RegisterError::ReadOnly)
     }
 
-    /// Removes the registration of this name and incarnation, made here.
+    /// Removes the registration of this name and incarnation that was made here.
     ///
     /// # Errors
-    /// When there is none, or the back end cannot be written.
+    /// Fails when there is no such registration, or the back end cannot be written.
     fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
         let _ = (name, incarnation);
         Err(DeregisterError::ReadOnly)
     }
 
-    /// Removes these, by name and incarnation, then registers or changes those. One that fails
-    /// does not keep the others from it.
+    /// Removes the registrations in `leaving`, then registers or updates those in `joining`. A
+    /// failure of one does not affect the others.
     fn update(&self, leaving: &[(Arc<str>, Incarnation)], joining: Vec<Registration>) -> Updated {
         let left = leaving
             .iter()
@@ -93,39 +94,39 @@ pub trait Directory: Send + Sync {
         }
     }
 
-    /// Whether this back end knows better than others which coalitions there are at the message
-    /// transport service of this incarnation. A [merged view](crate::MergedDirectory) then takes
-    /// them from here only: of two that each tell a merger in one go, but not at the same moment,
-    /// it would make one with a state in between.
+    /// Whether this back end is authoritative for the coalitions of the message transport service
+    /// of this incarnation. A [merged view](crate::MergedDirectory) then takes them from here only:
+    /// two back ends each report a merger atomically, but at different times, and a mix of both
+    /// would show an intermediate state.
     fn speaks_for(&self, mts: Incarnation) -> bool {
         let _ = mts;
         false
     }
 
-    /// The agents that the message transport service of this incarnation may speak for, as far as
-    /// this back end knows a link that proves it. What this back end tells of that service is proved.
-    /// A [merged view](crate::MergedDirectory) prefers it to what is not, and leaves out entries of
-    /// other back ends with this service that the mandate does not cover.
+    /// Returns the agents for which the message transport service of this incarnation may speak, if
+    /// this back end has a link that proves the service. Entries of that service in this back end
+    /// are then proved. A [merged view](crate::MergedDirectory) prefers them to unproved entries,
+    /// and hides entries of other back ends with this service that the mandate does not cover.
     fn mandate(&self, mts: Incarnation) -> Mandate {
         let _ = mts;
         Mandate::Unproved
     }
 }
 
-/// What became of the parts of an [update](Directory::update), in their order.
+/// Results of an [update](Directory::update), in the order of its arguments.
 #[derive(Debug)]
 pub struct Updated {
-    /// Of those that were to be removed.
+    /// Results of the removals.
     pub left: Vec<Result<(), DeregisterError>>,
-    /// Of those that were to be registered.
+    /// Results of the registrations.
     pub joined: Vec<Result<Arc<Entry>, RegisterError>>,
 }
 
-/// Why an agent was not registered.
+/// Error of [`Directory::register`].
 #[derive(Debug, Clone, thiserror::Error)]
 #[non_exhaustive]
 pub enum RegisterError {
-    /// Somebody else has the name.
+    /// Another agent has the name.
     #[error(
         "the name {:?} is taken by a registration of {}, at the message transport service {:?}; \
          choose another name or end that agent",
@@ -134,20 +135,20 @@ pub enum RegisterError {
         holder.mts.name
     )]
     AlreadyRegistered {
-        /// Who has it.
+        /// The entry that holds the name.
         holder: Arc<Entry>,
     },
     /// The registration is not valid.
     #[error("cannot register: {0}")]
     Invalid(#[from] EntryError),
-    /// What was to be removed in the same go was not registered here.
-    #[error("nothing named {0:?} of this incarnation is registered here")]
+    /// The registration to be removed in the same update was not made here.
+    #[error("no agent {0:?} of this incarnation is registered here")]
     NotOurs(Arc<str>),
     /// There are too many registrations, or they are too large.
     #[error("the directory is full: {0}")]
     Full(String),
-    /// The back end only reads.
-    #[error("agents cannot be registered in this directory")]
+    /// The back end is read-only.
+    #[error("this directory is read-only; agents cannot be registered in it")]
     ReadOnly,
     /// The back end has been closed.
     #[error("the directory has been closed")]
@@ -160,17 +161,17 @@ pub enum RegisterError {
     Failed(Arc<dyn std::error::Error + Send + Sync>),
 }
 
-/// Why a registration was not removed.
+/// Error of [`Directory::deregister`].
 #[derive(Debug, Clone, thiserror::Error)]
 #[non_exhaustive]
 pub enum DeregisterError {
     /// This process has no such registration.
     #[error("no agent {0:?} of this incarnation is registered here")]
     NotRegistered(Arc<str>),
-    /// The back end only reads.
-    #[error("agents cannot be deregistered in this directory")]
+    /// The back end is read-only.
+    #[error("this directory is read-only; agents cannot be deregistered from it")]
     ReadOnly,
-    /// The back end has been closed, and its registrations with it.
+    /// The back end has been closed, which removed its registrations.
     #[error("the directory has been closed")]
     Closed,
     /// This process is a forked child of the one that opened the directory.

@@ -1,4 +1,4 @@
-//! Entries of the directory, and what somebody who registers has to say.
+//! Entries of the directory, and the data that an owner supplies on registration.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -8,47 +8,48 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Members, NameError, check_name};
 
-/// What the directory knows about one registration.
+/// The known data of one registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
     /// The agent's name, unique in the directory (see [`check_name`]).
     pub name: Arc<str>,
-    /// What kind of agent it is, in the words of its owner; may be empty.
+    /// Kind of agent, as free text of its owner; may be empty.
     pub agent_type: String,
-    /// This registration; unknown when it was learnt from a peer that has no incarnations.
+    /// Incarnation of this registration; unknown when it was learned from a peer without
+    /// incarnations.
     pub incarnation: Incarnation,
-    /// Where it can be reached, in order of preference, each with the incarnation of the message
+    /// Locations of the agent in order of preference, each with the incarnation of the message
     /// transport service that listens there.
     pub locations: Vec<Location>,
-    /// The message transport service that delivers to it.
+    /// The message transport service that delivers to the agent.
     pub mts: Mts,
     /// Free text of its owner; may be empty.
     pub description: String,
-    /// When it was registered, by the clock of the host it was registered on, in whole
+    /// Time of registration, by the clock of the host on which the agent was registered, in whole
     /// milliseconds.
     pub registered: SystemTime,
-    /// Where this entry was learnt.
+    /// Origin of this entry.
     pub source: Source,
-    /// Whether it lives on this host.
+    /// Whether the agent is on this host.
     pub reach: Reach,
-    /// Whether it is an agent, a gateway or a coalition.
+    /// Role: agent, gateway or coalition.
     pub role: Role,
 }
 
 impl Entry {
-    /// Most locations of one entry.
+    /// Maximum number of locations of one entry.
     pub const MAX_LOCATIONS: usize = 8;
-    /// Longest type, in bytes.
+    /// Maximum length of the type, in bytes.
     pub const MAX_TYPE: usize = 255;
-    /// Longest description, in bytes.
+    /// Maximum length of the description, in bytes.
     pub const MAX_DESCRIPTION: usize = 1024;
 
     /// Whether this entry keeps the name when `other` claims it too.
     ///
-    /// What lives on this host comes before what the network says, whatever times are claimed
-    /// there: a record on the network must not be able to cut a host's own traffic. Otherwise
-    /// the earlier registration keeps the name, and a tie goes to the lower incarnation, so that
-    /// all who know both decide alike.
+    /// Entries of this host precede entries from the network regardless of registration times: a
+    /// record on the network must not be able to cut a host's own traffic. Otherwise the earlier
+    /// registration keeps the name, and the lower incarnation breaks a tie, so that all hosts that
+    /// have both entries decide alike.
     #[must_use]
     pub fn precedes(&self, other: &Self) -> bool {
         let rank = |entry: &Self| {
@@ -58,17 +59,18 @@ impl Entry {
         rank(self) < rank(other)
     }
 
-    /// Whether it has locations, but only of transports that this project does not have.
+    /// Whether the entry has locations, and all of them use transports that this project does not
+    /// support.
     #[must_use]
     pub fn is_unsupported(&self) -> bool {
         let supported = |location: &Location| location.kind().is_supported();
         !self.locations.is_empty() && !self.locations.iter().any(supported)
     }
 
-    /// Whether the entry keeps to the limits that every back end relies on.
+    /// Checks the limits that every back end relies on.
     ///
     /// # Errors
-    /// Says which limit it breaks.
+    /// Returns the first limit that the entry exceeds.
     pub fn check(&self) -> Result<(), EntryError> {
         check_name(&self.name)?;
         check_name(&self.mts.name).map_err(EntryError::MtsName)?;
@@ -95,17 +97,17 @@ fn check_text(field: &'static str, text: &str, max: usize) -> Result<(), EntryEr
     Ok(())
 }
 
-/// A message transport service: the process that accepts letters for an agent, or the gateway.
+/// A message transport service: the process that accepts letters for an agent, or a gateway.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Mts {
-    /// Its name; several may have the same one.
+    /// Name of the service; several services may have the same name.
     pub name: Arc<str>,
-    /// This life of it; unknown for a peer that has no incarnations.
+    /// Incarnation of the service; unknown for a peer without incarnations.
     pub incarnation: Incarnation,
 }
 
 impl Mts {
-    /// A service with this name and incarnation.
+    /// Creates a service with this name and incarnation.
     #[must_use]
     pub fn new(name: impl Into<Arc<str>>, incarnation: Incarnation) -> Self {
         Self {
@@ -115,7 +117,7 @@ impl Mts {
     }
 }
 
-/// Where an entry was learnt.
+/// Origin of an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -124,48 +126,48 @@ pub enum Source {
     Memory,
     /// Written in the configuration.
     Static,
-    /// Told by a process of this host.
+    /// Reported by a process of this host.
     Host,
     /// Announced on the network.
     Mdns,
-    /// Told by the gateway of another host, in a letter.
+    /// Received from the gateway of another host, in a letter.
     Exchange,
-    /// It has written.
+    /// Learned from a letter that the agent sent.
     Contact,
 }
 
-/// Whether an agent lives on this host.
+/// Reach of an agent: on this host or behind a gateway.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Reach {
-    /// On this host, without anybody in between.
+    /// On this host; letters go to it directly.
     Local,
-    /// Beyond a gateway.
+    /// Behind a gateway.
     Remote {
-        /// The gateway that takes letters for it: the host's own when that has published the
-        /// entry, else the peer itself. Unknown for a peer that has no incarnations.
+        /// The gateway that accepts letters for the agent: this host's own gateway if it published
+        /// the entry, else the peer itself. Unknown for a peer without incarnations.
         gateway: Incarnation,
     },
 }
 
-/// Who stands behind an entry.
+/// Role of an entry.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Role {
-    /// Somebody to exchange letters with.
+    /// An agent that sends and receives letters.
     #[default]
     Agent,
-    /// A message transport service that forwards for others. Patterns do not match it.
+    /// A message transport service that forwards letters for agents. Patterns do not match it.
     Gateway,
-    /// A name that stands for these agents, or for their leader. Patterns do not match it: they
-    /// match its members.
+    /// A name that stands for these agents, or for their leader. Patterns match its members, not
+    /// the coalition.
     Coalition(Members),
 }
 
-/// What the owner of an agent says when registering it.
+/// Data that the owner of an agent supplies on registration.
 ///
-/// Registering again with the same name and incarnation changes the entry.
+/// Registering again with the same name and incarnation updates the entry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Registration {
     /// See [`Entry::name`].
@@ -178,14 +180,14 @@ pub struct Registration {
     pub locations: Vec<Location>,
     /// See [`Entry::description`].
     pub description: String,
-    /// See [`Entry::registered`]; cut to whole milliseconds.
+    /// See [`Entry::registered`]; truncated to whole milliseconds.
     pub registered: SystemTime,
     /// See [`Entry::role`].
     pub role: Role,
 }
 
 impl Registration {
-    /// A registration as of now, of an agent without type and description.
+    /// Creates a registration, with the current time, of an agent without type and description.
     #[must_use]
     pub fn new(
         name: impl Into<Arc<str>>,
@@ -203,7 +205,7 @@ impl Registration {
         }
     }
 
-    /// The entry that this registration makes at a service.
+    /// Converts this registration to an entry of a local service.
     pub(crate) fn into_entry(self, mts: &Mts, source: Source) -> Result<Entry, EntryError> {
         if !self.incarnation.is_known() {
             return Err(EntryError::NoIncarnation);
@@ -225,20 +227,20 @@ impl Registration {
     }
 }
 
-/// What is wrong with an entry.
+/// Error of [`Entry::check`] and of a registration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EntryError {
-    /// The name of the agent.
+    /// The name of the agent is not valid.
     #[error(transparent)]
     Name(#[from] NameError),
-    /// The name of its message transport service.
+    /// The name of the message transport service is not valid.
     #[error("message transport service: {0}")]
     MtsName(#[source] NameError),
     /// A text is too long.
     #[error("the {field} has {len} bytes; at most {max} are allowed")]
     TooLong {
-        /// Which one.
+        /// Name of the field.
         field: &'static str,
         /// Its length in bytes.
         len: usize,
@@ -248,18 +250,18 @@ pub enum EntryError {
     /// A text has control characters.
     #[error("the {field} has control characters; remove them")]
     Control {
-        /// Which one.
+        /// Name of the field.
         field: &'static str,
     },
-    /// There are more than [`Entry::MAX_LOCATIONS`].
+    /// The entry has more than [`Entry::MAX_LOCATIONS`] locations.
     #[error("{0} locations; at most {max} are allowed", max = Entry::MAX_LOCATIONS)]
     TooManyLocations(usize),
-    /// A registration without an incarnation.
+    /// A registration has no incarnation.
     #[error("a registration needs an incarnation (draw one with Incarnation::random)")]
     NoIncarnation,
 }
 
-/// Milliseconds since 1970, UTC; 0 for what is earlier.
+/// Milliseconds since 1970, UTC; 0 for earlier times, at most [`MAX_MILLIS`].
 pub(crate) fn millis_of_time(time: SystemTime) -> u64 {
     let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis())
@@ -267,10 +269,10 @@ pub(crate) fn millis_of_time(time: SystemTime) -> u64 {
         .min(MAX_MILLIS)
 }
 
-/// The year 9999, beyond which calendars do not reach.
+/// Milliseconds from 1970 to the year 9999, the last year that RFC 3339 can represent.
 const MAX_MILLIS: u64 = 253_370_764_800_000;
 
-/// The time that many milliseconds after 1970, UTC; what is beyond the year 9999 is cut to it.
+/// The time `millis` milliseconds after 1970, UTC; at most [`MAX_MILLIS`].
 pub(crate) fn time_of_millis(millis: u64) -> SystemTime {
     UNIX_EPOCH + Duration::from_millis(millis.min(MAX_MILLIS))
 }

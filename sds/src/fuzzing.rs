@@ -1,6 +1,6 @@
-//! Parts that the fuzz targets reach; `fuzz/` has the targets.
+//! Functions for the fuzz targets in `fuzz/`.
 
 #[cfg(feature = "mdns")]
-pub use crate::mdns::fuzzing::{Ear, announced};
+pub use crate::mdns::fuzzing::{Listener, announced};
 
 pub use crate::host::fuzzing::{file_name, read_and_written};

@@ -1,24 +1,25 @@
-//! The service directory: which agents there are, where they can be reached, and who joins and
-//! leaves.
+//! The service directory: the known agents, their locations, and notifications of joining and
+//! leaving agents.
 //!
-//! * [`Entry`] is what is known about one registration; [`Registration`] is what its owner says.
-//! * [`Directory`] is the one view everybody reads; [`Watch`] tells what changes in it.
+//! * [`Entry`] is the known data of one registration; [`Registration`] is the data that its owner
+//!   supplies.
+//! * [`Directory`] is the trait of all views; [`Watch`] reports changes of a view.
 //! * [`MemoryDirectory`], [`StaticDirectory`], [`ContactDirectory`], [`HostDirectory`],
 //!   [`ExchangeDirectory`] and (feature `mdns`) `MdnsDirectory` are its back ends;
-//!   [`MergedDirectory`] makes one view of several.
-//! * [`Exchange`] decides what gateways tell each other of their agents.
-//! * [`Query`] and [`Pattern`] search; [`resolve`] turns the name of a receiver into entries.
-//! * A coalition is an entry, too: its role names its [`Members`].
+//!   [`MergedDirectory`] merges several directories into one view.
+//! * [`Exchange`] decides which entries gateways send each other about their agents.
+//! * [`Query`] and [`Pattern`] search; [`resolve()`] turns the name of a receiver into entries.
+//! * A coalition is also an entry: its role lists its [`Members`].
 //!
-//! The crate depends on `fipa-transport`, sideways, for two words only: an entry lists
-//! [`Location`](fipa_transport::Location)s, and a registration is told from an earlier one of the
-//! same name by its [`Incarnation`](fipa_transport::Incarnation); and on `fipa-acl` for which
-//! characters a name may have ([`is_unprintable`](fipa_acl::is_unprintable)).
+//! The crate depends on `fipa-transport` for two types: an entry lists
+//! [`Location`](fipa_transport::Location)s, and an [`Incarnation`](fipa_transport::Incarnation)
+//! distinguishes a registration from an earlier one of the same name. It depends on `fipa-acl` for
+//! the characters that a name may have ([`is_unprintable`](fipa_acl::is_unprintable)).
 //!
-//! What must not live here: letters, routes, connections. Which of an agent's locations is tried
-//! first is the delivery core's business.
+//! Letters, routes and connections do not belong here. The delivery core decides which location of
+//! an agent is tried first.
 
-// First, for its macro.
+// Must come first: later modules use its macro.
 #[macro_use]
 mod table;
 

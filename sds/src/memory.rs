@@ -1,4 +1,4 @@
-//! The back ends that live in this process alone.
+//! Back ends that keep their entries in this process only.
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -20,7 +20,7 @@ pub struct MemoryDirectory {
 }
 
 impl MemoryDirectory {
-    /// An empty directory; what is registered is served by this message transport service.
+    /// Creates an empty directory; this message transport service serves all its registrations.
     #[must_use]
     pub fn new(mts: Mts) -> Self {
         Self {
@@ -50,21 +50,21 @@ impl Directory for MemoryDirectory {
     }
 }
 
-/// Those that the configuration names, for networks on which nobody can be discovered: gateways,
-/// and agents of old peers, which their locations tell from each other.
+/// The peers in the configuration, for networks without discovery: gateways, and agents of legacy
+/// peers; the signature of their locations distinguishes them.
 ///
-/// A gateway's incarnation is unknown until somebody has talked to it; the agents behind it are
-/// learnt then, and elsewhere.
+/// The incarnation of a gateway stays unknown in this directory; other back ends learn it, and the
+/// agents behind the gateway, after the first contact.
 #[derive(Debug)]
 pub struct StaticDirectory {
     table: Table<()>,
 }
 
 impl StaticDirectory {
-    /// A directory of them by name, each with its locations in order of preference.
+    /// Creates a directory of these names, each with its locations in order of preference.
     ///
     /// # Errors
-    /// When a name is not valid or has too many locations.
+    /// Fails when a name is not valid or has too many locations.
     pub fn new<N: Into<Arc<str>>>(
         gateways: impl IntoIterator<Item = (N, Vec<Location>)>,
     ) -> Result<Self, EntryError> {

@@ -11,17 +11,17 @@ use crate::{
     Subscriber, Watch,
 };
 
-/// Several directories as one.
+/// Several directories merged into one view.
 ///
-/// When more than one knows a name, the entry that [precedes](Entry::precedes) is seen. Of equals (one
-/// registration learnt twice) it is that of the directory named first, unless they name different
-/// message transport services, because the agent's one was started anew: then it is that of a
-/// directory that [speaks](Directory::speaks_for) for the service. Registrations go to the first
-/// directory that can be written.
+/// When several directories know a name, the view shows the entry that [precedes](Entry::precedes)
+/// the others. Of equal entries (one registration learned twice) it shows that of the first
+/// directory in the list. If they name different message transport services because the agent's
+/// service was restarted, it shows that of a directory that [speaks](Directory::speaks_for) for its
+/// service. Registrations go to the first writable directory.
 ///
-/// Where a link proves a service, its directory has a [mandate](Directory::mandate) of it. A proved entry
-/// precedes all unproved ones of other hosts except those of the configuration. Entries of a service
-/// that its mandate does not cover are not seen, whichever directory has them.
+/// A directory whose link proves a service has a [mandate](Directory::mandate) for it. A proved
+/// entry precedes all unproved entries of other hosts except those of the configuration. Entries of
+/// a service that its mandate does not cover are hidden in all directories.
 pub struct MergedDirectory {
     back_ends: BackEnds,
     sorted: ArcSwapOption<Sorted>,
@@ -35,7 +35,7 @@ struct Sorted {
 }
 
 impl MergedDirectory {
-    /// The view of these directories; what lives closer is named first.
+    /// Creates the view of these directories, closest first.
     #[must_use]
     pub fn new(back_ends: Vec<Arc<dyn Directory>>) -> Self {
         Self {
@@ -65,7 +65,7 @@ impl Directory for MergedDirectory {
     fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         let found = |one: &Arc<dyn Directory>| one.known_incarnation(incarnation);
         let entry = self.back_ends.iter().find_map(found)?;
-        // Somebody who lost the name in the merged view is not in it.
+        // An agent that lost its name in the merged view is not part of the view.
         self.known(&entry.name)
             .filter(|holder| holder.incarnation == incarnation)
     }
@@ -82,15 +82,15 @@ impl Directory for MergedDirectory {
         {
             return Arc::clone(&sorted.entries);
         }
-        // Taken before reading: what changes meanwhile is read again next time.
+        // Taken before reading: a change during the read causes another read next time.
         let generations = self.generations().collect();
-        let mut merged: HashMap<Arc<str>, Claim> = HashMap::new();
+        let mut merged: HashMap<Arc<str>, NameClaim> = HashMap::new();
         for (at, one) in self.back_ends.iter().enumerate() {
             for entry in one.entries().iter() {
                 if !counts(&self.back_ends, at, entry) {
                     continue;
                 }
-                let claim = Claim {
+                let claim = NameClaim {
                     at,
                     entry: Arc::clone(entry),
                 };
@@ -111,12 +111,12 @@ impl Directory for MergedDirectory {
     }
 
     fn generation(&self) -> u64 {
-        // Each of them only grows, so the sum changes whenever one does.
+        // Each generation only grows, so the sum changes whenever one of them does.
         self.generations().fold(0, u64::wrapping_add)
     }
 
-    /// The subscriber is told what changes in each directory, unmerged; [`watch`](Self::watch)
-    /// tells what changes in the merged view.
+    /// The subscriber receives the unmerged changes of each directory; [`watch`](Self::watch)
+    /// reports the changes of the merged view.
     fn subscribe(&self, subscriber: &Subscriber) {
         for one in self.back_ends.iter() {
             one.subscribe(subscriber);
@@ -166,24 +166,24 @@ impl Directory for MergedDirectory {
 fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
     let claims = back_ends.iter().enumerate().filter_map(|(at, one)| {
         let entry = one.known(name)?;
-        counts(back_ends, at, &entry).then_some(Claim { at, entry })
+        counts(back_ends, at, &entry).then_some(NameClaim { at, entry })
     });
-    let better = |best: Claim, next: Claim| match next.is_better(&best, back_ends) {
+    let better = |best: NameClaim, next: NameClaim| match next.is_better(&best, back_ends) {
         true => next,
         false => best,
     };
     claims.reduce(better).map(|claim| claim.entry)
 }
 
-/// What one of the directories says of a name.
-struct Claim {
-    /// The place of the directory.
+/// The entry of one directory for a name.
+struct NameClaim {
+    /// Index of the directory.
     at: usize,
     entry: Arc<Entry>,
 }
 
-impl Claim {
-    /// Whether this is seen rather than the claim of a directory that was named before.
+impl NameClaim {
+    /// Whether this claim replaces the claim of an earlier directory.
     fn is_better(&self, before: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
         let (new, old) = (&self.entry, &before.entry);
         let is_moved = new.incarnation == old.incarnation
@@ -201,8 +201,8 @@ impl Claim {
         }
     }
 
-    /// Whether this comes before that whatever times are claimed: it is on another host as that is, and
-    /// proved or of the configuration.
+    /// Whether this claim precedes `other` regardless of registration times: both are of other
+    /// hosts, and this one is proved or from the configuration.
     fn outranks(&self, other: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
         if self.entry.reach == Reach::Local || other.entry.reach == Reach::Local {
             return false;
@@ -221,14 +221,15 @@ impl Claim {
     }
 }
 
-/// The mandate of the service, of the first directory that has one.
+/// Returns the mandate of the service from the first directory that has one.
 fn mandate(back_ends: &[Arc<dyn Directory>], mts: Incarnation) -> Mandate {
     let mut mandates = back_ends.iter().map(|one| one.mandate(mts));
     mandates.find(Mandate::is_proved).unwrap_or_default()
 }
 
-/// Whether what that back end says counts: of services with a mandate, what that covers; of coalitions, what the one that
-/// [speaks](Directory::speaks_for) for their message transport service says.
+/// Whether an entry of a back end is visible. If the service has a mandate, the mandate must cover
+/// the agent. A coalition is visible only from the back end that [speaks](Directory::speaks_for)
+/// for its message transport service, if there is one.
 fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
     let is_agent = entry.reach != Reach::Local && entry.role != Role::Gateway;
     if is_agent && !mandate(back_ends, entry.mts.incarnation).speaks_for(&entry.name) {
@@ -242,24 +243,25 @@ fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
     speaker.is_none_or(|speaker| speaker == at)
 }
 
-/// What a watcher of a merged view has been told so far.
+/// The entries of a merged view that a watcher has been told of.
 pub(crate) struct MergedView {
     back_ends: BackEnds,
-    told: HashMap<Arc<str>, Arc<Entry>>,
+    reported: HashMap<Arc<str>, Arc<Entry>>,
 }
 
 impl MergedView {
     fn new(back_ends: &BackEnds) -> Self {
         let mut view = Self {
             back_ends: Arc::clone(back_ends),
-            told: HashMap::new(),
+            reported: HashMap::new(),
         };
         view.reread();
         view
     }
 
-    /// What a change in one of the directories means for the merged view, if anything.
-    pub(crate) fn told(&mut self, raw: Change) -> Option<Change> {
+    /// Converts a change in one of the directories to the change of the merged view, if there is
+    /// one.
+    pub(crate) fn translate(&mut self, raw: Change) -> Option<Change> {
         match &raw {
             Change::Together(raws) => {
                 let names = raws.iter().filter_map(Change::name);
@@ -276,22 +278,22 @@ impl MergedView {
         }
     }
 
-    /// What has changed about that name since it was told of.
+    /// Returns the change of that name since it was last reported.
     fn now(&mut self, name: &Arc<str>) -> Option<Change> {
         let after = holder(&self.back_ends, name);
         let before = match &after {
-            Some(entry) => self.told.insert(name.clone(), Arc::clone(entry)),
-            None => self.told.remove(name),
+            Some(entry) => self.reported.insert(name.clone(), Arc::clone(entry)),
+            None => self.reported.remove(name),
         };
         Change::between(before, after)
     }
 
     fn reread(&mut self) {
-        self.told.clear();
+        self.reported.clear();
         for one in self.back_ends.iter() {
             for entry in one.entries().iter() {
                 if let Some(entry) = holder(&self.back_ends, &entry.name) {
-                    self.told.insert(entry.name.clone(), entry);
+                    self.reported.insert(entry.name.clone(), entry);
                 }
             }
         }
@@ -303,7 +305,7 @@ mod tests {
     use super::*;
     use crate::{Members, MemoryDirectory, Mts, Query};
 
-    /// A back end that speaks for everybody.
+    /// A back end that speaks for every service.
     struct Speaker(MemoryDirectory);
 
     impl Directory for Speaker {
@@ -342,13 +344,13 @@ mod tests {
     }
 
     #[test]
-    fn coalitions_are_taken_from_who_speaks_for_them() {
+    fn coalitions_come_from_the_back_end_that_speaks_for_their_service() {
         let mts = Mts::new("mts", Incarnation::from_u64(1));
         let first = Arc::new(MemoryDirectory::new(mts.clone()));
         let speaker = Arc::new(Speaker(MemoryDirectory::new(mts)));
         let merged = MergedDirectory::new(vec![first.clone(), speaker.clone()]);
         let mut watch = merged.watch();
-        // The other is ahead, and then behind.
+        // The other back end is first ahead, then behind.
         let before = speaker.0.register(team(&["a"])).unwrap();
         assert_eq!(watch.try_next(), Some(Change::Joined(Arc::clone(&before))));
         first.register(team(&["a", "b"])).unwrap();
@@ -367,21 +369,21 @@ mod tests {
         assert_eq!(merged.known("team"), None);
         first.deregister("team", id).unwrap();
         assert_eq!(watch.try_next(), None);
-        // Of an agent whose service was started anew, what the new service says is seen.
-        let anew = Arc::new(Speaker(MemoryDirectory::new(Mts::new(
+        // After a restart of an agent's service, the entry of the new service is visible.
+        let restarted = Arc::new(Speaker(MemoryDirectory::new(Mts::new(
             "mts",
             Incarnation::from_u64(2),
         ))));
-        let merged = MergedDirectory::new(vec![first.clone(), anew.clone()]);
+        let merged = MergedDirectory::new(vec![first.clone(), restarted.clone()]);
         let leg = Registration {
             registered: std::time::UNIX_EPOCH,
             ..Registration::new("leg", Incarnation::from_u64(9), Vec::new())
         };
         first.register(leg.clone()).unwrap();
-        let moved = anew.0.register(leg).unwrap();
+        let moved = restarted.0.register(leg).unwrap();
         assert_eq!(merged.known("leg"), Some(Arc::clone(&moved)));
         assert!(merged.entries().contains(&moved));
-        // Agents are there as long as anybody knows them.
+        // An agent is visible as long as any back end has it.
         let agent = Registration::new("arm", Incarnation::from_u64(8), Vec::new());
         first.register(agent).unwrap();
         assert!(merged.known("arm").is_some());

@@ -1,4 +1,4 @@
-//! What may be the name of an agent.
+//! Names of agents.
 
 use fipa_acl::is_unprintable;
 
@@ -6,22 +6,22 @@ use crate::is_pattern;
 
 /// Longest name of an agent, in bytes.
 ///
-/// The standards set no limit. This one leaves room for the longest names in use (`agent@host:port`
-/// of JADE, coalitions of several agents) while a name still fits an mDNS record many times over.
+/// The standards set no limit. This limit admits the longest names in use (`agent@host:port` of
+/// JADE, coalitions of several agents), and an mDNS record holds many names of this length.
 pub const MAX_NAME: usize = 1024;
 
-/// Why a name cannot be the name of an agent.
+/// Error of [`check_name`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum NameError {
-    /// There is no name.
+    /// The name is empty.
     #[error("the name is empty; give the agent a name of 1 to {MAX_NAME} bytes")]
     Empty,
     /// The name is longer than [`MAX_NAME`].
     #[error("the name has {0} bytes; at most {MAX_NAME} are allowed")]
     TooLong(usize),
-    /// The name has a control character, a format character (bidirectional ones are such), or a
-    /// separator of lines: it could look like another name.
+    /// The name has a control character, a format character (such as a bidirectional one) or a line
+    /// separator: it could look like another name.
     #[error(
         "the name {name:?} has the control or format character {character:?} at byte {at}; remove it"
     )]
@@ -30,21 +30,22 @@ pub enum NameError {
         name: String,
         /// The character.
         character: char,
-        /// Where it stands, in bytes from the beginning.
+        /// Byte offset of the character in the name.
         at: usize,
     },
-    /// The name is a pattern: its agent would get the letters to those that match.
+    /// The name is a pattern: the agent would receive letters that are meant for every matching
+    /// agent.
     #[error(
         "the name {0:?} is a pattern; use a name without any of * + ? [ ( {{ | ^ $ \\ (a dot is allowed)"
     )]
     Pattern(String),
 }
 
-/// Whether this can be the name of an agent: UTF-8 of 1 to [`MAX_NAME`] bytes without
+/// Checks that `name` is a valid agent name: UTF-8 of 1 to [`MAX_NAME`] bytes without
 /// [unprintable](is_unprintable) characters that [is no pattern](is_pattern).
 ///
 /// # Errors
-/// Says what is wrong with the name.
+/// Returns the first rule that the name violates.
 pub fn check_name(name: &str) -> Result<(), NameError> {
     if name.is_empty() {
         return Err(NameError::Empty);
@@ -68,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_limits_are_the_limits() {
+    fn names_are_accepted_up_to_the_documented_limits() {
         for good in [
             "a",
             "béla@home:1099/JADE",

@@ -1,4 +1,4 @@
-//! Searching the directory, and the patterns in which receivers may be named.
+//! Queries of the directory, and the patterns that may name receivers.
 
 use std::fmt;
 
@@ -7,42 +7,43 @@ use regex::{Regex, RegexBuilder};
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::{Entry, MAX_NAME, Role};
 
-/// Whether a name that nobody has is a pattern: it contains one of `* + ? [ ( { | ^ $ \`.
+/// Whether a name is a pattern: it contains one of `* + ? [ ( { | ^ $ \`.
 ///
-/// A dot alone makes no pattern: names are full of dots.
+/// A dot alone does not make a pattern, because many names contain dots.
 #[must_use]
 pub fn is_pattern(name: &str) -> bool {
     name.contains(['*', '+', '?', '[', '(', '{', '|', '^', '$', '\\'])
 }
 
-/// A regular expression that is matched against the whole of a text.
+/// A regular expression that must match the whole text.
 ///
-/// The syntax is that of the crate `regex`, which matches in linear time; the compiled expression
-/// is bounded, so that a pattern from a stranger costs little.
+/// The syntax is that of the crate `regex`, which matches in linear time. The size of the compiled
+/// expression is bounded, so that a pattern from an untrusted peer costs little.
 #[derive(Debug, Clone)]
 pub struct Pattern(Regex);
 
 impl Pattern {
-    /// Longest pattern, in bytes.
+    /// Maximum length of a pattern, in bytes.
     pub const MAX_LEN: usize = MAX_NAME;
 
-    /// Bound of the compiled expression, in bytes.
+    /// Maximum size of the compiled expression, in bytes.
     const MAX_COMPILED: usize = 128 * 1024;
 
-    /// How deep groups may be nested.
+    /// Maximum nesting depth of groups.
     const MAX_DEPTH: u32 = 32;
 
     /// Compiles a pattern.
     ///
     /// # Errors
-    /// Says what is wrong with it.
+    /// Returns the cause when the pattern is too long, too big or not a regular expression.
     pub fn new(pattern: &str) -> Result<Self, PatternError> {
         if pattern.len() > Self::MAX_LEN {
             return Err(PatternError::TooLong(pattern.len()));
         }
-        // On its own first: what only compiles inside the group below would have left the group.
+        // Compiled alone first: a pattern such as `a)|(?:b` compiles only inside the group below,
+        // and would escape it.
         compile(pattern)?;
-        // A verbose pattern may end in a comment, which would swallow the end of the group.
+        // A verbose pattern may end in a comment, which would comment out the end of the group.
         compile(&format!(r"\A(?:{pattern})\z"))
             .or_else(|_| compile(&format!("\\A(?:{pattern}\n)\\z")))
             .map(Self)
@@ -55,7 +56,7 @@ impl Pattern {
     }
 }
 
-/// The pattern as it was written.
+/// Formats the pattern as it was written.
 impl fmt::Display for Pattern {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let whole = self.0.as_str();
@@ -77,7 +78,7 @@ fn compile(pattern: &str) -> Result<Regex, PatternError> {
         })
 }
 
-/// What is wrong with a pattern.
+/// Error of [`Pattern::new`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PatternError {
@@ -92,20 +93,20 @@ pub enum PatternError {
     Syntax(String),
 }
 
-/// What one field of an entry is compared with.
+/// The value that one field of an entry is compared with.
 #[derive(Debug, Clone)]
 pub enum Matcher {
-    /// The same text.
+    /// The text must be equal.
     Exact(String),
-    /// A pattern for the whole text.
+    /// The whole text must match the pattern.
     Pattern(Pattern),
 }
 
 impl Matcher {
-    /// A pattern when the text [is one](is_pattern), else the text itself.
+    /// Parses a pattern if the text [is one](is_pattern); otherwise the text must be equal.
     ///
     /// # Errors
-    /// When the pattern is not valid.
+    /// Fails when the pattern is not valid.
     pub fn parse(text: &str) -> Result<Self, PatternError> {
         if is_pattern(text) {
             Pattern::new(text).map(Self::Pattern)
@@ -114,7 +115,7 @@ impl Matcher {
         }
     }
 
-    /// Whether the whole text is the one that is meant, or matches.
+    /// Whether the text is equal, or matches the pattern as a whole.
     #[must_use]
     pub fn matches(&self, text: &str) -> bool {
         match self {
@@ -124,23 +125,24 @@ impl Matcher {
     }
 }
 
-/// What is searched for: entries that match in every field that is given.
+/// A query: an entry matches if every field that is given matches.
 #[derive(Debug, Clone, Default)]
 pub struct Query {
     /// Matches [`Entry::name`].
     pub name: Option<Matcher>,
     /// Matches [`Entry::agent_type`].
     pub agent_type: Option<Matcher>,
-    /// Matches one of [`Entry::locations`], written `kind://address`.
+    /// Matches one of [`Entry::locations`], in the form `kind://address`.
     pub location: Option<Matcher>,
     /// Matches [`Entry::description`].
     pub description: Option<Matcher>,
     /// Matches the name of the message transport service in [`Entry::mts`].
     pub mts: Option<Matcher>,
-    /// Matches [`Entry::registered`], written in UTC with milliseconds as RFC 3339 has it:
+    /// Matches [`Entry::registered`] in RFC 3339 form, UTC with milliseconds:
     /// `2026-03-01T09:30:00.000Z`.
     pub registered: Option<Matcher>,
-    /// Matches one of the [`Members`](crate::Members) of a coalition; nobody else has any.
+    /// Matches one of the [`Members`](crate::Members) of a coalition; other entries have no
+    /// members.
     pub member: Option<Matcher>,
 }
 
@@ -160,7 +162,7 @@ impl Query {
         }
     }
 
-    /// Whether the entry is searched for.
+    /// Whether the entry matches the query.
     #[must_use]
     pub fn matches(&self, entry: &Entry) -> bool {
         let matches = |matcher: &Option<Matcher>, text: &str| {
@@ -176,7 +178,7 @@ impl Query {
             })
             && matches(&self.mts, &entry.mts.name)
             && self.registered.as_ref().is_none_or(|matcher| {
-                // Within the years that can be written.
+                // Clamped to the years that RFC 3339 can represent.
                 let time = time_of_millis(millis_of_time(entry.registered));
                 matcher.matches(&humantime::format_rfc3339_millis(time).to_string())
             })
@@ -197,7 +199,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_dot_makes_no_pattern() {
+    fn a_dot_alone_is_not_a_pattern() {
         assert!(!is_pattern("arm.left@robot-1:1099/JADE"));
         for character in ["*", "+", "?", "[", "(", "{", "|", "^", "$", "\\"] {
             assert!(is_pattern(&format!("arm{character}")), "{character}");
@@ -219,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pattern_cannot_leave_its_anchors() {
+    fn a_pattern_cannot_escape_its_anchors() {
         let verbose = Pattern::new("(?x) a b # comment").unwrap();
         assert!(verbose.matches("ab"));
         assert!(!verbose.matches("abc"));
@@ -231,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_patterns_say_why() {
+    fn an_invalid_pattern_reports_its_cause() {
         let error = Pattern::new("arm_(").unwrap_err().to_string();
         assert!(error.contains("unclosed group"), "{error}");
         let huge = Pattern::new(r"(\w{500}){500}").unwrap_err();

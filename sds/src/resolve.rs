@@ -1,35 +1,36 @@
-//! From the name of a receiver to the entries it means.
+//! Resolution of a receiver's name to entries.
 
 use std::sync::Arc;
 
 use crate::{Directory, Entry, Matcher, Pattern, PatternError, Query, Role, coalition, is_pattern};
 
-/// Whom the name of a receiver means.
+/// Entries that the name of a receiver stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Resolution {
-    /// The entry of that name.
+    /// The entry with that name.
     Exact(Arc<Entry>),
-    /// The entries that match a pattern, by name; at least one.
+    /// The entries that match a pattern, sorted by name; at least one.
     Multicast(Vec<Arc<Entry>>),
-    /// The members of a coalition, coalitions among them followed, or its leader.
+    /// The agents of a coalition, with nested coalitions resolved, or its leader.
     Coalition {
-        /// Those that are there.
+        /// The agents that have an entry.
         agents: Vec<Arc<Entry>>,
-        /// Members whom nobody knows, or beyond the bounds of what one name can mean.
+        /// Members without an entry, or beyond the bounds of one coalition.
         missing: Vec<Arc<str>>,
     },
-    /// Nobody: an unknown name, or a pattern or coalition that has nobody but the sender.
+    /// No entry: the name is unknown, or the pattern or coalition has no agent except the sender.
     None,
 }
 
-/// Whom `receiver` means in a letter from `sender`.
+/// Resolves `receiver` in a letter from `sender`.
 ///
-/// The name of a coalition means its members, without the sender, or its leader. What
-/// [is a pattern](is_pattern), which no name is, means every agent whose whole name matches, except the sender
-/// itself and gateways, which nobody means who writes to `.*`.
+/// The name of a coalition resolves to its members without the sender, or to its leader. A name
+/// that [is a pattern](is_pattern) resolves to every agent whose whole name matches, except the
+/// sender; gateways are left out, because `.*` addresses agents. No agent can have a pattern as its
+/// name.
 ///
 /// # Errors
-/// When the name is a pattern that is not valid.
+/// Fails when the name is a pattern that is not valid.
 pub fn resolve(
     directory: &dyn Directory,
     receiver: &str,
@@ -48,7 +49,7 @@ pub fn resolve(
         return Ok(Resolution::None);
     }
     let pattern = Pattern::new(receiver)?;
-    // The look-up that found nobody has already made the directory look for what is new.
+    // The failed lookup above has already refreshed the directory.
     let mut found = directory.search(&Query::by_name(Matcher::Pattern(pattern)));
     found.retain(|entry| *entry.name != *sender && entry.role == Role::Agent);
     Ok(if found.is_empty() {
@@ -58,12 +59,12 @@ pub fn resolve(
     })
 }
 
-/// Resolves the receiver of a legacy peer's letter: as [`resolve`] does, except for a name whose only
-/// special character is `?`. That is no pattern but the name of an agent with dots in place of `?`, as
-/// fipa_services writes it, and costs one look-up.
+/// Resolves the receiver of a legacy peer's letter like [`resolve`], except for a name in which `?`
+/// is the only special character. fipa_services writes `?` for each dot of an agent's name; such a
+/// name is not a pattern and costs one lookup.
 ///
 /// # Errors
-/// When the name is a pattern that is not valid.
+/// Fails when the name is a pattern that is not valid.
 pub fn resolve_legacy(
     directory: &dyn Directory,
     receiver: &str,
@@ -78,7 +79,7 @@ pub fn resolve_legacy(
     }
 }
 
-/// Whether [`resolve_legacy`] compiles this name: it has other special characters of a pattern than
+/// Whether [`resolve_legacy`] compiles this name: it has a special character of patterns other than
 /// `?`.
 #[must_use]
 pub fn is_legacy_pattern(receiver: &str) -> bool {
@@ -113,16 +114,16 @@ mod tests {
     }
 
     #[test]
-    fn a_dot_is_a_dot_in_a_name() {
+    fn a_dot_in_a_name_matches_only_a_dot() {
         let directory = directory(&["arm_left", "arm.left"]);
         let dot = resolve(&directory, "arm.left", "me").unwrap();
         assert_eq!(names(&dot), ["arm.left"]);
-        let nobody = resolve(&directory, "arm.right", "me").unwrap();
-        assert_eq!(nobody, Resolution::None);
+        let none = resolve(&directory, "arm.right", "me").unwrap();
+        assert_eq!(none, Resolution::None);
     }
 
     #[test]
-    fn no_agent_has_the_name_of_a_pattern() {
+    fn a_pattern_cannot_be_registered_as_a_name() {
         let directory = directory(&["arm_left", "arm_right"]);
         let thief = Registration::new("arm_.*", Incarnation::random(), Vec::new());
         assert!(directory.register(thief).is_err());
@@ -138,8 +139,8 @@ mod tests {
         let one = resolve(&directory, "arm_.+", "arm_left").unwrap();
         assert_eq!(names(&one), ["arm_right"]);
         assert!(matches!(one, Resolution::Multicast(_)));
-        let nobody = resolve(&directory, "came.*", "camera").unwrap();
-        assert_eq!(nobody, Resolution::None);
+        let none = resolve(&directory, "came.*", "camera").unwrap();
+        assert_eq!(none, Resolution::None);
         let gateway = resolve(&directory, "arm_gateway", "camera").unwrap();
         assert_eq!(names(&gateway), ["arm_gateway"]);
     }
@@ -151,9 +152,9 @@ mod tests {
         assert_eq!(legacy("arm?left"), "arm.left");
         assert_eq!(legacy("who?is?it"), "who.is.it");
         assert_eq!(legacy("arm?down"), "");
-        // It is no valid pattern, and not read as one.
+        // It is not a valid pattern, and is not read as one.
         assert_eq!(legacy("?down"), "");
-        assert_eq!(legacy("arm?right"), "", "no pattern");
+        assert_eq!(legacy("arm?right"), "", "not a pattern");
         assert_eq!(legacy("le?g_[0-9]"), "leg_1", "a pattern");
         assert_eq!(legacy("armright"), "armright");
         let resolved = resolve(&directory, "arm?left", "me").unwrap();

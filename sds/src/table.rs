@@ -1,4 +1,4 @@
-//! The index behind the back ends: who claims which name, and who has it.
+//! The index behind the back ends: the claims on each name, and its holder.
 
 use std::collections::{BTreeSet, HashMap};
 use std::hash::Hash;
@@ -9,12 +9,11 @@ use arc_swap::ArcSwapOption;
 use fipa_transport::Incarnation;
 use parking_lot::RwLock;
 
-use crate::watch::Hub;
+use crate::watch::Subscribers;
 use crate::{Change, Entry, Subscriber};
 
-/// What a back end reads from its [`Table`] and nowhere else: the part of
-/// [`Directory`](crate::Directory) that all of them have in common. The field is named as it is
-/// reached from `self`.
+/// Implements the part of [`Directory`](crate::Directory) that all back ends read from their
+/// [`Table`]. The argument is the path of the table's field from `self`.
 macro_rules! reads_its_table {
     ($($field:ident).+) => {
         fn known(&self, name: &str) -> Option<Arc<Entry>> {
@@ -39,27 +38,27 @@ macro_rules! reads_its_table {
     };
 }
 
-/// Entries by the origin that claims them (a process, a record). When several claim one name, the
-/// entry that [precedes](Entry::precedes) has it, and the others wait for it to leave. Origins that are
-/// proved come before all others, in the order in which they claimed the name: the times that they
-/// state do not count.
+/// Entries by the origin that claims them (a process, a record). When several origins claim a name,
+/// the entry that [precedes](Entry::precedes) the others holds it, and the others take over when it
+/// leaves. Proved origins come before all others, in the order in which they claimed the name;
+/// their stated registration times do not count.
 #[derive(Debug)]
 pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
     sorted: ArcSwapOption<Sorted>,
     generation: AtomicU64,
-    hub: Hub,
+    subscribers: Subscribers,
 }
 
 #[derive(Debug)]
 struct Index<O> {
-    /// Never an empty list; who has the name stands first.
+    /// No list is empty; the first entry of a list holds the name.
     claims: HashMap<Arc<str>, Vec<(O, Arc<Entry>)>>,
-    /// The names that more than one proved origin claims.
+    /// Names that more than one proved origin claims.
     contested: BTreeSet<Arc<str>>,
     is_proved: fn(&O) -> bool,
     incarnations: HashMap<Incarnation, Arc<Entry>>,
-    /// What origins of one entry each have said last.
+    /// The latest name claimed by each origin of a single entry.
     #[cfg(feature = "mdns")]
     origins: HashMap<O, Arc<str>>,
 }
@@ -75,7 +74,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
         Self::proved_by(|_| false)
     }
 
-    /// A table in which some origins are proved.
+    /// Creates a table in which `is_proved` selects the proved origins.
     pub(crate) fn proved_by(is_proved: fn(&O) -> bool) -> Self {
         Self {
             index: RwLock::new(Index {
@@ -88,7 +87,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
             }),
             sorted: ArcSwapOption::empty(),
             generation: AtomicU64::new(0),
-            hub: Hub::default(),
+            subscribers: Subscribers::default(),
         }
     }
 
@@ -100,7 +99,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
         self.index.read().incarnations.get(&incarnation).cloned()
     }
 
-    /// Who has the name, and who claims it for them.
+    /// Returns the entry that holds the name, and its origin.
     pub(crate) fn holder(&self, name: &str) -> Option<(O, Arc<Entry>)> {
         self.index.read().claims.get(name)?.first().cloned()
     }
@@ -126,8 +125,8 @@ impl<O: Clone + Eq + Hash> Table<O> {
         entries
     }
 
-    /// The names that more than one proved origin claims, at most so many: the entry that has the name,
-    /// and each of the others.
+    /// Returns at most `most` pairs for names that more than one proved origin claims: the entry
+    /// that holds the name, and each other proved entry.
     pub(crate) fn contested(&self, most: usize) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         let index = self.index.read();
         let names = index.contested.iter();
@@ -141,10 +140,11 @@ impl<O: Clone + Eq + Hash> Table<O> {
         pairs.take(most).collect()
     }
 
-    /// What the entries mean to a view of several directories has changed.
-    pub(crate) fn tell_all(&self) {
+    /// Tells all watchers to read again, because the mandates that a merged view applies to these
+    /// entries changed.
+    pub(crate) fn notify_reread(&self) {
         let _index = self.index.write();
-        self.tell(Some(Change::Lagged));
+        self.notify(Some(Change::Lagged));
     }
 
     pub(crate) fn generation(&self) -> u64 {
@@ -152,16 +152,16 @@ impl<O: Clone + Eq + Hash> Table<O> {
     }
 
     pub(crate) fn subscribe(&self, subscriber: &Subscriber) {
-        self.hub.subscribe(subscriber);
+        self.subscribers.subscribe(subscriber);
     }
 
-    /// Puts the entry in, in place of the one that the same origin claims by that name.
+    /// Inserts the entry; replaces the one that the same origin claims by that name.
     pub(crate) fn put(&self, origin: O, entry: Arc<Entry>) {
         self.update(std::iter::once((origin, entry.name.clone(), Some(entry))));
     }
 
-    /// Puts the entry in unless an entry of another incarnation has the name, which is then
-    /// returned.
+    /// Inserts the entry unless an entry of another incarnation holds the name; that one is then
+    /// returned as the error.
     pub(crate) fn claim(&self, origin: O, entry: Arc<Entry>) -> Result<(), Arc<Entry>> {
         let mut index = self.index.write();
         match index.holder(&entry.name) {
@@ -173,7 +173,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
         }
     }
 
-    /// Takes out what the origin claims by that name, if it has this incarnation.
+    /// Removes the origin's claim on that name if it has this incarnation. Returns whether it did.
     pub(crate) fn release(&self, origin: O, name: &str, incarnation: Incarnation) -> bool {
         let mut index = self.index.write();
         let claims = index.claims.get(name);
@@ -189,67 +189,67 @@ impl<O: Clone + Eq + Hash> Table<O> {
         true
     }
 
-    /// Puts in what origins of one entry each say now, in place of what they said before, in one
-    /// go.
+    /// Replaces the entries of origins that have a single entry each, as one update.
     #[cfg(feature = "mdns")]
     pub(crate) fn replace(&self, updates: impl IntoIterator<Item = (O, Option<Arc<Entry>>)>) {
         let mut index = self.index.write();
-        let mut together = Vec::new();
+        let mut coalitions = Vec::new();
         for (origin, entry) in updates {
             let before = index.origins.remove(&origin);
             if let Some(name) = before
                 && entry.as_ref().is_none_or(|entry| entry.name != name)
             {
                 let change = index.change(origin.clone(), name, None);
-                self.tell_or_keep(change, &mut together);
+                self.notify_or_collect(change, &mut coalitions);
             }
             if let Some(entry) = entry {
                 let name = entry.name.clone();
                 index.origins.insert(origin.clone(), name.clone());
                 let change = index.change(origin, name, Some(entry));
-                self.tell_or_keep(change, &mut together);
+                self.notify_or_collect(change, &mut coalitions);
             }
         }
-        self.tell(Change::together(together));
+        self.notify(Change::together(coalitions));
     }
 
-    /// How many have said anything, by [`replace`](Self::replace).
+    /// Number of origins that have an entry by [`replace`](Self::replace).
     #[cfg(feature = "mdns")]
     pub(crate) fn len(&self) -> usize {
         self.index.read().origins.len()
     }
 
-    /// Puts in and takes out in one go.
+    /// Inserts and removes several entries as one update.
     pub(crate) fn update(
         &self,
         updates: impl IntoIterator<Item = (O, Arc<str>, Option<Arc<Entry>>)>,
     ) {
         let mut index = self.index.write();
-        let mut together = Vec::new();
+        let mut coalitions = Vec::new();
         for (origin, name, entry) in updates {
             let change = index.change(origin, name, entry);
-            self.tell_or_keep(change, &mut together);
+            self.notify_or_collect(change, &mut coalitions);
         }
-        self.tell(Change::together(together));
+        self.notify(Change::together(coalitions));
     }
 
-    /// Coalitions that change together are told together: a merger has no state in between.
-    fn tell_or_keep(&self, change: Option<Change>, together: &mut Vec<Change>) {
+    /// Collects changes of coalitions, which are reported as one change so that a merger has no
+    /// intermediate state; reports other changes at once.
+    fn notify_or_collect(&self, change: Option<Change>, coalitions: &mut Vec<Change>) {
         match change {
-            Some(change) if change.of_coalition() => together.push(change),
-            change => self.tell(change),
+            Some(change) if change.of_coalition() => coalitions.push(change),
+            change => self.notify(change),
         }
     }
 
-    /// Watchers are told under the lock, so that they are told in the order in which it happened.
+    /// Notifies watchers under the lock, so that they receive changes in order.
     fn apply(&self, index: &mut Index<O>, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) {
-        self.tell(index.change(origin, name, entry));
+        self.notify(index.change(origin, name, entry));
     }
 
-    fn tell(&self, change: Option<Change>) {
+    fn notify(&self, change: Option<Change>) {
         if let Some(change) = change {
             self.generation.fetch_add(1, Ordering::Release);
-            self.hub.tell(&change);
+            self.subscribers.tell(&change);
         }
     }
 }
@@ -260,7 +260,7 @@ impl<O: Eq> Index<O> {
         claims.first().map(|(_, entry)| entry)
     }
 
-    /// Puts in or takes out what the origin claims by that name.
+    /// Inserts or removes the origin's claim on that name.
     fn change(&mut self, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) -> Option<Change> {
         let before = self.holder(&name).cloned();
         self.set(origin, &name, entry);
@@ -284,15 +284,15 @@ impl<O: Eq> Index<O> {
         };
         let first_unproved = proved(&claims);
         if let Some(entry) = entry {
-            let place = match is_proved(&origin) {
+            let index = match is_proved(&origin) {
                 true => before.unwrap_or(first_unproved),
                 false => {
                     let mut unproved = claims.iter().skip(first_unproved);
-                    let place = unproved.position(|(_, other)| entry.precedes(other));
-                    place.map_or(claims.len(), |place| first_unproved + place)
+                    let index = unproved.position(|(_, other)| entry.precedes(other));
+                    index.map_or(claims.len(), |index| first_unproved + index)
                 }
             };
-            claims.insert(place, (origin, entry));
+            claims.insert(index, (origin, entry));
         }
         if proved(&claims) > 1 {
             self.contested.insert(name.clone());

@@ -1,4 +1,4 @@
-//! Telling what changes in a directory.
+//! Notifications of changes in a directory.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,26 +12,26 @@ use crate::{Entry, Role};
 /// One change of a directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Change {
-    /// An entry of a name that was free.
+    /// A name that was free has an entry.
     Joined(Arc<Entry>),
-    /// A name has another entry than before, perhaps of another incarnation.
+    /// The entry of a name was replaced, perhaps by one of another incarnation.
     Changed {
-        /// What it was.
+        /// The previous entry.
         before: Arc<Entry>,
-        /// What it is.
+        /// The current entry.
         after: Arc<Entry>,
     },
-    /// An entry that is gone.
+    /// An entry was removed.
     Left(Arc<Entry>),
-    /// Several that are one: nobody saw a state in between. At least two, none of them of this
-    /// kind; all of them are of coalitions.
+    /// Several changes that took effect at once, without an intermediate state. Has at least two
+    /// changes, all of coalitions and none of this kind.
     Together(Vec<Change>),
-    /// The watcher was too slow and has missed changes: it should read all entries again.
+    /// The watcher was too slow and missed changes; it must read all entries again.
     Lagged,
 }
 
 impl Change {
-    /// The change from one entry of a name to the other, if there is any.
+    /// Returns the change from one entry of a name to another, if they differ.
     pub(crate) fn between(before: Option<Arc<Entry>>, after: Option<Arc<Entry>>) -> Option<Self> {
         match (before, after) {
             (None, Some(after)) => Some(Self::Joined(after)),
@@ -41,7 +41,7 @@ impl Change {
         }
     }
 
-    /// Several changes as one, if there are any.
+    /// Combines several changes into one; `None` if there are none.
     pub(crate) fn together(mut changes: Vec<Self>) -> Option<Self> {
         if changes.len() < 2 {
             return changes.pop();
@@ -49,7 +49,7 @@ impl Change {
         Some(Self::Together(changes))
     }
 
-    /// The changes it is made of: itself, when it is one.
+    /// Returns the parts of a combined change, or the change itself.
     #[must_use]
     pub fn single(&self) -> &[Self] {
         match self {
@@ -58,7 +58,7 @@ impl Change {
         }
     }
 
-    /// Whether it is about a coalition, now or before.
+    /// Whether the change concerns a coalition, before or after it.
     pub(crate) fn of_coalition(&self) -> bool {
         let is = |entry: &Entry| matches!(entry.role, Role::Coalition(_));
         match self {
@@ -68,7 +68,7 @@ impl Change {
         }
     }
 
-    /// The name it is about, if it is one.
+    /// Returns the name that the change concerns, if there is exactly one.
     pub(crate) fn name(&self) -> Option<&Arc<str>> {
         match self {
             Self::Joined(entry) | Self::Left(entry) | Self::Changed { after: entry, .. } => {
@@ -79,10 +79,10 @@ impl Change {
     }
 }
 
-/// The changes of a directory from when it was asked for, in order.
+/// The changes of a directory since the watch was created, in order.
 ///
-/// Bounded: who does not read for more than [`Watch::CAPACITY`] changes gets
-/// [`Change::Lagged`] in their place.
+/// Bounded: when more than [`Watch::CAPACITY`] changes are unread, they are replaced by one
+/// [`Change::Lagged`].
 pub struct Watch {
     changes: mpsc::Receiver<Change>,
     lagged: Arc<AtomicBool>,
@@ -90,10 +90,10 @@ pub struct Watch {
 }
 
 impl Watch {
-    /// Most changes that wait for a watcher.
+    /// Maximum number of unread changes.
     pub const CAPACITY: usize = 1024;
 
-    /// A watch, and the subscriber to be handed to directories.
+    /// Creates a watch and the subscriber to pass to directories.
     #[must_use]
     pub fn new() -> (Subscriber, Self) {
         let (sender, changes) = mpsc::channel(Self::CAPACITY);
@@ -110,13 +110,13 @@ impl Watch {
         (subscriber, watch)
     }
 
-    /// The same watch, telling only what changes in the merged view.
+    /// Converts the watch to one that reports only changes of the merged view.
     pub(crate) fn merging(mut self, view: MergedView) -> Self {
         self.merged = Some(view);
         self
     }
 
-    /// The next change; none when the directory is gone. Cancelling the future loses nothing.
+    /// Waits for the next change; `None` when the directory is gone. This method is cancel-safe.
     pub async fn next(&mut self) -> Option<Change> {
         loop {
             let raw = if self.lags() {
@@ -124,13 +124,13 @@ impl Watch {
             } else {
                 self.changes.recv().await?
             };
-            if let Some(change) = self.told(raw) {
+            if let Some(change) = self.translate(raw) {
                 return Some(change);
             }
         }
     }
 
-    /// The next change if there is one already.
+    /// Returns the next change if one is ready.
     pub fn try_next(&mut self) -> Option<Change> {
         loop {
             let raw = if self.lags() {
@@ -138,14 +138,14 @@ impl Watch {
             } else {
                 self.changes.try_recv().ok()?
             };
-            if let Some(change) = self.told(raw) {
+            if let Some(change) = self.translate(raw) {
                 return Some(change);
             }
         }
     }
 
-    /// Whether changes were missed. What waits is then thrown away: the entries that will be read
-    /// again are newer.
+    /// Returns whether changes were missed. If so, discards unread changes: the entries that the
+    /// watcher reads next are newer.
     fn lags(&mut self) -> bool {
         let lags = self.lagged.swap(false, Ordering::AcqRel);
         if lags {
@@ -154,9 +154,9 @@ impl Watch {
         lags
     }
 
-    fn told(&mut self, raw: Change) -> Option<Change> {
+    fn translate(&mut self, raw: Change) -> Option<Change> {
         match &mut self.merged {
-            Some(view) => view.told(raw),
+            Some(view) => view.translate(raw),
             None => Some(raw),
         }
     }
@@ -168,7 +168,7 @@ impl std::fmt::Debug for Watch {
     }
 }
 
-/// Who is told of changes: the other end of a [`Watch`].
+/// The sending end of a [`Watch`].
 #[derive(Debug, Clone)]
 pub struct Subscriber {
     changes: mpsc::Sender<Change>,
@@ -176,7 +176,7 @@ pub struct Subscriber {
 }
 
 impl Subscriber {
-    /// Tells a change, without ever waiting. False when nobody listens any more.
+    /// Sends a change without blocking. Returns false when the watch was dropped.
     pub fn tell(&self, change: Change) -> bool {
         match self.changes.try_send(change) {
             Ok(()) => true,
@@ -189,16 +189,16 @@ impl Subscriber {
     }
 }
 
-/// All subscribers of one directory.
+/// All subscribers of a directory.
 #[derive(Debug, Default)]
-pub(crate) struct Hub {
+pub(crate) struct Subscribers {
     subscribers: Mutex<Vec<Subscriber>>,
 }
 
-impl Hub {
+impl Subscribers {
     pub(crate) fn subscribe(&self, subscriber: &Subscriber) {
         let mut subscribers = self.subscribers.lock();
-        // Watches that are gone are noticed at the next change, which may never come.
+        // Dropped watches are otherwise removed only at the next change, which may never come.
         subscribers.retain(|one| !one.changes.is_closed());
         subscribers.push(subscriber.clone());
     }

@@ -1,10 +1,10 @@
-//! With the real Avahi on another host: what we announce, `avahi-browse` shows to the peers'
-//! taste, and what `avahi-publish` announces, we find.
+//! Interoperation with Avahi on another host: `avahi-browse` shows the announcements of this
+//! project as the legacy peers need them, and the announcements of `avahi-publish` are found.
 //!
-//! Needs root, and of Debian the packages avahi-daemon, avahi-utils, dbus and iproute2. Where they
-//! are missing the test says so and is skipped; in CI it fails.
+//! Needs root, and the Debian packages avahi-daemon, avahi-utils, dbus and iproute2. Without them
+//! the test reports that it is skipped; in CI it fails.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
@@ -52,7 +52,7 @@ fn open(name: &str) -> MdnsDirectory {
     MdnsDirectory::open(config).unwrap()
 }
 
-/// In the namespace, too, because outside it would be heard beyond this machine.
+/// Runs in the namespace too, because otherwise its packets would leave this machine.
 async fn all_interfaces_include_loopback() {
     let open = |interfaces: &[&str]| {
         let config = MdnsConfig {
@@ -69,7 +69,7 @@ async fn all_interfaces_include_loopback() {
     eventually("said on loopback", || loopback.lookup("foot")).await;
 }
 
-/// The line of `avahi-browse` about a record that was resolved, with all of this in it.
+/// The line of `avahi-browse` about a resolved record that contains all of these parts.
 fn browsed(avahi: &Avahi<'_>, parts: &[&str]) -> Option<String> {
     let lines = avahi.browse(SERVICE_TYPE);
     let wanted =
@@ -107,7 +107,7 @@ async fn we_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     })
     .await;
 
-    // A goodbye is understood, too.
+    // Avahi also processes a goodbye.
     directory.deregister("arm.left", agent.incarnation).unwrap();
     eventually("avahi-browse no longer shows it", || {
         let lines = avahi.browse(SERVICE_TYPE);
@@ -147,8 +147,8 @@ async fn peers_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     gone(directory, name).await;
 }
 
-/// As fipa_services announces an agent with many transports: 1,300 bytes, with values split into
-/// strings of 200 bytes that repeat the key.
+/// A record like that of fipa_services for an agent with many transports: 1,300 bytes, with values
+/// split into strings of 200 bytes that repeat the key.
 async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     let mut watch = directory.watch();
     let location =
@@ -189,7 +189,7 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     assert_eq!(found.agent_type, "crane");
     drop(peer);
     gone(directory, "crane").await;
-    // It joined once and left once, whatever was learnt of it in between.
+    // It joined once and left once, whatever arrived of it in between.
     let mut told = Vec::new();
     while let Some(change) = watch.try_next() {
         told.push(change);
@@ -232,9 +232,9 @@ async fn records_with_little_in_them_are_read(directory: &MdnsDirectory, avahi: 
     gone(directory, "bare").await;
 }
 
-/// Who was there first keeps the name, whoever that is.
+/// The earlier registration keeps the name.
 async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
-    // Ours first: Avahi gives the peer another name.
+    // The own registration first: Avahi renames the peer.
     let ours = registration("lift");
     directory.register(ours.clone()).unwrap();
     eventually("avahi-browse shows ours", || {
@@ -250,7 +250,8 @@ async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     gone(directory, "lift #2").await;
     directory.deregister("lift", ours.incarnation).unwrap();
 
-    // The peer first: who has heard of it does not get the name, and who has not, loses it.
+    // The peer first: a directory that has its record refuses the name, and one without it
+    // withdraws its registration.
     let strings = ["TYPE=theirs", "TIMESTAMP=20200101-00:00:00:000000"];
     let _peer = avahi.publish("winch", SERVICE_TYPE, 0, &strings);
     let holder = eventually("the peer", || directory.lookup("winch")).await;
@@ -262,7 +263,7 @@ async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     let mut withdrawals = newcomer.withdrawals();
     newcomer.register(registration("winch")).unwrap();
     let told = tokio::time::timeout(common::WATCHDOG, withdrawals.recv()).await;
-    let told = told.expect("the later is told").unwrap();
+    let told = told.expect("the later registration is withdrawn").unwrap();
     assert_eq!(told.holder.agent_type, "theirs");
     eventually("the peer's is the only record", || {
         let lines = avahi.browse(SERVICE_TYPE);

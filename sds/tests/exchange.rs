@@ -1,7 +1,7 @@
-//! The exchange of directories: gateways on virtual time, letters that arrive late or not at all,
-//! drawn from a seed.
+//! The exchange of directories: gateways on virtual time, with letters that arrive late or not at
+//! all, drawn from a seed.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 use std::collections::{BTreeMap, VecDeque};
@@ -13,7 +13,7 @@ use fipa_sds::{
 };
 use fipa_transport::{Incarnation, Location};
 
-/// How long the simulated service tries to deliver a letter.
+/// Time for which the simulated service tries to deliver a letter.
 const DEADLINE: Duration = Duration::from_secs(5);
 
 struct Gateway {
@@ -22,7 +22,7 @@ struct Gateway {
     agents: BTreeMap<String, Arc<Entry>>,
 }
 
-/// A letter under way: it arrives when the link is there, or is given up.
+/// A letter in transit: it arrives when the link is connected, or expires.
 struct Letter {
     from: usize,
     to: usize,
@@ -35,7 +35,7 @@ struct World {
     now: Instant,
     gateways: Vec<Gateway>,
     letters: VecDeque<Letter>,
-    /// Links that are cut.
+    /// Disconnected links.
     cut: Vec<(usize, usize)>,
     random: fastrand::Rng,
     sent: usize,
@@ -69,7 +69,7 @@ impl World {
         one != other && !self.cut.contains(&(one.min(other), one.max(other)))
     }
 
-    /// Everybody learns who can be written to.
+    /// Tells every gateway which others are connected.
     fn connect(&mut self) {
         for index in 0..self.gateways.len() {
             let others = (0..self.gateways.len()).filter(|other| self.connected(index, *other));
@@ -93,7 +93,7 @@ impl World {
             .handle_own(self.now, gateway.agents.values());
     }
 
-    /// Joins, and nobody is told before something else happens.
+    /// Adds an agent without telling the exchange.
     fn appear(&mut self, index: usize, name: &str) {
         self.next += 1;
         let mts = self.gateways[index].mts.clone();
@@ -124,7 +124,7 @@ impl World {
             .handle_own(self.now, gateway.agents.values());
     }
 
-    /// Lets so much time pass.
+    /// Advances the time.
     fn run(&mut self, time: Duration) {
         self.step();
         let end = self.now + time;
@@ -133,7 +133,7 @@ impl World {
             let gateways = self.gateways.iter();
             let timeouts = gateways.filter_map(|gateway| gateway.exchange.poll_timeout());
             let expiries = self.letters.iter().map(|letter| letter.since + DEADLINE);
-            // What could not arrive waits for its link, or to expire.
+            // A letter that could not arrive waits for its link, or expires.
             let arrivals = self.letters.iter().map(|letter| letter.due);
             let arrivals = arrivals.filter(|due| *due > self.now);
             let next = timeouts.chain(expiries).chain(arrivals).min();
@@ -160,9 +160,12 @@ impl World {
                 });
             }
             let due = exchange.poll_timeout();
-            assert!(due.is_none_or(|due| due > now), "what is due has been done");
+            assert!(
+                due.is_none_or(|due| due > now),
+                "the timeout did not advance"
+            );
         }
-        // In order for each pair: a letter that waits holds up those behind it.
+        // In order for each pair: a letter that waits blocks those behind it.
         let mut waiting = VecDeque::new();
         let mut held: Vec<(usize, usize)> = Vec::new();
         while let Some(letter) = self.letters.pop_front() {
@@ -189,7 +192,7 @@ impl World {
         self.letters = waiting;
     }
 
-    /// Whether everybody knows the agents of those it is connected with, and of nobody else.
+    /// Whether every gateway has exactly the agents of its connected gateways.
     fn agrees(&self) -> bool {
         (0..self.gateways.len()).all(|index| {
             let expected = (0..self.gateways.len())
@@ -221,7 +224,7 @@ impl World {
 }
 
 #[test]
-fn neighbours_learn_of_each_others_agents() {
+fn neighbors_receive_each_others_agents() {
     let mut world = World::new(3, 1);
     for number in 0..10 {
         world.join(0, &format!("arm_{number}"));
@@ -263,7 +266,7 @@ fn hundreds_that_start_at_once_make_few_letters() {
     assert!(world.agrees());
     let letters = world.sent - before;
     assert!(letters <= 12, "{letters} letters");
-    // Nothing happens: nearly nothing is said.
+    // Without changes, few letters are sent.
     let before = world.sent;
     world.run(Duration::from_secs(60));
     let letters = world.sent - before;
@@ -285,7 +288,7 @@ fn many_agents_take_several_letters_and_may_change_meanwhile() {
     }
     world.run(Duration::from_secs(2));
     assert!(world.agrees());
-    // More than is remembered changes while nothing arrives.
+    // More changes than the log holds happen before a letter arrives.
     world.cut.push((0, 1));
     for _ in 0..8 {
         for number in 0..600 {
@@ -306,7 +309,7 @@ fn entries_leave_with_their_gateway() {
     world.run(Duration::from_millis(300));
     let directory = world.gateways[1].exchange.directory();
     assert!(directory.lookup("arm").is_some());
-    // A connection that is made again at once is not noticed.
+    // A brief disconnect has no effect.
     let now = world.now;
     world.gateways[1].exchange.handle_neighbours(now, &[]);
     world.run(Exchange::MEMORY / 2);
@@ -318,11 +321,11 @@ fn entries_leave_with_their_gateway() {
     world.gateways[1].exchange.handle_neighbours(now, &[]);
     world.run(Exchange::MEMORY + Duration::from_millis(10));
     assert!(directory.lookup("arm").is_none());
-    // It comes back, and has not noticed that it was away.
+    // It reconnects, without having noticed the disconnect.
     world.connect();
     world.run(Duration::from_secs(20));
     assert!(world.agrees());
-    // Who takes leave is gone at once.
+    // A goodbye removes the agents at once.
     let (to, content) = world.gateways[0].exchange.goodbye();
     assert_eq!(to, [Incarnation::from_u64(2)]);
     let now = world.now;
@@ -333,8 +336,8 @@ fn entries_leave_with_their_gateway() {
     assert!(directory.lookup("arm").is_none());
 }
 
-/// A gateway that is killed and started again has another incarnation at the same location: the entries
-/// of the old one do not outlive the first letter of the new one.
+/// A gateway that is killed and restarted has another incarnation at the same location: the entries
+/// of the old one are removed with the first letter of the new one.
 #[test]
 fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let mut world = World::new(2, 4);
@@ -354,16 +357,17 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
         [{"name":"arm","type":"arm","id":"00000000000003e9","registered":1001}]}}}"#;
     let now = world.now;
     let exchange = &mut world.gateways[1].exchange;
-    // A connection with the old one seems to be open: its entries stay.
+    // A connection with the old one appears open: its entries stay.
     exchange.handle_neighbours(now, &[known, restarted.clone()]);
     exchange.handle_letter(now, new, told).unwrap();
     assert!(directory.speaks_for(old));
-    // It ends: they leave at once, and those of the new one are there.
+    // It ends: its entries leave at once, and those of the new one are there.
     exchange.handle_neighbours(now, std::slice::from_ref(&restarted));
     assert!(!directory.speaks_for(old));
     assert_eq!(gateway(), Some(new));
 
-    // The connection with the old one ends first: its entries stay until the new one has told its own.
+    // The connection with the old one ends first: its entries stay until the new one has sent its
+    // own.
     let newer = Incarnation::from_u64(78);
     let at = location(0).with_incarnation(newer);
     let started_again = Present::unproved(Mts::new("same-name-mts", newer), vec![at]);
@@ -374,7 +378,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     assert_eq!(gateway(), Some(newer));
     assert!(!directory.speaks_for(new));
 
-    // The connection with the old one seems to be open, but it does not answer.
+    // The connection with the old one appears open, but it does not answer.
     let newest = Incarnation::from_u64(79);
     let at = location(0).with_incarnation(newest);
     let both = [
@@ -384,20 +388,24 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     exchange.handle_neighbours(now, &both);
     let silent = location(0).with_incarnation(newer);
     assert!(!exchange.handle_silence(now, &silent));
-    assert_eq!(gateway(), Some(newer), "no other has told its agents");
+    assert_eq!(
+        gateway(),
+        Some(newer),
+        "no other gateway has sent its agents"
+    );
     exchange.handle_letter(now, newest, told).unwrap();
     assert!(exchange.handle_silence(now, &silent));
     assert!(!directory.speaks_for(newer));
     assert_eq!(gateway(), Some(newest));
-    // It is asked for its agents, in case that it is there after all.
+    // It is asked for its agents, in case that it is still running.
     let later = now + Duration::from_secs(1);
     let asked: Vec<_> = std::iter::from_fn(|| exchange.poll_letter(later)).collect();
     assert!(asked.iter().any(|(to, _)| *to == newer), "{asked:?}");
 }
 
-/// What was announced by multicast may be newer than what a gateway told that is away.
+/// An announcement by multicast may be newer than the entries of a disconnected gateway.
 #[test]
-fn agents_of_a_gateway_that_is_away_are_left_to_other_directories() {
+fn agents_of_a_disconnected_gateway_are_dropped_if_another_directory_has_them() {
     let mut world = World::new(2, 4);
     world.join(0, "arm");
     world.join(0, "leg");
@@ -407,7 +415,10 @@ fn agents_of_a_gateway_that_is_away_are_left_to_other_directories() {
     let (is_arm, now) = (|entry: &Entry| &*entry.name == "arm", world.now);
     let exchange = &mut world.gateways[1].exchange;
     exchange.leave_to_others(is_arm);
-    assert!(directory.lookup("arm").is_some(), "the gateway is there");
+    assert!(
+        directory.lookup("arm").is_some(),
+        "the gateway is connected"
+    );
     exchange.handle_neighbours(now, &[]);
     exchange.leave_to_others(is_arm);
     assert!(directory.lookup("arm").is_none());
@@ -417,9 +428,9 @@ fn agents_of_a_gateway_that_is_away_are_left_to_other_directories() {
     assert!(world.agrees());
 }
 
-/// A letter may be faster than the news that its sender can be written to.
+/// A letter may arrive before its sender is reported as connected.
 #[test]
-fn what_was_told_too_early_is_asked_for() {
+fn entries_that_arrived_too_early_are_requested_again() {
     let mut world = World::new(2, 6);
     world.join(0, "arm");
     let now = world.now;
@@ -436,7 +447,7 @@ fn what_was_told_too_early_is_asked_for() {
 }
 
 #[test]
-fn a_gateway_that_is_elsewhere_takes_its_agents_along() {
+fn the_agents_of_a_gateway_follow_its_location() {
     let mut world = World::new(2, 5);
     world.join(0, "arm");
     world.connect();
@@ -453,7 +464,7 @@ fn a_gateway_that_is_elsewhere_takes_its_agents_along() {
     assert_eq!(entry.locations, [elsewhere]);
 }
 
-/// Links are cut and healed in random order; connections are noticed to be broken, or not.
+/// Links are disconnected and restored in random order; the gateways notice, or not.
 #[test]
 fn after_every_healing_all_agree_within_ten_seconds() {
     let seeds = std::env::var("FIPA_SIM_SEEDS")
@@ -475,7 +486,7 @@ fn after_every_healing_all_agree_within_ten_seconds() {
             }
             for _ in 0..world.random.usize(0..30) {
                 let index = world.random.usize(0..4);
-                // Names that several claim are among them.
+                // Includes names that several gateways claim.
                 let name = format!("agent_{}", world.random.usize(0..20));
                 if world.random.bool() {
                     world.join(index, &name);
@@ -506,7 +517,7 @@ fn with_neighbour() -> Exchange {
 }
 
 #[test]
-fn strangers_and_nonsense_are_refused() {
+fn unknown_senders_and_malformed_letters_are_rejected() {
     let mut exchange = with_neighbour();
     let stranger = Incarnation::from_u64(8);
     let again = br#"{"version":1,"tell":"again"}"#;
@@ -536,11 +547,11 @@ fn strangers_and_nonsense_are_refused() {
 }
 
 #[test]
-fn agents_that_cannot_be_are_left_out() {
+fn invalid_agents_are_left_out() {
     let mut exchange = with_neighbour();
     let agents = r#"[{"name":"","id":"0000000000000001","registered":1},
         {"name":"a\nb","id":"0000000000000001","registered":1},
-        {"name":"nobody","id":"0000000000000000","registered":1},
+        {"name":"absent","id":"0000000000000000","registered":1},
         {"name":"good","id":"0000000000000001","registered":99999999999999999,"more":[]}]"#;
     let full = format!(
         r#"{{"version":1,"tell":{{"full":{{"version":0,"first":true,"last":true,"agents":{agents}}}}}}}"#
@@ -553,7 +564,7 @@ fn agents_that_cannot_be_are_left_out() {
 }
 
 #[test]
-fn what_a_neighbour_can_tell_is_bounded() {
+fn the_number_of_agents_of_a_neighbor_is_bounded() {
     let mut exchange = with_neighbour();
     let part = |part: usize, last: bool| {
         let agents: Vec<String> = (0..5000)
@@ -576,14 +587,14 @@ fn what_a_neighbour_can_tell_is_bounded() {
         Err(ExchangeError::TooMany)
     ));
     assert!(exchange.directory().entries().is_empty());
-    // What it says next does not follow from anything, and is asked for.
+    // Its next changes do not fit the stored state, and all entries are requested.
     told(&mut exchange, &part(3, true)).unwrap();
     assert!(exchange.directory().entries().is_empty());
     let now = Instant::now() + Duration::from_millis(1);
     let (to, question) = exchange.poll_letter(now).unwrap();
     assert_eq!(to, Incarnation::from_u64(7));
     assert_eq!(question, br#"{"version":1,"tell":"again"}"#);
-    // Who asks all the time is told now and then.
+    // Frequent requests are answered at a limited rate.
     exchange.handle_sent(now, to, true);
     let mut answers = 0;
     for millis in 0..3000 {
@@ -596,7 +607,7 @@ fn what_a_neighbour_can_tell_is_bounded() {
         }
     }
     assert!((2..=4).contains(&answers), "{answers}");
-    // So many neighbours and no more.
+    // The number of neighbors is limited.
     let crowd: Vec<_> = (0..2000)
         .map(|number| {
             Present::unproved(

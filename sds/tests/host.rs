@@ -1,6 +1,6 @@
-//! The directory of one host, with real processes that come, go and are killed.
+//! The directory of one host, with real processes that start, end and are killed.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
@@ -36,8 +36,8 @@ fn files(dir: &Path) -> Vec<String> {
     names.collect()
 }
 
-/// A directory that does not exist yet, in one that goes away with the test.
-fn place() -> (tempfile::TempDir, PathBuf) {
+/// A path that does not exist yet, in a temporary directory.
+fn fresh_dir() -> (tempfile::TempDir, PathBuf) {
     let parent = tempfile::tempdir().unwrap();
     let dir = parent.path().join("domain");
     (parent, dir)
@@ -59,8 +59,8 @@ impl Process {
         process
     }
 
-    /// A process that gets no inotify instance, like the 119th of a user. None, and says so, where
-    /// this user may not make user namespaces; fails then if `CI=true`.
+    /// A process that gets no inotify instance, like the 119th of a user. Where this user may not
+    /// create user namespaces, prints that, returns `None`, and fails if `CI=true`.
     fn start_without_inotify(dir: &Path) -> Option<Self> {
         let unshare = || {
             let mut unshare = Command::new("unshare");
@@ -108,7 +108,7 @@ impl Process {
         writeln!(self.commands, "{command}").unwrap();
     }
 
-    /// The next answer; what the test harness prints in between is not one.
+    /// The next answer; other output of the test harness is skipped.
     fn answer(&mut self) -> String {
         let mut line = String::new();
         loop {
@@ -163,7 +163,7 @@ fn child_process() {
                 failed.map_or("ok".to_owned(), |error| error.to_string())
             }
             "lookup" => directory.lookup(name).is_some().to_string(),
-            // Unlike a lookup, it reads nothing: only the task has found out what there is.
+            // Unlike a lookup, it reads nothing: only the task updates it.
             "sees" => {
                 let entries = directory.search(&fipa_sds::Query::all());
                 entries.iter().any(|entry| &*entry.name == name).to_string()
@@ -210,7 +210,7 @@ fn child_process() {
 
 #[tokio::test]
 async fn host_conforms() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     conforms(&one, &two).await;
     conforms(&two, &two).await;
@@ -218,7 +218,7 @@ async fn host_conforms() {
 
 #[tokio::test]
 async fn the_directory_is_private_and_empty_after_the_last() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     let mode = std::fs::metadata(&dir).unwrap().permissions().mode();
     assert_eq!(mode & 0o7777, 0o700);
@@ -239,13 +239,13 @@ async fn the_directory_is_private_and_empty_after_the_last() {
 }
 
 #[tokio::test]
-async fn a_name_registered_a_moment_ago_is_found() {
-    let (_parent, dir) = place();
+async fn a_name_that_was_just_registered_is_found() {
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     for round in 0..200 {
         let name = format!("agent_{round}");
         one.register(registration(&name)).unwrap();
-        // No await in between: the task that listens has not run.
+        // No await in between: the watcher's task has not run.
         assert!(two.lookup(&name).is_some(), "{name}");
     }
 }
@@ -253,7 +253,7 @@ async fn a_name_registered_a_moment_ago_is_found() {
 #[tokio::test]
 async fn two_processes_cannot_have_one_name() {
     const NAMES: usize = 40;
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut processes: Vec<_> = (0..4).map(|_| Process::start(&dir)).collect();
     for number in 0..NAMES {
         for process in &mut processes {
@@ -277,7 +277,7 @@ async fn two_processes_cannot_have_one_name() {
 
 #[tokio::test]
 async fn a_killed_process_loses_its_names_at_once() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut victim = Process::start(&dir);
     let mut witness = Process::start(&dir);
     let here = open(&dir);
@@ -301,7 +301,7 @@ async fn a_killed_process_loses_its_names_at_once() {
     assert_eq!(here.lookup("arm"), None);
     while witness.ask("lookup leg") == "true" {}
     assert_eq!(witness.ask("register arm"), "ok");
-    // Two processes, two lock files; and the entries of the one that has registered.
+    // Two processes, two lock files; and the entries of the one with a registration.
     eventually("its files are removed", || {
         (files(&dir).len() == 4).then_some(())
     })
@@ -317,15 +317,15 @@ async fn a_killed_process_loses_its_names_at_once() {
 }
 
 #[tokio::test]
-async fn a_name_is_free_before_anybody_has_noticed_the_death() {
-    let (_parent, dir) = place();
+async fn a_name_is_free_before_the_death_of_its_process_is_detected() {
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     for _ in 0..10 {
         let mut victim = Process::start(&dir);
         assert_eq!(victim.ask("register arm"), "ok");
         assert!(here.lookup("arm").is_some());
         victim.kill();
-        // No await in between: the task that listens has not run.
+        // No await in between: the watcher's task has not run.
         let again = registration("arm");
         here.register(again.clone()).unwrap();
         here.deregister("arm", again.incarnation).unwrap();
@@ -333,8 +333,8 @@ async fn a_name_is_free_before_anybody_has_noticed_the_death() {
 }
 
 #[tokio::test]
-async fn the_end_of_every_process_is_told() {
-    let (_parent, dir) = place();
+async fn the_end_of_every_process_is_reported() {
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let mut departures = here.departures();
     let told = async |departures: &mut fipa_sds::Departures| {
@@ -343,7 +343,7 @@ async fn the_end_of_every_process_is_told() {
             .await
             .unwrap()
     };
-    // Neither has registered anything.
+    // Neither process has registered an agent.
     let mut killed = Process::start(&dir);
     killed.kill();
     assert!(told(&mut departures).await);
@@ -356,7 +356,7 @@ async fn the_end_of_every_process_is_told() {
 
 #[tokio::test]
 async fn without_inotify_the_directory_is_polled() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let Some(mut polling) = Process::start_without_inotify(&dir) else {
         return;
     };
@@ -367,10 +367,10 @@ async fn without_inotify_the_directory_is_polled() {
     assert!(here.lookup("leg").is_some());
     let _listening = here.listen().unwrap();
     assert_eq!(polling.ask("connect"), "ok");
-    // An end in order,
+    // A graceful end,
     drop(here);
     while polling.ask("sees arm") == "true" {}
-    // and ends that no other process tells of: more than one poll asks for.
+    // and ends that no other process reports, of more processes than one poll checks.
     let mut victims: Vec<Process> = (0..10).map(|_| Process::start(&dir)).collect();
     for (number, victim) in victims.iter_mut().enumerate() {
         assert_eq!(victim.ask(&format!("register agent_{number}")), "ok");
@@ -380,7 +380,7 @@ async fn without_inotify_the_directory_is_polled() {
     for number in 0..victims.len() {
         while polling.ask(&format!("sees agent_{number}")) == "true" {}
     }
-    // The remains of the dead are removed: the lock, and two files of the process itself.
+    // The files of dead processes are removed: the lock, and two files of the process itself.
     eventually("their files are removed", || {
         (files(&dir).len() == 3).then_some(())
     })
@@ -389,7 +389,7 @@ async fn without_inotify_the_directory_is_polled() {
 
 #[tokio::test]
 async fn the_last_one_cleans_up_after_the_killed() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut victims = [Process::start(&dir), Process::start(&dir)];
     for (number, victim) in victims.iter_mut().enumerate() {
         assert_eq!(victim.ask(&format!("register agent_{number}")), "ok");
@@ -403,13 +403,13 @@ async fn the_last_one_cleans_up_after_the_killed() {
     assert_eq!(files(&dir), Vec::<String>::new());
 }
 
-/// How many agents a process registers that is told to register many.
+/// Number of agents that the command `many` registers.
 const AGENTS: usize = 20;
 
 #[tokio::test]
 async fn many_processes_register_at_once_and_all_succeed() {
     const PROCESSES: usize = 50;
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let directory = open(&dir);
     let mut processes: Vec<_> = (0..PROCESSES)
         .map(|_| Process::start_unready(&dir))
@@ -430,10 +430,10 @@ async fn many_processes_register_at_once_and_all_succeed() {
 }
 
 #[tokio::test]
-async fn a_process_that_is_stopped_in_its_turn_keeps_nobody_from_registering() {
-    let (_parent, dir) = place();
+async fn a_process_that_is_stopped_in_its_turn_does_not_block_others() {
+    let (_parent, dir) = fresh_dir();
     let directory = open(&dir);
-    // What it holds then; a newcomer has had no turn yet.
+    // Holds the turn lock, as a stopped process would; the new process has had no turn yet.
     let stopped = std::fs::File::open(&dir).unwrap();
     stopped.lock().unwrap();
     let newcomer = open(&dir);
@@ -443,14 +443,14 @@ async fn a_process_that_is_stopped_in_its_turn_keeps_nobody_from_registering() {
 }
 
 #[tokio::test]
-async fn coming_and_going_at_the_same_time_leaves_nothing() {
-    let (_parent, dir) = place();
+async fn concurrent_joins_and_leaves_leave_no_files() {
+    let (_parent, dir) = fresh_dir();
     let mut processes: Vec<_> = (0..3).map(|_| Process::start(&dir)).collect();
     for process in &mut processes {
         assert_eq!(process.ask("close"), "ok");
     }
     assert_eq!(files(&dir), Vec::<String>::new());
-    // Now nobody stays, and the lock itself comes and goes.
+    // Without a remaining process, the lock file is also removed and created again.
     for (number, process) in processes.iter_mut().enumerate() {
         process.tell(&format!("churn visitor_{number}"));
     }
@@ -482,7 +482,7 @@ async fn a_directory_that_is_not_private_is_refused() {
     std::fs::write(&file, "").unwrap();
     assert!(refused(&file).contains("file"));
 
-    // Only root can give a directory away.
+    // Only root can change the owner of a directory.
     if rustix::process::geteuid().is_root() {
         std::os::unix::fs::chown(&real, Some(12345), None).unwrap();
         assert!(refused(&real).contains("12345"));
@@ -490,8 +490,8 @@ async fn a_directory_that_is_not_private_is_refused() {
 }
 
 #[tokio::test]
-async fn planted_files_are_not_believed_and_not_followed() {
-    let (parent, dir) = place();
+async fn planted_files_are_rejected_and_links_not_followed() {
+    let (parent, dir) = fresh_dir();
     let here = open(&dir);
     let mut other = Process::start(&dir);
     assert_eq!(other.ask("register arm"), "ok");
@@ -527,7 +527,7 @@ async fn planted_files_are_not_believed_and_not_followed() {
         eventually("believed", || here.known("arm")).await;
     }
 
-    // Something that is not a file, and something that leads elsewhere.
+    // A pipe, and a symbolic link.
     std::fs::remove_file(&theirs).unwrap();
     rustix::fs::mknodat(
         rustix::fs::CWD,
@@ -553,8 +553,8 @@ async fn planted_files_are_not_believed_and_not_followed() {
 }
 
 #[tokio::test]
-async fn a_gateway_publishes_what_it_has_learnt() {
-    let (_parent, dir) = place();
+async fn a_gateway_publishes_agents_of_other_hosts() {
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let entry = Entry {
         name: "camera".into(),
@@ -597,7 +597,7 @@ async fn a_gateway_publishes_what_it_has_learnt() {
         other => panic!("{other:?}"),
     }
 
-    // What lives here comes before what the network says, however early it claims to be.
+    // Agents of this host precede those of the network, whatever time of registration those state.
     let local = here.register(registration("arm")).unwrap();
     let impostor = Entry {
         name: "arm".into(),
@@ -617,8 +617,8 @@ async fn a_gateway_publishes_what_it_has_learnt() {
 #[tokio::test]
 async fn processes_connect_to_the_sockets_they_find() {
     use rustix::net::{RecvFlags, SendFlags, SocketFlags, accept_with, recv, send};
-    let (_parent, dir) = place();
-    // Longer than the path of a socket can be.
+    let (_parent, dir) = fresh_dir();
+    // Longer than the path of a socket may be.
     let dir = dir.join("x".repeat(120));
     let (one, mut other) = (open(&dir), Process::start(&dir));
     let mut sockets = one.sockets();
@@ -631,7 +631,7 @@ async fn processes_connect_to_the_sockets_they_find() {
     assert_eq!(
         open(&dir).sockets().borrow().clone(),
         found,
-        "a newcomer sees it too"
+        "a new process sees it too"
     );
     let name = files(&dir)
         .into_iter()
@@ -659,8 +659,8 @@ async fn processes_connect_to_the_sockets_they_find() {
 }
 
 #[tokio::test]
-async fn what_is_no_socket_of_ours_is_not_connected_to() {
-    let (_parent, dir) = place();
+async fn connections_to_files_that_are_not_sockets_of_this_user_are_refused() {
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     let mut sockets = one.sockets();
     let _listening = two.listen().unwrap();
@@ -687,7 +687,7 @@ async fn what_is_no_socket_of_ours_is_not_connected_to() {
 
 #[tokio::test]
 async fn a_directory_that_was_removed_is_joined_again() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     let arm = registration("arm");
     one.register(arm.clone()).unwrap();
@@ -695,7 +695,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
     assert!(one.is_there().unwrap());
     assert!(!one.rejoin().unwrap());
     for way in ["removed", "moved away", "one file removed"] {
-        // What is told of the removal of a file is told for each process.
+        // The removal of a file is reported for each process.
         match way {
             "removed" => std::fs::remove_dir_all(&dir).unwrap(),
             "moved away" => std::fs::rename(&dir, dir.with_extension(way)).unwrap(),
@@ -740,7 +740,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
 
 #[tokio::test]
 async fn a_name_that_was_registered_meanwhile_is_lost() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let ours = registration("arm");
     here.register(ours.clone()).unwrap();
@@ -761,8 +761,8 @@ async fn a_name_that_was_registered_meanwhile_is_lost() {
 }
 
 #[tokio::test]
-async fn what_changes_while_the_directory_is_gone_is_written_afterwards() {
-    let (_parent, dir) = place();
+async fn changes_during_the_removal_of_the_directory_are_written_afterwards() {
+    let (_parent, dir) = fresh_dir();
     let gateway = HostDirectory::open(HostConfig {
         gateway: true,
         ..config(&dir)

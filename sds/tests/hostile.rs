@@ -1,7 +1,6 @@
-//! Records that nobody honest would announce: others are found all the same, and what is kept is
-//! bounded.
+//! Malicious records: other agents are still found, and the stored state is bounded.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
@@ -17,9 +16,9 @@ use simple_dns::{CLASS, CharacterString, Label, Name, Packet, PacketFlag, Resour
 
 const SERVICE: [&str; 3] = ["_fipa_service_directory", "_udp", "local"];
 
-/// How many records are announced; `FIPA_FLOOD` says how many else.
+/// Number of announced records, unless `FIPA_FLOOD` sets another.
 const FLOOD: u32 = 10_000;
-/// How long a long run waits for what may be lost.
+/// Time for which a long run waits for records that may be lost.
 const PATIENCE: Duration = Duration::from_millis(100);
 
 struct Attacker {
@@ -41,7 +40,7 @@ impl Attacker {
         self.socket.send_to(packet, group).unwrap();
     }
 
-    /// A record with these strings, complete with everything that makes it be found.
+    /// Announces a record with these strings, with all parts that a browser needs.
     fn announce(&self, label: &[u8], strings: &[&[u8]]) {
         let service = labels(&[]);
         let instance = labels(&[label]);
@@ -95,7 +94,7 @@ fn open(port: u16, name: &str) -> MdnsDirectory {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn malformed_records_disturb_nobody() {
+async fn malformed_records_do_not_affect_other_agents() {
     let port = free_port();
     let (victim, honest) = (open(port, "victim"), open(port, "honest"));
     honest.register(registration("before")).unwrap();
@@ -117,7 +116,7 @@ async fn malformed_records_disturb_nobody() {
     attacker.announce(b"newline\n", &[b"TYPE=x"]);
     attacker.announce(b"liar", &[b"fipa-version=1", b"fipa-name=", b"fipa-id=0"]);
     attacker.announce(b"future", &[b"fipa-version=99"]);
-    // Names that point to themselves and to each other, and lengths that are lies.
+    // Names that point to themselves and to each other, and false lengths.
     for packet in [
         &b"\0\0\x84\0\0\0\0\x01\0\0\0\0\xc0\x0c\0\x10\0\x01\0\0\0\x78\0\0"[..],
         b"\0\0\x84\0\0\0\0\x02\0\0\0\0\xc0\x0e\xc0\x0c\0\x10\0\x01\0\0\0\x78\0\0",
@@ -129,8 +128,9 @@ async fn malformed_records_disturb_nobody() {
     ] {
         attacker.send(packet);
     }
-    // Beacons of a gateway that has a million agents, of nobody, and of the victim itself.
-    for label in ["00000000000000aa", "0000000000000000", "nobody"] {
+    // Beacons of a gateway that claims a million agents, of an unknown gateway, and of the victim
+    // itself.
+    for label in ["00000000000000aa", "0000000000000000", "absent"] {
         let mut packet = Packet::new_reply(0);
         let txt = TXT::new().with_string("agents=1000000").unwrap();
         let txt = txt.with_string("digest=0123456789abcdef").unwrap();
@@ -161,10 +161,10 @@ async fn malformed_records_disturb_nobody() {
     }
 }
 
-/// A record that is good for two minutes, of a peer without beacons: whose letters do not arrive is
-/// asked for, and nobody else.
+/// A record that is valid for two minutes, of a peer without beacons: only the record of an
+/// unreachable peer is queried.
 #[tokio::test(flavor = "multi_thread")]
-async fn an_old_peer_that_vanished_is_noticed_when_it_is_used() {
+async fn a_legacy_peer_that_vanished_is_removed_after_verification() {
     let port = free_port();
     let (directory, other) = (open(port, "directory"), open(port, "other"));
     other.register(registration("before")).unwrap();
@@ -176,7 +176,7 @@ async fn an_old_peer_that_vanished_is_noticed_when_it_is_used() {
     }
     directory.verify("used");
     let is_gone = || directory.lookup("used").is_none().then_some(());
-    eventually("nobody answers for it", is_gone).await;
+    eventually("the unanswered record is removed", is_gone).await;
     assert!(directory.lookup("unused").is_some());
 }
 
@@ -194,7 +194,8 @@ async fn a_flood_of_records_is_bounded_and_others_are_found() {
     let mut enough = 0;
     for number in 0..flood {
         attacker.announce(format!("agent {number}").as_bytes(), &[b"TYPE=x"]);
-        // So that most of it is heard. A long run waits until it has been handled, or is lost.
+        // Paced, so that most packets are received. A long run waits until they are handled, or
+        // lost.
         if number % 50 == 0 {
             tokio::time::sleep(Duration::from_millis(1)).await;
             let sent = Instant::now();
@@ -213,14 +214,14 @@ async fn a_flood_of_records_is_bounded_and_others_are_found() {
         started.elapsed()
     );
     assert!(known <= MdnsDirectory::MAX_RECORDS, "{known}");
-    assert!(known > 100, "the flood was not heard at all: {known}");
-    // Who was known stays known, and what is said directly still works.
+    assert!(known > 100, "the flood was not received: {known}");
+    // Known agents stay known, and unicast still works.
     assert!(victim.lookup("before").is_some());
     assert!(honest.register(registration("after")).is_ok());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_the_library_keeps_is_bounded_and_nobody_leaves() {
+async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
     let port = free_port();
     let (victim, honest) = (open(port, "victim"), open(port, "honest"));
     let entry = honest.register(registration("honest")).unwrap();
@@ -230,7 +231,7 @@ async fn what_the_library_keeps_is_bounded_and_nobody_leaves() {
     let (mut seen_by_victim, mut seen_by_honest) = (victim.watch(), honest.watch());
     let attacker = Attacker::new(port);
     let before = memory();
-    // Addresses belong to no service, so that no bound of ours sees them.
+    // Addresses belong to no service, so that only the limit of the library's cache applies.
     let addresses = |of: u32| {
         let mut packet = Packet::new_reply(0);
         packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
@@ -245,8 +246,8 @@ async fn what_the_library_keeps_is_bounded_and_nobody_leaves() {
         }
         packet.build_bytes_vec_compressed().unwrap()
     };
-    // Until both have had enough, as both hear it: the bound is reached, whatever was lost.
-    // `FIPA_FLOOD` goes on until so many were sent.
+    // Until the limit is reached in both, whatever was lost. `FIPA_FLOOD` sets a higher number of
+    // packets.
     let flood = std::env::var("FIPA_FLOOD").map_or(0, |flood| flood.parse().unwrap());
     let mut sent = 0;
     let flooding = async {
@@ -265,32 +266,32 @@ async fn what_the_library_keeps_is_bounded_and_nobody_leaves() {
         "after {} addresses: {more} MiB more, {restarts} restarts",
         sent * 250
     );
-    flooded.expect("the library is started anew");
+    flooded.expect("the library is restarted");
     assert!(u64::from(sent) * 250 > MdnsDirectory::MAX_CACHED);
-    eventually("the flood is told", || {
+    eventually("the flood is reported", || {
         let why = victim.status().last_error?;
         why.contains("floods the network").then_some(())
     })
     .await;
-    // What is registered while there is no library, and after that, is found.
+    // A registration while the library is stopped, and one after that, are found.
     honest.register(registration("during")).unwrap();
-    eventually("who registered during it", || victim.lookup("during")).await;
+    eventually("registered during the flood", || victim.lookup("during")).await;
     victim.register(registration("after")).unwrap();
-    eventually("who registered after it", || honest.lookup("after")).await;
+    eventually("registered after the flood", || honest.lookup("after")).await;
     for watch in [&mut seen_by_victim, &mut seen_by_honest] {
         while let Some(change) = watch.try_next() {
             assert!(!matches!(change, Change::Left(_)), "{change:?}");
         }
     }
-    // What had been announced before is announced by the new library: it can say goodbye to it.
+    // The new library announces the earlier registrations, and can withdraw them.
     honest.deregister("honest", entry.incarnation).unwrap();
-    eventually("who left after it", || {
+    eventually("left after the flood", || {
         victim.lookup("honest").is_none().then_some(())
     })
     .await;
 }
 
-/// How many records of others were used or refused.
+/// Number of records of others that were used or refused.
 fn heard(directory: &MdnsDirectory) -> u64 {
     let status = directory.status();
     status.known as u64 + status.refused

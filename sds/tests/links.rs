@@ -1,10 +1,10 @@
-//! Three hosts whose links are cut and healed: after every healing all views agree again, though
-//! announcements and goodbyes were missed and names were given out twice meanwhile.
+//! Three hosts whose links are disconnected and restored: after every restoration all views agree,
+//! although announcements and goodbyes were missed and names were registered twice in the meantime.
 //!
-//! Needs root, and of Debian the package iproute2. Where they are missing the test says so and is
-//! skipped; in CI it fails.
+//! Needs root, and the Debian package iproute2. Without them the test reports that it is skipped;
+//! in CI it fails.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
@@ -67,7 +67,7 @@ fn inside_views_agree_after_every_healing() {
         );
     }
 
-    // A host that vanishes while nobody needs it is noticed, and so is that it is back.
+    // A host that disconnects without traffic to it is detected, and so is its return.
     members[0].change("last", true);
     agree(&mut members);
     network.host(0).unplug();
@@ -83,7 +83,7 @@ fn inside_views_agree_after_every_healing() {
     agree(&mut members);
     println!("back {:.1?} after healing", healed.elapsed());
 
-    // Its interface goes away and comes back with another address.
+    // Its interface goes down and comes back with another address.
     network.host(0).ip("link set eth0 down");
     network.host(0).ip("addr flush dev eth0");
     members[0].change("meanwhile", true);
@@ -96,18 +96,18 @@ fn inside_views_agree_after_every_healing() {
         "agreed {:.1?} after the change of address",
         healed.elapsed()
     );
-    // What was believed to be a long time, and nobody there to ask, is no error.
+    // A disconnect for a long time, without any host to query, is not an error.
     for member in &members {
         assert!(member.directory.status().refused == 0);
     }
 }
 
-/// One host's gateway, as far as the directory goes.
+/// The directory of one host's gateway.
 struct Member {
     directory: MdnsDirectory,
     withdrawals: Receiver<Withdrawal>,
     own: BTreeMap<String, Incarnation>,
-    /// Its workers are in the host's namespace.
+    /// Its worker threads are in the host's namespace.
     _runtime: Runtime,
 }
 
@@ -140,7 +140,7 @@ impl Member {
     fn change(&mut self, name: &str, here: bool) {
         self.forget_withdrawn();
         if let Some(incarnation) = self.own.remove(name) {
-            // It may have been withdrawn just now.
+            // It may have been withdrawn in the meantime.
             let _ = self.directory.deregister(name, incarnation);
         }
         if here {
@@ -160,7 +160,7 @@ impl Member {
         }
     }
 
-    /// Who is there, as this host sees it.
+    /// The agents in this host's view.
     fn view(&mut self) -> BTreeMap<String, Incarnation> {
         self.forget_withdrawn();
         let entries = self.directory.entries();
@@ -173,7 +173,7 @@ impl Member {
     }
 }
 
-/// Waits until all see the same: whatever anybody has registered, each name once.
+/// Waits until all views have every registration, with each name once.
 fn agree(members: &mut [Member]) {
     let mut views = Vec::new();
     let started = Instant::now();

@@ -1,6 +1,6 @@
 //! The directory of the network, on the loopback interface.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
@@ -16,7 +16,7 @@ use fipa_sds::{
 use fipa_testbed::{PacketRepeater, Running};
 use fipa_transport::{Incarnation, Location};
 
-/// A port that nobody else uses, so that tests do not see each other.
+/// An unused port, so that tests do not receive each other's packets.
 fn free_port() -> u16 {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     socket.local_addr().unwrap().port()
@@ -53,7 +53,7 @@ async fn entries_are_marked_and_ones_own_are_not_read_back() {
     assert_eq!(&*leg.mts.name, "two");
     let gateway = leg.mts.incarnation;
     assert_eq!(leg.reach, Reach::Remote { gateway });
-    // By now each has heard both.
+    // By now each directory has received both.
     assert_eq!(one.entries().to_vec(), [leg]);
     assert_eq!(two.entries().to_vec(), [arm]);
     assert_eq!((one.status().announced, one.status().known), (1, 1));
@@ -78,7 +78,8 @@ async fn closing_says_goodbye() {
     ));
 }
 
-/// Two register one name before they can know of each other; `first` is who is heard first.
+/// Two directories register one name before they can know of each other; `first` is the one that is
+/// received first.
 async fn conflict(first: u64, second: u64) {
     let port = free_port();
     let (one, two) = (open(port, "one"), open(port, "two"));
@@ -99,7 +100,7 @@ async fn conflict(first: u64, second: u64) {
         (agent_one, agent_two, &mut withdrawn.0)
     };
     let told = tokio::time::timeout(common::WATCHDOG, receiver.recv());
-    let told = told.await.expect("the loser is told").unwrap();
+    let told = told.await.expect("the withdrawal is reported").unwrap();
     assert_eq!(told.withdrawn.incarnation, loser.incarnation);
     assert_eq!(told.holder.incarnation, winner.incarnation);
     eventually("one record is left, and it is the earlier's", || {
@@ -118,7 +119,7 @@ async fn the_later_of_two_registrations_is_withdrawn() {
 }
 
 #[tokio::test]
-async fn the_later_of_two_registrations_is_withdrawn_though_it_was_heard_first() {
+async fn the_later_of_two_registrations_is_withdrawn_though_it_was_received_first() {
     conflict(2000, 1000).await;
 }
 
@@ -126,7 +127,7 @@ async fn the_later_of_two_registrations_is_withdrawn_though_it_was_heard_first()
 async fn different_names_may_share_a_label() {
     let port = free_port();
     let (one, two) = (open(port, "one"), open(port, "two"));
-    // The same label for the network, which does not tell upper from lower case.
+    // The same label on the network, where case does not matter.
     one.register(registration("Arm")).unwrap();
     two.register(registration("aRM")).unwrap();
     eventually("both", || one.lookup("aRM").zip(two.lookup("Arm"))).await;
@@ -134,10 +135,10 @@ async fn different_names_may_share_a_label() {
     assert_eq!((one.status().announced, two.status().announced), (1, 1));
 }
 
-/// A gateway that splits a coalition and merges the parts, over and over, as the other one tells it
-/// to those who watch: all members belong to exactly one coalition all the time.
+/// A gateway repeatedly splits a coalition and merges the parts, and the other one watches: every
+/// member belongs to exactly one coalition at any time.
 #[tokio::test(flavor = "multi_thread")]
-async fn mergers_and_splits_are_seen_in_one_go() {
+async fn mergers_and_splits_are_visible_at_once() {
     let port = free_port();
     let (one, two) = (open(port, "one"), open(port, "two"));
     let mut watch = two.watch();
@@ -175,7 +176,7 @@ async fn mergers_and_splits_are_seen_in_one_go() {
     };
     look(1).await;
     for round in 0..2 {
-        // The part has another name each time: a label that was just given up rests.
+        // The part has another name each time, because a withdrawn label rests.
         let part = format!("Part {round}");
         let rest = coalition("Whole", ids[0], &["b", "c"]);
         let parting = coalition(&part, ids[1], &["a"]);
@@ -186,7 +187,7 @@ async fn mergers_and_splits_are_seen_in_one_go() {
         assert!(merged.left[0].is_ok() && merged.joined[0].is_ok());
         look(1).await;
     }
-    // Its end is seen at once, though it comes without a beacon of its own to follow.
+    // Its end is visible at once, although no further beacon follows.
     one.close();
     assert!(matches!(next(&mut watch).await, Change::Left(_)));
     assert_eq!(two.entries().len(), 0);
@@ -224,7 +225,7 @@ async fn a_gateway_that_vanished_is_noticed_by_verification() {
     let port = free_port();
     let two = open(port, "two");
     let (peer, gateway) = announcing(port, &two).await;
-    // Its beacons go on, so that they cannot be what is noticed.
+    // Its beacons continue, so that only the verification can detect it.
     let mut repeater = PacketRepeater::capture(&gateway, Ipv4Addr::LOCALHOST, port);
     drop(peer);
     repeater.start();
@@ -239,7 +240,7 @@ async fn a_gateway_that_vanished_is_noticed_by_its_silence() {
     let two = open(port, "two");
     let (peer, _) = announcing(port, &two).await;
     drop(peer);
-    // Nobody asks for it, and its record is good for two minutes.
+    // No query is sent for it, and its record is valid for two minutes.
     eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;
 }
 

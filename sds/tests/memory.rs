@@ -1,6 +1,6 @@
 //! The back ends within one process, and the merged view.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
@@ -47,7 +47,7 @@ fn static_gateways_are_read_only() {
 }
 
 #[tokio::test]
-async fn a_slow_watcher_is_told_that_it_is_slow() {
+async fn a_slow_watcher_is_told_that_it_lagged() {
     let directory = memory();
     let mut watch = directory.watch();
     for number in 0..=Watch::CAPACITY {
@@ -96,7 +96,7 @@ async fn the_earlier_registration_is_seen_in_a_merged_view() {
         other => panic!("{other:?}"),
     }
 
-    // Who leaves without being seen is not told.
+    // The removal of an entry that is not visible is not reported.
     one.deregister("arm", later.incarnation).unwrap();
     assert_eq!(watch.try_next(), None);
     two.deregister("arm", earlier.incarnation).unwrap();

@@ -1,6 +1,7 @@
-//! Names that several gateways claim, some of them over links that prove what they may speak for.
+//! Names that several gateways claim, some over links that prove the agents that they may speak
+//! for.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
@@ -11,7 +12,7 @@ use fipa_sds::{
 };
 use fipa_transport::{Incarnation, Location, Mandate};
 
-/// A gateway and its agent have numbers that belong together.
+/// Offset between the number of a gateway and that of its agent.
 const fn agent_of(gateway: u64) -> Incarnation {
     Incarnation::from_u64(gateway + 1000)
 }
@@ -56,7 +57,7 @@ impl Bench {
         self.exchange.handle_neighbours(self.now, &self.neighbours);
     }
 
-    /// The gateway tells that these are its agents, each registered at this time.
+    /// The gateway sends its list of agents, each with this time of registration.
     fn tell(&mut self, gateway: u64, agents: &[&str], registered: u64) {
         self.versions += 1;
         let (version, id) = (self.versions, agent_of(gateway));
@@ -93,7 +94,7 @@ fn agents_that_the_certificate_does_not_name_are_left_out() {
         .map(|it| it.name.to_string())
         .collect();
     assert_eq!(names, ["arm_1", "rover"]);
-    // The owner trusts another certificate of that gateway: it tells everything again.
+    // The user trusts another certificate of that gateway: it sends all agents again.
     bench.neighbours = vec![present(1, certified(&["crex"]))];
     bench.connect();
     assert_eq!(directory.entries().len(), 0);
@@ -124,7 +125,7 @@ fn a_proved_claim_precedes_an_earlier_one_without_proof() {
 fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
     let mut bench = Bench::new(vec![present(1, certified(&[])), present(2, certified(&[]))]);
     bench.tell(1, &["rover"], 50);
-    // An earlier registration is only claimed.
+    // The time of registration is only a claim.
     bench.tell(2, &["rover"], 1);
     assert_eq!(bench.holder("rover"), Some(1));
     let contested = bench.exchange.directory().contested();
@@ -135,14 +136,14 @@ fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
         )
     });
     assert_eq!(claims.collect::<Vec<_>>(), [(1, 2)]);
-    // The holder tells the same again, or something new of itself, and keeps its place.
+    // The holder sends the same entry again, or an update, and keeps the name.
     bench.tell(1, &["rover"], 99);
     assert_eq!(bench.holder("rover"), Some(1));
     // An agent that moves is not locked out: it leaves one gateway.
     bench.tell(1, &[], 0);
     assert_eq!(bench.holder("rover"), Some(2));
     assert!(bench.exchange.directory().contested().is_empty());
-    // Nor is one whose host is lost.
+    // The same applies to an agent whose host is lost.
     bench.tell(1, &["rover"], 0);
     assert_eq!(bench.holder("rover"), Some(2));
     bench.neighbours.remove(1);
@@ -152,7 +153,7 @@ fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
 }
 
 #[test]
-fn proved_agents_of_a_gateway_that_is_away_are_not_left_to_other_directories() {
+fn proved_agents_of_a_disconnected_gateway_are_kept() {
     for (mandate, stays) in [(Mandate::Unproved, false), (certified(&[]), true)] {
         let mut bench = Bench::new(vec![present(1, mandate)]);
         bench.tell(1, &["rover"], 5);
@@ -173,7 +174,7 @@ fn without_proof_the_earlier_registration_has_the_name() {
     assert!(bench.exchange.directory().contested().is_empty());
 }
 
-/// What is announced or heard without proof, before what neighbours tell.
+/// A view of unproved entries, listed first, and those of neighbors.
 fn merged(bench: &Bench, unproved: Arc<dyn Directory>) -> MergedDirectory {
     MergedDirectory::new(vec![unproved, bench.exchange.directory()])
 }
@@ -193,7 +194,7 @@ fn in_a_merged_view_proved_entries_come_first() {
     let view = merged(&bench, heard("rover", 66, 6));
     let mut watch = view.watch();
     assert_eq!(view.known("rover").unwrap().mts.incarnation.as_u64(), 66);
-    // Registered long after the other was heard of, as it says.
+    // Its stated registration is long after the contact.
     bench.tell(1, &["rover"], 200_000_000_000_000);
     let is_proved = |view: &MergedDirectory| {
         let all = [view.known("rover"), view.entries().first().cloned()];
@@ -205,13 +206,13 @@ fn in_a_merged_view_proved_entries_come_first() {
         Some(Change::Changed { .. } | Change::Left(_))
     ));
     assert!(view.mandate(Incarnation::from_u64(1)).is_proved());
-    // A view of views keeps to it.
+    // A merged view of merged views has the same result.
     let outer = MergedDirectory::new(vec![heard("rover", 67, 7), Arc::new(view)]);
     assert!(is_proved(&outer));
 }
 
 #[test]
-fn what_the_configuration_says_comes_before_what_is_proved() {
+fn entries_of_the_configuration_precede_proved_ones() {
     let mut bench = Bench::new(vec![present(1, certified(&[]))]);
     let old = StaticDirectory::new([("rover", vec![location(9)])]).unwrap();
     let view = merged(&bench, Arc::new(old));

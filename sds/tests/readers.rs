@@ -1,8 +1,7 @@
-//! What every back end that is only read has to do, whoever fills it: static gateways, those who
-//! have written, what neighbours have told, and the merged view of all. Those that can be written
-//! run the suite in `common` as well.
+//! Conformance of back ends that are only read here: static gateways, contacts, entries of
+//! neighbors, and the merged view of all. Writable back ends also run the suite in `common`.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 use std::sync::Arc;
@@ -23,7 +22,7 @@ fn location(number: u64) -> Location {
         .unwrap()
 }
 
-/// A directory that has the agents [`NAMES`], camera at 10.0.0.3, and the others elsewhere.
+/// Checks a directory with the agents [`NAMES`], of which `camera` is at 10.0.0.3.
 fn conforms(directory: &dyn Directory, source: Source) {
     let entries = directory.entries();
     let names: Vec<&str> = entries.iter().map(|entry| &*entry.name).collect();
@@ -111,7 +110,7 @@ fn conforms(directory: &dyn Directory, source: Source) {
     ));
 }
 
-/// Checks that this is told, in time and in order, of an agent that leaves.
+/// Checks that the departure of an agent is reported, in order.
 fn tells_departures(directory: &dyn Directory, leave: impl FnOnce()) {
     let mut watch = directory.watch();
     assert_eq!(watch.try_next(), None);
@@ -139,7 +138,7 @@ fn contacts() -> (Instant, ContactDirectory) {
     (now, contacts)
 }
 
-/// Each of the agents is told of by a gateway of its own.
+/// A gateway of its own sends each of the agents.
 fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
     let (now, mut exchange) = (Instant::now(), Exchange::new(0));
     let gateways: Vec<_> = (1..=3)
@@ -171,7 +170,7 @@ fn static_gateways_conform() {
         .map(|(number, name)| (name, vec![location(number)]));
     let gateways = StaticDirectory::new(gateways).unwrap();
     conforms(&gateways, Source::Static);
-    // Nobody means gateways who writes to a pattern.
+    // Patterns do not match gateways.
     assert_eq!(resolve(&gateways, "arm_.*", "x").unwrap(), Resolution::None);
 }
 
@@ -185,7 +184,7 @@ fn contacts_conform() {
 }
 
 #[test]
-fn what_neighbours_tell_conforms() {
+fn entries_of_neighbors_conform() {
     let (now, mut exchange, directory) = exchange();
     conforms(&*directory, Source::Exchange);
     tells_departures(&*directory, || {
@@ -199,16 +198,16 @@ fn merged_views_of_them_conform() {
     let (_, _, told) = exchange();
     let (now, heard) = contacts();
     let heard = Arc::new(heard);
-    let nobody = StaticDirectory::new::<&str>([]).unwrap();
-    let view = MergedDirectory::new(vec![Arc::new(nobody), told, heard.clone()]);
-    // Told of is known for longer than heard of; each says where it was learnt.
+    let empty = StaticDirectory::new::<&str>([]).unwrap();
+    let view = MergedDirectory::new(vec![Arc::new(empty), told, heard.clone()]);
+    // Exchanged entries are kept for longer than contacts; each states its source.
     conforms(&view, Source::Exchange);
     let only_heard = MergedDirectory::new(vec![heard.clone()]);
     conforms(&only_heard, Source::Contact);
     tells_departures(&only_heard, || {
         heard.forget(now + ContactDirectory::MEMORY, |_| false)
     });
-    // One that can be written makes the view one that can be written.
+    // A writable directory makes the view writable.
     let memory = Arc::new(MemoryDirectory::new(Mts::new("own", Incarnation::random())));
     let view = MergedDirectory::new(vec![heard, memory.clone()]);
     let own = Registration::new("own", Incarnation::random(), Vec::new());

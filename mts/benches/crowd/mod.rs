@@ -13,30 +13,30 @@ use fipa_transport::{
 
 const PEERS: usize = 1_000;
 const AGENTS: usize = 10_000;
-/// This life of the service.
+/// Incarnation of the service.
 const HERE: Incarnation = Incarnation::from_u64(0x4e5e);
-/// This life of the agent that sends and receives here.
+/// Incarnation of the agent that sends and receives here.
 const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
 
-/// The core with one agent, and everybody else.
+/// The core with one agent, and all other agents.
 pub(crate) struct Crowd {
     core: Core,
     letter: Letter,
     now: Now,
     name: Arc<str>,
-    /// Where letters come from.
+    /// The hop from which letters arrive.
     peer: Location,
-    /// Letters that arrived.
+    /// Number of letters that arrived.
     arrived: u64,
 }
 
 impl Crowd {
-    /// The names of the agents there are.
+    /// Names of the agents.
     pub(crate) fn names() -> Vec<Arc<str>> {
         (0..AGENTS).map(|n| format!("arm_{n}").into()).collect()
     }
 
-    /// A core that knows where the agents of these names are.
+    /// A core whose directory has the agents of these names.
     pub(crate) fn new(names: &[Arc<str>]) -> Self {
         let config = CoreConfig::new("here-mts", HERE, vec![Kind::Tcp]);
         let mut core = Core::new(config, directory(names));
@@ -52,7 +52,7 @@ impl Crowd {
         }
     }
 
-    /// Which way a letter for this agent would go first.
+    /// The first route of a letter for this agent.
     pub(crate) fn route(&self, receiver: &str) -> Option<Location> {
         self.core.first_way(self.now, receiver)
     }
@@ -62,8 +62,8 @@ impl Crowd {
         self.send_and(receiver, Core::poll_action);
     }
 
-    /// The same while somebody watches.
-    #[allow(dead_code, reason = "one bench of two counts it")]
+    /// The same with watching turned on.
+    #[allow(dead_code, reason = "only one of two benches uses it")]
     pub(crate) fn send_watched(&mut self, receiver: &Arc<str>) {
         self.core.watch(true);
         self.send_and(receiver, |core| {
@@ -135,7 +135,7 @@ impl Crowd {
     }
 }
 
-/// Every agent at one of the peers.
+/// A directory with every agent at one of the peers.
 fn directory(names: &[Arc<str>]) -> Arc<MemoryDirectory> {
     let directory = MemoryDirectory::new(Mts::new("here-mts", HERE));
     let peers: Vec<Location> = (0..PEERS).map(peer).collect();

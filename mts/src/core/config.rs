@@ -1,4 +1,4 @@
-//! What the delivery core is told once, at its start.
+//! Configuration of the delivery core.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,44 +6,47 @@ use std::time::Duration;
 use fipa_sds::Pattern;
 use fipa_transport::{Incarnation, Kind};
 
-/// The longest deadline a letter may have. Receivers remember for at least this long what they
-/// took, so that nothing arrives twice.
+/// Maximum deadline of a letter. Receivers remember taken letters for at least this long, so that
+/// none is delivered twice.
 pub const MAX_DEADLINE: Duration = fipa_transport::wire::MAX_REMAINING;
 
-/// What the delivery core is told once, at its start.
+/// Configuration of the delivery core.
 #[derive(Debug, Clone)]
 pub struct CoreConfig {
-    /// The name of this message transport service. It stands in stamps and sends failure messages.
+    /// Name of this message transport service, used in stamps and as the sender of failure
+    /// messages.
     pub name: Arc<str>,
-    /// This life of it.
+    /// Incarnation of this service.
     pub incarnation: Incarnation,
-    /// Whether letters for agents of other processes are passed on: the role of the gateway.
+    /// Whether letters for agents of other processes are forwarded, which is the role of the
+    /// gateway.
     pub forwards: bool,
-    /// The transports in order of preference; what is not listed is not used.
+    /// Transports in order of preference; others are not used.
     pub order: Vec<Kind>,
-    /// Other orders, for receivers whose name matches; the first match counts.
+    /// Other orders for receivers whose name matches; the first match counts.
     pub routes: Vec<(Pattern, Vec<Kind>)>,
-    /// Letters that wait in an agent's queue before its senders are held back.
+    /// Number of letters in an agent's queue at which its senders are held back.
     pub queue: usize,
-    /// Bytes of the letters in an agent's queue before its senders are held back. One letter is
-    /// always taken.
+    /// Bytes of letters in an agent's queue at which its senders are held back. An empty queue
+    /// accepts a letter of any size.
     pub queue_bytes: usize,
-    /// Letters on their way from one sender to one receiver at a time.
+    /// Maximum number of letters from one sender to one receiver in transit at a time.
     pub window: usize,
-    /// Letters that wait for one receiver from one sender, on their way or not, before more are
-    /// held back.
+    /// Number of open letters from one sender to one receiver, in transit or waiting, at which more
+    /// are held back.
     pub lane: usize,
-    /// Bytes of the same. One letter is always taken.
+    /// Bytes of these letters at which more are held back. An empty lane accepts a letter of any
+    /// size.
     pub lane_bytes: usize,
-    /// Bytes of letters of others that a gateway has in custody before more are held back. One
-    /// letter is always taken.
+    /// Bytes of letters of others in a gateway's custody at which more are held back. One letter of
+    /// any size is always accepted.
     pub custody_bytes: usize,
-    /// How long an attempt may go without an answer, for a small letter.
+    /// Timeout of an attempt, for a small letter.
     pub attempt_timeout: Duration,
 }
 
 impl CoreConfig {
-    /// A configuration with the usual limits.
+    /// Creates a configuration with the default limits.
     #[must_use]
     pub fn new(name: impl Into<Arc<str>>, incarnation: Incarnation, order: Vec<Kind>) -> Self {
         Self {
@@ -67,8 +70,8 @@ impl CoreConfig {
         self.route_for(receiver).1
     }
 
-    /// The order of transports for letters to this receiver, and the pattern that says so when it
-    /// is an exception.
+    /// The order of transports for letters to this receiver, and the pattern of the exception that
+    /// selects it, if any.
     pub(crate) fn route_for(&self, receiver: &str) -> (Option<&Pattern>, &[Kind]) {
         let mut routes = self.routes.iter();
         match routes.find(|(pattern, _)| pattern.matches(receiver)) {

@@ -1,6 +1,6 @@
-//! Registrations that have left this host a moment ago. Letters that were sent to one of them before
-//! the news spread are answered with [`Answer::Moved`]: they are certainly not taken, and their
-//! sender's process may send them to the next registration of the name.
+//! Registrations that recently left this host. Letters that were sent to one of them before that
+//! became known are answered with [`Answer::Moved`]: they are certainly not taken, and the sender's
+//! process may send them to the next registration of the name.
 //!
 //! [`Answer::Moved`]: fipa_transport::Answer::Moved
 
@@ -12,12 +12,13 @@ use fipa_transport::Incarnation;
 
 use crate::Map;
 
-/// How long a registration is remembered: longer than news of it takes to spread.
+/// Time for which a registration is remembered: longer than the news of its departure takes to
+/// spread.
 const MEMORY: Duration = Duration::from_secs(30);
-/// Registrations that are remembered, at most; the one that left first is forgotten first.
+/// Maximum number of registrations; the earliest departure is evicted first.
 const MAX_DEPARTED: usize = 4096;
 
-/// The registrations that were on this host a moment ago.
+/// Registrations that recently left this host.
 #[derive(Debug, Default)]
 pub(crate) struct Departed {
     since: Map<Incarnation, Instant>,
@@ -25,7 +26,7 @@ pub(crate) struct Departed {
 }
 
 impl Departed {
-    /// This entry has left the directory, or its name has another registration now.
+    /// Records an entry that left the directory or was replaced by another registration.
     pub(super) fn left(&mut self, now: Instant, entry: &Entry) {
         if entry.reach != Reach::Local || entry.role != Role::Agent {
             return;
@@ -43,7 +44,7 @@ impl Departed {
         }
     }
 
-    /// Whether this registration was on this host a moment ago.
+    /// Whether this registration recently left this host.
     pub(crate) fn contains(&self, now: Instant, registration: Incarnation) -> bool {
         let since = self.since.get(&registration);
         since.is_some_and(|since| now.saturating_duration_since(*since) <= MEMORY)
@@ -65,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn a_registration_is_remembered_for_a_while() {
+    fn a_departed_registration_is_remembered_for_a_limited_time() {
         let (entry, now) = (entry(), Instant::now());
         let mut departed = Departed::default();
         assert!(!departed.contains(now, entry.incarnation));
@@ -76,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn the_memory_is_bounded() {
+    fn the_number_of_departed_registrations_is_bounded() {
         let (mut entry, now) = (entry(), Instant::now());
         let mut departed = Departed::default();
         for number in 0..10_000 {

@@ -1,4 +1,4 @@
-//! Failure messages: which senders are told of which failures, and how often.
+//! Failure messages: their receivers and their rate.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -8,20 +8,20 @@ use fipa_acl::Dialect;
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
 use fipa_transport::{FailureReason, Incarnation, LegacySource, Location, Signature, Stream};
 
-use super::desk::{Action, Author, Origin, Undelivered, life_of};
+use super::attempts::{Action, FailureTarget, Origin, Undelivered, registration_of};
 use super::inbox::Received;
 use super::lane::Delivery;
 use super::{Core, News, Now, own_lane, work};
 use crate::failure::Failure;
 use crate::stamp;
 
-/// How long a failure message to an old peer's agent may take.
+/// Deadline of a failure message to a legacy peer's agent.
 const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
 
 impl Core {
-    /// An agent of this process has taken a letter whose message cannot be decoded. The sender is told
-    /// if it is an agent of this process, or one that the directory has under the name that the
-    /// envelope gives. Nothing else proves a name in an envelope.
+    /// Handles a letter that an agent of this process took and whose message cannot be decoded. The
+    /// sender gets a failure message if it is an agent of this process, or one that the directory
+    /// has under the name in the envelope. Nothing else proves a name in an envelope.
     pub fn handle_undecodable(
         &mut self,
         now: Now,
@@ -29,35 +29,35 @@ impl Core {
         received: &Received,
         why: String,
     ) {
-        let life = received.sender;
-        if received.via.is_none() || !life.is_known() {
+        let registration = received.sender;
+        if received.via.is_none() || !registration.is_known() {
             return;
         }
-        let sender = if self.agents.contains_key(&life) {
-            Author::Ours(life)
+        let sender = if self.agents.contains_key(&registration) {
+            FailureTarget::Ours(registration)
         } else {
             let named = stamp::sender(&received.letter);
-            let known = self.desk.directory.known_incarnation(life);
+            let known = self.table.directory.known_incarnation(registration);
             match known {
                 Some(entry) if named.as_deref() == Some(&*entry.name) => {
-                    Author::Remote { from: None }
+                    FailureTarget::Remote { from: None }
                 }
                 _ => return,
             }
         };
-        self.desk.undelivered.push_back(Undelivered {
+        self.table.undelivered.push_back(Undelivered {
             sender,
             receiver: Arc::clone(receiver),
             letter: received.letter.clone(),
             reason: FailureReason::Refused,
             detail: cannot_be_decoded(&why),
         });
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
-    /// Tells senders of what failed, in the form of FIPA `failure` messages.
-    pub(super) fn tell_failures(&mut self, now: Now) {
-        while let Some(undelivered) = self.desk.undelivered.pop_front() {
+    /// Sends the pending FIPA `failure` messages.
+    pub(super) fn send_failures(&mut self, now: Now) {
+        while let Some(undelivered) = self.table.undelivered.pop_front() {
             let Undelivered {
                 sender,
                 receiver,
@@ -65,42 +65,42 @@ impl Core {
                 reason,
                 detail,
             } = undelivered;
-            let name = Arc::clone(&self.desk.config.name);
+            let name = Arc::clone(&self.table.config.name);
             let name = &*name;
             let from = match sender {
-                Author::Ours(_) => None,
-                Author::Remote { from } => {
-                    // Before the message is decoded, by the name that the envelope gives.
+                FailureTarget::Ours(_) => None,
+                FailureTarget::Remote { from } => {
+                    // Before the message is decoded, by the name in the envelope.
                     let named = stamp::sender(&letter).unwrap_or_default();
                     let address = from.map(|from| from.address);
                     if !self.failure_limit.allows(now.instant, address, &named) {
                         continue;
                     }
-                    // The message is decoded as often only as its bytes came.
+                    // Messages are decoded only in proportion to the received bytes.
                     if !self
                         .failure_limit
-                        .may_pay(now.instant, address, letter.len())
+                        .covers(now.instant, address, letter.len())
                     {
                         continue;
                     }
                     from
                 }
             };
-            // The message is decoded, and written anew.
+            // The message is decoded, and a new one encoded.
             work::steps(letter.len() / 512);
             let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
             };
-            let own = self.desk.config.incarnation;
+            let own = self.table.config.incarnation;
             let sequence = self.sequence_of(own);
-            if let Author::Ours(agent) = sender {
+            if let FailureTarget::Ours(agent) = sender {
                 let Some(inbox) = self.agents.get_mut(&agent) else {
                     continue;
                 };
                 let letter = match report.written_for(name, Dialect::Standard, now.utc) {
                     Ok(letter) => letter,
                     Err(error) => {
-                        tracing::warn!(%error, %receiver, "a failure message could not be written");
+                        tracing::warn!(%error, %receiver, "cannot encode a failure message");
                         continue;
                     }
                 };
@@ -110,24 +110,24 @@ impl Core {
                         receiver: agent,
                     };
                     let name = Arc::clone(&inbox.name);
-                    self.desk.notice(stream, sequence, &name, || News::Taken {
+                    self.table.notice(stream, sequence, &name, || News::Taken {
                         via: None,
                         letter,
                     });
-                    self.desk.actions.push_back(Action::Deliverable { agent });
+                    self.table.actions.push_back(Action::Deliverable { agent });
                 } else {
                     self.failure_limit.leave_out(now.instant);
                 }
                 continue;
             }
-            // Its sender is known by name, or a legacy peer's letter gives its address.
-            let known = self.desk.directory.lookup(report.sender.name());
-            let said = match known {
+            // The directory has the sender, or a legacy peer's letter states its address.
+            let known = self.table.directory.lookup(report.sender.name());
+            let stated = match known {
                 Some(_) => None,
-                None => from.and_then(|from| said_of_itself(&report, from)),
+                None => from.and_then(|from| stated_entry(&report, from)),
             };
-            let Some(entry) = known.or_else(|| said.clone()) else {
-                tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
+            let Some(entry) = known.or_else(|| stated.clone()) else {
+                tracing::info!(to = %report.sender, %reason, "cannot send a failure message: its receiver is not known");
                 continue;
             };
             if entry.role == Role::Gateway {
@@ -136,20 +136,19 @@ impl Core {
             let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
                 Ok(letter) => letter,
                 Err(error) => {
-                    tracing::warn!(%error, receiver = %report.receiver, "a failure message could not be written");
+                    tracing::warn!(%error, receiver = %report.receiver, "cannot encode a failure message");
                     continue;
                 }
             };
-            if !self.failure_limit.has_paid(
-                now.instant,
-                from.map(|from| from.address),
-                letter.len(),
-            ) {
+            if !self
+                .failure_limit
+                .debit(now.instant, from.map(|from| from.address), letter.len())
+            {
                 continue;
             }
             let stream = Stream {
-                sender: self.desk.config.incarnation,
-                receiver: life_of(&entry),
+                sender: self.table.config.incarnation,
+                receiver: registration_of(&entry),
             };
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
             if !self.has_room_for_stranger(id, letter.len()) {
@@ -158,17 +157,17 @@ impl Core {
             }
             let deadline = now.instant + FAILURE_DEADLINE;
             let letter_of = (stream.receiver, sequence);
-            let origin = Origin::Nobody;
+            let origin = Origin::FailureMessage;
             let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
-            self.desk
+            self.table
                 .notice(stream, sequence, &entry.name, || News::Sent {
                     send: None,
                     letter: delivery.letter.clone(),
                 });
-            if said.is_some()
+            if stated.is_some()
                 && let Some(lane) = self.lanes.get_mut(&id)
             {
-                lane.said(Arc::clone(&entry));
+                lane.set_stated(Arc::clone(&entry));
             }
             self.put(now, id, delivery);
         }
@@ -180,8 +179,8 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
     format!("the message cannot be decoded: {why}")
 }
 
-/// The locations that an agent of a legacy peer gives as its own: of its addresses, the numeric ones
-/// of the host that its letter came from. Any others could be claimed to have this service send to
+/// The locations that an agent of a legacy peer states as its own: of its addresses, the numeric
+/// ones of the host that its letter came from. Others could be claimed to make this service send to
 /// a third party.
 pub(super) fn locations_given<'a>(
     addresses: impl IntoIterator<Item = &'a str>,
@@ -198,8 +197,8 @@ pub(super) fn locations_given<'a>(
     locations.take(Entry::MAX_LOCATIONS).collect()
 }
 
-/// An agent that the directory does not know, with the locations that it gives as its own.
-fn said_of_itself(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
+/// An agent that is not in the directory, with the locations that it states as its own.
+fn stated_entry(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
     let agent = &report.sender;
     let addresses = agent.addresses().iter().map(|address| &**address);
     let locations = locations_given(addresses, from);
@@ -223,7 +222,7 @@ fn said_of_itself(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>
     entry.check().is_ok().then(|| Arc::new(entry))
 }
 
-/// What an agent understands, by what is understood where it can be reached.
+/// The dialect of an agent, by the signature of its first location.
 fn dialect_of(entry: &Entry) -> Dialect {
     match entry.locations.first().map(Location::signature) {
         Some(Signature::FipaServices) => Dialect::FipaServices,

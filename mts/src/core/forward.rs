@@ -11,7 +11,7 @@ use fipa_transport::{
     Signature, Stream, Ticket, Verdict,
 };
 
-use super::desk::{Action, Author, Origin, Undelivered, Upstream};
+use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::link_of;
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
@@ -23,46 +23,49 @@ use smallvec::smallvec;
 use crate::failure::sender_of;
 use crate::stamp;
 
-/// When the sender of a letter is told that it is in custody, if its outcome takes longer.
+/// Time after which a sender is told that its letter is in custody, unless its outcome is known
+/// earlier.
 const CUSTODY_AFTER: Duration = Duration::from_millis(200);
 
-/// Time from the registration of an agent until legacy peers have found it by mDNS. Avahi takes 1.2 s
-/// to resolve a new agent; a peer that gets a letter earlier cannot answer it.
+/// Time from the registration of an agent until legacy peers have found it by mDNS. Avahi takes 1.2
+/// s to resolve a new agent; a peer that receives a letter earlier cannot answer it.
 const FOUND_AFTER: Duration = Duration::from_millis(1500);
-/// Time that is left for the delivery of a letter that waits for its sender to be found.
+/// Time that remains for the delivery of a letter that waits until its sender is found.
 const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
-/// How long an agent of a legacy peer stays known by a letter before another letter renews that. Less
-/// than the time after which it is forgotten.
+/// Time after which another letter renews an agent of a legacy peer that is known only by its
+/// letters. Less than the time after which it is dropped.
 const HEARD_AGAIN_AFTER: Duration = Duration::from_secs(15);
 
-/// Receivers of one letter of a legacy peer, at most. fipa_services writes one.
+/// Maximum number of receivers of one letter of a legacy peer. fipa_services writes one.
 const MAX_UNFRAMED_RECEIVERS: usize = 64;
-/// Patterns among the receivers of one letter of a legacy peer, at most.
+/// Maximum number of patterns among the receivers of one letter of a legacy peer.
 const MAX_UNFRAMED_PATTERNS: usize = 1;
-/// Longest pattern of a legacy peer, in bytes: a longer one takes tens of milliseconds to compile.
+/// Maximum length of a legacy peer's pattern, in bytes: a longer one takes tens of milliseconds to
+/// compile.
 const MAX_UNFRAMED_PATTERN: usize = 128;
 
-/// A letter of a legacy peer, read as far as the core needs it, with its receivers looked up. That
-/// takes time in proportion to the bytes of the letter, so it comes before the core is locked.
+/// A letter of a legacy peer, parsed as far as the core needs it, with its receivers looked up.
+/// That takes time in proportion to the bytes of the letter, so it happens before the core is
+/// locked.
 #[derive(Debug)]
 pub struct Unframed {
     letter: Letter,
     via: Kind,
     from: LegacySource,
-    /// The receivers that the envelope names, and the entries meant.
+    /// The receivers in the envelope, and the entries that they stand for.
     receivers: Vec<(Arc<str>, Resolution)>,
-    /// The name of the sender, and a location that it gives as its own.
+    /// The name of the sender, and a location that it states as its own.
     sender: Option<(String, Location)>,
-    /// Why the letter is refused, if it is.
+    /// The reason why the letter is refused, if it is.
     fault: Option<String>,
 }
 
 impl Unframed {
-    /// Reads the letter, which came from this source, and looks up its receivers.
+    /// Parses the letter, which came from this source, and looks up its receivers.
     ///
     /// # Errors
-    /// When the envelope cannot be read.
+    /// Fails when the envelope cannot be parsed.
     pub fn read(
         letter: Letter,
         via: Kind,
@@ -98,7 +101,7 @@ impl Unframed {
     }
 }
 
-/// Why a legacy peer's letter to these receivers is refused, if it is.
+/// The reason why a legacy peer's letter to these receivers is refused, if it is.
 fn too_many(names: &[String]) -> Option<String> {
     if names.len() > MAX_UNFRAMED_RECEIVERS {
         return Some(format!(
@@ -116,7 +119,7 @@ fn too_many(names: &[String]) -> Option<String> {
     too_long.then(|| format!("the pattern has more than {MAX_UNFRAMED_PATTERN} bytes"))
 }
 
-/// The name of the sender, and the first location that it gives as its own.
+/// The name of the sender, and the first location that it states as its own.
 fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(String, Location)> {
     let sender = sender_of(message, letter)?;
     let addresses = sender.addresses().iter().map(|address| &**address);
@@ -124,15 +127,15 @@ fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(Str
     Some((sender.name().to_owned(), locations.next()?))
 }
 
-/// Agents of legacy peers a second that become known by their letters: each one is published to the
-/// processes of the host.
+/// Limits the rate at which agents of legacy peers become known by their letters: each is published
+/// to the processes of the host.
 pub(super) fn contact_limit() -> SenderLimit {
     SenderLimit::new(2.0, 20.0, 50.0)
 }
 
 impl Core {
-    /// Takes a letter for somebody else into custody, or says why not. `unanswered` is the arrival
-    /// that may be answered later.
+    /// Takes a letter for an agent of another process into custody, or returns the reason why not.
+    /// `unanswered` is the arrival that may be answered later.
     pub(super) fn forward(
         &mut self,
         now: Now,
@@ -159,11 +162,11 @@ impl Core {
         };
         if let Some(id) = self.lane_ids.get(&key).copied() {
             let mut kept = Some(upstream);
-            self.with_lane(now, id, |lane, desk| {
+            self.with_lane(now, id, |lane, table| {
                 let letter = (parcel.sequence, parcel.after);
                 kept = kept
                     .take()
-                    .and_then(|it| lane.adopt(now.instant, letter, it, desk).err());
+                    .and_then(|it| lane.adopt(now.instant, letter, it, table).err());
             });
             upstream = match kept {
                 Some(upstream) => upstream,
@@ -175,7 +178,7 @@ impl Core {
         }
         let id = self.lane(now, key, &entry.name);
         if let Some(lane) = self.lanes.get_mut(&id)
-            && !lane.admits(parcel.sequence, stamped.len(), &self.desk)
+            && !lane.admits(parcel.sequence, stamped.len(), &self.table)
         {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
@@ -184,9 +187,9 @@ impl Core {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.is_remote() {
-            self.hear(stream.sender, &stamped, &from);
+            self.report_contact(stream.sender, &stamped, &from);
         }
-        self.desk
+        self.table
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
                 via,
                 remote: from.is_remote(),
@@ -215,8 +218,9 @@ impl Core {
         taken
     }
 
-    /// When the legacy peer of the receiver, which was found by mDNS, has found the sender, if it has
-    /// not yet. Early enough for a letter that has this much time left.
+    /// The time until which a letter waits so that the receiver's legacy peer, which was found by
+    /// mDNS, can find the sender. `None` if it need not wait. At least part of the letter's
+    /// remaining time is left.
     fn found_by_peer(
         &self,
         now: Now,
@@ -228,8 +232,8 @@ impl Core {
         if receiver.source != Source::Mdns || !receiver.locations.iter().any(is_legacy) {
             return None;
         }
-        let sender = self.desk.directory.known_incarnation(sender)?;
-        // A registration in the future shows that the calendar was set back.
+        let sender = self.table.directory.known_incarnation(sender)?;
+        // A registration in the future means that the clock was set back.
         let ago = now.utc.duration_since(sender.registered);
         let wait = FOUND_AFTER.checked_sub(ago.unwrap_or_default())?;
         let latest = remaining - LEFT_FOR_DELIVERY.min(remaining / 2);
@@ -237,7 +241,7 @@ impl Core {
         (!wait.is_zero()).then(|| now.instant + wait)
     }
 
-    /// What the gate says, if there is one.
+    /// Asks the gate, if there is one.
     fn admits(&self, now: Now, receiver: &str, letter: &Letter, link: Link) -> Result<(), String> {
         match &self.gate {
             Some(gate) => gate.admits(now.instant, receiver, letter, link),
@@ -245,7 +249,8 @@ impl Core {
         }
     }
 
-    /// Whether this service passes the letter on: to whom, and the letter with its stamp.
+    /// Checks whether this service forwards the letter; returns the receiver and the stamped
+    /// letter.
     fn admit(
         &self,
         now: Now,
@@ -253,16 +258,16 @@ impl Core {
         letter: Letter,
         from: &Hop,
     ) -> Result<(Arc<Entry>, Letter), Answer> {
-        let config = &self.desk.config;
+        let config = &self.table.config;
         let unknown = |why: &str| Answer::failed(FailureReason::NoSuchAgent, why);
         let refused = |why: String| Answer::failed(FailureReason::Refused, why);
         if !config.forwards {
             return Err(unknown("the agent is not in this process any more"));
         }
         let registration = parcel.stream.receiver;
-        let Some(entry) = self.desk.receiver(registration, &parcel.receiver) else {
+        let Some(entry) = self.table.receiver(registration, &parcel.receiver) else {
             return Err(
-                match self.desk.departed.contains(now.instant, registration) {
+                match self.table.departed.contains(now.instant, registration) {
                     true => Answer::Moved,
                     false => unknown("the agent is not known to the gateway"),
                 },
@@ -273,11 +278,11 @@ impl Core {
                 "letters for another gateway are not passed on".to_owned(),
             ));
         }
-        // Letters from the network are for this host: a gateway never relays between others.
+        // A gateway never relays between other hosts: letters from the network must be for its own.
         if from.is_remote() && entry.reach != Reach::Local {
             return Err(unknown("the agent is not on the gateway's host"));
         }
-        // The envelope is read for stamps, and again for its sender.
+        // The envelope is parsed for stamps, and later for its sender.
         work::steps(letter.envelope().len() / 512);
         match stamp::carries(&letter, &config.name, config.incarnation) {
             Ok(true) => return Err(Answer::failed(FailureReason::Loop, &*config.name)),
@@ -289,21 +294,22 @@ impl Core {
         Ok((entry, stamped))
     }
 
-    /// Makes known who has written this stamped letter, if nobody has told of that agent yet: it can be answered.
-    fn hear(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
-        let directory = &self.desk.directory;
+    /// Reports the sender of this stamped letter as a contact if it is unknown, so that it can be
+    /// answered.
+    fn report_contact(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
+        let directory = &self.table.directory;
         if !agent.is_known() || directory.known_incarnation(agent).is_some() {
             return;
         }
-        // Passed on by the gateway that its receiver has left, it does not come from where its
-        // sender is.
+        // A letter that was forwarded by the receiver's previous gateway does not come from the
+        // sender's location.
         let direct = stamp::count(letter).is_ok_and(|stamps| stamps <= 2);
         if let Some(name) = stamp::sender(letter)
             && direct
             && directory.known(&name).is_none()
         {
             let location = from.location.clone();
-            self.desk.actions.push_back(Action::Heard {
+            self.table.actions.push_back(Action::Heard {
                 name,
                 agent,
                 location,
@@ -311,14 +317,18 @@ impl Core {
         }
     }
 
-    /// Makes an agent of a legacy peer known, which can then be answered, at the location that it gives
-    /// as its own. Only an agent that nothing else is known of, and one that became known in this way
-    /// and writes from the same host.
-    fn hear_unframed(&mut self, now: Now, (name, location): (String, Location), from: IpAddr) {
-        if !self.desk.config.forwards {
+    /// Reports an agent of a legacy peer as a contact, at the location that it states as its own.
+    /// Only for an agent that is unknown, or known as a contact that sends from the same host.
+    fn report_legacy_contact(
+        &mut self,
+        now: Now,
+        (name, location): (String, Location),
+        from: IpAddr,
+    ) {
+        if !self.table.config.forwards {
             return;
         }
-        if let Some(known) = self.desk.directory.known(&name) {
+        if let Some(known) = self.table.directory.known(&name) {
             let at = known.locations.first();
             let address = at.and_then(|at| at.address().parse::<SocketAddr>().ok());
             let same = address.is_some_and(|address| address.ip().to_canonical() == from);
@@ -330,30 +340,31 @@ impl Core {
             }
         }
         if !self.contact_limit.take(now.instant, Some(from), &name) {
-            tracing::debug!(%from, "too many new agents of legacy peers; this one cannot be answered");
+            tracing::debug!(%from, "rate limit of new agents of legacy peers exceeded; this one cannot be answered");
             return;
         }
-        self.desk.actions.push_back(Action::Heard {
+        self.table.actions.push_back(Action::Heard {
             name,
             agent: Incarnation::UNKNOWN,
             location,
         });
     }
 
-    /// Whether there is room for another letter in this lane.
+    /// Whether this lane has room for another letter.
     pub(super) fn has_room(&self, lane: LaneId, len: usize) -> bool {
         let lane = self.lanes.get(&lane);
-        lane.is_some_and(|lane| lane.has_room(len, &self.desk))
+        lane.is_some_and(|lane| lane.has_room(len, &self.table))
     }
 
-    /// Whether there is room for a letter whose sender cannot be held back.
+    /// Whether this lane has room for a letter whose sender cannot be held back.
     pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
-        let bytes = self.desk.held.saturating_add(len);
-        bytes <= self.desk.config.custody_bytes && self.has_room(lane, len)
+        let bytes = self.table.held.saturating_add(len);
+        bytes <= self.table.config.custody_bytes && self.has_room(lane, len)
     }
 
-    /// A legacy peer's letter arrived, for the agents of this host that its envelope names. If its
-    /// message cannot be decoded, or it has too many receivers, it is refused, and its sender is told.
+    /// Handles a legacy peer's letter for the agents of this host in its envelope. If its message
+    /// cannot be decoded, or it has too many receivers, it is refused, and its sender gets a
+    /// failure message.
     pub fn handle_unframed(&mut self, now: Now, deadline: Duration, unframed: Unframed) {
         let Unframed {
             letter,
@@ -364,17 +375,17 @@ impl Core {
             fault,
         } = unframed;
         self.failure_limit
-            .came(now.instant, from.address, letter.len());
+            .credit(now.instant, from.address, letter.len());
         if let Some(fault) = fault {
             tracing::info!(from = %from.address, "refused a letter of a legacy peer: {fault}");
             for (receiver, _) in receivers {
                 let why = (FailureReason::Refused, fault.clone());
                 self.unframed_failed(&receiver, &letter, (via, from), why);
             }
-            self.tell_failures(now);
+            self.send_failures(now);
             return;
         }
-        let stream_sender = self.desk.config.incarnation;
+        let stream_sender = self.table.config.incarnation;
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
@@ -388,7 +399,7 @@ impl Core {
                     agents,
                     mut missing,
                 } => {
-                    // Its members elsewhere are not reached from here, and the sender is told.
+                    // Members on other hosts cannot be reached from here, which the sender is told.
                     let away = agents.iter().filter(|entry| entry.reach != Reach::Local);
                     missing.extend(away.map(|entry| Arc::clone(&entry.name)));
                     (agents, missing)
@@ -396,9 +407,9 @@ impl Core {
                 Resolution::None => (Vec::new(), Vec::new()),
             };
             let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
-            let nobody = here.clone().next().is_none() && missing.is_empty();
-            for name in missing.into_iter().chain(nobody.then_some(receiver)) {
-                tracing::info!(receiver = %name, from = %from.address, "an unframed letter names nobody of this host");
+            let none_here = here.clone().next().is_none() && missing.is_empty();
+            for name in missing.into_iter().chain(none_here.then_some(receiver)) {
+                tracing::info!(receiver = %name, from = %from.address, "cannot deliver an unframed letter: no agent of this host has the name");
                 let why = (FailureReason::NoSuchAgent, String::new());
                 self.unframed_failed(&name, &letter, (via, from), why);
             }
@@ -410,7 +421,7 @@ impl Core {
                     continue;
                 }
                 if let Some(located) = located.take() {
-                    self.hear_unframed(now, located, from.address);
+                    self.report_legacy_contact(now, located, from.address);
                 }
                 let stream = Stream {
                     sender: stream_sender,
@@ -420,16 +431,16 @@ impl Core {
                 if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
                     && inbox.push_unframed(letter.clone(), via)
                 {
-                    self.desk
+                    self.table
                         .notice(stream, sequence, &entry.name, || News::Taken {
                             via: Some(via),
                             letter: letter.clone(),
                         });
                     let agent = entry.incarnation;
-                    self.desk.actions.push_back(Action::Deliverable { agent });
+                    self.table.actions.push_back(Action::Deliverable { agent });
                     continue;
                 }
-                self.desk
+                self.table
                     .notice(stream, sequence, &entry.name, || News::Passed {
                         via,
                         remote: true,
@@ -437,14 +448,14 @@ impl Core {
                     });
                 let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
                 if !self.has_room_for_stranger(lane, letter.len()) {
-                    self.desk.undelivered.push_back(Undelivered {
-                        sender: Author::Remote { from: Some(from) },
+                    self.table.undelivered.push_back(Undelivered {
+                        sender: FailureTarget::Remote { from: Some(from) },
                         receiver: Arc::clone(&entry.name),
                         letter: letter.clone(),
                         reason: FailureReason::QueueFull,
                         detail: String::new(),
                     });
-                    self.desk
+                    self.table
                         .notice(stream, sequence, &entry.name, || News::Settled {
                             outcome: failed(FailureReason::QueueFull),
                             sender: true,
@@ -452,17 +463,17 @@ impl Core {
                     continue;
                 }
                 let until = now.instant + deadline.min(MAX_DEADLINE);
-                let origin = Origin::OldPeer { from };
+                let origin = Origin::LegacyPeer { from };
                 let letter_of = (stream.receiver, sequence);
                 let letter = letter.clone();
                 let delivery = Delivery::new(now.instant, origin, letter, letter_of, until);
                 self.put(now, lane, delivery);
             }
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
-    /// An old peer's letter does not get to this receiver.
+    /// Reports that a legacy peer's letter cannot be delivered to this receiver.
     fn unframed_failed(
         &mut self,
         receiver: &Arc<str>,
@@ -470,25 +481,25 @@ impl Core {
         (via, from): (Kind, LegacySource),
         (reason, detail): (FailureReason, String),
     ) {
-        let own = self.desk.config.incarnation;
+        let own = self.table.config.incarnation;
         let stream = Stream {
             sender: own,
             receiver: Incarnation::UNKNOWN,
         };
         let sequence = self.sequence_of(own);
-        self.desk
+        self.table
             .notice(stream, sequence, receiver, || News::Passed {
                 via,
                 remote: true,
                 letter: letter.clone(),
             });
-        self.desk
+        self.table
             .notice(stream, sequence, receiver, || News::Settled {
                 outcome: failed(reason),
                 sender: true,
             });
-        self.desk.undelivered.push_back(Undelivered {
-            sender: Author::Remote { from: Some(from) },
+        self.table.undelivered.push_back(Undelivered {
+            sender: FailureTarget::Remote { from: Some(from) },
             receiver: Arc::clone(receiver),
             letter: letter.clone(),
             reason,

@@ -1,5 +1,5 @@
-//! The receiving end: an agent's queue, and what is remembered of every sender so that letters
-//! are taken once and in order.
+//! The receiving end: an agent's queue, and the state of each sender that makes letters be taken
+//! once and in order.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -18,13 +18,13 @@ use crate::gate::{Link, Source};
 pub struct Received {
     /// The letter.
     pub letter: Letter,
-    /// The life of the agent that sent it; unknown for an old peer's, and for what this process
-    /// told the agent itself.
+    /// The incarnation of the sending agent; unknown for an agent of a legacy peer, and for letters
+    /// of this process itself.
     pub sender: Incarnation,
-    /// How it came, on its last stretch; none for what this process told the agent itself.
+    /// The transport of its last hop; `None` for letters of this process itself.
     pub via: Option<Kind>,
-    /// The service that handed it over, as it introduced itself; unknown for what this process told the
-    /// agent itself, and for a letter of a legacy peer.
+    /// The service that handed it over, as it introduced itself; unknown for letters of this
+    /// process itself and of a legacy peer.
     pub service: Incarnation,
     /// Whether that service is on another host, as far as its link proves; see [`Hop::is_remote`].
     pub remote: bool,
@@ -39,11 +39,11 @@ pub(crate) struct Inbox {
     /// Bytes of the letters in the queue, without failure messages.
     bytes: usize,
     bytes_bound: usize,
-    /// Letters of one sender that are remembered: as many as it can have open.
+    /// Number of remembered letters of one sender: as many as it can have open.
     recent: usize,
-    /// By a keyed hash: strangers choose these, tens of thousands of them.
-    senders: HashMap<Incarnation, Taken>,
-    /// Who was told that the queue is full and waits for a credit, in order.
+    /// With a keyed hash, because untrusted peers choose these keys, tens of thousands of them.
+    senders: HashMap<Incarnation, SenderState>,
+    /// Streams that were told that the queue is full and wait for a credit, in order.
     waiting: VecDeque<(Stream, Location)>,
     /// Failure messages in the queue, which do not count against its bound.
     failures: usize,
@@ -51,21 +51,21 @@ pub(crate) struct Inbox {
     pub(crate) next_sequence: u64,
 }
 
-/// What is remembered of one sender: enough to tell a letter that was taken from one that was
-/// left out of the order.
+/// State of one sender: distinguishes a letter that was taken from one that was passed over.
 #[derive(Debug)]
-struct Taken {
+struct SenderState {
     last: u64,
     recent: VecDeque<u64>,
     seen: Instant,
 }
 
-/// Senders remembered by one agent. They are not forgotten before every letter of theirs has
-/// passed its deadline, so the bound is on how many different lives may write within an hour.
+/// Maximum number of senders of one agent. A sender is kept until every letter of it has passed its
+/// deadline, so this bounds the number of incarnations that may send within an hour.
 const MAX_SENDERS: usize = 65_536;
-/// Streams that wait for a credit. One beyond is not told, and asks again by itself.
+/// Maximum number of streams that wait for a credit. Further streams get none, and retry after a
+/// pause.
 const MAX_WAITING: usize = 4096;
-/// Failure messages that may lie in a queue beyond its bound.
+/// Maximum number of failure messages in a queue, which do not count against its limit.
 const MAX_FAILURES: usize = 256;
 
 impl Inbox {
@@ -85,7 +85,7 @@ impl Inbox {
         }
     }
 
-    /// Takes a letter into the queue, or says why not; that is asked of the gate, too.
+    /// Puts a letter into the queue, or returns the reason why not. Asks the gate as well.
     pub(crate) fn accept(
         &mut self,
         now: Instant,
@@ -135,14 +135,14 @@ impl Inbox {
         Answer::Accepted
     }
 
-    /// Whether there is room for a letter of this many bytes. One letter is always taken.
+    /// Whether there is room for a letter of this many bytes. An empty queue accepts any letter.
     fn has_room(&self, len: usize) -> bool {
         let letters = self.queue.len() - self.failures;
         let fits = self.bytes.saturating_add(len) <= self.bytes_bound;
         letters < self.bound && (fits || letters == 0)
     }
 
-    /// Whether there is room for a letter without a stream; for what has no way to wait.
+    /// Puts a letter without a stream, whose sender cannot wait, into the queue if there is room.
     pub(crate) fn push_unframed(&mut self, letter: Letter, via: Kind) -> bool {
         if !self.has_room(letter.len()) {
             return false;
@@ -158,8 +158,8 @@ impl Inbox {
         true
     }
 
-    /// Puts a failure message into the queue. There is always room for some: whoever does not
-    /// read cannot be told of all its failures.
+    /// Puts a failure message into the queue. Some fit beyond its limit; an agent that does not
+    /// read may miss failures.
     pub(crate) fn push_failure(&mut self, letter: Letter) -> bool {
         if self.failures >= MAX_FAILURES {
             return false;
@@ -188,8 +188,8 @@ impl Inbox {
         self.queue.len()
     }
 
-    /// Who may be told that there is room again: nobody before the queue is half empty, so that
-    /// a full queue does not cost a credit per letter.
+    /// Streams to notify of room: none before the queue is half empty, so that a full queue does
+    /// not cost one credit per letter.
     pub(crate) fn credits(&mut self) -> impl Iterator<Item = (Stream, Location)> {
         let used = self.queue.len() - self.failures;
         let room = if used * 2 <= self.bound && self.bytes <= self.bytes_bound / 2 {
@@ -200,7 +200,7 @@ impl Inbox {
         self.waiting.drain(..room.min(self.waiting.len()))
     }
 
-    /// Everybody who waits: the agent is going away.
+    /// All waiting streams, because the agent is going away.
     pub(crate) fn all_waiting(&mut self) -> impl Iterator<Item = (Stream, Location)> {
         self.waiting.drain(..)
     }
@@ -223,7 +223,7 @@ impl Inbox {
                 ));
             }
         }
-        let taken = self.senders.entry(sender).or_insert_with(|| Taken {
+        let taken = self.senders.entry(sender).or_insert_with(|| SenderState {
             last: 0,
             recent: VecDeque::new(),
             seen: now,
@@ -239,9 +239,9 @@ impl Inbox {
         Ok(())
     }
 
-    /// Forgets senders of which nothing can still be under way.
+    /// Drops senders that cannot have a letter in transit any more.
     fn forget_old(&mut self, now: Instant) {
-        // Twice, because a letter's remaining time does not count the time on the way.
+        // Twice, because a letter's remaining time does not include its time in transit.
         work::steps(self.senders.len());
         let memory = MAX_DEADLINE * 2;
         self.senders
@@ -259,9 +259,9 @@ pub(super) fn link_of(via: Kind, from: &Hop) -> Link {
     }
 }
 
-impl Taken {
-    /// Answers a copy of a letter that was taken or left out before. The last `bound` letters are
-    /// remembered.
+impl SenderState {
+    /// Answers a copy of a letter that was taken or passed over before. The last `bound` letters
+    /// are remembered.
     fn answer_again(&self, sequence: u64, bound: usize) -> Answer {
         if self.recent.binary_search(&sequence).is_ok() {
             return Answer::Accepted;
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn order_holds_and_copies_are_taken_once() {
+    fn letters_are_taken_in_order_and_copies_once() {
         let mut inbox = inbox(10);
         assert_eq!(offer(&mut inbox, 5, 3), Answer::OutOfOrder { last: 0 });
         assert_eq!(offer(&mut inbox, 3, 0), Answer::Accepted);
@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_left_out_is_not_taken_later_nor_called_delivered() {
+    fn a_letter_that_was_passed_over_is_refused() {
         let mut inbox = inbox(10);
         assert_eq!(offer(&mut inbox, 7, 0), Answer::Accepted);
         let late = offer(&mut inbox, 6, 0);
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_old_to_remember_is_not_called_delivered() {
+    fn a_letter_that_is_too_old_to_remember_is_unconfirmed() {
         let mut inbox = inbox(2000);
         let recent = inbox.recent as u64;
         for sequence in 1..=recent + 1 {
@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_queue_holds_back_and_gives_credit_when_half_empty() {
+    fn a_full_queue_answers_busy_and_gives_credit_when_half_empty() {
         let mut inbox = inbox(4);
         for sequence in 1..=4 {
             assert_eq!(offer(&mut inbox, sequence, 0), Answer::Accepted);
@@ -384,7 +384,7 @@ mod tests {
         assert_eq!(offer(&mut inbox, 5, 4), Answer::Busy);
         assert!(
             inbox.push_failure(Letter::default()),
-            "a failure message always finds room"
+            "a failure message fits beyond the limit"
         );
         inbox.take();
         assert_eq!(inbox.credits().count(), 0);
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn failure_messages_are_bounded_too() {
+    fn the_number_of_failure_messages_is_bounded() {
         let mut inbox = inbox(1);
         let taken = (0..1000)
             .filter(|_| inbox.push_failure(Letter::default()))

@@ -1,8 +1,8 @@
-//! Limits of what a gateway does because of legacy peers' letters: failure messages, and agents that
-//! become known by a letter.
+//! Limits of the work that a gateway does because of legacy peers' letters: failure messages, and
+//! agents that become known by a letter.
 //!
-//! A legacy peer may send letters as fast as it likes, under any name. Three rates bound what is done
-//! about them: for one sender, for one address, and for all.
+//! A legacy peer may send letters at any rate, under any name. Three rates bound the work: per
+//! sender, per address, and in total.
 
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
@@ -11,32 +11,32 @@ use fipa_transport::Allowance;
 
 use crate::Map;
 
-/// Failure messages a second to one sender.
+/// Maximum number of failure messages per second to one sender.
 const PER_SENDER: f64 = 20.0;
-/// Failure messages a second to all senders of one address.
+/// Maximum number of failure messages per second to all senders of one address.
 const PER_ADDRESS: f64 = 100.0;
-/// Failure messages a second to all senders.
+/// Maximum number of failure messages per second to all senders.
 const IN_ALL: f64 = 400.0;
-/// How long an allowance is remembered. After that it is a full one again, so nothing is lost.
+/// Time after which a token bucket is full again, so that it can be dropped.
 const MEMORY: Duration = Duration::from_secs(1);
-/// Addresses whose bytes are remembered, at most.
-const MAX_PAID: usize = 4096;
-/// How long they are remembered when another address needs the room. Longer than the deadline of most
-/// letters.
-const PAID_MEMORY: Duration = Duration::from_secs(60);
-/// Bytes that a letter counts as, at least. A failure message about a letter of 119 bytes has 300 to 700, and
-/// the headers of the letter's own connection have 270.
-const MIN_PAID: u64 = 1024;
-/// Bytes that an address may have in store, at most.
+/// Maximum number of addresses with a byte credit.
+const MAX_CREDIT_ADDRESSES: usize = 4096;
+/// Time for which a credit is kept when another address needs the space. Longer than the deadline
+/// of most letters.
+const CREDIT_MEMORY: Duration = Duration::from_secs(60);
+/// Minimum credit of a letter, in bytes. A failure message about a letter of 119 bytes has 300 to
+/// 700, and the headers of the letter's own connection have 270.
+const MIN_CREDIT: u64 = 1024;
+/// Maximum credit of an address, in bytes.
 const MAX_CREDIT: u64 = 1 << 20;
-/// How often it is logged that failure messages were left out.
+/// Interval of the log line about omitted failure messages.
 const LOG_EVERY: Duration = Duration::from_secs(1);
 
-/// The address that a letter came from, if that is known, and the name of its sender.
+/// The address from which a letter came, if known, and the name of its sender.
 type Sender = (Option<IpAddr>, String);
 
-/// Limits what is done for senders: for one, for those of one address, and for all. What exceeds one
-/// rate takes nothing from others.
+/// Limits actions for senders: per sender, per address, and in total. A request that exceeds one
+/// rate does not use up the others.
 #[derive(Debug)]
 pub(super) struct SenderLimit {
     per_sender: f64,
@@ -48,11 +48,11 @@ pub(super) struct SenderLimit {
 }
 
 impl SenderLimit {
-    /// Senders that are remembered, at most, and addresses. Only what is allowed makes entries: twice
-    /// `in_all` within the memory.
+    /// Maximum number of senders, and of addresses. Only granted requests create entries: at most
+    /// twice `in_all` within `MEMORY`.
     const MAX_ENTRIES: usize = 1024;
 
-    /// So much a second, each.
+    /// Creates a limit with these rates per second.
     pub(super) fn new(per_sender: f64, per_address: f64, in_all: f64) -> Self {
         Self {
             per_sender,
@@ -64,7 +64,7 @@ impl SenderLimit {
         }
     }
 
-    /// Whether it is allowed once more.
+    /// Takes a token; returns whether the action is allowed.
     pub(super) fn take(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
         if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
             let is_recent = |it: &Allowance| now.saturating_duration_since(it.asked()) < MEMORY;
@@ -76,8 +76,8 @@ impl SenderLimit {
         }
         let address = from.map(host);
         let sender = (address, sender.to_owned());
-        // The narrowest first: what it refuses takes nothing from the others. Refused by the
-        // widest, nothing is remembered.
+        // The narrowest first, because a refused request must not use up the wider rates. If the
+        // widest refuses, nothing is stored.
         if let Some(known) = self.senders.get_mut(&sender)
             && !known.take(1.0, self.per_sender, now)
         {
@@ -103,22 +103,22 @@ impl SenderLimit {
     }
 }
 
-/// Bytes that came from one address, less those of the failure messages about them.
+/// Bytes received from one address, minus those of the failure messages about them.
 #[derive(Debug, Clone, Copy)]
-struct Paid {
+struct ByteCredit {
     bytes: u64,
     last: Instant,
 }
 
-/// Limits failure messages, and counts those that are left out. Sans-I/O, but for the log.
+/// Limits failure messages, and counts those that are omitted. Without I/O except for the log.
 #[derive(Debug)]
 pub(super) struct FailureLimit {
     limit: SenderLimit,
-    /// What legacy peers have sent: failure messages about letters from one address never have more
-    /// bytes than these letters count as.
-    paid: Map<IpAddr, Paid>,
+    /// Credit of legacy peers' addresses: failure messages about letters from one address never
+    /// have more bytes than these letters are credited for.
+    credits: Map<IpAddr, ByteCredit>,
     left_out: u64,
-    /// When it is logged how many were left out.
+    /// Time of the next log line about omitted messages.
     log_at: Option<Instant>,
 }
 
@@ -126,7 +126,7 @@ impl Default for FailureLimit {
     fn default() -> Self {
         Self {
             limit: SenderLimit::new(PER_SENDER, PER_ADDRESS, IN_ALL),
-            paid: Map::default(),
+            credits: Map::default(),
             left_out: 0,
             log_at: None,
         }
@@ -134,7 +134,7 @@ impl Default for FailureLimit {
 }
 
 impl FailureLimit {
-    /// Whether one more failure message may leave for this sender. If not, it is counted.
+    /// Whether another failure message may be sent to this sender; otherwise counts it as omitted.
     pub(super) fn allows(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
         let allowed = self.limit.take(now, from, sender);
         if !allowed {
@@ -143,52 +143,55 @@ impl FailureLimit {
         allowed
     }
 
-    /// A letter of so many bytes came from a legacy peer at this address. It counts as
-    /// [`MIN_PAID`] at least.
-    pub(super) fn came(&mut self, now: Instant, from: IpAddr, bytes: usize) {
-        let (from, bytes) = (host(from), (bytes as u64).max(MIN_PAID));
-        if self.paid.len() >= MAX_PAID && !self.paid.contains_key(&from) {
-            let is_recent = |it: &Paid| now.saturating_duration_since(it.last) < PAID_MEMORY;
-            self.paid.retain(|_, paid| is_recent(paid));
-            if self.paid.len() >= MAX_PAID {
-                // Its failure messages are left out.
+    /// Credits the bytes of a letter from a legacy peer at this address, at least [`MIN_CREDIT`].
+    pub(super) fn credit(&mut self, now: Instant, from: IpAddr, bytes: usize) {
+        let (from, bytes) = (host(from), (bytes as u64).max(MIN_CREDIT));
+        if self.credits.len() >= MAX_CREDIT_ADDRESSES && !self.credits.contains_key(&from) {
+            let is_recent =
+                |it: &ByteCredit| now.saturating_duration_since(it.last) < CREDIT_MEMORY;
+            self.credits.retain(|_, credit| is_recent(credit));
+            if self.credits.len() >= MAX_CREDIT_ADDRESSES {
+                // Failure messages to it are omitted.
                 return;
             }
         }
-        let none = Paid {
+        let none = ByteCredit {
             bytes: 0,
             last: now,
         };
-        let paid = self.paid.entry(from).or_insert(none);
-        paid.bytes = paid.bytes.saturating_add(bytes).min(MAX_CREDIT);
-        paid.last = now;
+        let credit = self.credits.entry(from).or_insert(none);
+        credit.bytes = credit.bytes.saturating_add(bytes).min(MAX_CREDIT);
+        credit.last = now;
     }
 
-    /// Whether letters from this address had as many bytes as the letter that failed, less those of
-    /// failure messages. If not, the message is counted.
-    pub(super) fn may_pay(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+    /// Whether the credit of this address covers the bytes of the failed letter; otherwise counts
+    /// the message as omitted.
+    pub(super) fn covers(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let paid = self.paid.get(&host(from)).map_or(0, |paid| paid.bytes);
-        // No more is ever in store.
-        let may = paid >= (bytes as u64).min(MAX_CREDIT);
+        let credit = self
+            .credits
+            .get(&host(from))
+            .map_or(0, |credit| credit.bytes);
+        // Larger letters than the maximum credit need only that.
+        let may = credit >= (bytes as u64).min(MAX_CREDIT);
         if !may {
             self.leave_out(now);
         }
         may
     }
 
-    /// Whether letters from this address had as many bytes as a failure message about one of them, and
-    /// takes these bytes away. If not, the message is counted. Without an address nothing is limited:
-    /// the sender is an agent of another gateway.
-    pub(super) fn has_paid(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+    /// Subtracts the bytes of a failure message from the credit of this address, if it covers them;
+    /// otherwise counts the message as omitted. Without an address there is no limit: the sender is
+    /// an agent of another gateway.
+    pub(super) fn debit(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let paid = self.paid.get_mut(&host(from));
-        let left = paid
+        let credit = self.credits.get_mut(&host(from));
+        let left = credit
             .as_ref()
             .and_then(|it| it.bytes.checked_sub(bytes as u64));
-        match (paid, left) {
-            (Some(paid), Some(left)) => {
-                paid.bytes = left;
+        match (credit, left) {
+            (Some(credit), Some(left)) => {
+                credit.bytes = left;
                 true
             }
             _ => {
@@ -198,33 +201,33 @@ impl FailureLimit {
         }
     }
 
-    /// Counts a failure message that does not leave.
+    /// Counts an omitted failure message.
     pub(super) fn leave_out(&mut self, now: Instant) {
         self.left_out = self.left_out.saturating_add(1);
         self.log_at.get_or_insert(now + LOG_EVERY);
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Time of the next call of [`handle_timeout`](Self::handle_timeout).
     pub(super) fn due(&self) -> Option<Instant> {
         self.log_at
     }
 
-    /// Logs how many were left out, when it is time to.
+    /// Logs the number of omitted messages when it is due.
     pub(super) fn handle_timeout(&mut self, now: Instant) {
         if self.log_at.is_some_and(|at| at <= now) {
             self.log_at = None;
             let count = std::mem::take(&mut self.left_out);
             tracing::warn!(
                 count,
-                "left out failure messages: more than {PER_SENDER} a second to one sender, \
-                 {PER_ADDRESS} to one address or {IN_ALL} in all, more bytes than came from one address, or \
-                 the sender does not take them"
+                "omitted failure messages beyond a limit: {PER_SENDER} per second to one sender, \
+                 {PER_ADDRESS} to one address, {IN_ALL} in total, the bytes received from one \
+                 address, or a full queue of the sender"
             );
         }
     }
 }
 
-/// The address that stands for a host: of IPv6 the first 64 bits, unless it is link-local.
+/// The address that represents a host: for IPv6 the /64 network, unless it is link-local.
 fn host(address: IpAddr) -> IpAddr {
     match address {
         IpAddr::V6(v6) if !v6.is_unicast_link_local() => {
@@ -234,7 +237,7 @@ fn host(address: IpAddr) -> IpAddr {
     }
 }
 
-/// A full allowance of which one was taken.
+/// A full token bucket from which one token was taken.
 fn less_one(per_second: f64, now: Instant) -> Allowance {
     let mut allowance = Allowance::new(per_second, now);
     allowance.take(1.0, per_second, now);
@@ -252,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn one_sender_takes_nothing_from_another() {
+    fn one_sender_does_not_use_up_the_rate_of_another() {
         let (mut limit, now) = (FailureLimit::default(), Instant::now());
         let allowed = (0..1000).filter(|_| limit.allows(now, address(1), "loud"));
         assert_eq!(allowed.count(), 20);
@@ -264,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn one_address_with_many_names_takes_nothing_from_another() {
+    fn one_address_with_many_names_does_not_use_up_the_rate_of_another() {
         let (mut limit, now) = (FailureLimit::default(), Instant::now());
         let names = (0..1000).map(|number| format!("name {number}"));
         let allowed = names.filter(|name| limit.allows(now, address(1), name));
@@ -280,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_is_bounded() {
+    fn the_number_of_entries_is_bounded() {
         let (mut limit, start) = (FailureLimit::default(), Instant::now());
         let mut allowed = 0;
         for number in 0..50_000_u32 {
@@ -290,7 +293,7 @@ mod tests {
             assert!(limit.limit.senders.len() <= SenderLimit::MAX_ENTRIES);
             assert!(limit.limit.addresses.len() <= SenderLimit::MAX_ENTRIES);
         }
-        // Ten seconds, and what may leave at once.
+        // Ten seconds, and the initial burst.
         assert!((4000..=4400).contains(&allowed), "{allowed}");
     }
 
@@ -298,25 +301,25 @@ mod tests {
     fn an_address_gets_no_more_bytes_than_came_from_it() {
         let (mut limit, now) = (FailureLimit::default(), Instant::now());
         let [one, other] = [1, 2].map(|last| address(last).unwrap());
-        limit.came(now, one, 1500);
-        assert!(limit.has_paid(now, Some(one), 1000));
-        assert!(!limit.has_paid(now, Some(one), 600));
-        assert!(!limit.has_paid(now, Some(other), 1));
+        limit.credit(now, one, 1500);
+        assert!(limit.debit(now, Some(one), 1000));
+        assert!(!limit.debit(now, Some(one), 600));
+        assert!(!limit.debit(now, Some(other), 1));
         assert_eq!(limit.left_out, 2);
-        limit.came(now, one, 200);
-        assert!(limit.has_paid(now, Some(one), 600), "200 count as 1024");
-        assert!(limit.has_paid(now, None, 600), "another gateway's agent");
-        for number in 0..2 * MAX_PAID as u32 {
-            limit.came(now, Ipv4Addr::from(number).into(), 1);
+        limit.credit(now, one, 200);
+        assert!(limit.debit(now, Some(one), 600), "200 count as 1024");
+        assert!(limit.debit(now, None, 600), "another gateway's agent");
+        for number in 0..2 * MAX_CREDIT_ADDRESSES as u32 {
+            limit.credit(now, Ipv4Addr::from(number).into(), 1);
         }
-        assert_eq!(limit.paid.len(), MAX_PAID);
-        limit.came(now + PAID_MEMORY, other, 9);
-        assert_eq!(limit.paid.len(), 1);
-        assert!(limit.has_paid(now + PAID_MEMORY, Some(other), 9));
+        assert_eq!(limit.credits.len(), MAX_CREDIT_ADDRESSES);
+        limit.credit(now + CREDIT_MEMORY, other, 9);
+        assert_eq!(limit.credits.len(), 1);
+        assert!(limit.debit(now + CREDIT_MEMORY, Some(other), 9));
     }
 
     #[test]
-    fn what_was_left_out_is_logged_once_a_second() {
+    fn omitted_messages_are_logged_once_a_second() {
         let (mut limit, now) = (FailureLimit::default(), Instant::now());
         assert_eq!(limit.due(), None);
         limit.leave_out(now);

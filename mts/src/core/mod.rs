@@ -1,29 +1,29 @@
-//! The delivery core: what the promises of delivery hang on, without input and output.
+//! The delivery core: implements the delivery guarantees without I/O.
 //!
-//! Everything that happens (a letter to be sent, a parcel that arrived, the end of an attempt, a
-//! change of the directory, time that passed) goes in with `now`; what is to be done comes out as
-//! [`Action`]s. The same core serves a robot process and, with leave to forward, the gateway; and
-//! the same core runs in simulations on virtual time.
+//! Every input (a letter to send, an arrived parcel, the end of an attempt, a change of the
+//! directory, elapsed time) is passed in with `now`; the actions to perform come out as
+//! [`Action`]s. The same core serves a robot process and, with permission to forward, the gateway;
+//! simulations run it on virtual time.
 //!
-//! * `rules`: what keeps a stream in order and alive, as pure functions.
-//! * `lane`: letters of one stream on their way, in order, one way at a time.
-//! * `inbox`: the receiving end, where letters are taken once and in order.
+//! * `rules`: the rules that keep a stream in order and alive, as pure functions.
+//! * `lane`: the open letters of one stream, in order, on one route at a time.
+//! * `inbox`: the receiving end, which accepts letters once and in order.
 //! * `forward`: letters for agents of other processes.
-//! * `failures`: which senders are told of which failures, by messages.
-//! * `limits`: how many of these messages leave.
-//! * `departed`: registrations that have left this host a moment ago.
-//! * `peers`: services that the configuration names, and how it stands with them.
-//! * `routes`: which way letters would go and what happened on each way, for people.
-//! * `desk`: what lanes share: attempts, health of ways, things to be done.
-//! * `notice`: what somebody who watches is told.
+//! * `failures`: failure messages to senders.
+//! * `limits`: rate limits of these messages.
+//! * `departed`: registrations that recently left this host.
+//! * `peers`: services in the configuration, and the state of contact with them.
+//! * `routes`: reports of the routes of letters, and counters of each route.
+//! * `attempts`: state that lanes share: attempts, health of routes, pending actions.
+//! * `notice`: notifications for watchers.
 //!
-//! A letter's order and identity are its *stream* (one registration of the sender, one of the
-//! receiver) and its sequence. Every copy names the letter that must be taken before it, so that
-//! letters that failed leave no hole that would be waited for.
+//! A letter is identified and ordered by its *stream* (one registration of the sender, one of the
+//! receiver) and its sequence number. Every copy names its predecessor, the letter that must be
+//! taken before it, so that a failed letter leaves no gap to wait for.
 
+mod attempts;
 mod config;
 mod departed;
-mod desk;
 mod failures;
 mod forward;
 mod inbox;
@@ -50,9 +50,9 @@ use fipa_transport::{
     Kind, Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
+pub use attempts::Action;
+use attempts::{AttemptTable, FailureTarget, Note, Origin, Purpose, Undelivered};
 pub use config::{CoreConfig, MAX_DEADLINE};
-pub use desk::Action;
-use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
 pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
@@ -63,20 +63,20 @@ pub use notice::{News, Notice};
 use crate::{Gate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
-use principals::{Impostor, Principals};
+use principals::{PrincipalError, Principals};
 pub use routes::{Route, Standing, Way, WayState};
 
-/// What time it is, by both clocks.
+/// The current time by two clocks.
 #[derive(Debug, Clone, Copy)]
 pub struct Now {
-    /// The clock that never goes back: deadlines and pauses.
+    /// Monotonic clock, for deadlines and pauses.
     pub instant: Instant,
-    /// The calendar: dates in envelopes, for people.
+    /// Wall clock, for dates in envelopes.
     pub utc: SystemTime,
 }
 
 impl Now {
-    /// Both clocks of this machine.
+    /// Reads both clocks of this machine.
     #[must_use]
     pub fn read() -> Self {
         Self {
@@ -86,7 +86,7 @@ impl Now {
     }
 }
 
-/// One call of [`Core::send`]: outcomes name it.
+/// Identifies a call of [`Core::send`] in its outcomes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct SendId(pub u64);
 
@@ -95,22 +95,22 @@ pub struct SendId(pub u64);
 pub struct Submission {
     /// The sending agent's incarnation.
     pub sender: Incarnation,
-    /// The letter, for all receivers.
+    /// The letter, the same for all receivers.
     pub letter: Letter,
-    /// Names of the receivers, of coalitions too, or patterns.
+    /// Names of receivers or coalitions, or patterns.
     pub receivers: Vec<Arc<str>>,
-    /// How long delivery may take, at most [`MAX_DEADLINE`].
+    /// Time limit of the delivery, at most [`MAX_DEADLINE`].
     pub deadline: Duration,
 }
 
-/// Lanes that are empty are forgotten when there are more than this many.
+/// Empty lanes are dropped when there are more lanes than this.
 const IDLE_LANES: usize = 1024;
-/// How long an empty lane is remembered after that.
+/// Time for which an empty lane is kept nevertheless.
 const IDLE_TIME: Duration = Duration::from_secs(60);
 
-/// The delivery core. See the module's documentation.
+/// The delivery core. See the module documentation.
 pub struct Core {
-    desk: Desk,
+    table: AttemptTable,
     lanes: Map<LaneId, Lane>,
     lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
@@ -120,32 +120,33 @@ pub struct Core {
     principals: Principals,
     gate: Option<Arc<dyn Gate>>,
     failure_limit: FailureLimit,
-    /// Limits how many agents of legacy peers become known by their letters.
+    /// Limits the rate at which agents of legacy peers become known by their letters.
     contact_limit: SenderLimit,
-    /// No more letters of others are taken.
+    /// Whether letters of others are no longer accepted.
     ending: bool,
-    /// The service has ended: nothing is sent any more.
+    /// Whether the service has ended, so that nothing is sent any more.
     closed: bool,
     next_lane: u64,
     next_send: u64,
-    /// Sequence of the letters that this service sends in its own name, where it is no agent.
+    /// Next sequence number of the letters that this service sends in its own name.
     next_sequence: u64,
     next_forget: Option<Instant>,
 }
 
-/// What is to be done about a note at a later time.
+/// A scheduled action for a note.
 struct LateNote(Instant, Late);
 
 enum Late {
     /// Send it again.
     Again(Box<Note>),
-    /// See whether it was acknowledged.
+    /// Check whether it was acknowledged.
     Check(AttemptId),
 }
 
-/// Notes that are repeated until they are acknowledged, at most. Beyond that a note is sent once.
+/// Maximum number of notes that are repeated until they are acknowledged. Further notes are sent
+/// once.
 const MAX_LATE_NOTES: usize = 65_536;
-/// Pauses before a note that was not acknowledged is sent again.
+/// Backoff before a note that was not acknowledged is sent again.
 const FIRST_NOTE_PAUSE: Duration = Duration::from_millis(20);
 const LONGEST_NOTE_PAUSE: Duration = Duration::from_secs(1);
 
@@ -170,11 +171,11 @@ impl PartialEq for LateNote {
 impl Eq for LateNote {}
 
 impl Core {
-    /// A core that looks up receivers in this directory.
+    /// Creates a core that looks up receivers in this directory.
     #[must_use]
     pub fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
         Self {
-            desk: Desk::new(config, directory),
+            table: AttemptTable::new(config, directory),
             lanes: Map::default(),
             lane_ids: Map::default(),
             agents: Map::default(),
@@ -194,7 +195,7 @@ impl Core {
         }
     }
 
-    /// The same core, that asks this gate which letters it takes.
+    /// Sets the gate that decides which letters are accepted.
     #[must_use]
     pub fn gated(self, gate: Arc<dyn Gate>) -> Self {
         Self {
@@ -203,40 +204,40 @@ impl Core {
         }
     }
 
-    /// What the core was told at its start.
+    /// Returns the configuration.
     #[must_use]
     pub fn config(&self) -> &CoreConfig {
-        &self.desk.config
+        &self.table.config
     }
 
-    /// An agent of this process has been registered: letters for it are taken from now on.
+    /// Registers an agent of this process: letters for it are accepted from now on.
     pub fn register(&mut self, name: Arc<str>, incarnation: Incarnation) {
-        let inbox = Inbox::new(name, &self.desk.config);
+        let inbox = Inbox::new(name, &self.table.config);
         self.agents.insert(incarnation, inbox);
     }
 
-    /// An agent of this process goes away: its unread letters are dropped, its letters under way
-    /// end as failed or unconfirmed.
+    /// Removes an agent of this process: its unread letters are dropped, and its open letters end
+    /// as failed or unconfirmed.
     pub fn deregister(&mut self, now: Now, incarnation: Incarnation) {
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
             for (stream, back) in inbox.all_waiting() {
-                self.desk.credit(stream, Arc::clone(&receiver), back);
+                self.table.credit(stream, Arc::clone(&receiver), back);
             }
         }
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id)
                 && lane.sender() == incarnation
             {
-                lane.give_up(now.instant, &mut self.desk);
+                lane.give_up(now.instant, &mut self.table);
             }
         }
-        self.desk.undelivered.clear();
+        self.table.undelivered.clear();
         self.forget_lanes(|lane| lane.is_idle() && lane.sender() == incarnation);
     }
 
-    /// Sends a letter. Returns how many outcomes will follow under this number; outcomes that are
-    /// known at once are among the actions when this returns.
+    /// Sends a letter. Returns the number of outcomes that follow under this ID; outcomes that are
+    /// known at once are among the actions when this method returns.
     pub fn send(&mut self, now: Now, submission: Submission) -> (SendId, usize) {
         let Submission {
             sender,
@@ -252,11 +253,11 @@ impl Core {
                 let reason = FailureReason::Closed;
                 self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
-            self.desk.undelivered.clear();
+            self.table.undelivered.clear();
             return (send, receivers.len());
         }
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
-        let directory = Arc::clone(&self.desk.directory);
+        let directory = Arc::clone(&self.table.directory);
         let sender_name = self
             .agents
             .get(&sender)
@@ -267,10 +268,10 @@ impl Core {
         for receiver in receivers {
             let own = sender_name.as_deref().unwrap_or_default();
             let entries = match fipa_sds::resolve(&*directory, &receiver, own) {
-                // What nearly every letter is, without what more of them would take.
+                // The common case, without the data structures that several receivers need.
                 Ok(Resolution::Exact(entry)) if only_one && entry.incarnation.is_known() => {
                     self.send_one(now, (send, sender), &entry, letter, deadline);
-                    self.tell_failures(now);
+                    self.send_failures(now);
                     return (send, 1);
                 }
                 Ok(Resolution::Exact(entry)) => vec![entry],
@@ -294,28 +295,28 @@ impl Core {
                 self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
             for entry in entries {
-                let life = desk::life_of(&entry);
-                if reached.contains(&life) {
+                let registration = attempts::registration_of(&entry);
+                if reached.contains(&registration) {
                     continue;
                 }
-                reached.push(life);
+                reached.push(registration);
                 count += 1;
                 self.send_one(now, (send, sender), &entry, letter.clone(), deadline);
             }
         }
-        self.tell_failures(now);
+        self.send_failures(now);
         (send, count)
     }
 
-    /// Sends a letter to this one life of an agent, whatever others are called; the receivers of
-    /// the submission are not looked at. One outcome will follow under this number.
+    /// Sends a letter to exactly this registration of an agent; the receivers in the submission are
+    /// ignored. One outcome follows under this ID.
     pub fn send_to(&mut self, now: Now, submission: Submission, entry: &Entry) -> SendId {
         let send = SendId(self.next_send);
         self.next_send += 1;
         let deadline = now.instant + submission.deadline.min(MAX_DEADLINE);
         let sending = (send, submission.sender);
         self.send_one(now, sending, entry, submission.letter, deadline);
-        self.tell_failures(now);
+        self.send_failures(now);
         send
     }
 
@@ -329,7 +330,7 @@ impl Core {
     ) {
         let stream = Stream {
             sender,
-            receiver: desk::life_of(entry),
+            receiver: attempts::registration_of(entry),
         };
         let name = Arc::clone(&entry.name);
         if self.closed {
@@ -340,7 +341,7 @@ impl Core {
             return self.undeliverable(send, sender, name, letter, FailureReason::QueueFull);
         }
         let sequence = self.sequence_of(sender);
-        self.desk.notice(stream, sequence, &name, || News::Sent {
+        self.table.notice(stream, sequence, &name, || News::Sent {
             send: Some(send),
             letter: letter.clone(),
         });
@@ -376,39 +377,39 @@ impl Core {
             sender,
             receiver: Incarnation::UNKNOWN,
         };
-        self.desk
+        self.table
             .notice(stream, sequence, &receiver, || News::Sent {
                 send: Some(send),
                 letter: letter.clone(),
             });
-        self.desk
+        self.table
             .notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
                 sender: true,
             });
-        self.desk.undelivered.push_back(Undelivered {
-            sender: Author::Ours(sender),
+        self.table.undelivered.push_back(Undelivered {
+            sender: FailureTarget::Ours(sender),
             receiver: Arc::clone(&receiver),
             letter,
             reason,
             detail: String::new(),
         });
-        self.desk.actions.push_back(Action::Outcome {
+        self.table.actions.push_back(Action::Outcome {
             send,
             receiver,
             outcome,
         });
     }
 
-    /// Puts a letter into its lane and gets it moving.
+    /// Puts a letter into its lane and dispatches what can be dispatched.
     fn put(&mut self, now: Now, lane: LaneId, delivery: Delivery) {
-        self.with_lane(now, lane, |lane, desk| {
-            lane.push(delivery, desk);
-            lane.pump(now.instant, desk);
+        self.with_lane(now, lane, |lane, table| {
+            lane.push(delivery, table);
+            lane.pump(now.instant, table);
         });
     }
 
-    /// The lane with this key, which is made if there is none.
+    /// Returns the lane with this key; creates it if necessary.
     fn lane(&mut self, now: Now, key: LaneKey, receiver: &Arc<str>) -> LaneId {
         if let Some(id) = self.lane_ids.get(&key) {
             return *id;
@@ -421,7 +422,7 @@ impl Core {
         id
     }
 
-    /// All lanes, in the order in which they were made: runs with one seed are the same.
+    /// All lanes in the order of creation, so that runs with one seed are equal.
     fn lanes_in_order(&self) -> Vec<LaneId> {
         work::steps(self.lanes.len());
         let mut lanes: Vec<LaneId> = self.lanes.keys().copied().collect();
@@ -429,7 +430,7 @@ impl Core {
         lanes
     }
 
-    /// The lane that holds letters of this stream for the receiver of this name.
+    /// Returns the lane with letters of this stream for the receiver of this name.
     fn lane_of(&self, stream: Stream, receiver: &Arc<str>) -> Option<LaneId> {
         let keys = [
             LaneKey::Custody(stream),
@@ -439,60 +440,60 @@ impl Core {
         keys.iter().find_map(|key| self.lane_ids.get(key).copied())
     }
 
-    /// Works on a lane, then takes care of its timer.
-    fn with_lane(&mut self, now: Now, id: LaneId, work: impl FnOnce(&mut Lane, &mut Desk)) {
+    /// Runs `work` on a lane, then schedules its timer and repeated notes.
+    fn with_lane(&mut self, now: Now, id: LaneId, work: impl FnOnce(&mut Lane, &mut AttemptTable)) {
         let Some(lane) = self.lanes.get_mut(&id) else {
             return;
         };
-        work(lane, &mut self.desk);
+        work(lane, &mut self.table);
         if let Some(due) = lane.due()
             && lane.scheduled.is_none_or(|scheduled| due < scheduled)
         {
             lane.scheduled = Some(due);
             self.timers.push(Reverse((due, id)));
         }
-        while let Some(attempt) = self.desk.repeated.pop_front() {
-            if let Some(Purpose::Note(note)) = self.desk.attempts.get_mut(&attempt) {
+        while let Some(attempt) = self.table.repeated.pop_front() {
+            if let Some(Purpose::Note(note)) = self.table.attempts.get_mut(&attempt) {
                 note.sent = Some(now.instant);
             }
             if self.notes.len() < MAX_LATE_NOTES {
-                let due = now.instant + self.desk.config.attempt_timeout;
+                let due = now.instant + self.table.config.attempt_timeout;
                 self.notes
                     .push(Reverse(LateNote(due, Late::Check(attempt))));
             }
         }
     }
 
-    /// Where receivers are looked up.
+    /// Returns the directory in which receivers are looked up.
     #[must_use]
     pub fn directory(&self) -> &Arc<dyn Directory> {
-        &self.desk.directory
+        &self.table.directory
     }
 
-    /// Whether somebody watches: then [`Action::Notice`] tells of every letter, before what is to
-    /// be done about it.
+    /// Turns watching on or off: while it is on, an [`Action::Notice`] reports every event of a
+    /// letter before the action that follows from it.
     pub fn watch(&mut self, watched: bool) {
-        self.desk.watched = watched;
+        self.table.watched = watched;
     }
 
-    /// Takes the next letter out of an agent's queue.
+    /// Takes the next letter from an agent's queue.
     pub fn take(&mut self, agent: Incarnation) -> Option<Received> {
         let inbox = self.agents.get_mut(&agent)?;
         let received = inbox.take()?;
         let receiver = Arc::clone(&inbox.name);
         for (stream, back) in inbox.credits() {
-            self.desk.credit(stream, Arc::clone(&receiver), back);
+            self.table.credit(stream, Arc::clone(&receiver), back);
         }
         Some(received)
     }
 
-    /// How many letters wait in an agent's queue.
+    /// Number of letters in an agent's queue.
     #[must_use]
     pub fn waiting(&self, agent: Incarnation) -> usize {
         self.agents.get(&agent).map_or(0, Inbox::len)
     }
 
-    /// A parcel arrived by the transport of this kind.
+    /// Handles a parcel that arrived by this kind of transport.
     pub fn handle_arrival(
         &mut self,
         now: Now,
@@ -506,25 +507,25 @@ impl Core {
             ticket,
         } = arrival;
         work::steps(1);
-        if let Err(impostor) = self.principals.check_service(&from) {
-            return Verdict::Now(Answer::failed(FailureReason::Refused, impostor.to_string()));
+        if let Err(error) = self.principals.check_service(&from) {
+            return Verdict::Now(Answer::failed(FailureReason::Refused, error.to_string()));
         }
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
                 let sender = parcel.stream.sender;
-                let directory = &*self.desk.directory;
-                if let Err(impostor) = self.principals.check_sender(sender, &from, directory) {
-                    if impostor == Impostor::Stranger {
+                let directory = &*self.table.directory;
+                if let Err(error) = self.principals.check_sender(sender, &from, directory) {
+                    if error == PrincipalError::NotIntroduced {
                         return Verdict::Now(Answer::Busy);
                     }
-                    let detail = impostor.to_string();
+                    let detail = error.to_string();
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
                 if parcel.sequence == 0 || parcel.after >= parcel.sequence {
                     let detail = "the letter's sequence is not above its predecessor's";
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
-                let watched = self.desk.watched;
+                let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
                     let gate = self.gate.as_deref();
@@ -536,20 +537,20 @@ impl Core {
                             let Parcel {
                                 stream, sequence, ..
                             } = parcel;
-                            self.desk
+                            self.table
                                 .notice(stream, sequence, &parcel.receiver, || News::Taken {
                                     via,
                                     letter,
                                 });
                         }
                         let agent = parcel.stream.receiver;
-                        self.desk.actions.push_back(Action::Deliverable { agent });
+                        self.table.actions.push_back(Action::Deliverable { agent });
                     }
                     return Verdict::Now(answer);
                 }
                 let unanswered = (!answers_at_once).then_some((via, ticket));
                 let verdict = self.forward(now, via, &parcel, letter, from, unanswered);
-                self.tell_failures(now);
+                self.send_failures(now);
                 verdict
             }
             Body::Report(report) => {
@@ -558,9 +559,9 @@ impl Core {
             }
             Body::Credit => {
                 if let Some(lane) = self.lane_of(parcel.stream, &parcel.receiver) {
-                    self.with_lane(now, lane, |lane, desk| lane.resume(now.instant, desk));
+                    self.with_lane(now, lane, |lane, table| lane.resume(now.instant, table));
                 }
-                self.tell_failures(now);
+                self.send_failures(now);
                 Verdict::Now(Answer::Accepted)
             }
             Body::Predecessor => {
@@ -568,14 +569,14 @@ impl Core {
                 if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(parcel.stream)) {
                     let letter = (parcel.sequence, parcel.after, parcel.transfer);
                     let from = from.location.incarnation();
-                    self.with_lane(now, *lane, |lane, desk| {
-                        is_here = lane.predecessor_told(now.instant, from, letter, desk);
+                    self.with_lane(now, *lane, |lane, table| {
+                        is_here = lane.handle_predecessor_note(now.instant, from, letter, table);
                     });
                 }
-                self.tell_failures(now);
+                self.send_failures(now);
                 // A report that is on its way tells more than that the letter is gone.
                 let (sequence, transfer) = (parcel.sequence, parcel.transfer);
-                let is_reported = self.desk.is_reporting(parcel.stream, sequence, transfer);
+                let is_reported = self.table.is_reporting(parcel.stream, sequence, transfer);
                 let is_here = is_here || is_reported;
                 Verdict::Now(match is_here {
                     true => Answer::Accepted,
@@ -594,58 +595,58 @@ impl Core {
                 ..
             } = *parcel;
             let letter = (stream.receiver, sequence, transfer);
-            self.with_lane(now, lane, |lane, desk| {
-                lane.reported(now.instant, from, letter, report, desk);
+            self.with_lane(now, lane, |lane, table| {
+                lane.reported(now.instant, from, letter, report, table);
             });
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
-    /// An attempt has ended, or was refused by its transport at once.
+    /// Handles the end of an attempt, or its immediate refusal by the transport.
     pub fn handle_conclusion(&mut self, now: Now, attempt: AttemptId, conclusion: Conclusion) {
-        match self.desk.attempts.remove(&attempt) {
+        match self.table.attempts.remove(&attempt) {
             Some(Purpose::Letter { lane: id, sequence }) => {
-                let mut way = None;
-                // What found no room has made none: told that it had, it would try again at once,
-                // and in vain, until the way counts as broken.
+                let mut route = None;
+                // An attempt that failed for lack of room has freed none; waking a waiting lane
+                // here would make it retry and fail, until the route counts as broken.
                 let made_room = !matches!(
                     &conclusion,
                     Conclusion::NotSent(error) if error.fault == WayFault::Congested
                 );
-                self.with_lane(now, id, |lane, desk| {
-                    way = lane.way_of(sequence).filter(|_| made_room).cloned();
-                    lane.concluded(now.instant, sequence, attempt, conclusion, desk);
+                self.with_lane(now, id, |lane, table| {
+                    route = lane.route_of(sequence).filter(|_| made_room).cloned();
+                    lane.concluded(now.instant, sequence, attempt, conclusion, table);
                 });
-                // Whatever has ended has made room.
-                if let Some(id) = way.and_then(|way| self.desk.room_for(&way)) {
-                    self.with_lane(now, id, |lane, desk| lane.resume(now.instant, desk));
+                // The attempt that ended has made room.
+                if let Some(id) = route.and_then(|route| self.table.room_for(&route)) {
+                    self.with_lane(now, id, |lane, table| lane.resume(now.instant, table));
                 }
             }
             Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
-            Some(Purpose::Touch { peer }) => {
+            Some(Purpose::PeerCheck { peer }) => {
                 let asked = (peer, attempt);
                 self.peers
-                    .concluded(now.instant, asked, conclusion, &mut self.desk);
+                    .concluded(now.instant, asked, conclusion, &mut self.table);
             }
             None => {}
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     fn note_concluded(&mut self, now: Now, note: Note, conclusion: Conclusion) {
-        // A note that is refused has changed nothing.
+        // A refused note has changed nothing.
         let arrived = matches!(
             conclusion,
             Conclusion::Answered(Answer::Accepted | Answer::Returned { .. }) | Conclusion::Handed
         );
         if arrived && let Some(sent) = note.sent {
             let took = now.instant.saturating_duration_since(sent);
-            self.desk.acknowledged(note.location.incarnation(), took);
+            self.table.acknowledged(note.location.incarnation(), took);
         }
         let again = note.until.is_some_and(|until| now.instant < until);
         let again = again && !arrived && self.notes.len() < MAX_LATE_NOTES;
         if !again || matches!(conclusion, Conclusion::Answered(_)) {
-            self.desk.note_ended(&note);
+            self.table.note_ended(&note);
         }
         if note.parcel.body == Body::Predecessor && is_denied(&conclusion) {
             let Parcel {
@@ -656,13 +657,13 @@ impl Core {
             } = note.parcel;
             if let Some(lane) = self.lane_of(stream, &note.parcel.receiver) {
                 let letter = (stream.receiver, sequence, transfer);
-                self.with_lane(now, lane, |lane, desk| {
-                    lane.custodian_denied(now.instant, letter, desk);
+                self.with_lane(now, lane, |lane, table| {
+                    lane.custodian_denied(now.instant, letter, table);
                 });
             }
             return;
         }
-        // Other notes that are lost are made up for by the pauses of those they are for.
+        // Other lost notes are compensated by the pauses of the lanes that they are for.
         if again {
             let pause = FIRST_NOTE_PAUSE.saturating_mul(1 << note.tries.min(10));
             let due = now.instant + pause.min(LONGEST_NOTE_PAUSE);
@@ -673,43 +674,44 @@ impl Core {
 
     fn handle_late_note(&mut self, now: Now, late: Late) {
         match late {
-            Late::Again(note) => self.desk.note(*note),
+            Late::Again(note) => self.table.note(*note),
             Late::Check(attempt) => {
-                if let Some(Purpose::Note(note)) = self.desk.attempts.remove(&attempt) {
+                if let Some(Purpose::Note(note)) = self.table.attempts.remove(&attempt) {
                     let kind = note.location.kind();
                     let error = WayError::new(WayFault::TimedOut, "");
-                    self.desk.abandon(kind, attempt, error.clone());
+                    self.table.abandon(kind, attempt, error.clone());
                     self.note_concluded(now, *note, Conclusion::Unconfirmed(error));
                 }
             }
         }
     }
 
-    /// Something in the directory has changed.
+    /// Handles a change of the directory.
     pub fn handle_directory_change(&mut self, now: Now) {
         for lane in self.lanes_in_order() {
-            self.with_lane(now, lane, |lane, desk| {
+            self.with_lane(now, lane, |lane, table| {
                 if !lane.is_empty() {
-                    lane.directory_changed(now.instant, desk);
+                    lane.directory_changed(now.instant, table);
                 }
             });
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
-    /// This entry has left the directory, or its name has another one now. Comes before
-    /// [`handle_directory_change`](Self::handle_directory_change). For half a minute a gateway
-    /// answers letters for an agent that has left its host with [`Answer::Moved`].
+    /// Handles an entry that left the directory or was replaced by another of the same name. Must
+    /// be called before [`handle_directory_change`](Self::handle_directory_change). For 30 s a
+    /// gateway answers letters for an agent that left its host with [`Answer::Moved`].
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
-        if self.desk.config.forwards {
-            self.desk.departed.left(now.instant, entry);
+        if self.table.config.forwards {
+            self.table.departed.left(now.instant, entry);
             self.principals.left(entry);
         }
     }
 
-    /// Time has passed: call this when [`poll_timeout`](Self::poll_timeout) says so.
+    /// Handles elapsed time; call it at the time that [`poll_timeout`](Self::poll_timeout) returns.
     pub fn handle_timeout(&mut self, now: Now) {
-        // Taken first: work on a lane may set its timer again, and never for this call.
+        // Collected first, because work on a lane may set its timer again; that one is for a later
+        // call.
         let mut lanes = Vec::new();
         while let Some(Reverse((due, id))) = self.timers.peek().copied() {
             if due > now.instant {
@@ -724,7 +726,7 @@ impl Core {
             }
         }
         for id in lanes {
-            self.with_lane(now, id, |lane, desk| lane.pump(now.instant, desk));
+            self.with_lane(now, id, |lane, table| lane.pump(now.instant, table));
         }
         let mut notes = Vec::new();
         while self
@@ -737,39 +739,39 @@ impl Core {
         for Reverse(LateNote(_, late)) in notes {
             self.handle_late_note(now, late);
         }
-        self.peers.handle_timeout(now.instant, &mut self.desk);
+        self.peers.handle_timeout(now.instant, &mut self.table);
         self.failure_limit.handle_timeout(now.instant);
-        self.tell_failures(now);
+        self.send_failures(now);
         self.forget_idle_lanes(now);
     }
 
-    /// Uses these orders of transports from now on, for letters that wait as well. What is under
-    /// way stays so.
+    /// Replaces the orders of transports, also for waiting letters. Attempts in progress are not
+    /// affected.
     pub fn reorder(&mut self, now: Now, order: Vec<Kind>, routes: Vec<(Pattern, Vec<Kind>)>) {
-        self.desk.config.order = order;
-        self.desk.config.routes = routes;
-        self.peers.reorder(now.instant, &mut self.desk);
+        self.table.config.order = order;
+        self.table.config.routes = routes;
+        self.peers.reorder(now.instant, &mut self.table);
         self.handle_directory_change(now);
     }
 
-    /// Takes no more letters of others into custody: the service is about to end. Whoever has one
-    /// keeps it, and looks for another way or another gateway.
+    /// Stops taking letters of others into custody, because the service is about to end. Services
+    /// that hold such a letter keep it, and try another route or gateway.
     pub fn refuse_custody(&mut self) {
         self.ending = true;
     }
 
-    /// Keeps in touch with these services, and no others, from now on.
+    /// Sets the services to keep in touch with.
     pub fn keep_in_touch(&mut self, now: Now, peers: Vec<Peer>) {
-        self.peers.set(now.instant, peers, &mut self.desk);
+        self.peers.set(now.instant, peers, &mut self.table);
     }
 
-    /// How it stands with the services to keep in touch with.
+    /// Returns the state of contact with each of these services.
     #[must_use]
     pub fn peers(&self, now: Now) -> Vec<PeerState> {
         self.peers.states(now.instant)
     }
 
-    /// A connection that was opened for this location has ended.
+    /// Handles the end of a connection that was opened for this location.
     pub fn handle_parted(&mut self, now: Now, peer: &Introduction) {
         self.principals.parted(peer);
         if let Some(dialled) = &peer.dialled {
@@ -784,8 +786,8 @@ impl Core {
         self.principals.accepts(peer)
     }
 
-    /// A service has introduced itself on a connection. From now on its incarnation belongs to what the
-    /// link proves, and what failed on routes to it before may work.
+    /// Handles the introduction of a service on a connection. Its incarnation now belongs to the
+    /// principal that the link proves, and failed routes to it may work again.
     pub fn handle_introduced(&mut self, now: Now, peer: &Introduction) {
         self.principals.introduced(peer);
         let service = peer.hop.location.incarnation();
@@ -794,36 +796,36 @@ impl Core {
         }
     }
 
-    /// The network of this host has changed, or this service has opened a connection: what failed
-    /// before may work now. Failures of routes to the service, or of all routes without one, are
-    /// forgotten, and what waits because of them is sent at once.
+    /// Handles a change of this host's network, or a connection that this service has opened. Drops
+    /// the recorded failures of routes to the service, or of all routes if `service` is `None`, and
+    /// dispatches the letters that wait because of them.
     pub fn handle_reachable(&mut self, now: Now, service: Option<Incarnation>) {
         let is_meant = |location: &Location| service.is_none_or(|it| it == location.incarnation());
-        self.desk.forget_failures(is_meant);
+        self.table.forget_failures(is_meant);
         if service.is_none() {
-            self.peers.ask_again(now.instant, &mut self.desk);
+            self.peers.ask_again(now.instant, &mut self.table);
         }
         for lane in self.lanes_in_order() {
-            self.with_lane(now, lane, |lane, desk| {
-                if lane.is_paused_towards(desk, is_meant) {
-                    lane.resume(now.instant, desk);
+            self.with_lane(now, lane, |lane, table| {
+                if lane.is_paused_towards(table, is_meant) {
+                    lane.resume(now.instant, table);
                 }
             });
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
-    /// Opens connections to these locations, for peers that are to be told where this service is
-    /// now: dispatches a credit that no lane waits for to each. Nothing is repeated.
+    /// Opens connections to these locations, to announce the current locations of this service to
+    /// them: dispatches one credit to each, which no lane waits for. It is not repeated.
     pub fn greet(&mut self, services: Vec<(Arc<str>, Location)>) {
         for (name, location) in services {
-            let nobodys = Stream {
+            let no_stream = Stream {
                 sender: Incarnation::UNKNOWN,
                 receiver: Incarnation::UNKNOWN,
             };
-            self.desk.note(Note {
+            self.table.note(Note {
                 location,
-                parcel: desk::note_parcel(nobodys, name, 0, Body::Credit),
+                parcel: attempts::note_parcel(no_stream, name, 0, Body::Credit),
                 tries: 0,
                 sent: None,
                 until: None,
@@ -854,7 +856,7 @@ impl Core {
         });
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called next.
+    /// Time of the next call of [`handle_timeout`](Self::handle_timeout).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
@@ -863,32 +865,31 @@ impl Core {
         others.into_iter().chain([lanes, notes]).flatten().min()
     }
 
-    /// The next thing to be done.
+    /// Returns the next action to perform.
     pub fn poll_action(&mut self) -> Option<Action> {
-        self.desk.actions.pop_front()
+        self.table.actions.pop_front()
     }
 
-    /// Whether any letter sent or taken into custody here still has no outcome.
+    /// Whether any letter that was sent or taken into custody here has no outcome yet.
     #[must_use]
     pub fn has_open_letters(&self) -> bool {
         self.lanes.values().any(|lane| !lane.is_empty())
     }
 
-    /// Gives up everything that is under way: the service ends, and whatever is sent from now on
-    /// fails as closed. Outcomes are among the actions, and follow from the conclusions of the
-    /// attempts that are abandoned.
+    /// Abandons all open letters, because the service ends; later submissions fail as closed.
+    /// Outcomes are among the actions, and follow from the conclusions of the abandoned attempts.
     pub fn give_up(&mut self, now: Now) {
         self.closed = true;
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {
-                lane.give_up(now.instant, &mut self.desk);
+                lane.give_up(now.instant, &mut self.table);
             }
         }
-        self.desk.undelivered.clear();
+        self.table.undelivered.clear();
     }
 }
 
-/// Whether a custodian that was asked does not have the letter, or is not there.
+/// Whether the custodian answered that it does not have the letter, or is gone.
 fn is_denied(conclusion: &Conclusion) -> bool {
     match conclusion {
         Conclusion::Answered(Answer::Returned { .. }) => true,
@@ -897,14 +898,14 @@ fn is_denied(conclusion: &Conclusion) -> bool {
     }
 }
 
-/// The lane for letters that this process sends to a receiver.
+/// Key of the lane for letters that this process sends to this receiver.
 fn own_lane(sender: Incarnation, entry: &Entry) -> LaneKey {
     match entry.role {
         Role::Agent => LaneKey::Name(sender, Arc::clone(&entry.name)),
-        // Services may share a name.
+        // Several services may have the same name.
         _ => LaneKey::Service(Stream {
             sender,
-            receiver: desk::life_of(entry),
+            receiver: attempts::registration_of(entry),
         }),
     }
 }

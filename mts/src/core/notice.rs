@@ -1,4 +1,4 @@
-//! What a watched core tells of the letters that pass it: see [`Core::watch`](super::Core::watch).
+//! Notifications about letters from a watched core: see [`Core::watch`](super::Core::watch).
 
 use std::sync::Arc;
 
@@ -7,45 +7,45 @@ use fipa_transport::{Kind, Outcome, Stream};
 
 use super::SendId;
 
-/// Something that has just happened to a letter here, on its way to one receiver.
+/// An event of a letter to one receiver.
 ///
-/// Stream and sequence are the same wherever the letter passes: the sender's life and the sequence
-/// tell it from all others.
+/// Stream and sequence number are the same at every point of the route: the sender's incarnation
+/// and the sequence number identify the letter.
 #[derive(Debug, Clone)]
 pub struct Notice {
     /// The stream of the letter.
     pub stream: Stream,
-    /// Its position among all that the sender sends.
+    /// Sequence number among all letters of the sender.
     pub sequence: u64,
-    /// The name of the receiver.
+    /// Name of the receiver.
     pub receiver: Arc<str>,
-    /// What has happened.
+    /// The event.
     pub news: News,
 }
 
-/// What happens to letters.
+/// An event of a letter.
 #[derive(Debug, Clone)]
 pub enum News {
-    /// It begins its way here: an agent of this process sends it, or this service on behalf of
-    /// somebody who cannot be watched (an old peer) or of itself (failure messages). Comes before
-    /// the letter leaves.
+    /// An agent of this process sends it, or this service does: on behalf of a legacy peer, which
+    /// cannot be watched, or in its own name (failure messages). Precedes the first attempt.
     Sent {
-        /// The call of [`Core::send`](super::Core::send), when there was one: letters with the
-        /// same one are one message to several receivers.
+        /// The call of [`Core::send`](super::Core::send), if any: letters of one call carry one
+        /// message to several receivers.
         send: Option<SendId>,
         /// The letter.
         letter: Letter,
     },
-    /// It was put into the queue of an agent of this process.
+    /// It was added to the queue of an agent of this process.
     Taken {
-        /// How it came on its last stretch; none for what this process itself tells the agent.
+        /// Transport of the last hop; `None` for letters that this process itself sends to the
+        /// agent.
         via: Option<Kind>,
         /// The letter.
         letter: Letter,
     },
     /// This gateway has taken it into custody.
     Passed {
-        /// How it came.
+        /// Transport by which it arrived.
         via: Kind,
         /// Whether it came from another host.
         remote: bool,
@@ -54,10 +54,10 @@ pub enum News {
     },
     /// It has an outcome.
     Settled {
-        /// What became of it.
+        /// The outcome.
         outcome: Outcome,
-        /// Whether this is what the sender is told; else what a gateway knows, which is told to
-        /// the sender.
+        /// Whether this is the outcome reported to the sender; otherwise it is the outcome at a
+        /// gateway, which reports it towards the sender.
         sender: bool,
     },
 }

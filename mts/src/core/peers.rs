@@ -1,12 +1,12 @@
-//! Static peers: message transport services that the configuration names, and that this one keeps
-//! in touch with before any letter needs it.
+//! Static peers: message transport services in the configuration, with which this service keeps in
+//! touch before any letter needs them.
 //!
-//! Being in touch means that a parcel without consequences (a credit that no lane waits for) was
-//! answered a moment ago. Asking opens the connection, keeps it from being closed as idle, and
-//! notices when it leads nowhere any more; the transport tells which service is at its other end.
+//! Being in touch means that a parcel without effect (a credit that no lane waits for) was recently
+//! answered. The check opens the connection, keeps it from being closed as idle, and detects when
+//! it is dead; the transport learns which service is at the other end.
 //!
-//! All locations of a peer are asked at the same time until one answers, so that addresses at which
-//! no host is (a peer may be listed with several, and have one of them) delay nothing.
+//! All locations of a peer are checked concurrently until one answers, so that addresses without a
+//! host (a peer may be listed with several, and have only one of them) cause no delay.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,14 +15,14 @@ use fipa_transport::{
     AttemptId, Body, Conclusion, Incarnation, Location, Signature, Stream, WayError, WayFault,
 };
 
-use super::desk::{Desk, Purpose, note_parcel};
+use super::attempts::{AttemptTable, Purpose, note_parcel};
 
-/// A message transport service that the configuration names.
+/// A message transport service in the configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Peer {
-    /// What it is called here.
+    /// Its name in the configuration.
     pub name: Arc<str>,
-    /// Where it may be found. Who is there is not known before it was asked.
+    /// Its possible locations. The service there is unknown until it answers.
     pub locations: Vec<Location>,
 }
 
@@ -31,51 +31,51 @@ pub struct Peer {
 pub struct PeerState {
     /// The peer.
     pub peer: Peer,
-    /// Where it answered last, if it still does.
+    /// The location that answered last, if it still does.
     pub answers: Option<Location>,
-    /// Why it did not answer, for each location since it last did.
+    /// The error of each location since a location last answered.
     pub failures: Vec<(Location, WayError)>,
-    /// How often in a row it could not be found at any of its locations.
+    /// Number of consecutive rounds in which no location answered.
     pub rounds: u32,
-    /// How long until it is asked again; none while an answer is awaited.
+    /// Time until the next check; `None` while an answer is awaited.
     pub asked_again_in: Option<Duration>,
 }
 
-/// How often a peer that answers is asked.
+/// Interval of checks of a peer that answers.
 const KEEP: Duration = Duration::from_secs(5);
-/// Pauses before a location is asked again that did not answer.
+/// Backoff before a location that did not answer is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// Pause before asking again when a connection with the peer has ended.
+/// Pause before a check after a connection with the peer has ended.
 const PARTED_PAUSE: Duration = Duration::from_millis(200);
 
 /// The static peers of a service.
 #[derive(Debug, Default)]
 pub(super) struct Peers {
-    all: Vec<Watched>,
+    all: Vec<StaticPeer>,
     next: u64,
-    /// The earliest of their times.
+    /// The earliest time of all peers.
     due: Option<Instant>,
 }
 
 #[derive(Debug)]
-struct Watched {
+struct StaticPeer {
     id: u64,
     peer: Peer,
     /// Its locations in the order of the configuration's transports.
-    ways: Vec<Way>,
-    /// Where the peer answers. No other location is asked meanwhile.
+    candidates: Vec<PeerLocation>,
+    /// The location that answers. No other location is checked meanwhile.
     answers: Option<Location>,
 }
 
 /// A location of a peer.
 #[derive(Debug)]
-struct Way {
+struct PeerLocation {
     location: Location,
     state: State,
-    /// Failures in a row.
+    /// Number of consecutive failures.
     failures: u32,
-    /// Why it did not answer, since the peer last did at any of its locations.
+    /// Its latest error since a location of the peer last answered.
     error: Option<WayError>,
     last_asked: Option<Instant>,
 }
@@ -87,230 +87,264 @@ enum State {
 }
 
 impl Peers {
-    /// Keeps in touch with these from now on. Those that were there before stay as they are.
-    pub(super) fn set(&mut self, now: Instant, peers: Vec<Peer>, desk: &mut Desk) {
+    /// Replaces the list of peers. Peers on both lists keep their state.
+    pub(super) fn set(&mut self, now: Instant, peers: Vec<Peer>, table: &mut AttemptTable) {
         let mut before = std::mem::take(&mut self.all);
         for peer in peers {
-            let same = before.iter().position(|watched| watched.peer == peer);
-            let mut watched = match same {
+            let same = before
+                .iter()
+                .position(|static_peer| static_peer.peer == peer);
+            let mut static_peer = match same {
                 Some(index) => before.swap_remove(index),
                 None => {
                     self.next += 1;
-                    Watched::new(self.next, peer)
+                    StaticPeer::new(self.next, peer)
                 }
             };
-            watched.order(now, desk);
-            self.all.push(watched);
+            static_peer.order(now, table);
+            self.all.push(static_peer);
         }
         for gone in before {
-            gone.ways.into_iter().for_each(|way| way.give_up(desk));
+            gone.candidates
+                .into_iter()
+                .for_each(|candidate| candidate.give_up(table));
         }
-        self.ask_those_due(now, desk);
+        self.ask_those_due(now, table);
     }
 
-    /// The order of transports has changed.
-    pub(super) fn reorder(&mut self, now: Instant, desk: &mut Desk) {
-        for watched in &mut self.all {
-            watched.order(now, desk);
+    /// Applies a new order of transports.
+    pub(super) fn reorder(&mut self, now: Instant, table: &mut AttemptTable) {
+        for static_peer in &mut self.all {
+            static_peer.order(now, table);
         }
-        self.ask_those_due(now, desk);
+        self.ask_those_due(now, table);
     }
 
-    /// A connection that had been opened for this location has ended.
+    /// Handles the end of a connection that was opened for this location.
     pub(super) fn parted(&mut self, now: Instant, location: &Location) {
-        let ways = self.all.iter_mut().flat_map(|watched| &mut watched.ways);
-        for way in ways.filter(|way| way.location == *location) {
-            let soon = way.last_asked.map_or(now, |asked| asked + PARTED_PAUSE);
-            way.ask_by(soon.max(now));
+        let candidates = self
+            .all
+            .iter_mut()
+            .flat_map(|static_peer| &mut static_peer.candidates);
+        for candidate in candidates.filter(|candidate| candidate.location == *location) {
+            let soon = candidate
+                .last_asked
+                .map_or(now, |asked| asked + PARTED_PAUSE);
+            candidate.ask_by(soon.max(now));
         }
-        self.look_ahead();
+        self.update_due();
     }
 
-    /// The network of this host has changed: peers that did not answer are asked at once.
-    pub(super) fn ask_again(&mut self, now: Instant, desk: &mut Desk) {
-        let ways = self.all.iter_mut().flat_map(|watched| &mut watched.ways);
-        for way in ways {
-            way.failures = 0;
-            way.ask_by(now);
+    /// Checks all peers at once, because this host's network has changed.
+    pub(super) fn ask_again(&mut self, now: Instant, table: &mut AttemptTable) {
+        let candidates = self
+            .all
+            .iter_mut()
+            .flat_map(|static_peer| &mut static_peer.candidates);
+        for candidate in candidates {
+            candidate.failures = 0;
+            candidate.ask_by(now);
         }
-        self.ask_those_due(now, desk);
+        self.ask_those_due(now, table);
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// Time of the next call of [`handle_timeout`](Self::handle_timeout).
     pub(super) fn due(&self) -> Option<Instant> {
         self.due
     }
 
-    pub(super) fn handle_timeout(&mut self, now: Instant, desk: &mut Desk) {
+    pub(super) fn handle_timeout(&mut self, now: Instant, table: &mut AttemptTable) {
         if self.due.is_none_or(|due| due > now) {
             return;
         }
-        for watched in &mut self.all {
-            for index in 0..watched.ways.len() {
-                let Some(way) = watched.ways.get(index) else {
+        for static_peer in &mut self.all {
+            for index in 0..static_peer.candidates.len() {
+                let Some(candidate) = static_peer.candidates.get(index) else {
                     break;
                 };
-                if let State::Asked { attempt, until } = way.state
+                if let State::Asked { attempt, until } = candidate.state
                     && until <= now
                 {
-                    desk.drop_attempt(way.location.kind(), attempt);
-                    watched.failed(now, index, WayError::new(WayFault::TimedOut, ""));
+                    table.drop_attempt(candidate.location.kind(), attempt);
+                    static_peer.failed(now, index, WayError::new(WayFault::TimedOut, ""));
                 }
             }
         }
-        self.ask_those_due(now, desk);
+        self.ask_those_due(now, table);
     }
 
-    /// The conclusion of asking one of them.
+    /// Handles the conclusion of a check.
     pub(super) fn concluded(
         &mut self,
         now: Instant,
         (peer, attempt): (u64, AttemptId),
         conclusion: Conclusion,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
-        let Some(watched) = self.all.iter_mut().find(|watched| watched.id == peer) else {
+        let Some(static_peer) = self
+            .all
+            .iter_mut()
+            .find(|static_peer| static_peer.id == peer)
+        else {
             return;
         };
-        let is_asked = |way: &Way| matches!(way.state, State::Asked { attempt: asked, .. } if asked == attempt);
-        let Some(index) = watched.ways.iter().position(is_asked) else {
+        let is_asked = |candidate: &PeerLocation| matches!(candidate.state, State::Asked { attempt: asked, .. } if asked == attempt);
+        let Some(index) = static_peer.candidates.iter().position(is_asked) else {
             return;
         };
         match conclusion {
             Conclusion::NotSent(error) | Conclusion::Unconfirmed(error) => {
-                watched.failed(now, index, error);
+                static_peer.failed(now, index, error);
             }
-            // Any answer shows that the peer is there.
-            _ => watched.answered(now, index),
+            // Any answer shows that the peer is reachable.
+            _ => static_peer.answered(now, index),
         }
-        self.ask_those_due(now, desk);
+        self.ask_those_due(now, table);
     }
 
     pub(super) fn states(&self, now: Instant) -> Vec<PeerState> {
-        self.all.iter().map(|watched| watched.tell(now)).collect()
+        self.all
+            .iter()
+            .map(|static_peer| static_peer.state(now))
+            .collect()
     }
 
-    fn ask_those_due(&mut self, now: Instant, desk: &mut Desk) {
-        for watched in &mut self.all {
-            watched.ask_those_due(now, desk);
+    fn ask_those_due(&mut self, now: Instant, table: &mut AttemptTable) {
+        for static_peer in &mut self.all {
+            static_peer.ask_those_due(now, table);
         }
-        self.look_ahead();
+        self.update_due();
     }
 
-    fn look_ahead(&mut self) {
-        self.due = self.all.iter().filter_map(Watched::due).min();
+    fn update_due(&mut self) {
+        self.due = self.all.iter().filter_map(StaticPeer::due).min();
     }
 }
 
-impl Watched {
+impl StaticPeer {
     fn new(id: u64, peer: Peer) -> Self {
         Self {
             id,
             peer,
-            ways: Vec::new(),
+            candidates: Vec::new(),
             answers: None,
         }
     }
 
-    /// Brings the ways into the order of transports, which may have changed.
-    fn order(&mut self, now: Instant, desk: &mut Desk) {
-        let mut before = std::mem::take(&mut self.ways);
-        let order = desk.config.order.iter();
+    /// Sorts the locations by the order of transports, which may have changed.
+    fn order(&mut self, now: Instant, table: &mut AttemptTable) {
+        let mut before = std::mem::take(&mut self.candidates);
+        let order = table.config.order.iter();
         let listed = order.flat_map(|kind| {
             let all = self.peer.locations.iter();
-            // Legacy peers understand nothing but letters.
+            // Legacy peers accept only letters.
             all.filter(move |location| {
                 location.kind() == *kind && location.signature() == Signature::Frames
             })
         });
         for location in listed {
-            let known = before.iter().position(|way| way.location == *location);
-            self.ways.push(match known {
+            let known = before
+                .iter()
+                .position(|candidate| candidate.location == *location);
+            self.candidates.push(match known {
                 Some(index) => before.swap_remove(index),
-                None => Way::new(now, location.clone()),
+                None => PeerLocation::new(now, location.clone()),
             });
         }
         for gone in before {
             self.answers.take_if(|at| *at == gone.location);
-            gone.give_up(desk);
+            gone.give_up(table);
         }
     }
 
-    /// Whether this way is asked now and then: all are until one answers.
-    fn is_of_use(&self, way: &Way) -> bool {
-        self.answers.as_ref().is_none_or(|at| *at == way.location)
+    /// Whether this location is checked: all are until one answers.
+    fn is_of_use(&self, candidate: &PeerLocation) -> bool {
+        self.answers
+            .as_ref()
+            .is_none_or(|at| *at == candidate.location)
     }
 
     fn due(&self) -> Option<Instant> {
-        let due = |way: &Way| match way.state {
-            State::AskAt(at) => self.is_of_use(way).then_some(at),
+        let due = |candidate: &PeerLocation| match candidate.state {
+            State::AskAt(at) => self.is_of_use(candidate).then_some(at),
             State::Asked { until, .. } => Some(until),
         };
-        self.ways.iter().filter_map(due).min()
+        self.candidates.iter().filter_map(due).min()
     }
 
-    fn ask_those_due(&mut self, now: Instant, desk: &mut Desk) {
+    fn ask_those_due(&mut self, now: Instant, table: &mut AttemptTable) {
         let (id, name, answers) = (self.id, &self.peer.name, &self.answers);
-        let of_use = |way: &&mut Way| answers.as_ref().is_none_or(|at| *at == way.location);
-        for way in self.ways.iter_mut().filter(of_use) {
-            if matches!(way.state, State::AskAt(at) if at <= now) {
-                way.ask(now, (id, name), desk);
+        let of_use = |candidate: &&mut PeerLocation| {
+            answers.as_ref().is_none_or(|at| *at == candidate.location)
+        };
+        for candidate in self.candidates.iter_mut().filter(of_use) {
+            if matches!(candidate.state, State::AskAt(at) if at <= now) {
+                candidate.ask(now, (id, name), table);
             }
         }
     }
 
     fn answered(&mut self, now: Instant, index: usize) {
-        let Some(way) = self.ways.get_mut(index) else {
+        let Some(candidate) = self.candidates.get_mut(index) else {
             return;
         };
         if self.answers.is_none() {
-            tracing::info!(peer = %self.peer.name, at = %way.location, "in touch");
+            tracing::info!(peer = %self.peer.name, at = %candidate.location, "the static peer answers");
         }
-        way.state = State::AskAt(now + KEEP);
-        self.answers = Some(way.location.clone());
-        for way in &mut self.ways {
-            way.failures = 0;
-            way.error = None;
+        candidate.state = State::AskAt(now + KEEP);
+        self.answers = Some(candidate.location.clone());
+        for candidate in &mut self.candidates {
+            candidate.failures = 0;
+            candidate.error = None;
         }
     }
 
     fn failed(&mut self, now: Instant, index: usize, error: WayError) {
-        let Some(way) = self.ways.get_mut(index) else {
+        let Some(candidate) = self.candidates.get_mut(index) else {
             return;
         };
-        let parted = self.answers.take_if(|at| *at == way.location).is_some();
-        if parted || way.failures == 0 && self.answers.is_none() {
-            tracing::info!(peer = %self.peer.name, at = %way.location, %error, "not in touch");
+        let parted = self
+            .answers
+            .take_if(|at| *at == candidate.location)
+            .is_some();
+        if parted || candidate.failures == 0 && self.answers.is_none() {
+            tracing::info!(peer = %self.peer.name, at = %candidate.location, %error, "the static peer does not answer");
         }
-        let pause = FIRST_PAUSE.saturating_mul(1 << way.failures.min(10));
-        way.state = State::AskAt(now + pause.min(LONGEST_PAUSE));
-        way.failures = way.failures.saturating_add(1);
+        let pause = FIRST_PAUSE.saturating_mul(1 << candidate.failures.min(10));
+        candidate.state = State::AskAt(now + pause.min(LONGEST_PAUSE));
+        candidate.failures = candidate.failures.saturating_add(1);
         if self.answers.is_none() {
-            way.error = Some(error);
+            candidate.error = Some(error);
         }
         if parted {
-            let others = self.ways.iter_mut().enumerate();
+            let others = self.candidates.iter_mut().enumerate();
             others
                 .filter(|(other, _)| *other != index)
-                .for_each(|(_, way)| way.ask_by(now));
+                .for_each(|(_, candidate)| candidate.ask_by(now));
         }
     }
 
-    fn tell(&self, now: Instant) -> PeerState {
-        let failed = |way: &Way| Some((way.location.clone(), way.error.clone()?));
-        let awaited = |way: &Way| matches!(way.state, State::Asked { .. });
-        let due = self.due().filter(|_| !self.ways.iter().any(awaited));
+    fn state(&self, now: Instant) -> PeerState {
+        let failed =
+            |candidate: &PeerLocation| Some((candidate.location.clone(), candidate.error.clone()?));
+        let awaited = |candidate: &PeerLocation| matches!(candidate.state, State::Asked { .. });
+        let due = self.due().filter(|_| !self.candidates.iter().any(awaited));
         PeerState {
             peer: self.peer.clone(),
             answers: self.answers.clone(),
-            failures: self.ways.iter().filter_map(failed).collect(),
-            rounds: self.ways.iter().map(|way| way.failures).min().unwrap_or(0),
+            failures: self.candidates.iter().filter_map(failed).collect(),
+            rounds: self
+                .candidates
+                .iter()
+                .map(|candidate| candidate.failures)
+                .min()
+                .unwrap_or(0),
             asked_again_in: due.map(|due| due.saturating_duration_since(now)),
         }
     }
 }
 
-impl Way {
+impl PeerLocation {
     fn new(now: Instant, location: Location) -> Self {
         Self {
             location,
@@ -321,33 +355,33 @@ impl Way {
         }
     }
 
-    /// Is asked at this time at the latest, unless an answer is awaited.
+    /// Schedules a check for this time at the latest, unless an answer is awaited.
     fn ask_by(&mut self, time: Instant) {
         if let State::AskAt(at) = &mut self.state {
             *at = time.min(*at);
         }
     }
 
-    fn ask(&mut self, now: Instant, (peer, name): (u64, &Arc<str>), desk: &mut Desk) {
+    fn ask(&mut self, now: Instant, (peer, name): (u64, &Arc<str>), table: &mut AttemptTable) {
         let no_stream = Stream {
             sender: Incarnation::UNKNOWN,
             receiver: Incarnation::UNKNOWN,
         };
         let parcel = note_parcel(no_stream, Arc::clone(name), 0, Body::Credit);
-        let attempt = desk.next_attempt();
-        let purpose = Purpose::Touch { peer };
-        desk.dispatch(attempt, purpose, self.location.clone(), parcel);
+        let attempt = table.next_attempt();
+        let purpose = Purpose::PeerCheck { peer };
+        table.dispatch(attempt, purpose, self.location.clone(), parcel);
         self.last_asked = Some(now);
         self.state = State::Asked {
             attempt,
-            // Opening a connection may take longer than an answer on one that is there.
-            until: now + desk.config.attempt_timeout * 3,
+            // Opening a connection may take longer than an answer on an open one.
+            until: now + table.config.attempt_timeout * 3,
         };
     }
 
-    fn give_up(self, desk: &mut Desk) {
+    fn give_up(self, table: &mut AttemptTable) {
         if let State::Asked { attempt, .. } = self.state {
-            desk.drop_attempt(self.location.kind(), attempt);
+            table.drop_attempt(self.location.kind(), attempt);
         }
     }
 }

@@ -1,9 +1,9 @@
-//! Which principal a service or a registration of an agent belongs to.
+//! Principals of services and of agents' registrations.
 //!
-//! A parcel names the service that handed it over, and the registration of the agent that sent it. Both
-//! names are public, so they count only as far as the link proves them: a service belongs to the
-//! [principal](Principal) that introduced itself with its incarnation, and an agent to the principal of
-//! its gateway. Without keys all services of other hosts are one principal.
+//! A parcel names the service that handed it over, and the registration of the agent that sent it.
+//! Both names are public, so they count only as far as the link proves them: a service belongs to
+//! the [principal](Principal) that introduced itself with its incarnation, and an agent to the
+//! principal of its gateway. Without keys, all services of other hosts are one principal.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -13,11 +13,11 @@ use fipa_transport::{Hop, Incarnation, Introduction, Principal};
 
 use crate::Map;
 
-/// Services that are remembered, at most. Of those without a connection the one that was first
-/// connected is forgotten first.
+/// Maximum number of services. Of those without a connection, the earliest connected is evicted
+/// first.
 const MAX_SERVICES: usize = 4096;
-/// Registrations that are remembered for one principal, at most: who invents senders makes this service
-/// forget no senders of others.
+/// Maximum number of registrations of one principal: a principal that invents senders evicts only
+/// its own.
 const MAX_SENDERS: usize = 4096;
 
 /// The services and senders of other hosts.
@@ -26,8 +26,8 @@ pub(super) struct Principals {
     services: Map<Incarnation, Service>,
     /// The services in the order in which they were first connected.
     order: VecDeque<Incarnation>,
-    /// Senders that the directory did not know when they first wrote,
-    /// and those that have left it; none for one whose gateway was never connected.
+    /// Senders that were not in the directory when their first letter came, and those that left it;
+    /// `None` for one whose gateway was never connected.
     senders: Map<Incarnation, Option<Principal>>,
     heard: Map<Option<Principal>, VecDeque<Incarnation>>,
 }
@@ -36,28 +36,28 @@ pub(super) struct Principals {
 struct Service {
     principal: Principal,
     name: Arc<str>,
-    /// Connections that are open with it.
+    /// Number of open connections with it.
     connections: usize,
 }
 
-/// Why a parcel is refused.
+/// Reason for refusing a parcel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Impostor {
+pub(super) enum PrincipalError {
     /// The service of the link belongs to another principal.
-    #[error("another service has proved to be the one that this link names")]
+    #[error("another service has already proved the incarnation that this link claims")]
     Service,
-    /// The gateway of the sender has not introduced itself yet, so it is not this one as far as is
-    /// known. No final answer.
+    /// The gateway of the sender has not introduced itself yet, so it is not known to be this one.
+    /// The answer is not final.
     #[error("the gateway of the sender has not introduced itself yet")]
-    Stranger,
+    NotIntroduced,
     /// The sender belongs to another principal.
     #[error("the link does not prove to speak for the sender of this letter")]
     Sender,
 }
 
 impl Principals {
-    /// A service has introduced itself on a connection. It keeps its principal while it is connected;
-    /// later a service of the same name may have renewed its certificate.
+    /// Handles the introduction of a service on a connection. The service keeps its principal while
+    /// it is connected; afterwards, a service of the same name may have renewed its certificate.
     pub(super) fn introduced(&mut self, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         if !peer.hop.is_remote() || !incarnation.is_known() {
@@ -98,7 +98,7 @@ impl Principals {
         !self.senders.get(&incarnation).is_some_and(of_others)
     }
 
-    /// A connection with this service has ended.
+    /// Handles the end of a connection with this service.
     pub(super) fn parted(&mut self, peer: &Introduction) {
         let service = self.services.get_mut(&peer.hop.location.incarnation());
         if let Some(service) = service.filter(|it| it.principal == peer.hop.principal) {
@@ -120,45 +120,47 @@ impl Principals {
         }
     }
 
-    /// Whether the link proves the service that it names. Every parcel is asked for this.
-    pub(super) fn check_service(&self, from: &Hop) -> Result<(), Impostor> {
-        // A process of this user may say what it likes.
+    /// Checks whether the link proves the service that it names; called for every parcel.
+    pub(super) fn check_service(&self, from: &Hop) -> Result<(), PrincipalError> {
+        // Processes of this user are trusted.
         if !from.is_remote() {
             return Ok(());
         }
         let known = self.services.get(&from.location.incarnation());
         match known {
-            Some(known) if known.principal != from.principal => Err(Impostor::Service),
+            Some(known) if known.principal != from.principal => Err(PrincipalError::Service),
             _ => Ok(()),
         }
     }
 
-    /// Whether the link may carry letters of this sender. The directory decides where it knows the
-    /// sender; else the link on which the sender was first heard.
+    /// Checks whether the link may carry letters of this sender. If the directory has the sender,
+    /// its gateway's principal decides; otherwise the link of the sender's first letter.
     pub(super) fn check_sender(
         &mut self,
         sender: Incarnation,
         from: &Hop,
         directory: &dyn Directory,
-    ) -> Result<(), Impostor> {
+    ) -> Result<(), PrincipalError> {
         if !from.is_remote() || !sender.is_known() {
             return Ok(());
         }
         let known = directory.known_incarnation(sender);
-        // The letters of a service itself come on links of its own only. A service that introduces
-        // itself with the registration of an agent takes nothing from that agent.
+        // Letters of a service itself come only on its own links. A service that introduces itself
+        // with the registration of an agent takes nothing from that agent.
         let is_agent = known.as_ref().is_some_and(|it| it.role == Role::Agent);
         if !is_agent && self.services.contains_key(&sender) && sender != from.location.incarnation()
         {
-            return Err(Impostor::Sender);
+            return Err(PrincipalError::Sender);
         }
         let owner = match known.map(|it| it.reach) {
             Some(Reach::Local) => Some(Principal::Host),
             Some(Reach::Remote { gateway }) => match self.services.get(&gateway) {
                 Some(gateway) => Some(gateway.principal),
-                // The gateway introduces itself before it hands letters over. It may also have a new
-                // incarnation that the directory will show.
-                None if from.principal != Principal::Unproved => return Err(Impostor::Stranger),
+                // The gateway introduces itself before it hands letters over. It may also have a
+                // new incarnation that the directory does not show yet.
+                None if from.principal != Principal::Unproved => {
+                    return Err(PrincipalError::NotIntroduced);
+                }
                 None => None,
             },
             None => None,
@@ -169,12 +171,13 @@ impl Principals {
         };
         match owner == from.principal {
             true => Ok(()),
-            false => Err(Impostor::Sender),
+            false => Err(PrincipalError::Sender),
         }
     }
 
-    /// This entry has left the directory. Its registration keeps its principal: the gateway may have
-    /// lost the connection only, and letters in the agent's name are not for others to send meanwhile.
+    /// Records the principal of an entry that left the directory. The gateway may only have lost
+    /// its connection, and other principals must not send letters in the agent's name in the
+    /// meantime.
     pub(super) fn left(&mut self, entry: &Entry) {
         let owner = match entry.reach {
             Reach::Local => Some(Principal::Host),
@@ -189,11 +192,11 @@ impl Principals {
         &mut self,
         sender: Incarnation,
         principal: Principal,
-    ) -> Result<Principal, Impostor> {
+    ) -> Result<Principal, PrincipalError> {
         match self.senders.get(&sender) {
             Some(Some(owner)) => Ok(*owner),
             // Its gateway left before it introduced itself.
-            Some(None) if principal != Principal::Unproved => Err(Impostor::Stranger),
+            Some(None) if principal != Principal::Unproved => Err(PrincipalError::NotIntroduced),
             _ => {
                 self.remember(sender, Some(principal));
                 Ok(principal)
@@ -244,7 +247,7 @@ mod tests {
         }
     }
 
-    fn nobody() -> MemoryDirectory {
+    fn no_agents() -> MemoryDirectory {
         MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(1)))
     }
 
@@ -256,8 +259,8 @@ mod tests {
         principals.introduced(&peer("rover", CREX));
         assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
         let other = principals.check_service(&hop(SERVICE, CREX));
-        assert_eq!(other, Err(Impostor::Service));
-        // A connection of the impostor ends, which changes nothing.
+        assert_eq!(other, Err(PrincipalError::Service));
+        // The end of the impostor's connection changes nothing.
         principals.parted(&peer("rover", CREX));
         principals.introduced(&peer("rover", CREX));
         assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
@@ -270,7 +273,7 @@ mod tests {
         principals.parted(&peer("rover", ROVER));
         principals.introduced(&peer("crex", CREX));
         let other = principals.check_service(&hop(SERVICE, CREX));
-        assert_eq!(other, Err(Impostor::Service));
+        assert_eq!(other, Err(PrincipalError::Service));
         principals.introduced(&peer("rover", CREX));
         assert_eq!(principals.check_service(&hop(SERVICE, CREX)), Ok(()));
     }
@@ -278,7 +281,7 @@ mod tests {
     #[test]
     fn invented_senders_displace_those_of_the_same_principal_only() {
         let mut principals = Principals::default();
-        let directory = nobody();
+        let directory = no_agents();
         let mut hear = |sender: u64, principal| {
             let sender = Incarnation::from_u64(sender);
             principals.check_sender(sender, &hop(SERVICE, principal), &directory)
@@ -287,12 +290,12 @@ mod tests {
         for sender in 0..2 * MAX_SENDERS as u64 {
             assert_eq!(hear(1000 + sender, CREX), Ok(()));
         }
-        assert_eq!(hear(100, CREX), Err(Impostor::Sender));
+        assert_eq!(hear(100, CREX), Err(PrincipalError::Sender));
         assert!(principals.senders.len() <= MAX_SENDERS + 1);
     }
 
     #[test]
-    fn services_are_bounded() {
+    fn the_number_of_services_is_bounded() {
         let mut principals = Principals::default();
         for service in 0..2 * MAX_SERVICES as u64 {
             let peer = Introduction {

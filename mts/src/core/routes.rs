@@ -1,33 +1,31 @@
-//! Routes and ways as people look at them: which way a letter to somebody would go now, and why;
-//! what has happened on each way so far. And as those do who loan memory for a letter before there
-//! is one.
+//! Reports of routes: the locations to which a letter would go now, and counters of each location
+//! since the start. The allocation of memory for a letter in advance also uses them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use fipa_sds::{Entry, Reach, Resolution, Role};
 use fipa_transport::{Incarnation, Kind, Location};
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
-use super::desk::{self, Desk};
+use super::attempts::{self, AttemptTable};
 use super::{Core, Now};
 use crate::{Map, stamp};
 
-/// How letters to one agent would go now.
+/// The route that letters to one agent would take now.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Route {
     /// The agent's name.
     pub receiver: String,
-    /// This life of it.
+    /// Its incarnation.
     pub incarnation: Incarnation,
-    /// The gateway that letters go to, when the agent is on another host.
+    /// The gateway to which letters go, when the agent is on another host.
     pub gateway: Option<Incarnation>,
-    /// The pattern of `[routes]` that decides, or none for the order of `mts.transports`.
+    /// The pattern of `[routes]` that applies, or `None` for the order of `mts.transports`.
     pub exception: Option<String>,
-    /// Its locations, in the order in which they would be tried. Those that would not be come
-    /// last.
+    /// Its locations, in the order in which they would be tried. Unused ones come last.
     pub ways: Vec<Way>,
 }
 
@@ -36,24 +34,24 @@ pub struct Route {
 pub struct Way {
     /// The location.
     pub location: Location,
-    /// Whether letters would go there.
+    /// State of the location.
     pub standing: Standing,
 }
 
-/// Whether letters would go to a location.
+/// State of a location for letters.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "standing", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Standing {
-    /// It works as far as is known.
+    /// Not known to fail.
     Ready,
-    /// It failed, and is tried after all that work, until this time has passed.
+    /// It failed, and is tried after all working ones until this time has passed.
     Failing {
-        /// How long it is put back still.
+        /// Remaining time of its backoff.
         milliseconds: u64,
-        /// How often in a row it failed.
+        /// Number of consecutive failures.
         failures: u32,
-        /// Why it failed last.
+        /// The latest error.
         error: String,
     },
     /// Its transport is not in the order for this receiver.
@@ -62,33 +60,34 @@ pub enum Standing {
     Unsupported,
 }
 
-/// What has happened on one way since the service started, or since the way was last forgotten:
-/// the least used are, when there are more than 4096.
+/// Counters of one location since the service started, or since the location was last dropped.
+/// Beyond 4096 locations, those without letters in flight are dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WayState {
-    /// Where to.
+    /// The location.
     pub location: Location,
-    /// How it stands now.
+    /// Its current state.
     #[serde(flatten)]
     pub standing: Standing,
-    /// Letters that were sent there and have no answer yet.
+    /// Number of letters that were sent there and have no answer yet.
     pub in_flight: u64,
-    /// Attempts to send a letter there.
+    /// Number of attempts to send a letter there.
     pub tried: u64,
-    /// Letters that the other side took, into a queue or into custody, or that were handed to a
-    /// peer that cannot confirm.
+    /// Number of letters that the other side took, into a queue or into custody, or that were
+    /// handed to a peer that cannot confirm.
     pub taken: u64,
-    /// Letters that the other side did not take: its queue was full, or it had a reason of its own.
+    /// Number of letters that the other side did not take, because its queue was full or for
+    /// another reason.
     pub turned_back: u64,
-    /// Attempts that failed: nobody reached, or nothing heard.
+    /// Number of failed attempts: no connection, or no answer.
     pub failed: u64,
-    /// Why the last of these failed.
+    /// Error of the last of these.
     pub last_error: Option<String>,
-    /// How many seconds ago that was.
+    /// Seconds since that error.
     pub last_error_seconds: Option<u64>,
 }
 
-/// What happens on one way, counted.
+/// Counters of one location.
 #[derive(Debug, Default)]
 pub(crate) struct Tally {
     pub(super) tried: AtomicU64,
@@ -99,11 +98,11 @@ pub(crate) struct Tally {
     last_error: Mutex<Option<(String, Instant)>>,
 }
 
-/// The tallies of all ways.
+/// Counters of all locations.
 #[derive(Debug, Default)]
 pub(super) struct Tallies(Map<Location, Arc<Tally>>);
 
-/// Ways that are counted, at most.
+/// Maximum number of locations with counters.
 const MAX_TALLIES: usize = 4096;
 
 impl Tally {
@@ -123,7 +122,7 @@ impl Tally {
 }
 
 impl Tallies {
-    /// The tally of this way. Beyond the bound those nothing is under way on are forgotten.
+    /// Counters of this location. Beyond the limit, those without letters in flight are dropped.
     pub(super) fn of(&mut self, location: &Location) -> Arc<Tally> {
         if let Some(tally) = self.0.get(location) {
             return Arc::clone(tally);
@@ -139,8 +138,8 @@ impl Tallies {
     }
 }
 
-impl Desk {
-    /// How letters to this agent would go now.
+impl AttemptTable {
+    /// The route that letters to this agent would take now.
     pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
         let (exception, order) = self.config.route_for(&entry.name);
         let mut ways = Vec::new();
@@ -187,7 +186,7 @@ impl Desk {
         }
     }
 
-    /// What has happened on each way, by location.
+    /// The counters of each location, sorted by location.
     pub(super) fn way_states(&self, now: Instant) -> Vec<WayState> {
         let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let tallies = self.tallies.0.iter();
@@ -203,7 +202,7 @@ impl Desk {
                     taken: read(&tally.taken),
                     turned_back: read(&tally.turned_back),
                     failed: read(&tally.failed),
-                    last_error_seconds: last_error.as_ref().map(|(_, at)| seconds(ago(*at))),
+                    last_error_seconds: last_error.as_ref().map(|(_, at)| ago(*at).as_secs()),
                     last_error: last_error.map(|(text, _)| text),
                 }
             })
@@ -213,55 +212,52 @@ impl Desk {
     }
 }
 
-fn seconds(duration: Duration) -> u64 {
-    duration.as_secs()
-}
-
 impl Core {
-    /// How letters from here to the agent of this entry would go now.
+    /// Returns the route that letters from here to the agent of this entry would take now.
     #[must_use]
     pub fn route(&self, now: Now, entry: &Entry) -> Route {
-        self.desk.route(now.instant, entry)
+        self.table.route(now.instant, entry)
     }
 
-    /// What has happened on each way so far, in the order of their locations.
+    /// Returns the counters of each location, sorted by location.
     #[must_use]
     pub fn ways(&self, now: Now) -> Vec<WayState> {
-        self.desk.way_states(now.instant)
+        self.table.way_states(now.instant)
     }
 
-    /// The first way that a letter from here to this receiver would take now; none to several.
+    /// Returns the first location to which a letter from here to this receiver would go now; `None`
+    /// for several receivers.
     #[must_use]
     pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
-        let entry = self.desk.directory.lookup(receiver)?;
+        let entry = self.table.directory.lookup(receiver)?;
         if matches!(entry.role, Role::Coalition(_)) {
             return None;
         }
-        self.desk.choose(now.instant, &entry, &[])
+        self.table.choose(now.instant, &entry, &[])
     }
 
-    /// The first way that a letter of others, for this life of an agent with this name, would take
-    /// from here now, if this service passes it on within its host; and the bytes that its stamp
-    /// takes.
+    /// Returns the first location to which this service would forward a letter for this
+    /// registration and name now, and the length of its stamp in bytes. `None` unless the receiver
+    /// is another process of this host.
     #[must_use]
     pub fn first_way_onwards(
         &self,
         now: Now,
-        life: Incarnation,
+        registration: Incarnation,
         receiver: &str,
     ) -> Option<(Location, usize)> {
-        let config = &self.desk.config;
-        if !config.forwards || self.agents.contains_key(&life) {
+        let config = &self.table.config;
+        if !config.forwards || self.agents.contains_key(&registration) {
             return None;
         }
-        let entry = self.desk.receiver(life, receiver)?;
+        let entry = self.table.receiver(registration, receiver)?;
         let here = entry.role == Role::Agent && entry.reach == Reach::Local;
-        let way = here.then(|| self.desk.choose(now.instant, &entry, &[]))?;
-        Some((way?, stamp::room(&config.name)))
+        let way = here.then(|| self.table.choose(now.instant, &entry, &[]))?;
+        Some((way?, stamp::max_len(&config.name)))
     }
 
-    /// The kind of transport by which a letter to these receivers would go first to two of them at
-    /// least, now; of several kinds, the one that most of them would be reached by.
+    /// Returns the kind of transport that would come first for most of these receivers now, if that
+    /// applies to at least two of them.
     #[must_use]
     pub fn kind_for_many<'a>(
         &self,
@@ -269,7 +265,7 @@ impl Core {
         sender: Incarnation,
         receivers: impl IntoIterator<Item = &'a str>,
     ) -> Option<Kind> {
-        let directory = &*self.desk.directory;
+        let directory = &*self.table.directory;
         let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
         let mut reached = Map::default();
         for receiver in receivers {
@@ -280,8 +276,8 @@ impl Core {
                 Ok(Resolution::None) | Err(_) => Vec::new(),
             };
             for entry in entries {
-                if let Some(way) = self.desk.choose(now.instant, &entry, &[]) {
-                    reached.insert(desk::life_of(&entry), way.kind());
+                if let Some(way) = self.table.choose(now.instant, &entry, &[]) {
+                    reached.insert(attempts::registration_of(&entry), way.kind());
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! The rules of a stream, as pure functions: the delivery core decides by them, and the model in
+//! The rules of a stream, as pure functions: the delivery core applies them, and the model in
 //! `tests/model` explores every order in which they can be applied.
 //!
 //! A *stream* is one registration of a sender and one registration of a receiver. A letter has one
@@ -7,28 +7,28 @@
 //! * The **sender's process** assigns sequences, computes predecessors, moves letters to a new
 //!   registration of their receiver, and gives outcomes. No other role does any of these. A letter
 //!   is *open* while it has no outcome there.
-//! * A **custodian** (a gateway) holds letters on their way, passes their predecessor on as it was
-//!   told, and hands a letter back when the predecessor does not come.
+//! * A **custodian** (a gateway) holds letters in transit, forwards their predecessor as it was
+//!   received, and returns a letter when the predecessor does not arrive.
 //! * The **receiver's process** takes letters.
 //!
-//! What follows from them: letters are taken in order, and at most once by each registration,
-//! whatever routes and custodians do ([`offer`]); no letter that is still open is passed over
-//! ([`predecessor`]); a stream never waits for a letter that has an outcome ([`hold`]).
+//! Consequences: letters are taken in order, and at most once by each registration, whatever routes
+//! and custodians do ([`offer`]); no open letter is passed over ([`predecessor`]); a stream never
+//! waits for a letter that has an outcome ([`hold`]).
 
 use std::time::Duration;
 
-/// What the receiver's process says of a copy.
+/// Decision of the receiver's process about a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Offer {
-    /// It is taken.
+    /// The copy is taken.
     Take,
-    /// This sequence, or a later one, was taken before.
+    /// This sequence number, or a later one, was taken before.
     Earlier,
-    /// The predecessor was not taken yet. Certainly not taken by this attempt.
+    /// The predecessor was not taken yet. This attempt certainly did not deliver the letter.
     OutOfOrder,
 }
 
-/// Decides about a copy, by the last letter of the stream that was taken (0 when there is none).
+/// Decides about a copy, given the last letter of the stream that was taken (0 if none).
 #[must_use]
 pub fn offer(last: u64, sequence: u64, after: u64) -> Offer {
     if sequence <= last {
@@ -47,8 +47,8 @@ pub fn predecessor(open: impl DoubleEndedIterator<Item = u64>, sequence: u64) ->
     open.rev().find(|other| *other < sequence).unwrap_or(0)
 }
 
-/// Whether the sender's process may dispatch a letter for this registration of its receiver:
-/// not while an earlier letter to the same name is open for another registration.
+/// Whether the sender's process may dispatch a letter for this registration of its receiver: not
+/// while an earlier letter to the same name is open for another registration.
 #[must_use]
 pub fn may_dispatch<R: PartialEq>(
     mut earlier_open: impl Iterator<Item = R>,
@@ -64,9 +64,9 @@ pub fn may_move(uncertain: bool) -> bool {
     !uncertain
 }
 
-/// The end of a custody, as far as belief in it goes.
+/// The end of a custody according to a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Told {
+pub enum CustodyReport {
     /// The receiver has it.
     Delivered,
     /// It failed, or was returned; it may have been taken nevertheless if `uncertain`.
@@ -76,92 +76,92 @@ pub enum Told {
     },
 }
 
-/// What the previous hop makes of a report.
+/// Effect of a report at the previous hop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Belief {
     /// It ends the custody, or the attempt.
     Believed,
-    /// It is about an earlier hand-over: only the uncertainty is kept.
+    /// It concerns an earlier hand-over: only the uncertainty is recorded.
     OnlyUncertain,
     /// It changes nothing.
     Ignored,
 }
 
 /// Decides about a report of the hand-over `transfer`, when `current` is the latest hand-over of
-/// the letter, if one is under way or in custody. `handed` is whether the letter was ever handed
-/// to the service that reports.
+/// the letter, if one is in progress or in custody. `handed` is whether the letter was ever handed
+/// to the reporting service.
 #[must_use]
-pub fn believe(handed: bool, told: Told, transfer: u64, current: Option<u64>) -> Belief {
+pub fn believe(handed: bool, told: CustodyReport, transfer: u64, current: Option<u64>) -> Belief {
     match told {
         _ if !handed => Belief::Ignored,
-        Told::Delivered => Belief::Believed,
-        Told::NotDelivered { .. } if current == Some(transfer) => Belief::Believed,
-        Told::NotDelivered { uncertain: true } => Belief::OnlyUncertain,
-        Told::NotDelivered { uncertain: false } => Belief::Ignored,
+        CustodyReport::Delivered => Belief::Believed,
+        CustodyReport::NotDelivered { .. } if current == Some(transfer) => Belief::Believed,
+        CustodyReport::NotDelivered { uncertain: true } => Belief::OnlyUncertain,
+        CustodyReport::NotDelivered { uncertain: false } => Belief::Ignored,
     }
 }
 
-/// Returns the predecessor of a held letter of which another copy arrived: the smaller one, since
+/// Returns the predecessor of a held letter of which another copy arrived: the smaller one, because
 /// only the sender's process lowers it.
 #[must_use]
 pub fn lower(held: u64, told: u64) -> u64 {
     held.min(told)
 }
 
-/// Whether a custodian whose lane is full takes this letter: only when it holds a higher one,
-/// because that one waits for it.
+/// Whether a custodian whose lane is full takes this letter: only when it holds a higher one, which
+/// waits for it.
 #[must_use]
 pub fn admits_when_full(highest_held: Option<u64>, sequence: u64) -> bool {
     highest_held.is_some_and(|highest| sequence < highest)
 }
 
-/// What a custodian does with a letter that came back as out of order.
+/// Decision of a custodian about a letter that came back as out of order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Hold {
-    /// The predecessor is here: the letter waits for it.
+pub enum HoldDecision {
+    /// The letter waits for its predecessor, which is in the lane.
     ForPredecessor,
-    /// The predecessor may still arrive: the letter waits for this long.
+    /// The letter waits this long for its predecessor to arrive.
     For(Duration),
-    /// The letter is handed back.
+    /// The letter is returned.
     Return,
 }
 
 /// Decides about a letter that came back as out of order. `missing_for` is the time since its
-/// predecessor left the lane or, when it was never here, since the letter arrived; `patience` is
-/// how long a predecessor may take to arrive.
+/// predecessor left the lane or, if it was never in it, since the letter arrived; `patience` is the
+/// maximum time for a predecessor to arrive.
 #[must_use]
-pub fn hold(predecessor_is_here: bool, missing_for: Duration, patience: Duration) -> Hold {
+pub fn hold(predecessor_is_here: bool, missing_for: Duration, patience: Duration) -> HoldDecision {
     if predecessor_is_here {
-        Hold::ForPredecessor
+        HoldDecision::ForPredecessor
     } else if missing_for < patience {
-        Hold::For(patience - missing_for)
+        HoldDecision::For(patience - missing_for)
     } else {
-        Hold::Return
+        HoldDecision::Return
     }
 }
 
 /// The end of an attempt, or of a custody, of a letter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum End {
-    /// It certainly did not deliver the letter: not sent, busy, out of order, no such agent, moved,
-    /// refused, or handed back as certain.
+pub enum AttemptEnd {
+    /// The letter was certainly not delivered: not sent, busy, out of order, no such agent, moved,
+    /// refused, or returned as certain.
     NotTaken,
-    /// It may have delivered the letter.
+    /// The letter may have been delivered.
     Unknown,
     /// The custodian was lost with the letter.
     CustodianLost,
 }
 
-/// Whether a letter may have been delivered, after one more attempt or custody of it ended. Once
-/// uncertain, it stays so.
+/// Whether a letter may have been delivered, after another attempt or custody ended. An uncertain
+/// letter stays uncertain.
 #[must_use]
-pub fn stays_uncertain(uncertain: bool, end: End) -> bool {
-    uncertain || end != End::NotTaken
+pub fn stays_uncertain(uncertain: bool, end: AttemptEnd) -> bool {
+    uncertain || end != AttemptEnd::NotTaken
 }
 
 /// Whether a custodian dispatches a letter again that came back as out of order: its predecessor
-/// was lowered meanwhile, to one that the receiver has taken. `last` is the last letter that the
-/// receiver had taken, or 0 when the answer does not say.
+/// was lowered in the meantime, to one that the receiver has taken. `last` is the last letter that
+/// the receiver took, or 0 if the answer does not state it.
 #[must_use]
 pub fn goes_again(after: u64, last: u64) -> bool {
     after <= last
@@ -190,16 +190,22 @@ mod tests {
     }
 
     #[test]
-    fn reports_are_believed_as_far_as_the_hand_over_reaches() {
-        let failed = |uncertain| Told::NotDelivered { uncertain };
-        // A service that the letter was never handed to.
-        for told in [Told::Delivered, failed(true), failed(false)] {
+    fn reports_count_for_the_hand_over_that_they_name() {
+        let failed = |uncertain| CustodyReport::NotDelivered { uncertain };
+        // The letter was never handed to this service.
+        for told in [CustodyReport::Delivered, failed(true), failed(false)] {
             assert_eq!(believe(false, told, 3, Some(3)), Belief::Ignored);
         }
-        // Delivered, whatever hand-over it names.
-        assert_eq!(believe(true, Told::Delivered, 1, Some(3)), Belief::Believed);
-        assert_eq!(believe(true, Told::Delivered, 1, None), Belief::Believed);
-        // Anything else for the latest hand-over only.
+        // "Delivered" counts for any hand-over.
+        assert_eq!(
+            believe(true, CustodyReport::Delivered, 1, Some(3)),
+            Belief::Believed
+        );
+        assert_eq!(
+            believe(true, CustodyReport::Delivered, 1, None),
+            Belief::Believed
+        );
+        // Other reports count for the latest hand-over only.
         assert_eq!(believe(true, failed(false), 3, Some(3)), Belief::Believed);
         assert_eq!(believe(true, failed(false), 1, Some(3)), Belief::Ignored);
         assert_eq!(
@@ -210,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_lane_takes_what_a_held_letter_waits_for() {
+    fn a_full_lane_takes_a_letter_that_a_held_one_waits_for() {
         assert!(admits_when_full(Some(9), 8));
         assert!(!admits_when_full(Some(9), 9));
         assert!(!admits_when_full(None, 1));

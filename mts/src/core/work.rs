@@ -1,4 +1,4 @@
-//! Counts the steps of the core, in builds with debug assertions: letters looked at, receivers, and
+//! Counts the steps of the core in builds with debug assertions: letters visited, receivers, and
 //! kilobytes read. Tests bound them by the bytes that arrived.
 
 #[cfg(debug_assertions)]
@@ -6,7 +6,7 @@ thread_local! {
     static STEPS: std::cell::Cell<u64> = const { std::cell::Cell::new(0) };
 }
 
-/// Counts so many steps. Does nothing in a release.
+/// Adds steps. Does nothing without debug assertions.
 #[inline]
 pub(crate) fn steps(count: usize) {
     #[cfg(debug_assertions)]

@@ -4,20 +4,20 @@ use fipa_acl::{Message, Payload, Performative};
 
 use super::one_line;
 
-/// What the message transport service or the agent management system of either host says in a
-/// failure message: a letter was not delivered to one receiver.
+/// A failure message of the message transport service or agent management system of either host: a
+/// letter was not delivered to one receiver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeliveryFailure {
-    /// The name of the receiver, if the message gives it.
+    /// Name of the receiver, if the message has it.
     pub receiver: Option<String>,
-    /// The reason, as the service words it: one line of at most 400 bytes,
+    /// The reason in the words of the service: one line of at most 400 bytes,
     /// [escaped](fipa_acl::escape).
     pub reason: String,
 }
 
 impl DeliveryFailure {
-    /// Reads a failure message. None if the message is no failure, or the failure of something else
-    /// than a delivery, such as of an action that the receiver agreed to.
+    /// Reads a failure message. `None` if the message is not a failure, or reports another failure
+    /// than a delivery, such as that of an action that the receiver agreed to.
     #[must_use]
     pub fn read(message: &Message) -> Option<Self> {
         if *message.performative() != Performative::Failure {
@@ -54,14 +54,15 @@ fn of_sl(text: &str) -> Option<DeliveryFailure> {
 
 /// A nested `inform` to the receiver in the language `internal-error`.
 fn of_fipa_services(content: Payload) -> Option<DeliveryFailure> {
-    let told = Message::decode(&content).ok()?;
-    if *told.performative() != Performative::Inform || told.language() != Some("internal-error") {
+    let report = Message::decode(&content).ok()?;
+    if *report.performative() != Performative::Inform || report.language() != Some("internal-error")
+    {
         return None;
     }
-    let text = String::from_utf8_lossy(told.content()?).into_owned();
+    let text = String::from_utf8_lossy(report.content()?).into_owned();
     let first = text.lines().next().unwrap_or_default();
     Some(DeliveryFailure {
-        receiver: told.receivers().first().map(|to| to.name().to_owned()),
+        receiver: report.receivers().first().map(|to| to.name().to_owned()),
         reason: one_line(first.strip_prefix("description: ").unwrap_or(first)),
     })
 }
@@ -110,7 +111,7 @@ impl<'a> Iterator for Tokens<'a> {
     }
 }
 
-/// Where the literal that begins this text ends: at a quotation mark without `\` before it.
+/// Offset of the literal's end: of the first quotation mark without `\` before it.
 fn end_of_text(inside: &str) -> usize {
     let mut escaped = false;
     let end = inside.bytes().position(|byte| {
@@ -136,7 +137,7 @@ mod tests {
     const FIPA_SERVICES: &[u8] = include_bytes!("../../../acl/tests/vectors/failure_letter.bin");
     const JADE: &[u8] = include_bytes!("../../../acl/tests/vectors/jade_failure.str");
 
-    fn told(receiver: &str, reason: &str) -> DeliveryFailure {
+    fn report(receiver: &str, reason: &str) -> DeliveryFailure {
         DeliveryFailure {
             receiver: Some(receiver.to_owned()),
             reason: reason.to_owned(),
@@ -149,7 +150,7 @@ mod tests {
         let message = Message::decode(letter.payload()).unwrap();
         assert_eq!(
             DeliveryFailure::read(&message),
-            Some(told("nobo", "message delivery failed"))
+            Some(report("nobo", "message delivery failed"))
         );
     }
 
@@ -159,7 +160,7 @@ mod tests {
         let reason = "Agent not found: getContainerID() failed to find agent nobody@jadetest";
         assert_eq!(
             DeliveryFailure::read(&message),
-            Some(told("nobody@jadetest", reason))
+            Some(report("nobody@jadetest", reason))
         );
     }
 
@@ -182,12 +183,12 @@ mod tests {
         ] {
             let letter = failure.written_for("mts", dialect, SystemTime::UNIX_EPOCH);
             let message = Message::decode(letter.unwrap().payload()).unwrap();
-            assert_eq!(DeliveryFailure::read(&message), Some(told("arm", reason)));
+            assert_eq!(DeliveryFailure::read(&message), Some(report("arm", reason)));
         }
     }
 
     #[test]
-    fn other_failures_are_none_of_a_delivery() {
+    fn failures_of_other_actions_are_not_delivery_failures() {
         let message = |performative, content: &str| {
             Message::builder(performative)
                 .content(content.to_owned())
@@ -213,7 +214,7 @@ mod tests {
         let failure = message(Performative::Failure, open);
         assert_eq!(
             DeliveryFailure::read(&failure),
-            Some(told("arm", r"a\u{1b}b"))
+            Some(report("arm", r"a\u{1b}b"))
         );
     }
 }

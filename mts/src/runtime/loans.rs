@@ -1,4 +1,4 @@
-//! Memory for contents, from the transport that will carry them.
+//! Memory for contents, allocated by the transport that will carry them.
 
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
@@ -10,10 +10,10 @@ use crate::core::{Now, Submission};
 type Loaned = Option<Box<dyn LoanedContent>>;
 
 impl Mts {
-    /// Memory for the content of a letter from this agent to these receivers, names or patterns,
-    /// to be filled in place: shared memory when that is the way a letter would go now, else the
-    /// heap. `head_room` and `tail_room` are the lengths of what will stand in front of the
-    /// content and behind it.
+    /// Allocates memory for the content of a letter from this agent to these receivers (names or
+    /// patterns), to be filled in place: shared memory if the letter's first route is shared
+    /// memory, otherwise heap memory. `head_room` and `tail_room` are the lengths of the encoded
+    /// data before and after the content.
     pub fn loan(
         &self,
         sender: Incarnation,
@@ -22,17 +22,17 @@ impl Mts {
         len: usize,
         tail_room: usize,
     ) -> Box<dyn LoanedContent> {
-        let loaned = match self.way_to_one(receivers) {
-            Some(way) => self.shared.loan_from(way.kind(), |transport| {
-                transport.loan(&way, head_room, len, tail_room)
+        let loaned = match self.route_to_one(receivers) {
+            Some(route) => self.shared.loan_from(route.kind(), |transport| {
+                transport.loan(&route, head_room, len, tail_room)
             }),
             None => self.loan_for_many(sender, receivers.iter().copied(), len),
         };
         loaned.unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
     }
 
-    /// The way a letter to the only receiver would take first, now.
-    fn way_to_one(&self, receivers: &[&str]) -> Option<Location> {
+    /// Returns the first route of a letter to the only receiver.
+    fn route_to_one(&self, receivers: &[&str]) -> Option<Location> {
         let [receiver] = receivers else {
             return None;
         };
@@ -54,8 +54,8 @@ impl Mts {
             .loan_from(kind, |transport| transport.loan_for_many(len))
     }
 
-    /// The content of a letter in memory that all its receivers can read, if it should be moved
-    /// there.
+    /// Copies the content of a letter to memory that all its receivers can read, if that saves
+    /// copies.
     pub(super) fn content_for_many(&self, submission: &Submission) -> Option<Bytes> {
         let receivers = &submission.receivers;
         let content = &submission.letter.payload().content;
@@ -75,8 +75,8 @@ impl Mts {
 }
 
 impl Shared {
-    /// Memory for the content of a letter that arrives for somebody else on this host: that of the
-    /// transport by which it will be passed on.
+    /// Allocates memory for the content of a letter that arrives for another agent of this host,
+    /// from the transport that will forward it.
     pub(super) fn memory_for(&self, arriving: &Arriving<'_>) -> Loaned {
         let Arriving {
             receiver,
@@ -85,17 +85,19 @@ impl Shared {
             len,
             tail,
         } = *arriving;
-        let (way, stamp) = {
+        let (route, stamp) = {
             let state = self.state.lock();
-            let life = stream.receiver;
-            state.core.first_way_onwards(Now::read(), life, receiver)?
+            let registration = stream.receiver;
+            state
+                .core
+                .first_way_onwards(Now::read(), registration, receiver)?
         };
-        self.loan_from(way.kind(), |transport| {
-            transport.loan(&way, front.saturating_add(stamp), len, tail)
+        self.loan_from(route.kind(), |transport| {
+            transport.loan(&route, front.saturating_add(stamp), len, tail)
         })
     }
 
-    /// A loan, if this transport gives one.
+    /// Returns a loan if this transport offers one.
     fn loan_from(
         &self,
         kind: Kind,
@@ -104,14 +106,14 @@ impl Shared {
         match loan(&**self.transport(kind)?) {
             Ok(loaned) => loaned,
             Err(error) => {
-                tracing::debug!(%error, %kind, "no loan; the heap serves instead");
+                tracing::debug!(%error, %kind, "cannot loan memory of the transport; using the heap");
                 None
             }
         }
     }
 }
 
-/// The same letter with this content. Nothing is copied.
+/// Replaces the content of the letter without copying.
 pub(super) fn with_content(letter: Letter, content: Bytes) -> Letter {
     let envelope = letter.envelope();
     let payload = Payload {

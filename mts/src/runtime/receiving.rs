@@ -1,4 +1,4 @@
-//! The side of the runtime that transports see: what they tell is handed to the core.
+//! The sink of the transports: passes their events to the core.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
@@ -12,14 +12,14 @@ use fipa_transport::{
 use super::Shared;
 use crate::core::{Now, Unframed};
 
-/// What a transport sees of the service.
-pub(super) struct Receiving {
+/// The sink of one transport.
+pub(super) struct TransportSink {
     pub(super) shared: Weak<Shared>,
     pub(super) kind: Kind,
     pub(super) answers_at_once: bool,
 }
 
-impl Sink for Receiving {
+impl Sink for TransportSink {
     fn arrived(&self, arrival: Arrival) -> Verdict {
         let Some(shared) = self.shared.upgrade() else {
             return closing();
@@ -44,7 +44,7 @@ impl Sink for Receiving {
         let unframed = match Unframed::read(letter, via, from, &*directory) {
             Ok(unframed) => unframed,
             Err(error) => {
-                tracing::warn!(%error, "an unframed letter with a malformed envelope was dropped");
+                tracing::warn!(%error, "dropping an unframed letter: its envelope is malformed");
                 return;
             }
         };
@@ -74,7 +74,7 @@ impl Sink for Receiving {
             return Vec::new();
         };
         let directory = Arc::clone(shared.state.lock().core.directory());
-        // All that is behind one service is at the same places.
+        // All agents of a service have the same locations.
         let entries = directory.entries();
         let mut entries = entries.iter();
         let Some(entry) = entries.find(|entry| entry.locations.contains(location)) else {
@@ -133,5 +133,5 @@ impl Sink for Receiving {
 
 fn closing() -> Verdict {
     let reason = FailureReason::NoSuchAgent;
-    Verdict::Now(Answer::failed(reason, "the process is ending"))
+    Verdict::Now(Answer::failed(reason, "the process is closing"))
 }

@@ -1,10 +1,10 @@
-//! From the records of all processes to one event per letter.
+//! Joins the records of all processes to one event per letter.
 //!
-//! A letter is told of by its sender's process, by the gateways of this host and by its receiver's
-//! process, in any order and with any of them missing: a sender on another host tells nothing, and
-//! records may be lost. The first record makes the letter known; it is held back for a moment, so
-//! that what others tell of it and of earlier letters arrives, and then becomes an event, in the
-//! order in which letters were sent. An outcome that comes later than that is an event of its own.
+//! The sender's process, the gateways of this host and the receiver's process report a letter, in
+//! any order and with any report missing: a sender on another host reports nothing, and records may
+//! be lost. The first record creates the letter. It is held back for a short time, so that other
+//! records of this and earlier letters arrive, and then becomes an event, in the order of sending.
+//! A later outcome is an event of its own.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -16,63 +16,62 @@ use fipa_transport::{Incarnation, Kind, Outcome, Stream};
 
 use super::record::{LetterId, Origin, Record, RecordBody, RecordError, Seen, SeenLetter};
 
-/// How long a letter is held back at least: what others tell of letters before it may still be on
-/// its way.
+/// Minimum time for which a letter is held back: records of earlier letters may still arrive.
 const HOLD: Duration = Duration::from_millis(40);
-/// How long it is held back for its outcome.
+/// Time for which a letter is held back for its outcome.
 const PATIENCE: Duration = Duration::from_millis(250);
-/// Letters held back at most; then the earliest is told as it is.
+/// Maximum number of letters that are held back; beyond it the earliest is reported as it is.
 const MAX_WAITING: usize = 65_536;
-/// Letters remembered after they were told, so that none is told twice.
-const MAX_TOLD: usize = 65_536;
-/// Outcomes remembered of letters that nobody has told of yet.
+/// Maximum number of reported letters that are remembered, so that none is reported twice.
+const MAX_REPORTED: usize = 65_536;
+/// Maximum number of outcomes of unknown letters that are remembered.
 const MAX_EARLY: usize = 4096;
-/// Processes whose names and losses are remembered.
+/// Maximum number of processes that are remembered.
 const MAX_PROCESSES: usize = 4096;
 
-/// Which process tells, by a number of the watcher's choice.
+/// A process that sends records, by a number that the watcher chooses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Source(pub u64);
 
-/// A letter on its way to one receiver, as far as it is known.
+/// The known data of one letter to one receiver.
 #[derive(Debug, Clone)]
 pub struct Passage {
-    /// Counts the letters in the order in which they are told, from 1.
+    /// Number of the letter in the order of reporting, from 1.
     pub number: u64,
-    /// When it was sent or, if nobody has told that, first seen; by the clock of this host.
+    /// Time of sending or, if unknown, of the first record; by the clock of this host.
     pub at: SystemTime,
-    /// One life of its sender, and one life of its receiver.
+    /// The incarnations of its sender and its receiver.
     pub stream: Stream,
-    /// Its position among all that the sender sends.
+    /// Sequence number of the letter among all letters of the sender.
     pub sequence: u64,
-    /// Letters of one sender with the same number are one message to several receivers.
+    /// Letters of one sender with the same number carry one message to several receivers.
     pub send: Option<u64>,
-    /// The name of the receiver.
+    /// Name of the receiver.
     pub receiver: Arc<str>,
-    /// Its envelope, unless that is very long or malformed.
+    /// Its envelope, unless it is too long or malformed.
     pub envelope: Option<Envelope>,
-    /// Its message without content, unless that is very long or malformed.
+    /// Its message without content, unless it is too long or malformed.
     pub message: Option<Message>,
-    /// Length of the content in bytes, if the message has any.
+    /// Length of the content in bytes, if the message has content.
     pub content_len: Option<u64>,
-    /// The content or its beginning: as much as was asked for.
+    /// The content or its beginning, up to the requested length.
     pub content: Bytes,
     /// Length of envelope and message in bytes, content included.
     pub size: u64,
-    /// The way it went: between the hosts, if it comes from or goes to another.
+    /// The transport of its route; the one between hosts, if it crossed hosts.
     pub via: Option<Kind>,
-    /// The gateway that it passed on this host.
+    /// The gateway of this host that forwarded it.
     pub gateway: Option<Arc<str>>,
-    /// Whether it comes from another host, where nobody is watched.
+    /// Whether it comes from another host, which sends no records.
     pub from_elsewhere: bool,
-    /// Whether a message transport service wrote it, to tell of a failure: no agent.
+    /// Whether a message transport service, not an agent, wrote it to report a failure.
     pub from_service: bool,
-    /// What has become of it.
+    /// State of the delivery.
     pub fate: Fate,
 }
 
 impl Passage {
-    /// The name of the sender, as message or envelope has it.
+    /// Name of the sender in the message or, without one, in the envelope.
     #[must_use]
     pub fn sender(&self) -> Option<&str> {
         let said = self.message.as_ref().and_then(Message::sender);
@@ -87,57 +86,57 @@ impl Passage {
     }
 }
 
-/// What has become of a letter.
+/// State of a letter's delivery.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Fate {
-    /// Nothing that anybody has told.
+    /// No outcome is known.
     UnderWay,
-    /// Its receiver has it; what the sender was told is not known here.
+    /// The receiver has it; the outcome reported to the sender is not known.
     Taken,
-    /// What a gateway knows of it; what the sender was told is not known here.
+    /// Outcome at a gateway; the outcome reported to the sender is not known.
     Passed(Outcome),
-    /// What its sender was told.
+    /// Outcome that was reported to the sender.
     Settled(Outcome),
 }
 
-/// What a watcher sees.
+/// An event for a watcher.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub enum Event {
     /// A letter passes.
     Letter(Arc<Passage>),
-    /// There is news of a letter that was told before.
+    /// The state of an already reported letter has changed.
     Later(Arc<Passage>),
-    /// A process could not tell everything: so many records more were lost.
+    /// A process could not send this many records.
     Lost {
-        /// The name of its message transport service.
+        /// Name of its message transport service.
         process: Arc<str>,
-        /// How many.
+        /// Number of records that were lost since the previous event.
         records: u64,
     },
-    /// A process has told something that is no record, and is not listened to any more.
+    /// A process sent invalid data; its further records are ignored.
     Refused {
-        /// The name of its message transport service, or its number.
+        /// Name of its message transport service, or a placeholder.
         process: Arc<str>,
-        /// What is wrong.
+        /// The error.
         why: RecordError,
     },
 }
 
-/// Which letter: a sender's sequence is the same for all its receivers, and goes with the letter
-/// when it follows its receiver to another life.
+/// Identifies a letter. The sequence number is unique among all letters of a sender, and stays when
+/// the letter follows its receiver to another incarnation.
 type Key = (Incarnation, u64);
-/// When it was sent, and which one it is among those of the same moment.
-type Place = (SystemTime, u64);
+/// Time of sending, and order of arrival among letters of the same time.
+type SendPosition = (SystemTime, u64);
 
-/// Makes events of records. See the module's documentation.
+/// Joins records to events; see the module documentation.
 #[derive(Debug, Default)]
 pub struct Joiner {
-    letters: HashMap<Key, Known>,
-    /// Those held back, in order.
-    waiting: BTreeMap<Place, Key>,
-    /// Those told, in order.
-    told: VecDeque<Key>,
+    letters: HashMap<Key, KnownLetter>,
+    /// Letters that are held back, in order.
+    waiting: BTreeMap<SendPosition, Key>,
+    /// Letters that were reported, in order.
+    reported: VecDeque<Key>,
     early: HashMap<Key, (Outcome, bool)>,
     processes: HashMap<Source, Process>,
     events: VecDeque<Event>,
@@ -146,31 +145,31 @@ pub struct Joiner {
 }
 
 #[derive(Debug)]
-struct Known {
-    place: Place,
+struct KnownLetter {
+    place: SendPosition,
     since: Instant,
     passage: Passage,
-    told: bool,
-    /// Whether its beginning was told, whose time counts.
+    reported: bool,
+    /// Whether the sender's record has arrived, which sets the time.
     sent: bool,
 }
 
 #[derive(Debug)]
 struct Process {
     name: Arc<str>,
-    /// Known once it has greeted.
+    /// Known once its greeting has arrived.
     mts: Option<Incarnation>,
     lost: u64,
 }
 
 impl Joiner {
-    /// One who has not heard anything yet.
+    /// Creates a joiner without processes.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// A process can be heard; by this name, until it says its own.
+    /// Adds a process, with this name until its greeting arrives.
     pub fn handle_begin(&mut self, from: Source, name: impl Into<Arc<str>>) {
         if self.processes.len() < MAX_PROCESSES {
             let name = name.into();
@@ -179,14 +178,14 @@ impl Joiner {
         }
     }
 
-    /// A process has told something that is no record, and is not listened to any more.
+    /// Handles invalid data of a process, whose further records are then ignored.
     pub fn handle_malformed(&mut self, from: Source, why: RecordError) {
         let process = self.name(from);
         self.events.push_back(Event::Refused { process, why });
         self.handle_end(from);
     }
 
-    /// A process has told something.
+    /// Handles a record of a process.
     pub fn handle(&mut self, now: Instant, from: Source, record: Record) {
         let Record { at, lost, body } = record;
         if let RecordBody::Hello {
@@ -220,12 +219,12 @@ impl Joiner {
         }
     }
 
-    /// A process tells nothing any more.
+    /// Removes a process.
     pub fn handle_end(&mut self, from: Source) {
         self.processes.remove(&from);
     }
 
-    /// The message transport services that tell of their letters.
+    /// The message transport services that send records.
     pub fn services(&self) -> impl Iterator<Item = Incarnation> {
         self.processes.values().filter_map(|process| process.mts)
     }
@@ -253,12 +252,14 @@ impl Joiner {
             return;
         };
         let before = known.passage.fate.clone();
-        // A process that has just begun does not know yet that content was asked for.
-        if known.passage.content.is_empty() && !known.told {
+        // A process that has just started may not have the request for content yet.
+        if known.passage.content.is_empty() && !known.reported {
             known.passage.content = content;
         }
         known.see(seen, gateway);
-        if matches!(seen, Seen::Sent(_)) && !std::mem::replace(&mut known.sent, true) && !known.told
+        if matches!(seen, Seen::Sent(_))
+            && !std::mem::replace(&mut known.sent, true)
+            && !known.reported
         {
             let place = (at, known.place.1);
             self.waiting
@@ -266,7 +267,7 @@ impl Joiner {
             known.passage.at = at;
             self.waiting.insert(place, key);
         }
-        if known.told && known.passage.fate != before {
+        if known.reported && known.passage.fate != before {
             let later = Event::Later(Arc::new(known.passage.clone()));
             self.events.push_back(later);
         }
@@ -303,11 +304,11 @@ impl Joiner {
         if let Some((outcome, sender)) = self.early.remove(&key) {
             passage.settle(outcome, sender);
         }
-        let known = Known {
+        let known = KnownLetter {
             place,
             since: now,
             passage,
-            told: false,
+            reported: false,
             sent: false,
         };
         self.letters.insert(key, known);
@@ -318,7 +319,7 @@ impl Joiner {
         let key = (id.stream.sender, id.sequence);
         let Some(known) = self.letters.get_mut(&key) else {
             if self.early.len() >= MAX_EARLY {
-                // Of letters whose beginning was lost, or was before the watching.
+                // Of letters whose first record was lost or precedes the watch.
                 self.early.clear();
             }
             self.early.insert(key, (outcome, sender));
@@ -327,26 +328,26 @@ impl Joiner {
         let (fate, seen_via) = (known.passage.fate.clone(), known.passage.via);
         known.passage.settle(outcome, sender);
         let news = match (&fate, &known.passage.fate) {
-            // That the sender was told just what was seen is none.
+            // The sender's outcome that equals the receiver's record is not a change.
             (Fate::Taken, Fate::Settled(Outcome::Delivered { via, attempts })) => {
                 !attempts.is_empty() || seen_via != Some(*via)
             }
             (before, after) => before != after,
         };
-        if known.told && news {
+        if known.reported && news {
             let later = Event::Later(Arc::new(known.passage.clone()));
             self.events.push_back(later);
         }
     }
 
-    /// When [`poll_event`](Self::poll_event) is to be asked again, if nothing else happens.
+    /// Time of the next call of [`poll_event`](Self::poll_event), if no record arrives before.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let (_, key) = self.waiting.first_key_value()?;
-        self.letters.get(key).map(Known::due)
+        self.letters.get(key).map(KnownLetter::due)
     }
 
-    /// The next event. Hand over all records that are there before asking.
+    /// Returns the next event. Pass all available records before calling it.
     pub fn poll_event(&mut self, now: Instant) -> Option<Event> {
         if let Some(event) = self.events.pop_front() {
             return Some(event);
@@ -361,37 +362,37 @@ impl Joiner {
             return None;
         }
         self.waiting.remove(&place);
-        self.tell(key)
+        self.report(key)
     }
 
-    /// The next event, without waiting for anything: the watching ends.
+    /// Returns the next event without holding back letters, at the end of the watch.
     pub fn finish(&mut self) -> Option<Event> {
         if let Some(event) = self.events.pop_front() {
             return Some(event);
         }
         let (_, key) = self.waiting.pop_first()?;
-        self.tell(key)
+        self.report(key)
     }
 
-    fn tell(&mut self, key: Key) -> Option<Event> {
-        if self.told.len() >= MAX_TOLD
-            && let Some(oldest) = self.told.pop_front()
+    fn report(&mut self, key: Key) -> Option<Event> {
+        if self.reported.len() >= MAX_REPORTED
+            && let Some(oldest) = self.reported.pop_front()
         {
             self.letters.remove(&oldest);
         }
-        self.told.push_back(key);
+        self.reported.push_back(key);
         let known = self.letters.get_mut(&key)?;
         self.number += 1;
         known.passage.number = self.number;
-        known.told = true;
+        known.reported = true;
         let passage = Arc::new(known.passage.clone());
-        // What is remembered of it is whose it is; what was in it has been told.
+        // The content has been reported and is not kept.
         known.passage.content = Bytes::new();
         Some(Event::Letter(passage))
     }
 }
 
-impl Known {
+impl KnownLetter {
     fn see(&mut self, seen: Seen, gateway: Option<Arc<str>>) {
         let passage = &mut self.passage;
         match seen {
@@ -422,7 +423,7 @@ impl Known {
         let passage = &self.passage;
         let complete = match &passage.fate {
             Fate::UnderWay => false,
-            // Nobody of this host will tell more.
+            // No process of this host will report more.
             Fate::Taken | Fate::Passed(_) => passage.from_elsewhere || passage.from_service,
             Fate::Settled(_) => true,
         };
@@ -436,7 +437,7 @@ impl Passage {
             return;
         }
         if sender {
-            // The way between the hosts, which the receiver does not see.
+            // The route between hosts, which the receiver's record does not have.
             if let Some(via) = outcome.via()
                 && !self.from_elsewhere
             {
@@ -444,7 +445,7 @@ impl Passage {
             }
             self.fate = Fate::Settled(outcome);
         } else if matches!(self.fate, Fate::UnderWay) || !outcome.is_success() {
-            // A receiver that has the letter is believed more than a gateway that does not know.
+            // The receiver's record takes precedence over an unknown outcome at a gateway.
             if self.fate != Fate::Taken {
                 self.fate = Fate::Passed(outcome);
             }

@@ -1,12 +1,13 @@
-//! Watching: what processes tell of the letters that pass them, and how that becomes one event per
-//! letter.
+//! Watching: the records that processes write about passing letters, and the events built from
+//! them.
 //!
-//! * [`record`] is what a process writes about a letter: a fixed header and a few encoded parts.
-//!   Whoever watches may be told anything, so every byte is checked.
-//! * [`Joiner`] makes events of the records of all processes: a letter that its sender, a gateway
-//!   and its receiver tell of is one letter.
+//! * [`record`] defines the record of a letter: a fixed header and a few encoded parts. A watcher
+//!   must not trust its sources, so every byte is checked.
 //!
-//! No input, no output, no clock: the socket between the two is the business of the crate `fipa`.
+//! * [`Joiner`] builds events from the records of all processes: a letter that its sender, a
+//!   gateway and its receiver report is one letter.
+//!
+//! No I/O and no clock: the crate `fipa` has the socket between the two.
 
 mod joiner;
 pub mod record;

@@ -1,16 +1,16 @@
-//! Records: what a process tells a watcher of a letter. Each is one datagram.
+//! Records: data that a process sends to a watcher about a letter. Each is one datagram.
 //!
 //! ```text
 //! record := header(96 bytes) name envelope message content outcome
 //! ```
 //! The header has a magic number, the version and the lengths of the parts, all integers
-//! little-endian. `name` is that of the receiver (in a greeting: of the message transport service
-//! that tells); `envelope` is as it was in the letter; `message` is the bit-efficient encoding
-//! (FIPA00069) of the message without its content, whatever it was encoded as; `content` is the
-//! beginning of it, if the watcher has asked for that; `outcome` is that of
-//! [`wire::write_outcome`]. What is absent has no length.
+//! little-endian. `name` is that of the receiver (in a greeting: of the reporting message transport
+//! service); `envelope` is as in the letter; `message` is the bit-efficient encoding (FIPA00069) of
+//! the message without its content, in whatever encoding it was sent; `content` is its beginning,
+//! if the watcher has requested that; `outcome` is encoded by [`wire::write_outcome`]. Absent parts
+//! have length 0.
 //!
-//! The other way goes one datagram, the [`Wish`]: what the watcher wants to be told.
+//! In the other direction goes one datagram, the [`Wish`]: the request of the watcher.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -25,16 +25,17 @@ use crate::core::{News, Notice};
 
 /// Largest record, in bytes.
 pub const MAX_LEN: usize = 64 * 1024;
-/// Most bytes of content in a record.
+/// Maximum length of the content in a record, in bytes.
 pub const MAX_CONTENT: usize = 24 * 1024;
-/// Longest envelope, and longest message without its content: what is longer is left out.
+/// Maximum length of the envelope, and of the message without its content; longer parts are left
+/// out.
 const MAX_PART: usize = 16 * 1024;
 
 const MAGIC: [u8; 4] = *b"fipw";
-/// Of the whole format: a watcher understands its own only.
+/// Version of the whole format: a watcher accepts only its own.
 const VERSION: u8 = 1;
 
-const WISH: u8 = 0;
+const REQUEST: u8 = 0;
 const HELLO: u8 = 1;
 const SENT: u8 = 2;
 const TAKEN: u8 = 3;
@@ -42,13 +43,13 @@ const PASSED: u8 = 4;
 const SETTLED: u8 = 5;
 const LOST: u8 = 6;
 
-const NO_WAY: u8 = u8::MAX;
+const NO_TRANSPORT: u8 = u8::MAX;
 
-/// The one who tells is a gateway.
+/// The reporting process is a gateway.
 const GATEWAY: u8 = 1;
 /// The letter came from another host.
 const REMOTE: u8 = 1 << 1;
-/// The outcome is what the sender is told.
+/// The outcome is the one reported to the sender.
 const SENDER: u8 = 1 << 2;
 /// The message has content, of the length in the header.
 const CONTENT: u8 = 1 << 3;
@@ -80,14 +81,14 @@ struct Header {
 
 const HEADER_LEN: usize = size_of::<Header>();
 
-/// What a process tells.
+/// A record of a process.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
-    /// When it happened, by the clock of this host.
+    /// Time of the event, by the clock of this host.
     pub at: SystemTime,
-    /// How many records this process could not hand to this watcher so far.
+    /// Number of records that this process could not send to this watcher so far.
     pub lost: u64,
-    /// What happened.
+    /// The event.
     pub body: RecordBody,
 }
 
@@ -98,56 +99,56 @@ pub enum RecordBody {
     Hello {
         /// The name of its message transport service.
         name: Arc<str>,
-        /// This life of it.
+        /// Incarnation of the service.
         incarnation: Incarnation,
         /// Whether it is the gateway.
         gateway: bool,
     },
     /// A letter passes.
     Letter {
-        /// Which letter.
+        /// The letter's identity.
         id: LetterId,
-        /// Where it is seen.
+        /// Point of the route at which it is reported.
         place: Seen,
-        /// The letter.
+        /// Data of the letter.
         letter: Box<SeenLetter>,
     },
     /// A letter has an outcome.
     Settled {
-        /// Which letter.
+        /// The letter's identity.
         id: LetterId,
-        /// What became of it.
+        /// The outcome.
         outcome: Outcome,
-        /// Whether that is what the sender is told.
+        /// Whether the sender was told this outcome.
         sender: bool,
     },
-    /// Nothing else than how many records were lost.
+    /// Only the number of lost records.
     Lost,
 }
 
-/// One letter on its way to one receiver, wherever it passes.
+/// Identifies one letter to one receiver at all points of its route.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LetterId {
     /// Its stream.
     pub stream: Stream,
-    /// Its position among all that the sender sends.
+    /// Sequence number of the letter among all letters of the sender.
     pub sequence: u64,
     /// The name of the receiver.
     pub receiver: Arc<str>,
 }
 
-/// Where a letter is seen; see [`News`].
+/// Point of the route at which a letter is reported; see [`News`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Seen {
-    /// Where it begins its way. Letters of one sender with the same number are one message.
+    /// At its sender. Letters of one sender with the same number carry one message.
     Sent(Option<u64>),
-    /// In the queue of its receiver, to which it came this way.
+    /// In the queue of its receiver, received by this transport.
     Taken(Option<Kind>),
-    /// At a gateway, to which it came this way.
+    /// At a gateway, received by this transport.
     Passed(Kind, Origin),
 }
 
-/// Where a letter that passes a gateway comes from.
+/// Origin of a letter that passes a gateway.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
     /// This host.
@@ -156,54 +157,54 @@ pub enum Origin {
     Elsewhere,
 }
 
-/// What is told of a letter.
+/// Reported data of a letter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SeenLetter {
-    /// Its envelope, unless that is very long or malformed.
+    /// Its envelope, unless it is too long or malformed.
     pub envelope: Option<Envelope>,
-    /// Its message without content, unless that is very long or malformed.
+    /// Its message without content, unless it is too long or malformed.
     pub message: Option<Message>,
-    /// Length of the content in bytes, if the message has any.
+    /// Length of the content in bytes, if the message has content.
     pub content_len: Option<u64>,
-    /// The content or, where it is longer, its beginning: as much as the watcher has asked for.
+    /// The content or its beginning, up to the length that the watcher requested.
     pub content: Bytes,
     /// Length of envelope and message in bytes, content included.
     pub size: u64,
 }
 
-/// What a watcher wants.
+/// A watcher's request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Wish {
-    /// Most bytes of content to be told, up to [`MAX_CONTENT`]; zero for none.
+    /// Maximum length of the reported content in bytes, up to [`MAX_CONTENT`]; zero for none.
     pub content: u32,
 }
 
-/// Bytes that are no record.
+/// Error of [`Record::parse`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RecordError {
-    /// It does not begin as records do.
-    #[error("not a record: {0} bytes that begin with something else")]
+    /// The magic number is missing.
+    #[error("not a record: {0} bytes without the magic number")]
     NotARecord(usize),
-    /// Written by another version.
+    /// The record has another version.
     #[error(
-        "a record of version {0}, and version {VERSION} is understood; use the fipa of the version \
+        "the record has version {0}, and this watcher reads version {VERSION}; use the fipa of the version \
          that the watched process was built with"
     )]
     Version(u8),
-    /// The kind is none that we know.
+    /// The kind is unknown.
     #[error("unknown kind of record: {0}")]
     Kind(u8),
-    /// The lengths in the header do not add up.
+    /// The lengths in the header do not match the datagram.
     #[error("the header announces {announced} bytes, and there are {found}")]
     Length {
-        /// What the header says.
+        /// Length according to the header.
         announced: u64,
-        /// What is there.
+        /// Actual length.
         found: usize,
     },
-    /// A part makes no sense.
-    #[error("the {0} of a record cannot be read")]
+    /// A part is malformed.
+    #[error("the {0} of a record is malformed")]
     Part(&'static str),
 }
 
@@ -214,7 +215,7 @@ impl Header {
             magic: MAGIC,
             version: VERSION,
             kind,
-            via: NO_WAY,
+            via: NO_TRANSPORT,
             at: U64::new(u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)),
             ..Self::new_zeroed()
         }
@@ -236,7 +237,7 @@ impl Header {
     }
 }
 
-/// The greeting of a process.
+/// Builds the greeting of a process.
 #[must_use]
 pub fn hello(name: &str, incarnation: Incarnation, gateway: bool, at: SystemTime) -> Vec<u8> {
     let mut header = Header::new(HELLO, at);
@@ -254,15 +255,15 @@ pub fn hello(name: &str, incarnation: Incarnation, gateway: bool, at: SystemTime
     )
 }
 
-/// A record of nothing, to tell how many were lost.
+/// Builds a record without an event, to report the number of lost records.
 #[must_use]
 pub fn lost(at: SystemTime) -> Vec<u8> {
     written(Header::new(LOST, at), [b""; 5])
 }
 
-/// What has happened to a letter, for a watcher with this wish.
+/// Builds the record of a notice, for a watcher with this request.
 #[must_use]
-pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
+pub fn of(notice: &Notice, request: Wish, at: SystemTime) -> Vec<u8> {
     let kind = match &notice.news {
         News::Sent { .. } => SENT,
         News::Taken { .. } => TAKEN,
@@ -279,7 +280,7 @@ pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
             letter
         }
         News::Taken { via, letter } => {
-            header.via = via.map_or(NO_WAY, wire::kind_code);
+            header.via = via.map_or(NO_TRANSPORT, wire::kind_code);
             letter
         }
         News::Passed {
@@ -295,7 +296,7 @@ pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
             header.flags |= if *sender { SENDER } else { 0 };
             let mut written_outcome = wire::write_outcome(outcome);
             if written_outcome.len() > MAX_PART {
-                // Very long reasons for very many attempts; what became of the letter counts.
+                // Long reasons of many attempts are dropped; the outcome matters more.
                 let brief = without_attempts(outcome);
                 written_outcome = brief.map_or(written_outcome, |it| wire::write_outcome(&it));
             }
@@ -303,7 +304,7 @@ pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
             return written(header, [name, b"", b"", b"", &written_outcome]);
         }
     };
-    written_letter(header, &notice.receiver, letter, wish)
+    written_letter(header, &notice.receiver, letter, request)
 }
 
 fn without_attempts(outcome: &Outcome) -> Option<Outcome> {
@@ -325,7 +326,7 @@ fn without_attempts(outcome: &Outcome) -> Option<Outcome> {
     })
 }
 
-fn written_letter(mut header: Header, receiver: &str, letter: &Letter, wish: Wish) -> Vec<u8> {
+fn written_letter(mut header: Header, receiver: &str, letter: &Letter, request: Wish) -> Vec<u8> {
     header.size = U64::new(letter.len() as u64);
     let envelope = letter.envelope();
     let envelope: &[u8] = if envelope.len() <= MAX_PART {
@@ -344,7 +345,7 @@ fn written_letter(mut header: Header, receiver: &str, letter: &Letter, wish: Wis
         header.content_len = U64::new(content.len() as u64);
     }
     let content = content.unwrap_or_default();
-    let given = usize::try_from(wish.content).unwrap_or(MAX_CONTENT);
+    let given = usize::try_from(request.content).unwrap_or(MAX_CONTENT);
     let given = content.len().min(given).min(MAX_CONTENT);
     let (given, _) = content.split_at(given);
     let message = message.unwrap_or_default();
@@ -354,7 +355,7 @@ fn written_letter(mut header: Header, receiver: &str, letter: &Letter, wish: Wis
     )
 }
 
-/// All parts are within their limits here, so that no length is cut.
+/// Callers keep all parts within their limits, so that no length is truncated.
 fn written(mut header: Header, parts: [&[u8]; 5]) -> Vec<u8> {
     let [name, envelope, message, content, outcome] =
         parts.map(|part| U32::new(u32::try_from(part.len()).unwrap_or(u32::MAX)));
@@ -372,7 +373,7 @@ fn written(mut header: Header, parts: [&[u8]; 5]) -> Vec<u8> {
     out
 }
 
-/// Writes into a record how many were lost before it.
+/// Sets the number of lost records in a built record.
 pub fn set_lost(record: &mut [u8], lost: u64) {
     if let Ok((header, _)) = Header::mut_from_prefix(record) {
         header.lost = U64::new(lost);
@@ -380,10 +381,10 @@ pub fn set_lost(record: &mut [u8], lost: u64) {
 }
 
 impl Record {
-    /// The record in these bytes.
+    /// Parses a record.
     ///
     /// # Errors
-    /// When they are no record of this version, or a part of it makes no sense.
+    /// Fails when the bytes are not a record of this version, or a part is malformed.
     pub fn parse(bytes: &Bytes) -> Result<Self, RecordError> {
         let (header, _) =
             Header::read_from_prefix(bytes).map_err(|_| RecordError::NotARecord(bytes.len()))?;
@@ -399,7 +400,7 @@ impl Record {
             return Err(RecordError::Length { announced, found });
         }
         let mut rest = bytes.slice(HEADER_LEN..);
-        // Adds up, as was seen above.
+        // The lengths add up, as checked above.
         let [name, envelope, message, content, outcome] = header
             .parts()
             .map(|len| rest.split_to(rest.len().min(usize::try_from(len).unwrap_or(usize::MAX))));
@@ -447,7 +448,7 @@ impl Header {
         let via = || wire::kind_of_code(self.via).ok_or(RecordError::Part("transport"));
         Ok(match self.kind {
             SENT => Seen::Sent(Some(self.send.get()).filter(|send| *send != 0)),
-            TAKEN if self.via == NO_WAY => Seen::Taken(None),
+            TAKEN if self.via == NO_TRANSPORT => Seen::Taken(None),
             TAKEN => Seen::Taken(Some(via()?)),
             _ if self.flags & REMOTE != 0 => Seen::Passed(via()?, Origin::Elsewhere),
             _ => Seen::Passed(via()?, Origin::Here),
@@ -460,12 +461,12 @@ impl Header {
         message: Bytes,
         content: Bytes,
     ) -> Result<SeenLetter, RecordError> {
-        // As it was in the letter, of which nobody has read more than was needed.
+        // Unchanged from the letter, and not yet checked as a whole.
         let whole = |(decoded, len): (Envelope, usize)| (len == envelope.len()).then_some(decoded);
         let envelope = Envelope::decode(envelope).ok().and_then(whole);
         let message = match message.is_empty() {
             true => None,
-            // Written by the process itself.
+            // The reporting process encoded it.
             false => {
                 Some(Message::decode(&message.into()).map_err(|_| RecordError::Part("message"))?)
             }
@@ -493,24 +494,24 @@ fn name_of(name: &[u8]) -> Result<Arc<str>, RecordError> {
 }
 
 impl Wish {
-    /// Length of a wish, in bytes.
+    /// Length of an encoded request, in bytes.
     pub const LEN: usize = 10;
 
-    /// The wish as a watcher sends it.
+    /// Encodes the request.
     #[must_use]
     pub fn to_bytes(self) -> [u8; Self::LEN] {
         let mut bytes = [0; Self::LEN];
         let (head, content) = bytes.split_at_mut(6);
-        head.copy_from_slice(&[&MAGIC[..], &[VERSION, WISH]].concat());
+        head.copy_from_slice(&[&MAGIC[..], &[VERSION, REQUEST]].concat());
         content.copy_from_slice(&self.content.to_le_bytes());
         bytes
     }
 
-    /// The wish in these bytes; none when they are something else.
+    /// Parses a request; `None` if the bytes are not one.
     #[must_use]
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let (head, content) = bytes.split_at_checked(6)?;
-        let understood = head.strip_prefix(&MAGIC)? == [VERSION, WISH];
+        let understood = head.strip_prefix(&MAGIC)? == [VERSION, REQUEST];
         let content = u32::from_le_bytes(content.try_into().ok()?);
         understood.then_some(Self { content })
     }

@@ -1,8 +1,8 @@
-//! The custodians: hold letters, pass them on, and hand them back.
+//! The custodians: hold letters, forward them, and return them.
 
 use std::time::Duration;
 
-use fipa_mts::core::rules::{self, Hold};
+use fipa_mts::core::rules::{self, HoldDecision};
 
 use crate::hop::Heard;
 use crate::protocol::{Mutant, Protocol};
@@ -28,7 +28,7 @@ impl Protocol {
         lane.iter().any(|held| held.key == key)
     }
 
-    /// Takes a letter out of the lane, and tells the services that handed it over.
+    /// Removes a letter from the lane, and reports to the services that handed it over.
     pub(crate) fn leave(
         &self,
         state: &mut State,
@@ -227,9 +227,9 @@ impl Protocol {
         let after = held.after;
         let here = Self::holds(state, custodian, key.registration, after);
         match rules::hold(here, PATIENCE, PATIENCE) {
-            Hold::ForPredecessor | Hold::For(_) => {}
-            Hold::Return if self.is(Mutant::NeverReturn) => {}
-            Hold::Return => {
+            HoldDecision::ForPredecessor | HoldDecision::For(_) => {}
+            HoldDecision::Return if self.is(Mutant::NeverReturn) => {}
+            HoldDecision::Return => {
                 self.leave(state, custodian, key, |uncertain| What::Returned {
                     uncertain,
                 });

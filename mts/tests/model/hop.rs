@@ -1,7 +1,7 @@
 //! One hop: messages between services, the receiver, and the meaning of answers and reports to the
 //! service that handed a letter over.
 
-use fipa_mts::core::rules::{self, Belief, End, Offer, Told};
+use fipa_mts::core::rules::{self, AttemptEnd, Belief, CustodyReport, Offer};
 
 use crate::protocol::{Mutant, Protocol};
 use crate::state::{CUSTODIANS, Custodian, Key, Message, Place, SENDER, Service, State, What};
@@ -13,11 +13,11 @@ pub(crate) enum Heard {
     Doubt,
     Delivered,
     /// It is dispatched again.
-    NotNow(End),
-    OutOfOrder(End, u8),
-    Returned(End),
+    NotNow(AttemptEnd),
+    OutOfOrder(AttemptEnd, u8),
+    Returned(AttemptEnd),
     Moved,
-    Failed(End),
+    Failed(AttemptEnd),
 }
 
 impl Protocol {
@@ -76,7 +76,7 @@ impl Protocol {
         }
     }
 
-    pub(crate) fn mark(uncertain: &mut bool, end: End) {
+    pub(crate) fn mark(uncertain: &mut bool, end: AttemptEnd) {
         *uncertain = rules::stays_uncertain(*uncertain, end);
     }
 
@@ -89,15 +89,15 @@ impl Protocol {
         let answers = matches!(place, Place::Out { to, transfer, .. }
             if to == message.from && transfer == message.transfer);
         let told = match message.what {
-            What::Delivered => Told::Delivered,
+            What::Delivered => CustodyReport::Delivered,
             What::Failed { uncertain } | What::Returned { uncertain } => {
-                Told::NotDelivered { uncertain }
+                CustodyReport::NotDelivered { uncertain }
             }
             _ if !answers => return Heard::Nothing,
             What::Accepted => return Heard::Delivered,
-            What::OutOfOrder { last } => return Heard::OutOfOrder(End::NotTaken, last),
-            What::Busy => return Heard::NotNow(End::NotTaken),
-            What::Refused => return Heard::Failed(End::NotTaken),
+            What::OutOfOrder { last } => return Heard::OutOfOrder(AttemptEnd::NotTaken, last),
+            What::Busy => return Heard::NotNow(AttemptEnd::NotTaken),
+            What::Refused => return Heard::Failed(AttemptEnd::NotTaken),
             What::Gone => return Heard::Moved,
             What::Copy { .. } | What::Predecessor { .. } => return Heard::Nothing,
         };
@@ -107,8 +107,8 @@ impl Protocol {
             belief = Belief::Believed;
         }
         let end = match told {
-            Told::NotDelivered { uncertain: true } => End::Unknown,
-            _ => End::NotTaken,
+            CustodyReport::NotDelivered { uncertain: true } => AttemptEnd::Unknown,
+            _ => AttemptEnd::NotTaken,
         };
         match (belief, message.what) {
             (Belief::Ignored, _) => Heard::Nothing,
@@ -154,7 +154,7 @@ impl Protocol {
     }
 
     /// Ends an attempt or a custody without an answer or a report.
-    pub(crate) fn give_up(&self, state: &mut State, at: Service, key: Key, end: End) {
+    pub(crate) fn give_up(&self, state: &mut State, at: Service, key: Key, end: AttemptEnd) {
         let (place, uncertain) = match at.custodian() {
             None => {
                 let letter = &mut state.letters[usize::from(key.sequence) - 1];
@@ -168,7 +168,7 @@ impl Protocol {
             }
         };
         *place = Place::Ready;
-        if !(self.is(Mutant::CertainLoss) && end == End::CustodianLost) {
+        if !(self.is(Mutant::CertainLoss) && end == AttemptEnd::CustodianLost) {
             Self::mark(uncertain, end);
         }
     }

@@ -3,7 +3,7 @@
 //!
 //! The model has one sender's process, two custodians and two registrations of one receiver. Each
 //! decision is a call of [`fipa_mts::core::rules`], as in the delivery core. There is no clock: a
-//! timeout may end at any time, and any message under way may be the next one to arrive.
+//! timeout may end at any time, and any message in transit may be the next one to arrive.
 //!
 //! * [`protocol`] has the steps, the faults, the invariants and the mutants; [`sender`],
 //!   [`custodian`] and [`hop`] have what the services do.
@@ -19,7 +19,7 @@
 //! FIPA_MODEL_WALKS=1000000 cargo test --release -p fipa-mts --test model walks -- --nocapture
 //! ```
 
-#![expect(clippy::print_stdout, reason = "a long run tells how far it went")]
+#![expect(clippy::print_stdout, reason = "a long run prints its progress")]
 
 mod custodian;
 mod graph;

@@ -1,7 +1,7 @@
 //! The steps of the model: every step that a service or the network can take, each decided by
 //! the functions of [`fipa_mts::core::rules`].
 
-use fipa_mts::core::rules::End;
+use fipa_mts::core::rules::AttemptEnd;
 use stateright::{Model, Property};
 
 use crate::state::{
@@ -105,11 +105,11 @@ pub(crate) struct Protocol {
     pub(crate) faults: u8,
     /// Kinds of faults that a run may have.
     pub(crate) kinds: &'static [Fault],
-    /// Whether the receiver is registered anew once.
+    /// Whether the receiver is registered again once.
     pub(crate) moves: bool,
     /// Letters that fit into the lanes of a custodian.
     pub(crate) capacity: usize,
-    /// Letters of the sender that may be under way at once.
+    /// Letters of the sender that may be in transit at once.
     pub(crate) window: usize,
     /// Whether notes of a lower predecessor are sent.
     pub(crate) notes: bool,
@@ -127,7 +127,7 @@ pub(crate) enum Action {
     Pass { custodian: usize, key: Key, to: u8 },
     /// A message arrives.
     Arrive(Message),
-    /// A report or note arrives; a second one is under way.
+    /// A report or note arrives; a second one is in transit.
     ArriveTwice(Message),
     /// A message is lost.
     Lose(Message),
@@ -137,7 +137,7 @@ pub(crate) enum Action {
     TimeOut { at: Service, key: Key },
     /// The transport certifies that the frame of the attempt has not left.
     NotSent(Message),
-    /// The attempt times out; nothing of it is under way any more.
+    /// The attempt times out; nothing of it is in transit any more.
     GiveUp { at: Service, key: Key },
     /// The service notices that the custodian it handed the letter to has died.
     NoticeDeath { at: Service, key: Key },
@@ -147,12 +147,12 @@ pub(crate) enum Action {
     Expire { sequence: u8 },
     /// The letter's deadline ends at a custodian.
     ExpireEarly { custodian: usize, key: Key },
-    /// A custodian dies; its reports that are under way are lost with it or not.
+    /// A custodian dies; its reports that are in transit are lost with it or not.
     Die {
         custodian: usize,
         reports_lost: bool,
     },
-    /// The receiver is registered anew. The old registration may still take letters.
+    /// The receiver is registered again. The old registration may still take letters.
     Register,
     /// The old registration ends.
     EndOld,
@@ -444,14 +444,14 @@ impl Model for Protocol {
                 Self::reply(state, message, What::Refused);
             }
             Action::TimeOut { at, key } | Action::GiveUp { at, key } => {
-                self.give_up(state, at, key, End::Unknown);
+                self.give_up(state, at, key, AttemptEnd::Unknown);
             }
             Action::NotSent(message) => {
                 Self::remove(state, message);
-                self.give_up(state, message.from, message.key, End::NotTaken);
+                self.give_up(state, message.from, message.key, AttemptEnd::NotTaken);
             }
             Action::NoticeDeath { at, key } => {
-                self.give_up(state, at, key, End::CustodianLost);
+                self.give_up(state, at, key, AttemptEnd::CustodianLost);
             }
             Action::LosePatience { custodian, key } => self.hold(state, custodian, key),
             Action::Expire { sequence } => {

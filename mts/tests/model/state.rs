@@ -6,7 +6,7 @@ use std::fmt;
 /// Highest number of letters in a configuration.
 pub(crate) const MAX_LETTERS: usize = 4;
 
-/// A service in one life: a custodian that dies and starts again is another service.
+/// A service with one incarnation: a custodian that dies and restarts is another service.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct Service {
     pub(crate) node: u8,
@@ -17,7 +17,7 @@ pub(crate) const SENDER: Service = Service { node: 0, life: 0 };
 pub(crate) const RECEIVER: Service = Service { node: 3, life: 0 };
 /// Nodes of the two custodians.
 pub(crate) const CUSTODIANS: [u8; 2] = [1, 2];
-/// Lives of one custodian: it dies at most once.
+/// Incarnations of one custodian: it dies at most once.
 pub(crate) const LIVES: u8 = 2;
 
 impl Service {
@@ -26,7 +26,7 @@ impl Service {
         CUSTODIANS.iter().position(|node| *node == self.node)
     }
 
-    /// Services in all their lives.
+    /// Services in all their incarnations.
     pub(crate) const COUNT: usize = 4 * LIVES as usize;
 
     /// A number below [`Service::COUNT`].
@@ -39,7 +39,7 @@ impl Service {
         1 << self.index()
     }
 
-    /// Index in [`Held::upstream`]: the sender, or the first custodian in one of its lives.
+    /// Index in [`Held::upstream`]: the sender, or the first custodian in one of its incarnations.
     pub(crate) fn slot(self) -> usize {
         match self.node {
             0 => 0,
@@ -88,7 +88,7 @@ impl fmt::Debug for Key {
 pub(crate) enum Place {
     /// It may be dispatched.
     Ready,
-    /// It was handed over: the attempt is under way, or the letter is in custody there. The model
+    /// It was handed over: the attempt is in progress, or the letter is in custody there. The model
     /// does not tell the two apart, so that each attempt may also be answered late.
     Out {
         to: Service,
@@ -203,13 +203,13 @@ pub(crate) struct State {
     pub(crate) letters: [Letter; MAX_LETTERS],
     pub(crate) custodians: [Custodian; 2],
     pub(crate) registrations: [Registration; 2],
-    /// Whether the receiver was registered anew.
+    /// Whether the receiver was registered again.
     pub(crate) registered_anew: bool,
     /// Whether the old registration has ended. Until then both take letters.
     pub(crate) old_gone: bool,
     /// Whether the sender's directory shows the new registration.
     pub(crate) new_known: bool,
-    /// Messages under way, sorted. Any of them may arrive next.
+    /// Messages in transit, sorted. Any of them may arrive next.
     pub(crate) network: Vec<Message>,
     pub(crate) faults_left: u8,
     /// Whether a registration took a letter after a later one, or twice.

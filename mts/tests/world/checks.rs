@@ -1,4 +1,4 @@
-//! The promises, as invariants.
+//! The delivery guarantees, as invariants.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,20 +10,20 @@ use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Parcel};
 use super::links::transfer_time;
 use super::{ATTEMPT_TIMEOUT, World};
 
-/// Longest time that a failed route is left alone.
+/// Maximum backoff of a failed route.
 const LONGEST_PENALTY: Duration = Duration::from_secs(5);
-/// How long a busy receiver is left alone when no credit comes.
+/// Pause for a busy receiver without a credit.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
 
-/// Steps of a core for each byte that arrives, at most.
+/// Maximum number of steps of a core per received byte.
 const STEPS_PER_BYTE: f64 = 1.0;
-/// Steps of a core for one arrival, at most, for each letter that a lane may hold.
+/// Maximum number of steps of a core for one arrival, per letter that a lane may hold.
 const MOST_STEPS: u64 = 8;
 
-/// What must hold in every run.
+/// The invariants that must hold in every run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Invariant {
-    /// The world itself, and that what is watched is what happens.
+    /// The simulation itself is consistent, and watchers see what happens.
     World,
     /// One outcome for each receiver of a letter, within its deadline.
     OneOutcome,
@@ -42,15 +42,15 @@ pub(crate) enum Invariant {
     Liveness,
     /// A receiver remembers every letter that can be open.
     Remembered,
-    /// The reason of a failure is the true one.
+    /// The reason of a failure is correct.
     Reason,
     /// A letter in the name of an honest agent was sent by it.
     NoForgery,
-    /// No gateway passes letters of one host on to another.
+    /// No gateway relays letters between other hosts.
     NoRelay,
-    /// The steps of cores are bounded by the bytes that arrive.
+    /// The steps of cores are bounded by the received bytes.
     Work,
-    /// Without any fault no letter fails, and each failure is told.
+    /// Without any fault no letter fails, and each failure is reported.
     Calm,
 }
 
@@ -60,7 +60,7 @@ impl fmt::Display for Invariant {
     }
 }
 
-/// The first breach of each invariant.
+/// The first violation of each invariant.
 pub(crate) type Breaches = BTreeMap<Invariant, String>;
 
 impl World {
@@ -68,15 +68,15 @@ impl World {
         self.breaches.entry(invariant).or_insert_with(text);
     }
 
-    /// How long the delivery of a letter of this size that is sent now may take when nothing goes
-    /// wrong any more: two round trips, one back-off of the route, one attempt without an answer,
-    /// and the transfer of what is queued.
+    /// Maximum time for the delivery of a letter of this size that is sent now, without further
+    /// faults: two round trips, one backoff of the route, one attempt without an answer, and the
+    /// transfer of the queued letters.
     pub(super) fn bound(&self, size: usize) -> Duration {
         let w = self.weather;
         let hops = Duration::from_millis(3 * 5 + 2 * w.local_ms);
         let answers = Duration::from_millis(3 * (w.answering_ms + 5));
         let transfer = transfer_time(self.open_bytes + size);
-        // What is ahead in a slow agent's queue is queued, too.
+        // Letters ahead in a slow agent's queue count as queued.
         let open: usize = self.open.values().map(|open| open.len()).sum();
         let reading = match w.reading_pause_ms > 1 {
             true => (Duration::from_millis(w.reading_pause_ms + 2) + BUSY_PAUSE) * open as u32,
@@ -95,7 +95,7 @@ impl World {
         }
     }
 
-    /// A letter has this outcome now.
+    /// Checks an outcome of a letter.
     pub(super) fn check_outcome(&mut self, number: u64, receiver: &str, outcome: &Outcome) {
         let Outcome::Failed { reason, attempts } = outcome else {
             return;
@@ -111,7 +111,7 @@ impl World {
             FailureReason::NoSuchAgent,
             FailureReason::Unconfirmed,
         ];
-        // With less time than a letter may take, the clock is the reason.
+        // With less time than a letter may take, the deadline is the reason.
         let sent = self.sent.get(&number);
         let is_patient = sent.is_some_and(|sent| sent.deadline >= Duration::from_secs(2));
         let slow = self.forecast.is_slow_only() && !self.forecast.liars;
@@ -122,7 +122,7 @@ impl World {
         }
     }
 
-    /// A letter was sent by a service that has closed: it has failed as such already.
+    /// Checks a letter that was sent by a closed service: it has already failed as such.
     pub(super) fn check_closed(&mut self, number: u64) {
         let sent = &self.sent[&number];
         let closed = |outcome: &Outcome| {
@@ -152,7 +152,7 @@ impl World {
                 reason: FailureReason::Refused | FailureReason::Unconfirmed,
                 ..
             }) if was_refused() => return,
-            // Its sender may try again, and will succeed.
+            // The sender may try again, and will succeed.
             Some(Outcome::Failed {
                 reason: FailureReason::QueueFull,
                 attempts,
@@ -169,7 +169,7 @@ impl World {
         self.breach(Invariant::Liveness, || text);
     }
 
-    /// A registration has accepted a letter into its queue.
+    /// Checks a letter that a registration has accepted into its queue.
     pub(super) fn accepted(&mut self, agent: Incarnation, number: u64) {
         self.accepted.insert((agent, number));
         let sent = &self.sent[&number];
@@ -190,7 +190,7 @@ impl World {
         }
     }
 
-    /// An agent has taken a letter out of its queue.
+    /// Checks a letter that an agent has taken from its queue.
     pub(super) fn check_take(&mut self, agent: Incarnation, number: u64) {
         let sent = &self.sent[&number];
         let name = Arc::clone(&self.names[&agent]);
@@ -217,7 +217,7 @@ impl World {
         }
     }
 
-    /// A letter of a hostile member comes from one honest host to another.
+    /// Checks a letter of a hostile member that was forwarded from one honest host to another.
     pub(super) fn check_no_relay(&mut self, from: usize, to: usize, parcel: &Parcel) {
         let [one, other] = [from, to].map(|at| &self.processes[at]);
         let honest = !one.hostile && !other.hostile;
@@ -241,7 +241,7 @@ impl World {
         for (number, sent) in &self.sent {
             for (receiver, outcome) in &sent.outcomes {
                 if self.is_liars_name(receiver) {
-                    // What becomes of these is for the liars to say.
+                    // Hostile members determine the outcomes of these.
                     continue;
                 }
                 let key = (Arc::clone(receiver), *number);
@@ -294,7 +294,7 @@ impl World {
         let told = self.failures_told;
         if self.forecast.is_calm() && !self.forecast.liars && failed != told {
             self.breach(Invariant::Calm, || {
-                format!("{failed} failures, {told} told")
+                format!("{failed} failures, {told} reported")
             });
         }
         let mut living = self.processes.iter().filter(|process| process.alive);

@@ -1,4 +1,4 @@
-//! Faults that begin at some time and end: deaths, outages, stalls, changes of addresses.
+//! Faults with a start and an end: deaths, outages, stalls, changes of addresses.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,12 +9,12 @@ use super::checks::Invariant;
 use super::gates::Denied;
 use super::{Breach, Event, PROCESSES, World};
 
-/// How long a sender may keep letters for a registration that has ended (rule 16 of the stream
+/// Maximum time for which a sender keeps letters for an ended registration (rule 16 of the stream
 /// protocol): letters for the next one wait for them.
 pub(super) const ENDED: Duration = Duration::from_secs(2);
 
 impl World {
-    /// Every fault begins before the world heals.
+    /// Every fault begins before the simulation heals.
     pub(super) fn plan_faults(&mut self) {
         let w = self.weather;
         type Fault = (u32, fn() -> Event);
@@ -80,7 +80,7 @@ impl World {
         }
     }
 
-    /// A robot process gives up what is under way, refuses to send for a moment, and ends.
+    /// A robot process abandons its letters in transit, refuses to send for a moment, and ends.
     pub(super) fn close(&mut self) -> Result<(), Breach> {
         let open = self
             .robots()
@@ -110,7 +110,7 @@ impl World {
         }
     }
 
-    /// A robot process is killed and started again.
+    /// A robot process is killed and restarted.
     pub(super) fn restart(&mut self) -> Result<(), Breach> {
         let robots: Vec<usize> = self.robots().collect();
         match self.random.choice(&robots) {
@@ -119,10 +119,10 @@ impl World {
         }
     }
 
-    /// What the process had is gone, what was under way to it breaks off, and after a moment the
-    /// directory has noticed.
+    /// The state of the process is gone, attempts to it break off, and after a moment the directory
+    /// shows it.
     fn kill(&mut self, dead: usize, returns: bool) -> Result<(), Breach> {
-        // What lay in its queues had been delivered: that is where the promise ends.
+        // Letters in its queues had been delivered: the guarantee ends there.
         for (_, agent) in self.processes[dead].agents.clone() {
             while self.take(dead, agent) {}
         }
@@ -138,7 +138,7 @@ impl World {
         Ok(())
     }
 
-    /// The host of a dead process has noticed.
+    /// The host of a dead process has noticed its death.
     pub(super) fn forgotten(&mut self, dead: usize, returns: bool) -> Result<(), Breach> {
         let process = &self.processes[dead];
         let (host, own) = (process.host, process.incarnation);
@@ -169,7 +169,7 @@ impl World {
         Ok(())
     }
 
-    /// The gateway of a host has another address of one kind.
+    /// The gateway of a host gets another address of one kind.
     pub(super) fn readdress(&mut self) -> Result<(), Breach> {
         let host = self.random.usize(..self.weather.hosts);
         let kind = match self.random.bool() {
@@ -182,7 +182,7 @@ impl World {
         Ok(())
     }
 
-    /// A host is cut off from all others, for long enough that attempts are given up.
+    /// A host is disconnected from all others, for long enough that attempts time out.
     pub(super) fn cut_off(&mut self) {
         let host = self.random.usize(..self.weather.hosts);
         self.cut_off.insert(host);
@@ -190,7 +190,7 @@ impl World {
         self.fault_until(end);
     }
 
-    /// TCP between a host and the others stands still.
+    /// TCP between a host and the others stalls.
     pub(super) fn stall(&mut self) {
         let host = self.random.usize(..self.weather.hosts);
         let end = self.now + Duration::from_millis(self.random.u64(100..1500));
@@ -212,7 +212,7 @@ impl World {
         self.fault_until(end);
     }
 
-    /// When something that happens on this host now is known on each.
+    /// The time at which each host learns of an event on this host.
     pub(super) fn news_times(&mut self, host: usize) -> Vec<Instant> {
         let times = (0..self.weather.hosts).map(|other| {
             let most = match other == host {

@@ -1,4 +1,4 @@
-//! Rules of access: which letters gateways and receiving processes take.
+//! Access rules: which letters gateways and receiving processes accept.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -13,23 +13,23 @@ use super::Set;
 /// Letters that some gate refused, by number and receiver.
 pub(super) type Refused = Arc<Mutex<Set<(u64, Arc<str>)>>>;
 
-/// The rules of one process.
+/// The access rules of one process.
 pub(super) struct Rules {
     pub(super) seed: u64,
-    /// Share of letters that are refused.
+    /// Fraction of letters that are refused.
     pub(super) share: f64,
-    /// Names whose letters are refused for a while.
+    /// Names whose letters are refused temporarily.
     pub(super) denied: Vec<Denied>,
-    /// Letters a second, and until when that is a limit.
+    /// Maximum number of letters per second, and the end of that limit.
     pub(super) rate: Option<(f64, Instant)>,
-    /// Whether letters without a number are taken, which are of hostile members. They are not where
-    /// agents read slowly: queues full of them are no lie.
+    /// Whether letters without a number, which are those of hostile members, are accepted. Not
+    /// where agents read slowly: queues full of them would count as a failure of the core.
     pub(super) strangers: bool,
     pub(super) taken: Mutex<Option<Allowance>>,
     pub(super) refused: Refused,
 }
 
-/// All letters for one name are refused for a while.
+/// Temporarily refuses all letters for one name.
 #[derive(Debug, Clone)]
 pub(super) struct Denied {
     pub(super) name: Arc<str>,
@@ -73,14 +73,14 @@ impl Gate for Rules {
     }
 }
 
-/// The content of the letter with this number, at least as long as this.
+/// The content of the letter with this number, at least this long.
 pub(super) fn content_of(number: u64, size: usize) -> Vec<u8> {
     let mut content = format!("<<{number}>>").into_bytes();
     content.resize(size.max(content.len()), b'.');
     content
 }
 
-/// The number of a letter, which stands at the beginning of its content.
+/// The number of a letter, at the beginning of its content.
 pub(super) fn number_of(letter: &Letter) -> Option<u64> {
     let payload = letter.payload();
     let bytes = match payload.is_split() {
@@ -90,7 +90,7 @@ pub(super) fn number_of(letter: &Letter) -> Option<u64> {
     number_in(bytes)
 }
 
-/// The number of the letter with this content, or with this content somewhere in its message.
+/// The number of the letter with this content, or with this content anywhere in its message.
 pub(super) fn number_in(bytes: &[u8]) -> Option<u64> {
     let start = bytes.windows(2).position(|window| window == b"<<")? + 2;
     let digits = bytes[start..].split(|byte| *byte == b'>').next()?;

@@ -1,10 +1,10 @@
-//! Hostile members: the gateway of one more host, which has keys and is trusted, and a process of the
-//! first host. They lie in every field of what they send, at any time, with the incarnations of honest
-//! agents and services, and with sequences and hand-overs of honest letters. What they cannot forge is
-//! what a link proves: the certificate of the gateway, the mailbox of the process.
+//! Hostile members: the gateway of one more host, which has keys and is trusted, and a process of
+//! the first host. They send false data in every field, at any time, with the incarnations of
+//! honest agents and services, and with sequence numbers and hand-overs of honest letters. They
+//! cannot forge what a link proves: the certificate of the gateway, the mailbox of the process.
 //!
-//! The process names itself or an agent of the hostile gateway as the sender of its letters: processes
-//! of one user are not separated from each other.
+//! The process uses its own name or an agent of the hostile gateway as the sender of its letters:
+//! processes of one user are not isolated from each other.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,28 +23,28 @@ use super::links::Flown;
 use super::view::{Registered, View, way};
 use super::{AGENTS, Breach, Event, PROCESSES, Process, Set, World};
 
-/// Parcels of others whose headers the liars know.
+/// Maximum number of observed parcel headers.
 const OVERHEARD: usize = 64;
-/// Letters that the liars were handed.
+/// Maximum number of letters that the hostile members were handed.
 const HANDED: usize = 32;
-/// Pause between two lies, at most.
+/// Maximum pause between two false messages.
 const PAUSE_MS: u64 = 12;
-/// Share of letters that honest agents send to agents of the liar.
+/// Fraction of letters that honest agents send to agents of hostile members.
 pub(super) const TO_LIARS: f64 = 0.1;
 
-/// What the hostile members know.
+/// State of the hostile members.
 pub(super) struct Liars {
     /// The hostile gateway, and the hostile process on the first host.
     pub(super) at: [usize; 2],
     agents: Vec<(Arc<str>, Incarnation)>,
     overheard: Vec<Parcel>,
     handed: Vec<Letter>,
-    /// Answers of late arrivals: the process that waits, and its attempt.
+    /// Answers to deferred arrivals: the process that waits, and its attempt.
     owed: Vec<(usize, AttemptId)>,
-    /// Introductions whose connections are open, and where.
+    /// Introductions with open connections, and their targets.
     introduced: Vec<(usize, Introduction)>,
     attempts: u64,
-    /// Agents that a process has, or had, in its directory.
+    /// Agents that are or were in a process's directory.
     learnt: Set<(usize, Incarnation)>,
 }
 
@@ -56,13 +56,13 @@ impl Liars {
     }
 }
 
-/// What a link with a gateway of this host proves.
+/// The proof of a link with a gateway of this host.
 pub(super) fn certificate(host: usize) -> Principal {
     Principal::Certificate([u8::try_from(host).unwrap_or(u8::MAX); 32])
 }
 
 impl World {
-    /// Lets the hostile gateway and the hostile process join.
+    /// Adds the hostile gateway and the hostile process.
     pub(super) fn admit_liars(&mut self) {
         let known = vec![self.start; self.weather.hosts];
         let mut at = [0; 2];
@@ -148,7 +148,7 @@ impl World {
         }
     }
 
-    /// The connections of this gateway end.
+    /// Closes the connections of this gateway.
     pub(super) fn part(&mut self, gone: usize) {
         if !self.weather.liars || !self.processes[gone].gateway {
             return;
@@ -178,12 +178,12 @@ impl World {
         }
     }
 
-    /// Whether this registration is of an agent of a hostile member, or of none.
+    /// Whether this registration belongs to an agent of a hostile member, or to none.
     pub(super) fn is_hostile(&self, sender: Incarnation) -> bool {
         self.liars.is_some() && !self.honest.contains(&sender)
     }
 
-    /// Whether an agent of a living process has this registration.
+    /// Whether an agent of a running process has this registration.
     pub(super) fn is_registered(&self, agent: Incarnation) -> bool {
         let mut living = self.processes.iter().filter(|process| process.alive);
         living.any(|process| process.agents.iter().any(|(_, it)| *it == agent))
@@ -200,7 +200,7 @@ impl World {
         Some(Arc::clone(name))
     }
 
-    /// The hostile members learn the headers of what honest ones send.
+    /// Records the headers of parcels that honest members send.
     pub(super) fn overhear(&mut self, parcel: &Parcel) {
         if let Some(liars) = &mut self.liars {
             if liars.overheard.len() >= OVERHEARD {
@@ -215,7 +215,7 @@ impl World {
         }
     }
 
-    /// A parcel comes to a hostile member, which answers as it likes.
+    /// A parcel arrives at a hostile member, which answers arbitrarily.
     pub(super) fn answer_falsely(&mut self, from: usize, attempt: AttemptId, parcel: Parcel) {
         let answers = self.random.u32(..8);
         let answer = self.false_answer(parcel.sequence);
@@ -268,7 +268,7 @@ impl World {
         reasons[self.random.usize(..reasons.len())]
     }
 
-    /// A number near this one, at an end of the range, or any.
+    /// A number near this one, at an end of the range, or arbitrary.
     fn false_number(&mut self, near: u64) -> u64 {
         match self.random.u32(..12) {
             0 => 0,
@@ -312,7 +312,7 @@ impl World {
         }
     }
 
-    /// A letter whose message is false, or broken, with false stamps.
+    /// A letter with a false or corrupted message and false stamps.
     fn false_letter(&mut self, target: usize) -> Option<Letter> {
         let handed = self.liars.as_ref().map_or(0, |liars| liars.handed.len());
         let mut letter = match self.random.u32(..4) {
@@ -389,8 +389,8 @@ impl World {
         }
     }
 
-    /// Whether this registration is, or was, in the directory of the target. Before that it belongs to
-    /// the first link on which it is heard, whose ever that is.
+    /// Whether this registration is or was in the directory of the target. Before that it belongs
+    /// to the first link that uses it, whichever that is.
     fn is_known(&mut self, agent: Incarnation, target: usize) -> bool {
         let known = self.view(target).known_incarnation(agent).is_some();
         self.liars.as_mut().is_some_and(|liars| match known {
@@ -414,7 +414,7 @@ impl World {
         own[self.random.usize(..own.len())]
     }
 
-    /// One more lie.
+    /// Sends one more false message.
     pub(super) fn lie(&mut self) -> Result<(), Breach> {
         if self.now <= self.quiet + super::traffic::AFTER {
             let pause = Duration::from_micros(self.random.u64(100..PAUSE_MS * 1000));
@@ -452,7 +452,7 @@ impl World {
         }
     }
 
-    /// A hello in the name of any service, or the end of the connection with one.
+    /// A greeting in the name of any service, or the end of a connection with one.
     fn introduce_falsely(&mut self, liar: usize, target: usize) -> Result<(), Breach> {
         let now = self.clocks();
         let ended = self.random.u32(..3) == 0;
@@ -573,7 +573,7 @@ impl World {
             (true, false) => Kind::Shm,
             (false, _) => Kind::Tcp,
         };
-        // Its hello may name any service, its mailbox only itself.
+        // Its greeting may name any service, its mailbox only itself.
         let named = match remote && self.random.u32(..3) == 0 {
             true => self.any_incarnation(target),
             false => self.processes[liar].incarnation,

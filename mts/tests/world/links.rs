@@ -1,7 +1,7 @@
-//! What lies between processes: links that lose, delay and refuse, and never reorder.
+//! Links between processes, which lose, delay and refuse parcels, and never reorder them.
 //!
-//! The world's part of the interface between core and transports stands here: dispatch, abandon,
-//! answer and arrival.
+//! This module simulates the interface between core and transports: dispatch, abandon, answer and
+//! arrival.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -19,34 +19,34 @@ use super::liar::certificate;
 use super::view::{address_of, way};
 use super::{Breach, Event, World};
 
-/// Bytes a second between two hosts, by each transport. A full window of the largest letters takes
-/// less time than an attempt may.
+/// Bytes per second between two hosts, by transport. A full window of the largest letters takes
+/// less time than the timeout of an attempt.
 pub(super) const BYTES_PER_SECOND: u64 = 4_000_000;
-/// Bytes that a connection takes before parcels wait in the sender's outbox.
+/// Bytes that a connection accepts before parcels wait in the sender's outbox.
 const SOCKET: usize = 16 << 10;
 /// Largest letter in a datagram.
 pub(super) const MAX_DATAGRAM: usize = 8 << 10;
 
-/// Bytes of a parcel's header that count, at least.
+/// Minimum number of bytes that a parcel's header counts as.
 const HEADER: usize = 64;
 
 /// One direction between two processes.
 pub(super) struct Link {
-    /// When the last parcel arrives: links keep their order.
+    /// Arrival of the last parcel: links keep their order.
     arrives: Instant,
-    /// Parcels that have not been transmitted, by when they will be.
+    /// Parcels that have not been transmitted, by the end of their transmission.
     queue: VecDeque<(Instant, usize)>,
 }
 
 /// An attempt without a conclusion.
 pub(super) struct Flight {
-    /// The process that it goes to; `usize::MAX` for none.
+    /// Its target; `usize::MAX` for none.
     to: usize,
-    /// When its first byte leaves; none if no byte ever does.
+    /// Time at which its first byte leaves; `None` if none ever does.
     leaves: Option<Instant>,
-    /// Its arrival.
+    /// Its arrival event.
     event: Option<u64>,
-    /// The link that it waits for, and when it will be transmitted.
+    /// The link that it waits for, and the end of its transmission.
     queued: Option<((usize, usize, Kind), Instant)>,
 }
 
@@ -57,16 +57,16 @@ pub(super) struct Flown {
     kind: Kind,
     attempt: AttemptId,
     parcel: Parcel,
-    /// Its answer is lost.
+    /// Whether its answer is lost.
     mute: bool,
-    /// Not the parcel itself, but a second one.
+    /// Whether it is a duplicate.
     copy: bool,
-    /// The service that its link names, if it is not the one that sent it.
+    /// The service that its link claims, if that is not its sender.
     named: Option<Incarnation>,
 }
 
 impl Flown {
-    /// A parcel of a hostile member, on a link that names this service.
+    /// A parcel of a hostile member, on a link that claims this service.
     pub(super) fn lie(
         (from, to): (usize, usize),
         kind: Kind,
@@ -188,7 +188,7 @@ impl World {
         }
     }
 
-    /// When a parcel leaves its process, when it is transmitted, and when it arrives.
+    /// The times at which a parcel leaves its process, is transmitted, and arrives.
     fn transmit(
         &mut self,
         (at, to): (usize, usize),
@@ -257,7 +257,7 @@ impl World {
         self.after_ms(ms, conclude);
     }
 
-    /// A core is not interested in an attempt any more, and is told at once how it ended.
+    /// The core abandons an attempt, and gets its conclusion at once.
     pub(super) fn abandon(&mut self, at: usize, attempt: AttemptId, error: WayError) {
         let conclusion = match self.take_back(at, attempt) {
             true => Conclusion::NotSent(error),
@@ -270,7 +270,7 @@ impl World {
         core.handle_conclusion(now, attempt, conclusion);
     }
 
-    /// An attempt has this end.
+    /// Concludes an attempt.
     pub(super) fn note_end(&mut self, at: usize, attempt: AttemptId, conclusion: &Conclusion) {
         if let Conclusion::Answered(Answer::Accepted) | Conclusion::Unconfirmed(_) = conclusion {
             self.may_repeat.insert((at, attempt));
@@ -294,8 +294,8 @@ impl World {
         never
     }
 
-    /// This process is gone: what had not left it goes with it, what was under way to it breaks
-    /// off.
+    /// Handles the end of this process: parcels that had not left are lost with it, and attempts to
+    /// it break off.
     pub(super) fn break_off(&mut self, dead: usize) {
         let own: Vec<AttemptId> = self.processes[dead].open.keys().copied().collect();
         for attempt in own {
@@ -314,20 +314,20 @@ impl World {
         }
     }
 
-    /// Whether this location is where its service can be reached now.
+    /// Whether this location is a current location of its service.
     fn is_present(&self, to: usize, location: &Location) -> bool {
         let registry = self.registry.lock();
         let present = registry.present_address(self.processes[to].host, location.kind());
         address_of(location) == Some(present)
     }
 
-    /// Whether nothing passes from one of these processes to the other.
+    /// Whether these two processes are disconnected from each other.
     fn is_cut(&self, one: usize, other: usize) -> bool {
         let (one, other) = (self.processes[one].host, self.processes[other].host);
         one != other && (self.cut_off.contains(&one) || self.cut_off.contains(&other))
     }
 
-    /// The answer to an arrival that was put off.
+    /// The answer to a deferred arrival.
     pub(super) fn answer(&mut self, at: usize, ticket: Ticket, answer: Answer) {
         if let Some((sender, attempt)) = self.processes[at].tickets.remove(&ticket)
             && !self.is_cut(at, sender)
@@ -421,9 +421,9 @@ impl World {
         }
         let process = &mut self.processes[to];
         match verdict {
-            // What is said of a copy is no answer to the attempt (rule 3 of transports).
+            // The verdict on a duplicate does not answer the attempt (rule 3 of transports).
             _ if copy => {}
-            // The way back is cut.
+            // The return path is disconnected.
             Verdict::Now(_) if cut => {}
             Verdict::Now(answer) => {
                 let conclusion = match mute {

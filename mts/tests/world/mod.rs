@@ -1,4 +1,4 @@
-//! A simulated world: hosts, processes, links, time.
+//! A simulation of hosts, processes, links and time.
 
 mod checks;
 mod faults;
@@ -32,41 +32,42 @@ pub(crate) use self::weather::{Deadlines, Weather};
 
 const PROCESSES: usize = 3;
 const AGENTS: usize = 2;
-/// Letters are sent within this time at least, and a while after the world has healed.
+/// Minimum time during which letters are sent; they continue for a while after the simulation has
+/// healed.
 const ACTIVE_MS: u64 = 3000;
-/// How long an attempt may go without an answer.
+/// Timeout of an attempt.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_millis(300);
 
-/// Maps with the same order in every run.
+/// Maps with the same iteration order in every run.
 type Map<K, V> = HashMap<K, V, foldhash::fast::FixedState>;
 type Set<T> = HashSet<T, foldhash::fast::FixedState>;
 
-/// What makes a run worthless: the world or its watchers cannot go on.
+/// An inconsistency that ends a run.
 type Breach = String;
 
 /// A process: robot process or gateway.
 struct Process {
     host: usize,
     gateway: bool,
-    /// It lies; its core is not used.
+    /// Whether it is hostile; its core is not used then.
     hostile: bool,
     incarnation: Incarnation,
     core: Core,
     agents: Vec<(Arc<str>, Incarnation)>,
-    /// Attempts that have not been concluded: dead receivers break them off.
+    /// Attempts without a conclusion; the death of their receiver breaks them off.
     open: BTreeMap<AttemptId, Flight>,
-    /// Arrivals answered later: the process that waits for the answer, and its attempt.
+    /// Deferred arrivals: the process that waits for the answer, and its attempt.
     tickets: Map<Ticket, (usize, AttemptId)>,
     next_ticket: u64,
     alive: bool,
-    /// Since when it refuses to send: the service has ended.
+    /// Time since which it refuses to send, because its service has ended.
     closed: Option<Instant>,
     wake: Option<Instant>,
 }
 
 enum Event {
     Send,
-    /// A hostile member sends something.
+    /// A hostile member sends a message.
     Lie,
     /// The next letter of a pair that sends without a pause.
     Stream {
@@ -88,16 +89,16 @@ enum Event {
     Deadline {
         number: u64,
     },
-    /// By now this letter has to be delivered.
+    /// The deadline for the delivery of this letter.
     Liveness {
         number: u64,
     },
     Die,
     Restart,
     GatewayDies,
-    /// A process closes.
+    /// A process starts to close.
     Close,
-    /// It has closed, and ends.
+    /// A process that closed ends.
     Closed {
         process: usize,
     },
@@ -114,7 +115,7 @@ enum Event {
     Settle {
         name: Arc<str>,
     },
-    /// What has changed becomes known on a host, to these processes as a departure.
+    /// A change becomes known on a host, and to these processes as a departure.
     News {
         host: usize,
         departed: Vec<(usize, Arc<Entry>)>,
@@ -132,12 +133,12 @@ enum Event {
     },
 }
 
-/// Bytes that arrived, and the steps of cores because of them.
+/// Bytes received, and the steps of cores for them.
 #[derive(Debug, Default)]
 struct Work {
     bytes: u64,
     steps: u64,
-    /// Most steps for one arrival.
+    /// Maximum number of steps for one arrival.
     most: u64,
 }
 
@@ -152,16 +153,16 @@ impl Work {
 
 pub(crate) struct World {
     seed: u64,
-    /// What goes wrong until the world heals.
+    /// Faults until the simulation heals.
     forecast: Weather,
-    /// What goes wrong now.
+    /// Current faults.
     weather: Weather,
     random: fastrand::Rng,
     start: Instant,
     now: Instant,
-    /// When no new fault begins any more.
+    /// Time after which no fault begins.
     heals: Instant,
-    /// When the last fault is over, as far as faults have begun.
+    /// Time at which the last fault that has begun is over.
     quiet: Instant,
     events: BinaryHeap<Reverse<(Instant, u64)>>,
     due: Map<u64, Event>,
@@ -173,9 +174,9 @@ pub(crate) struct World {
     /// Attempts whose letter may arrive another time: it was accepted, or may have been.
     may_repeat: Set<(usize, AttemptId)>,
     down: Set<(usize, Kind)>,
-    /// Hosts that nothing gets to or from.
+    /// Disconnected hosts.
     cut_off: Set<usize>,
-    /// Until when TCP to and from a host stands still.
+    /// End of the stall of TCP to and from a host.
     stalled: Map<usize, Instant>,
     denied: Vec<(usize, Denied)>,
     refused: Refused,
@@ -189,7 +190,7 @@ pub(crate) struct World {
     open_bytes: usize,
     /// Letters that a registration has accepted into its queue.
     accepted: Set<(Incarnation, u64)>,
-    /// Which registration of a name has taken a letter.
+    /// The registration of a name that has taken a letter.
     taken: Map<(Arc<str>, u64), Incarnation>,
     /// The last letter of each sender that a registration has taken.
     last_taken: Map<(Incarnation, Incarnation), u64>,
@@ -197,27 +198,27 @@ pub(crate) struct World {
     /// All registrations of honest agents.
     honest: Set<Incarnation>,
     liars: Option<Liars>,
-    /// What arrived, and the steps of cores for it.
+    /// Received bytes, and the steps of cores for them.
     work: Work,
-    /// Gateways that have a connection with each other, or had.
+    /// Gateways that have or had a connection with each other.
     met: Set<(usize, usize)>,
     /// Agents that are about to read.
     reading: Set<Incarnation>,
     failures_told: u64,
-    /// Letters that another registration of their receiver took than the one that was known when
-    /// they were sent.
+    /// Number of letters that another registration of their receiver took than the one that was
+    /// current when they were sent.
     followed: u64,
-    /// The longest time that a letter sent after the faults took.
+    /// Maximum delivery time of a letter sent after the faults.
     slowest: Duration,
-    /// Letters that had to be delivered within the bound.
+    /// Number of letters that had to be delivered within the bound.
     bounded: u64,
     breaches: Breaches,
-    /// Whether everything that happens is printed.
+    /// Whether events are printed.
     traced: bool,
-    /// Whether anybody watches: in some worlds, so that the others show that it makes no
-    /// difference.
+    /// Whether watchers are active: only in some runs, so that the others show that watching has no
+    /// effect.
     watched: bool,
-    /// Who watches, by host.
+    /// The watchers, by host.
     watching: Vec<Watching>,
 }
 
@@ -299,14 +300,13 @@ impl World {
         self.followed
     }
 
-    /// Steps of cores for each byte that arrived, and most steps for one arrival.
+    /// Steps of cores per received byte, and maximum for one arrival.
     pub(crate) fn work(&self) -> (f64, u64) {
         let Work { bytes, steps, most } = self.work;
         (steps as f64 / bytes.max(1) as f64, most)
     }
 
-    /// How many letters the bound of liveness was checked for, and the longest time one of them
-    /// took.
+    /// Number of letters for which the liveness bound was checked, and their maximum delivery time.
     pub(crate) fn liveness(&self) -> (u64, Duration) {
         (self.bounded, self.slowest)
     }
@@ -328,12 +328,12 @@ impl World {
         at
     }
 
-    /// A fault lasts until then.
+    /// Extends the time of faults to then.
     fn fault_until(&mut self, end: Instant) {
         self.quiet = self.quiet.max(end);
     }
 
-    /// Prints what happens, for a look at one seed.
+    /// Prints an event if tracing is on.
     fn trace(&self, text: impl FnOnce() -> String) {
         if self.traced {
             println!("{:?} {}", self.now - self.start, text());
@@ -414,7 +414,7 @@ impl World {
         self.processes.push(process);
     }
 
-    /// The rules of access of a process on this host.
+    /// The access rules of a process on this host.
     fn rules(&self, host: usize, gateway: bool) -> Rules {
         let w = self.weather;
         let (share, place) = match gateway {
@@ -433,10 +433,10 @@ impl World {
         }
     }
 
-    /// Runs until nothing happens any more.
+    /// Runs until no event is left.
     ///
     /// # Errors
-    /// The first breach of each invariant.
+    /// Returns the first violation of each invariant.
     pub(crate) fn run(&mut self) -> Result<(), Breaches> {
         if let Err(breach) = self.play() {
             self.breach(Invariant::World, || breach);
@@ -542,7 +542,7 @@ impl World {
         }
     }
 
-    /// Does what a core wants done.
+    /// Carries out the actions of a core.
     fn carry_out(&mut self, at: usize) -> Result<(), Breach> {
         while let Some(action) = self.processes[at].core.poll_action() {
             match action {

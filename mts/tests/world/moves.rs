@@ -1,4 +1,4 @@
-//! Agents that move from process to process, and mostly from host to host.
+//! Agents that move between processes, usually to another host.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use super::view::Registered;
 use super::{Breach, Event, World};
 
 impl World {
-    /// An agent leaves its process, which hands it what it had not read. Its host knows at once.
+    /// An agent leaves its process, which returns its unread letters. Its host knows at once.
     pub(super) fn leave(&mut self) -> Result<(), Breach> {
         let movable: Vec<(usize, usize)> = self
             .robots()
@@ -60,7 +60,7 @@ impl World {
         self.tell(&times, seen);
     }
 
-    /// It is registered in another process, under the same name.
+    /// The agent is registered in another process, under the same name.
     pub(super) fn settle(&mut self, name: Arc<str>) -> Result<(), Breach> {
         let robots: Vec<usize> = self.robots().collect();
         let Some(&at) = self.random.choice(&robots) else {

@@ -16,16 +16,16 @@ use super::liar::TO_LIARS;
 use super::links::MAX_DATAGRAM;
 use super::{AGENTS, Breach, Event, PROCESSES, World};
 
-/// Outcomes may come this much after the deadline: one turn of the core's timer.
+/// Maximum delay of an outcome after the deadline: one turn of the core's timer.
 const SLACK: Duration = Duration::from_millis(5);
-/// How long letters are still sent when all faults are over.
+/// Time for which letters are still sent after all faults.
 pub(super) const AFTER: Duration = Duration::from_millis(1500);
 
-/// What is remembered of a sent letter, by its number.
+/// State of a sent letter, by its number.
 pub(super) struct Sent {
     pub(super) process: usize,
     pub(super) sender: Incarnation,
-    /// The names of the receivers, as far as they are known.
+    /// Names of the receivers that are known.
     pub(super) receivers: Vec<Arc<str>>,
     /// The registration of the only receiver that its sender knew of.
     pub(super) known: Option<Incarnation>,
@@ -34,7 +34,7 @@ pub(super) struct Sent {
     pub(super) at: Instant,
     pub(super) deadline: Duration,
     pub(super) size: usize,
-    /// How long delivery may take, when every fault was over before the letter was sent.
+    /// Maximum delivery time, if every fault was over before the letter was sent.
     pub(super) bound: Option<Duration>,
 }
 
@@ -69,11 +69,11 @@ impl World {
             return Ok(());
         };
         let host = self.random.usize(..self.weather.hosts);
-        // Few pairs and bursts, so that many letters share a stream.
-        // Few patterns: to compile them takes longer than all the rest.
+        // Few pairs and bursts, so that many letters share a stream. Few patterns, because
+        // compiling them takes longer than everything else.
         let receiver = match self.random.u32(..100) {
             0 => format!("h{host}_.*"),
-            1..=10 => "nobody".to_owned(),
+            1..=10 => "absent".to_owned(),
             _ => format!("h{host}_p{}_{}", self.random.usize(..PROCESSES), 0),
         };
         let mut receiver: Arc<str> = receiver.as_str().into();
@@ -180,7 +180,7 @@ impl World {
         Ok(())
     }
 
-    /// The names of those that get a letter for a pattern.
+    /// The names of the receivers of a letter to a pattern.
     fn meant_by(&self, at: usize, sender: &str, pattern: &str) -> Vec<Arc<str>> {
         let Some(start) = pattern.strip_suffix(".*") else {
             return Vec::new();
@@ -200,7 +200,9 @@ impl World {
         outcome: Outcome,
     ) -> Result<(), Breach> {
         let Some(&number) = self.sends.get(&sent) else {
-            return Err(format!("an outcome of a letter nobody sent: {outcome}"));
+            return Err(format!(
+                "an outcome of a letter that was not sent: {outcome}"
+            ));
         };
         self.trace(|| format!("letter {number} to {receiver}: {outcome}"));
         self.check_outcome(number, &receiver, &outcome);
@@ -226,7 +228,7 @@ impl World {
         if !self.processes[at].alive {
             return Ok(());
         }
-        // All at once when there is no pause to keep, so that queues do not fill in calm weather.
+        // All at once without a pause, so that queues do not fill in calm weather.
         let most = match self.weather.reading_pause_ms > 1 {
             true => 1,
             false => usize::MAX,
@@ -243,7 +245,7 @@ impl World {
         self.carry_out(at)
     }
 
-    /// An agent takes the next letter out of its queue. Returns whether there was one.
+    /// An agent takes the next letter from its queue. Returns whether there was one.
     pub(super) fn take(&mut self, at: usize, agent: Incarnation) -> bool {
         let Some(received) = self.processes[at].core.take(agent) else {
             return false;
@@ -268,7 +270,7 @@ impl World {
         let own = sent.filter(|(_, sent)| sent.sender == received.sender);
         match own.map(|(number, _)| number) {
             Some(number) => self.check_take(agent, number),
-            // What is sent in the name of a registration that has ended harms no agent.
+            // A letter in the name of an ended registration harms no agent.
             None if !self.is_registered(received.sender) => {}
             None => self.breach(Invariant::NoForgery, || {
                 let sender = received.sender;

@@ -1,4 +1,4 @@
-//! The directory of a simulated world, as it is seen from each of its processes.
+//! The directory of a simulation, as each process sees it.
 
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
@@ -9,7 +9,7 @@ use parking_lot::Mutex;
 
 use super::{Map, Set};
 
-/// All registrations of a world, and when each host knows of each.
+/// All registrations of a simulation, and the times at which each host learns of them.
 #[derive(Default)]
 pub(super) struct Registry {
     entries: Vec<Registered>,
@@ -18,8 +18,8 @@ pub(super) struct Registry {
     gateways: Vec<usize>,
     /// Changes of a gateway's address.
     readdressed: Vec<Readdressed>,
-    /// Entries as processes see them, by the place of the registration, the host that looks, and
-    /// whether its gateway looks. An entry changes with its locations only.
+    /// Entries as processes see them, by index of the registration, host of the viewer, and whether
+    /// the viewer is its gateway. An entry changes only with its locations.
     seen: Map<(usize, usize, bool), (Reached, Arc<Entry>)>,
     pub(super) now: Option<Instant>,
 }
@@ -30,9 +30,9 @@ pub(super) struct Registered {
     pub(super) host: usize,
     pub(super) mts: Incarnation,
     pub(super) role: Role,
-    /// When it is known on each host.
+    /// Time at which each host learns of it.
     pub(super) known: Vec<Instant>,
-    /// When its end is known on each host, once it has ended.
+    /// Time at which each host learns of its end, once it has ended.
     pub(super) left: Vec<Instant>,
 }
 
@@ -64,20 +64,20 @@ impl Registry {
         self.entries.push(registered);
     }
 
-    /// This registration has ended, which each host knows at its time.
+    /// Ends this registration, which each host learns at its own time.
     pub(super) fn end(&mut self, incarnation: Incarnation, left: &[Instant]) {
         if let Some(place) = self.by_incarnation.get(&incarnation) {
             self.entries[*place].left = left.to_vec();
         }
     }
 
-    /// The gateway of this host has another address of this kind, which each host knows at its
+    /// Changes the address of one kind of this host's gateway, which each host learns at its own
     /// time.
     pub(super) fn readdress(&mut self, host: usize, kind: Kind, known: Vec<Instant>) {
         self.readdressed.push(Readdressed { host, kind, known });
     }
 
-    /// The address of this host's gateway, as this other one knows it.
+    /// The address of this host's gateway that another host knows.
     fn address(&self, host: usize, kind: Kind, seen_from: usize) -> usize {
         let changes = self.readdressed.iter();
         let known = changes.filter(|change| {
@@ -86,7 +86,7 @@ impl Registry {
         known.count()
     }
 
-    /// The present address of this host's gateway.
+    /// The current address of this host's gateway.
     pub(super) fn present_address(&self, host: usize, kind: Kind) -> usize {
         self.address(host, kind, host)
     }
@@ -125,7 +125,7 @@ impl View {
             let locations = [address(Kind::Udp), address(Kind::Tcp)];
             (locations, Reach::Remote { gateway })
         } else {
-            // Only what the gateway knows a way to is known to the other processes.
+            // Other processes know only agents to which the gateway has a route.
             registry.gateway(registered.host, self.host)?;
             let gateway = registry.gateway(self.host, self.host)?;
             let locations = [(Kind::Shm, gateway, 0), (Kind::Tcp, gateway, 0)];
@@ -159,7 +159,7 @@ impl View {
 impl Directory for View {
     fn known(&self, name: &str) -> Option<Arc<Entry>> {
         let mut registry = self.registry.lock();
-        // The registration that has the name keeps it, until it is known to have ended.
+        // The registration that has the name keeps it until its end is known.
         let count = registry.by_name.get(name)?.len();
         (0..count).find_map(|nth| {
             let place = *registry.by_name.get(name)?.get(nth)?;

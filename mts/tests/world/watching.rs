@@ -1,5 +1,5 @@
-//! Somebody who watches each host: every letter is seen once, in order, with the outcome that its
-//! sender is told.
+//! A watcher of each host: every letter is seen once, in order, with the outcome that its sender is
+//! told.
 
 use super::Map;
 use std::sync::Arc;
@@ -13,17 +13,17 @@ use fipa_transport::{Incarnation, Outcome, wire};
 use super::gates::number_in;
 use super::{Breach, World};
 
-/// The watcher of a host, and what it has seen.
+/// The watcher of a host, and the letters that it has seen.
 #[derive(Default)]
 pub(super) struct Watching {
     joiner: Joiner,
-    /// By the sender's life and its sequence.
+    /// By the sender's incarnation and the sequence number.
     seen: Map<(Incarnation, u64), Arc<Passage>>,
     last: Map<Incarnation, u64>,
 }
 
 impl Watching {
-    /// A process tells of a letter, as real ones do.
+    /// Passes a record of a process to the watcher, as the runtime does.
     pub(super) fn hear(
         &mut self,
         (now, utc): (Instant, SystemTime),
@@ -53,7 +53,7 @@ impl Watching {
                 "seen twice, or news of what was not seen: {passage:?}"
             ));
         }
-        // Of senders on this host, whose beginnings are told.
+        // For senders of this host, which report the sending.
         if passage.send.is_some() && !later {
             let last = self.last.insert(sender, passage.sequence).unwrap_or(0);
             if last >= passage.sequence {
@@ -62,7 +62,7 @@ impl Watching {
         }
         let content = self.seen.remove(&key).map(|before| before.content.clone());
         let passage = match content {
-            // What was told before is not told again.
+            // An identical report is not repeated.
             Some(content) => Arc::new(Passage {
                 content,
                 ..Passage::clone(&passage)
@@ -89,7 +89,7 @@ impl World {
             for passage in watching.seen.values().filter(|it| !it.from_service) {
                 let outcome = match (&passage.fate, passage.via) {
                     (Fate::Settled(outcome), _) => outcome.clone(),
-                    // Nothing else was told to the sender, or there would have been news.
+                    // The sender got the same outcome, or there would have been another event.
                     (Fate::Taken, Some(via)) if passage.send.is_some() => Outcome::Delivered {
                         via,
                         attempts: Vec::new(),
@@ -105,7 +105,7 @@ impl World {
         for (number, sent) in &self.sent {
             for (receiver, outcome) in &sent.outcomes {
                 let seen = settled.get(&(*number, Arc::clone(receiver)));
-                // Of very many attempts the first are not told.
+                // Records of very many attempts leave out the attempts.
                 if seen.map(wire::write_outcome) != Some(wire::write_outcome(outcome)) {
                     return Err(format!(
                         "letter {number} to {receiver}: {outcome}, and seen was {seen:?}"

@@ -1,17 +1,17 @@
-//! What goes wrong in a simulated world.
+//! The faults of a simulation.
 
 use std::time::Duration;
 
 use fipa_mts::core::MAX_DEADLINE;
 use fipa_transport::Kind;
 
-/// How long most letters may take.
+/// Deadline of most letters.
 pub(super) const DEADLINE: Duration = Duration::from_millis(2500);
 
-/// Which deadlines letters have.
+/// Distribution of the letters' deadlines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Deadlines {
-    /// [`DEADLINE`] for each, and longer than any delay when the world has healed.
+    /// [`DEADLINE`] for each, which is longer than any delay after the simulation has healed.
     Same,
     /// From 10 ms to the maximum, drawn for each letter.
     Mixed,
@@ -34,93 +34,97 @@ impl Deadlines {
     }
 }
 
-/// What goes wrong, and how often, until the world heals. Only what belongs to the traffic itself
-/// goes on after that: short deadlines, large letters, and refusals of single letters.
+/// Kinds and rates of faults until the simulation heals. Only properties of the traffic itself
+/// continue after that: short deadlines, large letters, and refusals of single letters.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Weather {
-    /// A parcel is lost on the way; its sender hears that it is unconfirmed.
+    /// A parcel is lost in transit; its sender gets an unconfirmed conclusion.
     pub loss: f64,
-    /// A parcel arrives, its answer is lost.
+    /// A parcel arrives, and its answer is lost.
     pub answer_loss: f64,
-    /// Nothing leaves, and that is known.
+    /// A parcel does not leave, and its sender learns that.
     pub refusal: f64,
-    /// A parcel is lost, and nothing is ever heard of it.
+    /// A parcel is lost without any conclusion.
     pub silence: f64,
-    /// A parcel between hosts is late, by up to [`late_ms`](Self::late_ms), and others overtake
-    /// it: more than transports allow themselves.
+    /// A parcel between hosts is late, by up to [`late_ms`](Self::late_ms), and others overtake it,
+    /// which real transports do not allow.
     pub overtaken: f64,
-    /// A parcel between hosts arrives a second time, up to [`late_ms`](Self::late_ms) later: more
-    /// than transports allow themselves, too. A letter only if its attempt may have delivered it.
+    /// A parcel between hosts arrives a second time, up to [`late_ms`](Self::late_ms) later, which
+    /// real transports do not allow either. A letter only if its attempt may have delivered it.
     pub copies: f64,
-    /// Longest delay of late parcels and of copies. Longer than an attempt may take in these
-    /// worlds, so that parcels of abandoned attempts arrive, too.
+    /// Maximum delay of late parcels and of duplicates. Longer than the timeout of an attempt here,
+    /// so that parcels of abandoned attempts also arrive.
     pub late_ms: u64,
-    /// How often a host is cut off from the others for a while: nothing passes, and nobody is told.
+    /// Number of temporary disconnections of a host from the others: nothing passes, without a
+    /// notification.
     pub partitions: u32,
-    /// How often TCP between a host and the others stands still for a while: parcels wait in
-    /// sockets and outboxes, in order.
+    /// Number of temporary TCP stalls between a host and the others: parcels wait in sockets and
+    /// outboxes, in order.
     pub stalls: u32,
-    /// How many processes die in the course of the run. Most come back as a new life.
+    /// Number of processes that die during the run. Most restart with a new incarnation.
     pub deaths: u32,
-    /// How many gateways die, and come back.
+    /// Number of gateways that die and restart.
     pub gateway_deaths: u32,
-    /// How many robot processes close in order: they give up what is under way, refuse more, and end.
+    /// Number of robot processes that close gracefully: they abandon letters in transit, refuse
+    /// more, and end.
     pub closings: u32,
-    /// How many robot processes are killed and started again, with agents of the same names.
+    /// Number of robot processes that are killed and restarted, with agents of the same names.
     pub restarts: u32,
-    /// How often an agent leaves its process and is registered in another one, mostly elsewhere.
+    /// Number of agents that leave their process and are registered in another one, usually on
+    /// another host.
     pub moves: u32,
-    /// How long news of registrations and addresses take to another host, at most.
+    /// Maximum time for changes of registrations and addresses to reach another host.
     pub news_ms: u64,
-    /// How often a gateway's address of one kind changes; nothing reaches the old one.
+    /// Number of changes of a gateway's address of one kind; nothing reaches the old one.
     pub addresses: u32,
-    /// How many hosts there are.
+    /// Number of hosts.
     pub hosts: usize,
-    /// How often one kind of transport stops working on one host for a while.
+    /// Number of temporary outages of one kind of transport on one host.
     pub outages: u32,
-    /// How long agents wait between two letters they read.
+    /// Pause of agents between two letters that they read.
     pub reading_pause_ms: u64,
-    /// How long an answer may be on its way back.
+    /// Maximum delay of an answer.
     pub answering_ms: u64,
-    /// How long a parcel between two processes of a host may take, beyond the usual.
+    /// Maximum extra delay of a parcel between two processes of a host.
     pub local_ms: u64,
-    /// Bound of each agent's queue.
+    /// Limit of each agent's queue.
     pub queue: usize,
-    /// Bound of each lane.
+    /// Limit of each lane.
     pub lane: usize,
-    /// Bytes in each agent's queue.
+    /// Maximum bytes in each agent's queue.
     pub queue_bytes: usize,
-    /// Bytes in each lane.
+    /// Maximum bytes in each lane.
     pub lane_bytes: usize,
-    /// Bytes that a gateway has in custody.
+    /// Maximum bytes in a gateway's custody.
     pub custody_bytes: usize,
-    /// The transports in order of preference.
+    /// Transports in order of preference.
     pub order: &'static [Kind],
-    /// Which deadlines letters have.
+    /// Distribution of the letters' deadlines.
     pub deadlines: Deadlines,
-    /// Share of letters that are larger than a datagram.
+    /// Fraction of letters that are larger than a datagram.
     pub large: f64,
-    /// Share of letters that every gateway refuses.
+    /// Fraction of letters that every gateway refuses.
     pub refused_by_gateways: f64,
-    /// Share of letters that every receiving process refuses.
+    /// Fraction of letters that every receiving process refuses.
     pub refused_by_receivers: f64,
-    /// How often a gateway refuses all letters for one name, for a while.
+    /// Number of times that a gateway temporarily refuses all letters for one name.
     pub denials: u32,
-    /// Letters a second that a gateway takes from one host; 0 for any number.
+    /// Letters per second that a gateway accepts from one host; 0 for no limit.
     pub rate: f64,
-    /// Letters that it sends then, less than this.
+    /// Letters that an agent sends at a time are fewer than this.
     pub burst: u32,
-    /// How often an agent sends a few letters.
+    /// Number of times that an agent sends a few letters.
     pub bursts: u32,
-    /// Pairs of agents that send without a pause from the beginning to the end, also after the
-    /// world has healed.
+    /// Number of pairs of agents that send without a pause from start to end, also after the
+    /// simulation has healed.
     pub streams: usize,
-    /// Whether a gateway and a process lie, also after the world has healed. Gateways have keys then.
+    /// Whether a gateway and a process are hostile, also after the simulation has healed. Gateways
+    /// then have keys.
     pub liars: bool,
 }
 
 impl Weather {
-    /// Nothing goes wrong.
+    /// No faults.
     pub(crate) fn calm() -> Self {
         Self {
             loss: 0.0,
@@ -163,7 +167,7 @@ impl Weather {
         }
     }
 
-    /// Nothing goes wrong, and a few agents send without a pause, with all kinds of deadlines.
+    /// No faults, and a few agents that send without a pause, with all kinds of deadlines.
     pub(crate) fn busy() -> Self {
         Self {
             deadlines: Deadlines::Mixed,
@@ -175,7 +179,7 @@ impl Weather {
         }
     }
 
-    /// The same, with a gateway and a process that lie.
+    /// The same, with a hostile gateway and a hostile process.
     pub(crate) fn with_liars(self) -> Self {
         Self {
             liars: true,
@@ -183,7 +187,7 @@ impl Weather {
         }
     }
 
-    /// What still goes wrong once the world has healed.
+    /// The faults that remain after the simulation has healed.
     pub(super) fn healed(self) -> Self {
         Self {
             loss: 0.0,
@@ -197,7 +201,7 @@ impl Weather {
         }
     }
 
-    /// Whether nothing but slow reading goes wrong: then letters fail because queues are full.
+    /// Whether slow reading is the only fault: then letters fail because queues are full.
     pub(super) fn is_slow_only(&self) -> bool {
         let read_at_once = Self {
             queue: 64,

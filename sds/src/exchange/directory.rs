@@ -1,4 +1,4 @@
-//! The back end with what neighbours have told.
+//! The back end with the entries that neighbors sent.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,58 +11,58 @@ use super::{Agents, Exchange, ExchangeError};
 use crate::table::Table;
 use crate::{Directory, Entry, Role, Subscriber};
 
-/// The agents that neighbours have told of.
+/// The agents that neighbors sent.
 ///
-/// Of two neighbours with a [certified](Mandate::Certified) link that claim one name, the one that
-/// claimed it first here has it until its entry leaves: neither can claim an earlier registration.
+/// If two neighbors with a [certified](Mandate::Certified) link claim one name, the first claim
+/// received holds it until its entry leaves: a neighbor cannot claim an earlier registration.
 #[derive(Debug)]
 pub struct ExchangeDirectory {
-    table: Table<Teller>,
-    /// The certified links with neighbours.
+    table: Table<Origin>,
+    /// Mandates of the neighbors with certified links.
     mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
-    /// What each gateway has told. The lock is held while the table is changed, too.
-    told: Mutex<HashMap<Incarnation, Agents>>,
+    /// Agents of each gateway. The lock is held while the table is updated.
+    agents_of: Mutex<HashMap<Incarnation, Agents>>,
 }
 
 impl Default for ExchangeDirectory {
     fn default() -> Self {
         Self {
-            table: Table::proved_by(|teller| teller.is_proved),
+            table: Table::proved_by(|origin| origin.is_proved),
             mandates: ArcSwap::default(),
-            told: Mutex::default(),
+            agents_of: Mutex::default(),
         }
     }
 }
 
-/// The gateway that has told of an agent.
+/// The gateway that sent an agent's entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-struct Teller {
+struct Origin {
     gateway: Incarnation,
     /// Whether its link is certified.
     is_proved: bool,
 }
 
-type Update = (Teller, Arc<str>, Option<Arc<Entry>>);
+type Update = (Origin, Arc<str>, Option<Arc<Entry>>);
 
 impl ExchangeDirectory {
-    /// Most contested names that [`contested`](Self::contested) returns.
+    /// Maximum number of pairs that [`contested`](Self::contested) returns.
     pub const MAX_CONTESTED: usize = 1024;
 
-    /// Names that more than one neighbour with a certified link claims: the entry that has the name,
-    /// and each other one. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED).
+    /// Returns the names that several neighbors with a certified link claim: the entry that holds
+    /// the name, and each other entry. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED) pairs.
     #[must_use]
     pub fn contested(&self) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         self.table.contested(Self::MAX_CONTESTED)
     }
 
-    /// Whether any link with a neighbour is certified.
+    /// Whether any link with a neighbor is certified.
     #[must_use]
     pub fn is_proved(&self) -> bool {
         !self.mandates.load().is_empty()
     }
 
-    /// The link with the gateway proves this. What the gateway has told before is forgotten when that is
-    /// something else.
+    /// Sets the mandate that the link with the gateway proves. If it changed, the gateway's entries
+    /// are dropped.
     pub(super) fn prove(&self, gateway: Incarnation, mandate: &Mandate) {
         if self.mandate(gateway) == *mandate {
             return;
@@ -76,64 +76,64 @@ impl ExchangeDirectory {
             };
             mandates
         });
-        // What other directories say of this gateway counts, or no longer does.
-        self.table.tell_all();
+        // The mandate decides which entries of this gateway in other directories are visible.
+        self.table.notify_reread();
     }
 
-    fn teller(&self, gateway: Incarnation) -> Teller {
-        Teller {
+    fn origin(&self, gateway: Incarnation) -> Origin {
+        Origin {
             gateway,
             is_proved: self.mandates.load().contains_key(&gateway),
         }
     }
 
-    /// These are all agents of the gateway now.
+    /// Replaces all agents of the gateway.
     pub(super) fn replace(
         &self,
         gateway: Incarnation,
         entries: Agents,
     ) -> Result<(), ExchangeError> {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let others = told.iter().filter(|(other, _)| **other != gateway);
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let others = agents_of.iter().filter(|(other, _)| **other != gateway);
         let total: usize = others.map(|(_, entries)| entries.len()).sum();
         if total + entries.len() > Exchange::MAX_TOTAL {
             return Err(ExchangeError::TooMany);
         }
-        let before = told.insert(gateway, entries).unwrap_or_default();
-        let now = told.get(&gateway);
+        let before = agents_of.insert(gateway, entries).unwrap_or_default();
+        let now = agents_of.get(&gateway);
         let left = before
             .into_keys()
             .filter(|name| now.is_none_or(|now| !now.contains_key(name)))
-            .map(|name| (teller, name, None));
+            .map(|name| (origin, name, None));
         let here = now.into_iter().flatten();
-        let here = here.map(|(name, entry)| (teller, Arc::clone(name), Some(Arc::clone(entry))));
+        let here = here.map(|(name, entry)| (origin, Arc::clone(name), Some(Arc::clone(entry))));
         let updates: Vec<Update> = left.chain(here).collect();
         self.table.update(updates);
         Ok(())
     }
 
-    /// These agents of the gateway have joined or are different now, and those have left.
+    /// Adds or updates some agents of the gateway, and removes others.
     pub(super) fn change(
         &self,
         gateway: Incarnation,
         joined: Vec<Arc<Entry>>,
         left: Vec<String>,
     ) -> Result<(), ExchangeError> {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let total: usize = told.values().map(Agents::len).sum();
-        let of_gateway = told.entry(gateway).or_default();
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let total: usize = agents_of.values().map(Agents::len).sum();
+        let of_gateway = agents_of.entry(gateway).or_default();
         let mut after = of_gateway.clone();
         let mut updates: Vec<Update> = Vec::new();
         for name in left {
             if let Some((name, _)) = after.remove_entry(name.as_str()) {
-                updates.push((teller, name, None));
+                updates.push((origin, name, None));
             }
         }
         for entry in joined {
             after.insert(Arc::clone(&entry.name), Arc::clone(&entry));
-            updates.push((teller, Arc::clone(&entry.name), Some(entry)));
+            updates.push((origin, Arc::clone(&entry.name), Some(entry)));
         }
         let total = total - of_gateway.len() + after.len();
         if after.len() > Exchange::MAX_AGENTS || total > Exchange::MAX_TOTAL {
@@ -144,32 +144,32 @@ impl ExchangeDirectory {
         Ok(())
     }
 
-    /// The gateway is elsewhere now, and all its agents with it.
+    /// Sets new locations of the gateway and all its agents.
     pub(super) fn relocate(&self, gateway: Incarnation, locations: &[Location]) {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
         let mut updates: Vec<Update> = Vec::new();
-        for (name, entry) in told.get_mut(&gateway).into_iter().flatten() {
+        for (name, entry) in agents_of.get_mut(&gateway).into_iter().flatten() {
             *entry = Arc::new(Entry {
                 locations: locations.to_vec(),
                 ..Entry::clone(entry)
             });
-            updates.push((teller, Arc::clone(name), Some(Arc::clone(entry))));
+            updates.push((origin, Arc::clone(name), Some(Arc::clone(entry))));
         }
         self.table.update(updates);
     }
 
-    /// Lets go of agents of the gateway that another directory knows, unless they are proved. Says
-    /// whether there were any.
-    /// Coalitions stay: this directory [speaks for](Directory::speaks_for) them.
+    /// Drops agents of the gateway that another directory knows, unless they are proved. Returns
+    /// whether there were any. Coalitions stay, because this directory [speaks
+    /// for](Directory::speaks_for) them.
     pub(super) fn leave_to_others(
         &self,
         gateway: Incarnation,
         knows: impl Fn(&Entry) -> bool,
     ) -> bool {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let Some(agents) = told.get_mut(&gateway).filter(|_| !teller.is_proved) else {
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let Some(agents) = agents_of.get_mut(&gateway).filter(|_| !origin.is_proved) else {
             return false;
         };
         let agent = |entry: &&Arc<Entry>| entry.role == Role::Agent && knows(entry);
@@ -179,26 +179,26 @@ impl ExchangeDirectory {
             agents.remove(name);
         }
         let any = !known.is_empty();
-        let updates: Vec<Update> = known.into_iter().map(|name| (teller, name, None)).collect();
+        let updates: Vec<Update> = known.into_iter().map(|name| (origin, name, None)).collect();
         self.table.update(updates);
         any
     }
 
-    /// The gateway is gone, and all its agents with it.
+    /// Removes the gateway's agents.
     pub(super) fn forget(&self, gateway: Incarnation) {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let names = told.remove(&gateway).unwrap_or_default().into_keys();
-        self.table.update(names.map(|name| (teller, name, None)));
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let names = agents_of.remove(&gateway).unwrap_or_default().into_keys();
+        self.table.update(names.map(|name| (origin, name, None)));
     }
 }
 
 impl Directory for ExchangeDirectory {
     reads_its_table!(table);
 
-    /// What a gateway tells in letters comes at once and is all there is.
+    /// The letters of a gateway apply atomically and contain all its coalitions.
     fn speaks_for(&self, mts: Incarnation) -> bool {
-        self.told.lock().contains_key(&mts)
+        self.agents_of.lock().contains_key(&mts)
     }
 
     fn mandate(&self, mts: Incarnation) -> Mandate {

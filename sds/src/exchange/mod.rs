@@ -1,19 +1,20 @@
-//! The exchange of directories between gateways that can write to each other.
+//! Exchange of directory entries between gateways that have a connection.
 //!
-//! Where multicast is filtered, nobody is found by it; but gateways that a connection is open
-//! between, whoever knows whose address, can tell each other who is on their hosts. Each tells
-//! its **neighbours** of its own agents only, in letters: everything first, then what changes.
-//! What it is told goes into an [`ExchangeDirectory`], and leaves it with the neighbour.
+//! Where multicast is filtered, mDNS finds nothing; but connected gateways, of which one has the
+//! other's address, can send each other the agents of their hosts. Each sends its **neighbors** its
+//! own agents only, in letters: all of them first, then changes. Received entries are stored in an
+//! [`ExchangeDirectory`], and are removed when the neighbor disconnects.
 //!
-//! [`Exchange`] has no input, output or clock: neighbours, own agents, letters and `now` go in,
-//! letters to be sent come out. It relies on nothing but letters arriving once and in order, or
-//! being known not to have: every letter says from which state of the teller to which it leads,
-//! and who cannot follow asks for everything again. At most one letter is under way to each
-//! neighbour, and what changes meanwhile goes into the next, so that hundreds of agents that
+//! [`Exchange`] has no I/O and no clock: neighbors, own agents, letters and `now` go in, letters to
+//! send come out. It requires only that each letter arrives once and in order, or is reported as
+//! lost. Every letter states the state of the sender to which it applies and the state to which it
+//! leads; a receiver in another state requests all entries again. At most one letter is in flight
+//! to each neighbor, and changes in the meantime go into the next, so that hundreds of agents that
 //! start at once make a few letters.
 //!
-//! A neighbour may be hostile: it can tell of agents of its own only, that are reached through
-//! itself, and that the certificate of its link names, if it has one; how many it may tell of is bounded; and what makes no sense is not used.
+//! A neighbor may be hostile. It can send only agents of its own that are reached through itself
+//! and, if its link has a certificate, that this certificate names. The number of its agents is
+//! bounded, and malformed letters are rejected.
 
 mod directory;
 mod wire;
@@ -27,41 +28,43 @@ use fipa_acl::escape;
 use fipa_transport::{Incarnation, Location, Mandate};
 
 pub use directory::ExchangeDirectory;
-use wire::{Changes, Full, Told};
+use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
 use crate::{Entry, Mts, Reach, Role, Source};
 
-/// The ontology of the letters, by which they are told from others.
+/// Ontology of the letters of the exchange.
 pub const EXCHANGE_ONTOLOGY: &str = "fipa-sds-exchange";
 
 /// Agents by name.
 type Agents = BTreeMap<Arc<str>, Arc<Entry>>;
 
-/// The agents of one's neighbours, and what they are told of one's own.
+/// State of the exchange with all neighbors.
 #[derive(Debug)]
 pub struct Exchange {
-    own: Own,
-    neighbours: HashMap<Incarnation, Neighbour>,
-    /// Who has told something before it was known to be a neighbour, and is to be asked for it.
+    own: LocalAgents,
+    neighbors: HashMap<Incarnation, Neighbor>,
+    /// Gateways that sent a letter before they were reported as neighbors; they are asked for all
+    /// entries later.
     early: HashSet<Incarnation>,
     directory: Arc<ExchangeDirectory>,
     random: u64,
 }
 
-/// A gateway that can be written to.
+/// A gateway with an open connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Present {
     /// The gateway.
     pub mts: Mts,
-    /// Where it takes letters.
+    /// Locations at which it accepts letters.
     pub locations: Vec<Location>,
-    /// The agents that its links prove it to speak for. It can tell of no others.
+    /// The agents for which its links prove that it may speak. Entries of other agents are
+    /// rejected.
     pub mandate: Mandate,
 }
 
 impl Present {
-    /// A gateway on whose links nothing is proved.
+    /// Creates a gateway whose links prove nothing.
     #[must_use]
     pub const fn unproved(mts: Mts, locations: Vec<Location>) -> Self {
         Self {
@@ -72,59 +75,60 @@ impl Present {
     }
 }
 
-/// What this gateway tells.
+/// The agents that this gateway sends to its neighbors.
 #[derive(Debug, Default)]
-struct Own {
+struct LocalAgents {
     agents: Agents,
-    /// Counts the changes of `agents`.
+    /// Number of changes of `agents` so far.
     version: u64,
-    /// The names that changed, the latest last; that of `version` is the last one. Coalitions that
-    /// changed together stand together.
+    /// Names that changed, the latest last; the last one belongs to `version`. Coalitions that
+    /// changed together are adjacent.
     log: VecDeque<Logged>,
 }
 
 #[derive(Debug, Clone)]
 struct Logged {
     name: Arc<str>,
-    /// It changed together with the one before it: they are told in one letter.
-    together: bool,
+    /// Whether it changed together with the previous one; both are then sent in one letter.
+    with_previous: bool,
 }
 
-/// A gateway that can be written to, or could a moment ago.
+/// A gateway that is connected, or was until recently.
 #[derive(Debug)]
-struct Neighbour {
+struct Neighbor {
     mts: Mts,
     locations: Vec<Location>,
     mandate: Mandate,
-    /// Since when it cannot be written to.
+    /// Time of the disconnect.
     gone: Option<Instant>,
-    telling: Telling,
-    /// What was sent and has not arrived yet, if anything is under way.
-    under_way: Option<Telling>,
-    /// When the next letter may go.
+    state: SyncState,
+    /// State of the neighbor once the letter in flight has arrived, if there is one.
+    under_way: Option<SyncState>,
+    /// Earliest time of the next letter.
     due: Instant,
-    /// Letters in a row that did not arrive.
+    /// Number of consecutive letters that did not arrive.
     failures: u32,
-    /// Which of its states is in the directory.
-    held: Option<u64>,
-    /// What it has told so far, of a state that takes several letters.
+    /// The neighbor's version that is in the directory.
+    stored: Option<u64>,
+    /// Entries received so far of a state that takes several letters.
     staged: Option<Staged>,
-    /// When to ask it for everything, if that is wanted, and when that was done last.
+    /// Time at which to request all entries, if necessary, and time of the last request.
     ask: Option<Instant>,
     asked: Option<Instant>,
-    /// When it was last told everything from the start.
+    /// Time at which this gateway last started to send all entries.
     told: Option<Instant>,
 }
 
-/// What a neighbour knows of one's own agents.
+/// State of a neighbor's copy of this gateway's agents.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Telling {
-    /// Everything up to this name, of a state that is not older than this one; nothing at first.
+enum SyncState {
+    /// It has the agents up to this name, of a state at least as new as this version; initially
+    /// none.
     Some {
         upto: Option<Arc<str>>,
         version: u64,
     },
-    /// All of this state.
+    /// It has all agents of this version.
     All { version: u64 },
 }
 
@@ -135,53 +139,53 @@ struct Staged {
 }
 
 impl Exchange {
-    /// Most agents that one neighbour can tell of.
+    /// Maximum number of agents of one neighbor.
     pub const MAX_AGENTS: usize = 10_000;
-    /// Most agents that all neighbours together can tell of.
+    /// Maximum number of agents of all neighbors together.
     pub const MAX_TOTAL: usize = 40_000;
-    /// Most neighbours that are told anything.
+    /// Maximum number of neighbors.
     pub const MAX_NEIGHBOURS: usize = 256;
-    /// Largest letter content that is read, in bytes.
+    /// Maximum length of a letter's content, in bytes.
     pub const MAX_CONTENT: usize = 1024 * 1024;
-    /// How long the agents of a neighbour are kept when it cannot be written to any more: a
-    /// connection that breaks is usually made again.
+    /// Time for which the agents of a disconnected neighbor are kept: a broken connection is
+    /// usually restored.
     pub const MEMORY: Duration = Duration::from_secs(5);
 
-    /// How long changes are gathered before they are told.
+    /// Time for which changes are collected before they are sent.
     const GATHERING: Duration = Duration::from_millis(50);
-    /// Up to how much is added to that.
+    /// Maximum jitter of that time.
     const JITTER: Duration = Duration::from_millis(50);
-    /// How often a neighbour is told that nothing has changed.
+    /// Interval at which a letter is sent without changes.
     const ALIVE: Duration = Duration::from_secs(15);
-    /// Pauses after a letter that did not arrive, and between two questions.
+    /// Backoff after a letter that did not arrive, and minimum time between two requests.
     const FIRST_PAUSE: Duration = Duration::from_secs(1);
     const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-    /// Most agents in one letter, and most bytes of what they say about themselves.
+    /// Maximum number of agents in one letter, and maximum bytes of their texts.
     const BATCH: usize = 256;
     const BATCH_BYTES: usize = 192 * 1024;
-    /// Most changes that are remembered; who is further behind is told everything.
+    /// Maximum length of the change log; a neighbor that is further behind gets all entries.
     const LOG: usize = 4096;
 
-    /// Nobody is there yet. The seed decides the jitter; that of two gateways should differ.
+    /// Creates an exchange without neighbors. The seed determines the jitter and should differ
+    /// between gateways.
     #[must_use]
     pub fn new(seed: u64) -> Self {
         Self {
-            own: Own::default(),
-            neighbours: HashMap::new(),
+            own: LocalAgents::default(),
+            neighbors: HashMap::new(),
             early: HashSet::new(),
             directory: Arc::default(),
             random: seed,
         }
     }
 
-    /// What the neighbours have told.
+    /// Returns the directory with the entries of the neighbors.
     #[must_use]
     pub fn directory(&self) -> Arc<ExchangeDirectory> {
         Arc::clone(&self.directory)
     }
 
-    /// These are the agents and coalitions to be told of now: those of this host, gateways left
-    /// out.
+    /// Sets the agents and coalitions to send: those of this host. Gateways are left out.
     pub fn handle_own<'a>(
         &mut self,
         now: Instant,
@@ -198,29 +202,29 @@ impl Exchange {
             return;
         }
         let soon = now + Self::GATHERING + self.jitter();
-        for neighbour in self.neighbours.values_mut() {
-            if matches!(neighbour.telling, Telling::All { .. }) && neighbour.failures == 0 {
-                neighbour.due = neighbour.due.min(soon);
+        for neighbor in self.neighbors.values_mut() {
+            if matches!(neighbor.state, SyncState::All { .. }) && neighbor.failures == 0 {
+                neighbor.due = neighbor.due.min(soon);
             }
         }
     }
 
-    /// These gateways can be written to now.
+    /// Sets the gateways that are connected now.
     pub fn handle_neighbours(&mut self, now: Instant, present: &[Present]) {
-        for neighbour in self.neighbours.values_mut() {
-            let mts = neighbour.mts.incarnation;
+        for neighbor in self.neighbors.values_mut() {
+            let mts = neighbor.mts.incarnation;
             let here = present.iter().any(|it| it.mts.incarnation == mts);
             if here {
-                if neighbour.gone.take().is_some() {
-                    // It may have forgotten meanwhile what it was told, and then says so.
-                    neighbour.failures = 0;
-                    neighbour.due = now;
-                    if neighbour.held.is_none() {
-                        neighbour.ask_again(now);
+                if neighbor.gone.take().is_some() {
+                    // It may have dropped its copy in the meantime, and then requests all entries.
+                    neighbor.failures = 0;
+                    neighbor.due = now;
+                    if neighbor.stored.is_none() {
+                        neighbor.request_all(now);
                     }
                 }
-            } else if neighbour.gone.is_none() {
-                neighbour.gone = Some(now);
+            } else if neighbor.gone.is_none() {
+                neighbor.gone = Some(now);
             }
         }
         for Present {
@@ -229,12 +233,12 @@ impl Exchange {
             mandate,
         } in present
         {
-            if let Some(known) = self.neighbours.get_mut(&mts.incarnation) {
+            if let Some(known) = self.neighbors.get_mut(&mts.incarnation) {
                 if known.mandate != *mandate {
                     known.mandate = mandate.clone();
                     self.directory.prove(mts.incarnation, mandate);
-                    (known.held, known.staged) = (None, None);
-                    known.ask_again(now);
+                    (known.stored, known.staged) = (None, None);
+                    known.request_all(now);
                 }
                 if known.locations != *locations {
                     known.locations.clone_from(locations);
@@ -242,58 +246,59 @@ impl Exchange {
                 }
                 continue;
             }
-            if self.neighbours.len() >= Self::MAX_NEIGHBOURS || !mts.incarnation.is_known() {
+            if self.neighbors.len() >= Self::MAX_NEIGHBOURS || !mts.incarnation.is_known() {
                 continue;
             }
             let due = now + self.jitter();
-            let mut neighbour = Neighbour::new(mts.clone(), locations.clone(), due);
-            neighbour.mandate = mandate.clone();
+            let mut neighbor = Neighbor::new(mts.clone(), locations.clone(), due);
+            neighbor.mandate = mandate.clone();
             self.directory.prove(mts.incarnation, mandate);
             if self.early.remove(&mts.incarnation) {
-                neighbour.ask_again(now);
+                neighbor.request_all(now);
             }
-            self.neighbours.insert(mts.incarnation, neighbour);
+            self.neighbors.insert(mts.incarnation, neighbor);
         }
         self.end_replaced();
     }
 
-    /// Lets go of the agents of gateways that cannot be written to at present, if another directory
-    /// knows them: it may know them at another gateway already.
+    /// Drops agents of disconnected gateways that another directory knows, because that one may
+    /// already have them at another gateway.
     pub fn leave_to_others(&mut self, knows: impl Fn(&Entry) -> bool) {
-        for (incarnation, neighbour) in &mut self.neighbours {
-            if neighbour.gone.is_some() && self.directory.leave_to_others(*incarnation, &knows) {
-                // Everything is told again when the gateway is back.
-                neighbour.held = None;
+        for (incarnation, neighbor) in &mut self.neighbors {
+            if neighbor.gone.is_some() && self.directory.leave_to_others(*incarnation, &knows) {
+                // The gateway sends all entries again when it reconnects.
+                neighbor.stored = None;
             }
         }
     }
 
-    /// The gateway of this location did not answer there. If another gateway takes letters there and has
-    /// told its agents, the silent one has ended, even if a connection with it seems to be open: over
-    /// datagrams a connection outlives a gateway that was killed. Returns whether it has ended. One that
-    /// is there nevertheless is asked for its agents.
+    /// Handles a gateway that does not answer at this location. If another gateway accepts letters
+    /// there and has sent its agents, the silent one has ended, even if a connection with it
+    /// appears open: a datagram connection outlives a gateway that was killed. Returns whether it
+    /// has ended. If a connection with it is still open, it is asked for its agents.
     pub fn handle_silence(&mut self, now: Instant, location: &Location) -> bool {
         let gateway = location.incarnation();
         if !self.is_replaced(gateway, std::slice::from_ref(location)) {
             return false;
         }
-        match self.neighbours.get_mut(&gateway) {
+        match self.neighbors.get_mut(&gateway) {
             Some(silent) if silent.gone.is_none() => {
                 self.directory.forget(gateway);
-                (silent.held, silent.staged) = (None, None);
-                silent.ask_again(now);
+                (silent.stored, silent.staged) = (None, None);
+                silent.request_all(now);
             }
             _ => self.end(gateway),
         }
         true
     }
 
-    /// Ends gateways that another incarnation has replaced: a gateway that was killed and started again
-    /// listens where it listened before. Its agents are those that the new incarnation tells of, and
-    /// letters in the custody of the old one are lost. While a connection with the old one is open and
-    /// it answers, its entries stay: two gateways behind one address translator show the same location.
+    /// Ends disconnected gateways that another incarnation has replaced: a gateway that was killed
+    /// and restarted listens at the same address. Its agents are those that the new incarnation
+    /// sends, and letters in the custody of the old one are lost. Entries of a gateway that is
+    /// connected and answers stay: two gateways behind one address translator have the same
+    /// location.
     fn end_replaced(&mut self) {
-        let gone = self.neighbours.iter().filter(|(_, old)| old.gone.is_some());
+        let gone = self.neighbors.iter().filter(|(_, old)| old.gone.is_some());
         let replaced = gone.filter(|(gateway, old)| self.is_replaced(**gateway, &old.locations));
         let replaced: Vec<Incarnation> = replaced.map(|(incarnation, _)| *incarnation).collect();
         for incarnation in replaced {
@@ -301,26 +306,26 @@ impl Exchange {
         }
     }
 
-    /// Whether another gateway takes letters at one of these locations of this one, and has told its
+    /// Whether another connected gateway accepts letters at one of these locations and has sent its
     /// agents.
     fn is_replaced(&self, gateway: Incarnation, locations: &[Location]) -> bool {
-        let mut others = self.neighbours.iter();
+        let mut others = self.neighbors.iter();
         others.any(|(other, new)| {
-            let tells = new.gone.is_none() && new.held.is_some();
+            let tells = new.gone.is_none() && new.stored.is_some();
             *other != gateway && tells && new.is_at_one_of(locations)
         })
     }
 
     fn end(&mut self, gateway: Incarnation) {
-        self.neighbours.remove(&gateway);
+        self.neighbors.remove(&gateway);
         self.directory.forget(gateway);
         self.directory.prove(gateway, &Mandate::Unproved);
     }
 
-    /// What a letter of this gateway, with [`EXCHANGE_ONTOLOGY`], has as its content.
+    /// Handles the content of a letter from this gateway with [`EXCHANGE_ONTOLOGY`].
     ///
     /// # Errors
-    /// Says why it was not used. Nothing was changed then.
+    /// Returns the reason when the letter was rejected; nothing has changed then.
     pub fn handle_letter(
         &mut self,
         now: Instant,
@@ -330,69 +335,73 @@ impl Exchange {
         if content.len() > Self::MAX_CONTENT {
             return Err(ExchangeError::TooLarge(content.len()));
         }
-        let Some(neighbour) = self.neighbours.get_mut(&from) else {
+        let Some(neighbor) = self.neighbors.get_mut(&from) else {
             if self.early.len() < Self::MAX_NEIGHBOURS {
                 self.early.insert(from);
             }
             return Err(ExchangeError::Stranger);
         };
         match wire::decode(content)? {
-            Told::Again => {
-                neighbour.telling = Telling::nothing();
-                if let Some(under_way) = &mut neighbour.under_way {
-                    *under_way = Telling::nothing();
+            ExchangeMessage::Again => {
+                neighbor.state = SyncState::nothing();
+                if let Some(under_way) = &mut neighbor.under_way {
+                    *under_way = SyncState::nothing();
                 }
-                // Who asks all the time is answered now and then.
-                let told = neighbour.told.map_or(now, |told| told + Self::FIRST_PAUSE);
-                neighbour.due = told.max(now);
+                // Limits the rate of answers to a neighbor that keeps asking.
+                let told = neighbor.told.map_or(now, |told| told + Self::FIRST_PAUSE);
+                neighbor.due = told.max(now);
                 Ok(())
             }
-            Told::Goodbye => {
-                neighbour.held = None;
-                neighbour.staged = None;
+            ExchangeMessage::Goodbye => {
+                neighbor.stored = None;
+                neighbor.staged = None;
                 self.directory.forget(from);
                 Ok(())
             }
-            Told::Full(full) => {
-                neighbour.told_all(now, full, &self.directory)?;
+            ExchangeMessage::Full(full) => {
+                neighbor.handle_full(now, full, &self.directory)?;
                 self.end_replaced();
                 Ok(())
             }
-            Told::Changes(changes) => neighbour.told_changes(now, changes, &self.directory),
+            ExchangeMessage::Changes(changes) => {
+                neighbor.handle_changes(now, changes, &self.directory)
+            }
         }
     }
 
-    /// The letter that went to this neighbour has arrived, or will not.
+    /// Handles the result of the letter in flight to this neighbor.
     pub fn handle_sent(&mut self, now: Instant, to: Incarnation, arrived: bool) {
-        let Some(neighbour) = self.neighbours.get_mut(&to) else {
+        let Some(neighbor) = self.neighbors.get_mut(&to) else {
             return;
         };
-        match neighbour.under_way.take() {
-            Some(telling) if arrived => {
-                neighbour.failures = 0;
-                neighbour.telling = telling;
-                neighbour.due = match neighbour.telling {
-                    Telling::Some { .. } => now,
-                    Telling::All { version } if version < self.own.version => now + Self::GATHERING,
-                    Telling::All { .. } => now + Self::ALIVE,
+        match neighbor.under_way.take() {
+            Some(state) if arrived => {
+                neighbor.failures = 0;
+                neighbor.state = state;
+                neighbor.due = match neighbor.state {
+                    SyncState::Some { .. } => now,
+                    SyncState::All { version } if version < self.own.version => {
+                        now + Self::GATHERING
+                    }
+                    SyncState::All { .. } => now + Self::ALIVE,
                 };
             }
             _ if arrived => {}
             _ => {
-                // It may have arrived after all: what it knows is not known any more.
-                neighbour.telling = Telling::nothing();
-                let doubled = Self::FIRST_PAUSE * 2_u32.saturating_pow(neighbour.failures.min(8));
-                neighbour.failures += 1;
-                neighbour.due = now + doubled.min(Self::LONGEST_PAUSE);
+                // It may have arrived nevertheless, so the state of the neighbor is unknown.
+                neighbor.state = SyncState::nothing();
+                let doubled = Self::FIRST_PAUSE * 2_u32.saturating_pow(neighbor.failures.min(8));
+                neighbor.failures += 1;
+                neighbor.due = now + doubled.min(Self::LONGEST_PAUSE);
             }
         }
     }
 
-    /// Lets go of neighbours that have been away for too long, with all they have told.
+    /// Removes neighbors that have been disconnected for too long, with all their entries.
     pub fn handle_timeout(&mut self, now: Instant) {
         let directory = &self.directory;
-        self.neighbours.retain(|incarnation, neighbour| {
-            let gone = neighbour
+        self.neighbors.retain(|incarnation, neighbor| {
+            let gone = neighbor
                 .gone
                 .is_some_and(|since| now >= since + Self::MEMORY);
             if gone {
@@ -403,55 +412,50 @@ impl Exchange {
         });
     }
 
-    /// When there is something to be done next.
+    /// Time of the next action.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        let times = self
-            .neighbours
-            .values()
-            .map(|neighbour| match neighbour.gone {
-                Some(since) => Some(since + Self::MEMORY),
-                None if neighbour.under_way.is_some() => None,
-                None => Some(neighbour.next_letter()),
-            });
+        let times = self.neighbors.values().map(|neighbor| match neighbor.gone {
+            Some(since) => Some(since + Self::MEMORY),
+            None if neighbor.under_way.is_some() => None,
+            None => Some(neighbor.next_letter()),
+        });
         times.flatten().min()
     }
 
-    /// The next letter to be sent: to which neighbour, and its content. Each is followed by
-    /// [`handle_sent`](Self::handle_sent).
+    /// Returns the next letter to send: the neighbor and the content. The caller reports its result
+    /// with [`handle_sent`](Self::handle_sent).
     pub fn poll_letter(&mut self, now: Instant) -> Option<(Incarnation, Vec<u8>)> {
         let mut ready = self
-            .neighbours
+            .neighbors
             .iter_mut()
-            .filter(|(_, neighbour)| neighbour.gone.is_none() && neighbour.under_way.is_none());
-        let (incarnation, neighbour) =
-            ready.find(|(_, neighbour)| neighbour.next_letter() <= now)?;
-        if neighbour.ask.is_some_and(|at| at <= now) {
-            neighbour.ask = None;
-            neighbour.asked = Some(now);
-            neighbour.under_way = Some(neighbour.telling.clone());
-            return Some((*incarnation, wire::encode(&Told::Again)));
+            .filter(|(_, neighbor)| neighbor.gone.is_none() && neighbor.under_way.is_none());
+        let (incarnation, neighbor) = ready.find(|(_, neighbor)| neighbor.next_letter() <= now)?;
+        if neighbor.ask.is_some_and(|at| at <= now) {
+            neighbor.ask = None;
+            neighbor.asked = Some(now);
+            neighbor.under_way = Some(neighbor.state.clone());
+            return Some((*incarnation, wire::encode(&ExchangeMessage::Again)));
         }
-        let (told, telling) = self.own.next(&neighbour.telling);
-        if matches!(&told, Told::Full(full) if full.first) {
-            neighbour.told = Some(now);
+        let (told, state) = self.own.next(&neighbor.state);
+        if matches!(&told, ExchangeMessage::Full(full) if full.first) {
+            neighbor.told = Some(now);
         }
-        neighbour.under_way = Some(telling);
+        neighbor.under_way = Some(state);
         Some((*incarnation, wire::encode(&told)))
     }
 
-    /// The letters with which this gateway takes leave: to whom, and their content, which is the
-    /// same for all.
+    /// Returns the final letters of this gateway: their receivers and their common content.
     #[must_use]
     pub fn goodbye(&self) -> (Vec<Incarnation>, Vec<u8>) {
-        let present = self.neighbours.iter();
-        let present = present.filter(|(_, neighbour)| neighbour.gone.is_none());
+        let present = self.neighbors.iter();
+        let present = present.filter(|(_, neighbor)| neighbor.gone.is_none());
         let present = present.map(|(incarnation, _)| *incarnation).collect();
-        (present, wire::encode(&Told::Goodbye))
+        (present, wire::encode(&ExchangeMessage::Goodbye))
     }
 
     fn jitter(&mut self) -> Duration {
-        // SplitMix64: not to be guessed is not the point, differing is.
+        // SplitMix64: the values must differ, but need not be unpredictable.
         self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut mixed = self.random;
         mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -461,8 +465,8 @@ impl Exchange {
     }
 }
 
-impl Own {
-    /// Whether anything is different now.
+impl LocalAgents {
+    /// Replaces the agents; returns whether anything changed.
     fn replace(&mut self, agents: Agents) -> bool {
         let before = std::mem::replace(&mut self.agents, agents);
         let left = before
@@ -477,9 +481,9 @@ impl Own {
         let (coalitions, agents): (Vec<_>, Vec<_>) = left.chain(other).partition(is_coalition);
         let any = !coalitions.is_empty() || !agents.is_empty();
         self.version += (coalitions.len() + agents.len()) as u64;
-        let logged = |name: &Arc<str>, together| Logged {
+        let logged = |name: &Arc<str>, with_previous| Logged {
             name: Arc::clone(name),
-            together,
+            with_previous,
         };
         let agents = agents.into_iter().map(|name| logged(name, false));
         let coalitions = coalitions.into_iter().enumerate();
@@ -490,18 +494,18 @@ impl Own {
         any
     }
 
-    /// What to tell who knows that, and what it knows then.
-    fn next(&self, knows: &Telling) -> (Told, Telling) {
+    /// Returns the next message for a neighbor in this state, and its state after receipt.
+    fn next(&self, knows: &SyncState) -> (ExchangeMessage, SyncState) {
         match knows {
-            Telling::All { version } => {
+            SyncState::All { version } => {
                 let behind = self.version - version;
                 match usize::try_from(behind) {
                     Ok(behind) if behind <= self.log.len() => self.changes(*version, behind),
                     _ => self.part(None, self.version),
                 }
             }
-            Telling::Some { upto, version } => {
-                // Too much has changed since the first part of it was told.
+            SyncState::Some { upto, version } => {
+                // Start again if more has changed since the first part than the log holds.
                 let behind = usize::try_from(self.version - version).unwrap_or(usize::MAX);
                 match upto {
                     Some(_) if behind <= self.log.len() => self.part(upto.as_ref(), *version),
@@ -511,9 +515,9 @@ impl Own {
         }
     }
 
-    /// The part behind that name of everything. What has changed since the first part was told is
-    /// told again by what follows the last.
-    fn part(&self, upto: Option<&Arc<str>>, version: u64) -> (Told, Telling) {
+    /// Builds the part of all entries after that name. Changes since the first part are sent after
+    /// the last part.
+    fn part(&self, upto: Option<&Arc<str>>, version: u64) -> (ExchangeMessage, SyncState) {
         let from = upto.map_or(Bound::Unbounded, |name| Bound::Excluded(Arc::clone(name)));
         let rest = self
             .agents
@@ -524,12 +528,12 @@ impl Own {
             let behind = (Bound::Excluded(Arc::clone(&entry.name)), Bound::Unbounded);
             self.agents.range(behind).next().is_none()
         });
-        let telling = match batch.last() {
-            Some(entry) if !last => Telling::Some {
+        let state = match batch.last() {
+            Some(entry) if !last => SyncState::Some {
                 upto: Some(Arc::clone(&entry.name)),
                 version,
             },
-            _ => Telling::All { version },
+            _ => SyncState::All { version },
         };
         let full = Full {
             version,
@@ -537,17 +541,21 @@ impl Own {
             last,
             agents: batch.into_iter().map(wire::Agent::of).collect(),
         };
-        (Told::Full(full), telling)
+        (ExchangeMessage::Full(full), state)
     }
 
-    fn changes(&self, version: u64, behind: usize) -> (Told, Telling) {
+    fn changes(&self, version: u64, behind: usize) -> (ExchangeMessage, SyncState) {
         let start = self.log.len().saturating_sub(behind);
         let mut names = BTreeSet::new();
         let (mut bytes, mut taken) = (0, 0);
-        for Logged { name, together } in self.log.range(start..) {
+        for Logged {
+            name,
+            with_previous,
+        } in self.log.range(start..)
+        {
             let full = names.len() >= Exchange::BATCH || bytes > Exchange::BATCH_BYTES;
-            // Coalitions that changed together are not torn apart, as long as they fit a letter.
-            if full && !(*together && bytes <= Exchange::MAX_CONTENT / 2) {
+            // Coalitions that changed together stay in one letter, as long as they fit.
+            if full && !(*with_previous && bytes <= Exchange::MAX_CONTENT / 2) {
                 break;
             }
             if names.insert(Arc::clone(name)) {
@@ -573,11 +581,14 @@ impl Own {
                 .map(ToString::to_string)
                 .collect(),
         };
-        (Told::Changes(changes), Telling::All { version: to })
+        (
+            ExchangeMessage::Changes(changes),
+            SyncState::All { version: to },
+        )
     }
 }
 
-/// As many as go into one letter, at least one.
+/// As many entries as fit one letter, at least one.
 fn batch<'a>(entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<&'a Arc<Entry>> {
     let mut bytes = 0;
     let fits = |entry: &&Arc<Entry>| {
@@ -596,7 +607,7 @@ fn weight(entry: &Entry) -> usize {
     entry.name.len() + entry.agent_type.len() + entry.description.len() + members + 100
 }
 
-impl Telling {
+impl SyncState {
     fn nothing() -> Self {
         Self::Some {
             upto: None,
@@ -605,18 +616,18 @@ impl Telling {
     }
 }
 
-impl Neighbour {
+impl Neighbor {
     fn new(mts: Mts, locations: Vec<Location>, due: Instant) -> Self {
         Self {
             mts,
             locations,
             mandate: Mandate::Unproved,
             gone: None,
-            telling: Telling::nothing(),
+            state: SyncState::nothing(),
             under_way: None,
             due,
             failures: 0,
-            held: None,
+            stored: None,
             staged: None,
             ask: None,
             asked: None,
@@ -624,7 +635,7 @@ impl Neighbour {
         }
     }
 
-    /// Whether it takes letters at one of these locations, of whichever incarnation.
+    /// Whether it accepts letters at one of these locations, of any incarnation.
     fn is_at_one_of(&self, locations: &[Location]) -> bool {
         let same = |one: &Location, two: &Location| {
             one.kind() == two.kind() && one.address() == two.address()
@@ -633,20 +644,21 @@ impl Neighbour {
         own.any(|one| locations.iter().any(|two| same(one, two)))
     }
 
-    /// When the next letter to it may go.
+    /// Earliest time of the next letter to it.
     fn next_letter(&self) -> Instant {
         self.ask.map_or(self.due, |ask| ask.min(self.due))
     }
 
-    /// Asks it for everything: what it tells does not follow from what is known.
-    fn ask_again(&mut self, now: Instant) {
+    /// Schedules a request for all entries, because a received letter does not fit the stored
+    /// state.
+    fn request_all(&mut self, now: Instant) {
         let earliest = self
             .asked
             .map_or(now, |asked| asked + Exchange::FIRST_PAUSE);
         self.ask = Some(earliest.max(now));
     }
 
-    fn told_all(
+    fn handle_full(
         &mut self,
         now: Instant,
         full: Full,
@@ -659,7 +671,7 @@ impl Neighbour {
             },
             Some(staged) if staged.version == full.version => staged,
             _ => {
-                self.ask_again(now);
+                self.request_all(now);
                 return Ok(());
             }
         };
@@ -675,7 +687,7 @@ impl Neighbour {
         }
         if full.last {
             directory.replace(self.mts.incarnation, staged.entries)?;
-            self.held = Some(full.version);
+            self.stored = Some(full.version);
             self.ask = None;
         } else {
             self.staged = Some(staged);
@@ -683,30 +695,30 @@ impl Neighbour {
         Ok(())
     }
 
-    fn told_changes(
+    fn handle_changes(
         &mut self,
         now: Instant,
         changes: Changes,
         directory: &ExchangeDirectory,
     ) -> Result<(), ExchangeError> {
-        if self.held != Some(changes.from) {
-            self.ask_again(now);
+        if self.stored != Some(changes.from) {
+            self.request_all(now);
             return Ok(());
         }
         let agents = changes.agents.into_iter();
         let joined = agents.filter_map(|agent| self.entry(agent)).collect();
         directory.change(self.mts.incarnation, joined, changes.left)?;
-        self.held = Some(changes.to);
+        self.stored = Some(changes.to);
         Ok(())
     }
 
-    /// The entry of an agent of this neighbour. It is where the neighbour is, whatever it says.
-    /// None if there cannot be such an agent, or its link does not speak for it. The others are used
-    /// nevertheless.
+    /// Builds the entry of an agent of this neighbor; its locations are always those of the
+    /// neighbor. Returns `None` if the agent is not valid or the neighbor may not speak for it; the
+    /// other agents of the letter are still used.
     fn entry(&self, agent: wire::Agent) -> Option<Arc<Entry>> {
         if !self.mandate.speaks_for(&agent.name) {
             let (gateway, agent) = (escape(&self.mts.name), escape(&agent.name));
-            tracing::debug!(%gateway, %agent, "the certificate of the gateway does not name this agent");
+            tracing::debug!(%gateway, %agent, "agent ignored: the certificate of its gateway does not name it");
             return None;
         }
         let entry = Entry {
@@ -724,29 +736,29 @@ impl Neighbour {
             role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {
-            tracing::debug!(gateway = %self.mts.name, %error, "agent not used");
+            tracing::debug!(gateway = %self.mts.name, %error, "agent ignored");
             return None;
         }
         entry.incarnation.is_known().then(|| Arc::new(entry))
     }
 }
 
-/// Why what a neighbour has told was not used.
+/// Error of [`Exchange::handle_letter`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ExchangeError {
-    /// It came from somebody who is no neighbour.
-    #[error("the letter comes from somebody who is no neighbour")]
+    /// The sender is not a neighbor.
+    #[error("the sender of the letter is not a connected gateway")]
     Stranger,
     /// The letter is too large.
-    #[error("the letter has {0} bytes; at most {max} are read", max = Exchange::MAX_CONTENT)]
+    #[error("the letter has {0} bytes; at most {max} are allowed", max = Exchange::MAX_CONTENT)]
     TooLarge(usize),
-    /// It is none that is understood.
-    #[error("the letter makes no sense: {}", escape(&.0.to_string()))]
+    /// The content is not a valid letter of the exchange.
+    #[error("the letter is not a valid exchange letter: {}", escape(&.0.to_string()))]
     Malformed(#[from] serde_json::Error),
-    /// There are more agents than are kept.
+    /// The number of agents exceeds a limit.
     #[error(
-        "the neighbour tells of too many agents; {one} of one neighbour and {all} of all are kept",
+        "the neighbor sent too many agents; at most {one} per neighbor and {all} in total are kept",
         one = Exchange::MAX_AGENTS,
         all = Exchange::MAX_TOTAL
     )]

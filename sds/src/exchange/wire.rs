@@ -1,4 +1,4 @@
-//! What the letters say, in JSON.
+//! The JSON format of the letters.
 //!
 //! ```json
 //! { "version": 1, "tell": "again" }
@@ -9,8 +9,8 @@
 //!           "coalition": { "members": [name], "leader": name }, for a coalition }
 //! ```
 //!
-//! Where the agents are is not said: with the gateway whose letter it is. Unknown keys are passed
-//! over, so that a later version may add some.
+//! The agents' location is not part of the format: it is that of the gateway that sent the letter.
+//! Unknown keys are ignored, so that a later version may add some.
 
 use std::sync::Arc;
 
@@ -32,16 +32,16 @@ struct Envelope<T> {
 /// One letter.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum Told {
-    /// Tell me everything, again.
+pub(super) enum ExchangeMessage {
+    /// Requests all entries again.
     Again,
-    /// I am ending.
+    /// The gateway is closing.
     Goodbye,
     Full(Full),
     Changes(Changes),
 }
 
-/// A part of everything, in the state with this number.
+/// A part of all entries of this version.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Full {
     pub(super) version: u64,
@@ -50,12 +50,12 @@ pub(super) struct Full {
     pub(super) agents: Vec<Agent>,
 }
 
-/// What leads from one state to a later one.
+/// The changes from one version to a later one.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Changes {
     pub(super) from: u64,
     pub(super) to: u64,
-    /// New ones, and those that are different now.
+    /// New and changed agents.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) agents: Vec<Agent>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -92,18 +92,18 @@ impl Agent {
     }
 }
 
-pub(super) fn encode(tell: &Told) -> Vec<u8> {
+pub(super) fn encode(tell: &ExchangeMessage) -> Vec<u8> {
     let version = VERSION;
-    // Texts, numbers and lists of them: there is nothing in it that has no JSON.
+    // Serialization of text, numbers and lists cannot fail.
     serde_json::to_vec(&Envelope { version, tell }).unwrap_or_default()
 }
 
-pub(super) fn decode(content: &[u8]) -> Result<Told, serde_json::Error> {
-    let envelope: Envelope<Told> = serde_json::from_slice(content)?;
+pub(super) fn decode(content: &[u8]) -> Result<ExchangeMessage, serde_json::Error> {
+    let envelope: Envelope<ExchangeMessage> = serde_json::from_slice(content)?;
     match envelope.version {
         VERSION => Ok(envelope.tell),
         other => Err(serde_json::Error::custom(format!(
-            "version {other} is not understood"
+            "version {other} is not supported"
         ))),
     }
 }

@@ -6,11 +6,11 @@
 //!    "locations":["shm://…#00ab…"],"description":"…","registered":1795172400000,"role":"agent"}]}
 //! ```
 //! `registered` is in milliseconds since 1970, UTC. An entry of an agent on another host, which
-//! only a gateway writes, has `remote` with the message transport service that has it there; the
-//! gateway is the file's.
+//! only a gateway writes, has a `remote` with the message transport service of the agent; the
+//! gateway is the `mts` of the file.
 //!
-//! A file is written by a process of the same user, which does not make it true: everything is
-//! checked, and a file with any mistake is refused as a whole.
+//! A process of the same user writes the file, which does not make it trustworthy: everything is
+//! checked, and a file with any error is rejected as a whole.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -27,7 +27,7 @@ const VERSION: u32 = 1;
 /// The entries of one process, by name.
 pub(super) type Entries = HashMap<Arc<str>, Arc<Entry>>;
 
-/// Most entries in one file.
+/// Maximum number of entries in one file.
 pub(super) const MAX_ENTRIES: usize = 65_536;
 
 pub(super) fn write<'a>(mts: &Mts, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<u8> {
@@ -37,7 +37,7 @@ pub(super) fn write<'a>(mts: &Mts, entries: impl Iterator<Item = &'a Arc<Entry>>
         mts: mts.clone(),
         entries: entries.map(|entry| WrittenEntry::of(entry)).collect(),
     };
-    // Texts, numbers and lists of them: nothing that JSON could not hold.
+    // Serialization of text, numbers and lists cannot fail.
     serde_json::to_vec(&written).unwrap_or_default()
 }
 
@@ -62,16 +62,16 @@ pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
     Ok(entries)
 }
 
-/// Bytes that are not an entries file.
+/// Error of [`read`].
 #[derive(Debug, thiserror::Error)]
 pub(super) enum FileError {
     #[error("malformed: {0}")]
     Json(#[source] serde_json::Error),
-    #[error("the format is {0:?} and not {FORMAT:?}")]
+    #[error("the format is {0:?}, expected {FORMAT:?}")]
     Format(String),
-    #[error("version {0} is not understood (only {VERSION}); do all processes use one release?")]
+    #[error("version {0} is not supported (only {VERSION}); use the same release in all processes")]
     Version(u32),
-    #[error("{0} entries, and at most {MAX_ENTRIES} are allowed")]
+    #[error("{0} entries; at most {MAX_ENTRIES} are allowed")]
     TooMany(usize),
     #[error("the name {0:?} occurs twice")]
     Twice(Arc<str>),
@@ -102,7 +102,7 @@ struct WrittenEntry {
     role: Role,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     remote: Option<Mts>,
-    /// How the gateway learnt of it, of entries of other hosts.
+    /// Source from which the gateway learned it, for entries of other hosts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     source: Option<Source>,
 }
@@ -133,7 +133,7 @@ impl WrittenEntry {
                 gateway: mts.incarnation,
             },
         };
-        // Peers may have none, processes of this host always have one.
+        // Legacy peers may have no incarnation; processes of this host always have one.
         if reach == Reach::Local && !self.incarnation.is_known() {
             return Err(FileError::NoIncarnation(self.name));
         }

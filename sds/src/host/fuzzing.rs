@@ -1,22 +1,24 @@
-//! Entries files for fuzz targets.
+//! Entries files for the fuzz targets.
 
 use super::file;
-use super::place::Name;
+use super::host_dir::Name;
 use crate::{Entry, Mts, Reach, Source};
 
-/// Reads an entries file. What it says is the same when it is written and read again; returns that.
+/// Reads an entries file, writes it, asserts that reading it again gives the same, and returns it.
 ///
 /// # Errors
-/// Says what is wrong with the file.
+/// Returns the error of the file.
 ///
 /// # Panics
-/// When a file that was read breaks a limit.
+/// Panics when an accepted file exceeds a limit.
 pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
     let entries = file::read(bytes).map_err(|error| error.to_string())?;
     assert!(entries.len() <= file::MAX_ENTRIES);
     for (name, entry) in &entries {
         assert_eq!(*name, entry.name);
-        entry.check().expect("what is read keeps to the limits");
+        entry
+            .check()
+            .expect("an accepted file is within the limits");
     }
     let mut own: Option<Mts> = None;
     for entry in entries.values() {
@@ -32,11 +34,11 @@ pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
         return Ok(bytes.to_vec());
     };
     let written = file::write(&mts, entries.values());
-    let again = file::read(&written).expect("what was read can be written");
+    let again = file::read(&written).expect("an accepted file can be written and read again");
     let sorted = |entries: &file::Entries| {
         let mut all: Vec<Entry> = entries.values().map(|it| (**it).clone()).collect();
         for entry in &mut all {
-            // It is not written of an entry of this host.
+            // The source of a local entry is not written.
             if entry.reach == Reach::Local {
                 entry.source = Source::Host;
             }
@@ -48,10 +50,10 @@ pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
     Ok(written)
 }
 
-/// A name of a file in the directory is one of ours, and spelt as we spell it, or none.
+/// Checks that a parsed file name is formatted the same again.
 ///
 /// # Panics
-/// When it is spelt otherwise.
+/// Panics when the spelling differs.
 pub fn file_name(name: &str) {
     if let Some(parsed) = Name::parse(name) {
         assert_eq!(parsed.to_string(), name);

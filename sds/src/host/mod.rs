@@ -1,22 +1,20 @@
 //! The directory of one host, without a broker: files in a private directory of the domain.
 //!
-//! * Each process holds an advisory lock on a file of its own for as long as it lives, and writes
-//!   what it has registered into another, which it replaces as a whole.
-//! * Names are given out under one more lock, which is held for as long as it takes to see that
-//!   nobody who lives has the name, and to write. The name of a process that has died is free at
-//!   once.
-//! * Everybody watches the directory. A process that ends, even by SIGKILL, closes its lock file,
-//!   and the kernel tells all others, who then forget its agents and remove its files.
-//! * Reading takes no system call. Only for a name that is not known the generation is read (one
-//!   call), and the files when it has changed.
+//! * Each process holds an advisory lock on a file of its own while it runs, and writes its
+//!   registrations to another file, which it always replaces as a whole.
+//! * Names are assigned under one more lock, which is held while the process checks that no running
+//!   process holds the name, and writes. The name of a process that died is free at once.
+//! * All processes watch the directory. When a process ends, even by SIGKILL, its lock file is
+//!   closed, and the kernel notifies the others, which drop its agents and remove its files.
+//! * Reading takes no system call. Only a miss reads the generation (one call), and the files if it
+//!   changed.
 //!
-//! What must not live here: anything about the network. A gateway publishes here what it has
-//! learnt elsewhere.
+//! Nothing about the network belongs here. A gateway publishes the agents of other hosts here.
 
 mod file;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
-mod place;
+mod host_dir;
 mod shared;
 mod socket;
 mod watcher;
@@ -31,7 +29,7 @@ use fipa_transport::{Forked, Incarnation, OwnerProcess};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use self::place::{Id, Place};
+use self::host_dir::{HostDir, Id};
 use self::shared::Shared;
 use self::watcher::Watcher;
 use crate::{
@@ -39,11 +37,11 @@ use crate::{
     Subscriber,
 };
 
-/// Where the directory of a host is, and who joins it.
+/// Configuration of [`HostDirectory`].
 #[derive(Debug, Clone)]
 pub struct HostConfig {
-    /// The private directory of the domain: created with mode 0700 when it does not exist, and
-    /// refused when it belongs to somebody else, others may enter it, or it is a symbolic link.
+    /// The private directory of the domain. It is created with mode 0700 if it does not exist, and
+    /// refused if another user owns it or may access it, or if it is a symbolic link.
     pub dir: PathBuf,
     /// The message transport service of this process.
     pub mts: Mts,
@@ -53,7 +51,7 @@ pub struct HostConfig {
 
 /// The agents of all processes of one domain on one host.
 ///
-/// Leaves the directory when dropped.
+/// Dropping it leaves the directory.
 #[derive(Debug)]
 pub struct HostDirectory {
     shared: Arc<Shared>,
@@ -67,17 +65,17 @@ impl HostDirectory {
     /// Joins the directory. A task of the current tokio runtime keeps the view up to date.
     ///
     /// # Errors
-    /// When there is no runtime, or the directory is not private or cannot be used.
+    /// Fails when no tokio runtime is running, or the directory is not private or cannot be used.
     pub fn open(config: HostConfig) -> Result<Self, HostError> {
         let runtime = tokio::runtime::Handle::try_current().map_err(|_| HostError::NoRuntime)?;
-        // Not the service's incarnation: a process may open the directory more than once.
+        // Not the service's incarnation, because a process may open the directory more than once.
         let id = Id(Incarnation::random().as_u64());
-        let place = Place::join(&config.dir, id)?;
-        let shared = Arc::new(Shared::new(place, config.mts.clone()));
-        // Watching before reading, so that nothing is missed in between.
-        let watcher = Watcher::new(&shared.place());
+        let host_dir = HostDir::join(&config.dir, id)?;
+        let shared = Arc::new(Shared::new(host_dir, config.mts.clone()));
+        // Starts to watch before reading, so that no change is missed in between.
+        let watcher = Watcher::new(&shared.host_dir());
         if let Err(error) = shared.refresh().and_then(|()| shared.find_sockets()) {
-            // The first error is the one to be told.
+            // The first error is the one to return.
             let _ = shared.close();
             return Err(error);
         }
@@ -92,12 +90,13 @@ impl HostDirectory {
     }
 
     /// Replaces the agents of other hosts that this gateway publishes to the processes of this
-    /// one, who see them as [`Reach::Remote`] through this gateway; their locations are those at
-    /// which the gateway takes letters for them. They are not in this directory's own view.
+    /// host, in which they appear as [`Reach::Remote`] through this gateway. Their locations are
+    /// those at which the gateway accepts letters for them. This directory's own view does not
+    /// contain them.
     ///
     /// # Errors
-    /// When this is no gateway, an entry is not valid, there are too many, or they cannot be
-    /// written. Nothing has changed then.
+    /// Fails when this process is not a gateway, an entry is not valid, there are too many, or they
+    /// cannot be written; nothing has changed then.
     pub fn publish_remote(&self, entries: Vec<Entry>) -> Result<(), HostError> {
         self.owner.check()?;
         if !self.config.gateway {
@@ -118,13 +117,13 @@ impl HostDirectory {
         self.shared.publish(published.into_values().collect())
     }
 
-    /// Registers or changes all of these and removes those, by name and incarnation, or does
-    /// nothing at all. Those who watch see coalitions among them change in one go
+    /// Registers or updates all `registrations` and removes those in `leaving`, by name and
+    /// incarnation, or changes nothing. Watchers see coalitions among them change at once
     /// ([`Change::Together`](crate::Change::Together)).
     ///
     /// # Errors
-    /// When somebody else has one of the names, a registration is not valid, one to be removed was
-    /// not made here, or the directory cannot be written.
+    /// Fails when another agent has one of the names, a registration is not valid, one in `leaving`
+    /// was not made here, or the directory cannot be written.
     pub fn replace(
         &self,
         registrations: Vec<Registration>,
@@ -137,61 +136,60 @@ impl HostDirectory {
             .replace(entries.collect::<Result<_, _>>()?, leaving)
     }
 
-    /// Tells from now on when processes of this host have ended, in order or not.
+    /// Returns notifications of processes of this host that end, gracefully or not.
     #[must_use]
     pub fn departures(&self) -> Departures {
         Departures(self.shared.departures())
     }
 
-    /// A socket at which other processes of the domain can connect to this one: listening,
-    /// non-blocking, of the type SOCK_SEQPACKET. They see it in [`sockets`](Self::sockets) for as
-    /// long as this process lives. What is said there is not the directory's business.
+    /// Opens a socket at which other processes of the domain can connect to this one: listening,
+    /// non-blocking, of type SOCK_SEQPACKET. It is listed in their [`sockets`](Self::sockets) while
+    /// this process runs. The protocol on it is up to the caller.
     ///
     /// # Errors
-    /// When the directory was closed, or the system refuses the socket.
+    /// Fails when the directory was closed, or the system refuses the socket.
     pub fn listen(&self) -> Result<OwnedFd, HostError> {
         self.owner.check()?;
-        self.shared.place().lock()?.listen()
+        self.shared.host_dir().lock()?.listen()
     }
 
-    /// The other processes that can be connected to, as they come and go.
+    /// Returns the list of other processes that accept connections, and its changes.
     #[must_use]
     pub fn sockets(&self) -> watch::Receiver<Vec<SocketId>> {
         self.shared.sockets()
     }
 
-    /// Connects to another process of the domain and of this user; never waits.
+    /// Connects to another process of the domain and of this user without blocking.
     ///
     /// # Errors
-    /// When it has ended, has too many connections that it has not accepted yet
-    /// ([`io::ErrorKind::WouldBlock`]), or is not a socket of this user.
+    /// Fails when that process has ended, when too many of its connections are not accepted yet
+    /// ([`io::ErrorKind::WouldBlock`]), or when the socket is not of this user.
     pub fn connect(&self, socket: SocketId) -> Result<OwnedFd, HostError> {
-        self.shared.place().connect(socket.0)
+        self.shared.host_dir().connect(socket.0)
     }
 
-    /// Waits until the directory may have been removed by another program, which
-    /// [`rejoin`](Self::rejoin) finds out. Not every removal is reported: ask
-    /// [`is_there`](Self::is_there) from time to time, too.
+    /// Waits until another program may have removed the directory; [`rejoin`](Self::rejoin) checks
+    /// that. Not every removal is reported: also call [`is_there`](Self::is_there) periodically.
     pub async fn disturbed(&self) {
         self.shared.disturbed().await;
     }
 
-    /// Whether other processes can find what this one has registered. False when another program
-    /// has removed the directory, or files in it.
+    /// Whether other processes can find the registrations of this one. False when another program
+    /// removed the directory, or files in it.
     ///
     /// # Errors
-    /// When the directory cannot be examined.
+    /// Fails when the directory cannot be examined.
     pub fn is_there(&self) -> Result<bool, HostError> {
         self.shared.is_there()
     }
 
-    /// Joins the directory again if it was removed, with everything that is registered, and says
-    /// whether that was necessary. A name that another process registered meanwhile is lost.
-    /// Blocks for as long as others hold the lock of the directory. Sockets have to be made again
-    /// with [`listen`](Self::listen).
+    /// Joins the directory again if it was removed, with all registrations; returns whether that
+    /// was necessary. A name that another process registered in the meantime is lost. Blocks while
+    /// other processes hold the lock of the directory. The caller must create its socket again with
+    /// [`listen`](Self::listen).
     ///
     /// # Errors
-    /// When the directory cannot be made or written; to be tried again.
+    /// Fails when the directory cannot be created or written; the caller may retry.
     pub fn rejoin(&self) -> Result<bool, HostError> {
         self.owner.check()?;
         let mut task = self.task.lock();
@@ -200,8 +198,8 @@ impl HostDirectory {
         }
         task.abort();
         let _context = self.runtime.enter();
-        let watcher = Watcher::new(&self.shared.place());
-        // What others wrote before the watcher was there.
+        let watcher = Watcher::new(&self.shared.host_dir());
+        // Reads the changes that other processes made before the watcher started.
         let read = self
             .shared
             .refresh()
@@ -212,11 +210,11 @@ impl HostDirectory {
         read.map(|()| true)
     }
 
-    /// Leaves the directory, with everything that was registered. The last process leaves it
-    /// empty. Dropping does the same and can only log what goes wrong.
+    /// Leaves the directory with all registrations. The last process leaves it empty. Dropping does
+    /// the same, but can only log an error.
     ///
     /// # Errors
-    /// When files cannot be removed.
+    /// Fails when files cannot be removed.
     pub fn close(&self) -> Result<(), HostError> {
         self.owner.check()?;
         self.task.lock().abort();
@@ -227,13 +225,13 @@ impl HostDirectory {
 /// Time that other processes have to join again after the directory was removed.
 const SETTLING: Duration = Duration::from_secs(15);
 
-/// The ends of processes of this host.
+/// Notifications of processes of this host that ended.
 #[derive(Debug)]
 pub struct Departures(watch::Receiver<u64>);
 
 impl Departures {
-    /// Waits until some process has ended since the last time. False when the directory itself
-    /// has been left, and nothing more will be told.
+    /// Waits until a process has ended since the last call. Returns false when this directory was
+    /// closed.
     pub async fn next(&mut self) -> bool {
         self.0.changed().await.is_ok()
     }
@@ -241,12 +239,12 @@ impl Departures {
 
 impl Drop for HostDirectory {
     fn drop(&mut self) {
-        // In a forked child everything stays the parent's.
+        // In a forked child, everything remains the parent's.
         if !self.owner.is_this() {
             return;
         }
         if let Err(error) = self.close() {
-            tracing::error!(%error, "the host's directory was not left in order");
+            tracing::error!(%error, "cannot remove this process's files from the host's directory");
         }
     }
 }
@@ -273,43 +271,43 @@ impl Directory for HostDirectory {
     }
 }
 
-/// A process that can be connected to; see [`HostDirectory::sockets`].
+/// A process that accepts connections; see [`HostDirectory::sockets`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct SocketId(Id);
 
-/// What goes wrong with the directory of a host.
+/// Error of the directory of a host.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum HostError {
-    /// Somebody else could read or change it.
+    /// Another user could read or change the path.
     #[error("refusing to use {}: {why}; remove it, or configure another directory", path.display())]
     NotPrivate {
-        /// What is refused.
+        /// The refused path.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         why: String,
     },
-    /// The lock of the domain was not to be had.
+    /// The lock of the domain was not available in time.
     #[error(
-        "the lock {} was not to be had: another process holds it and does not let go (is one \
-         stopped, state T in ps?), or too many change the directory all the time",
+        "timed out waiting for the lock {}: another process holds it (stopped, state T in ps?), \
+         or too many processes change the directory; retry, or end the stopped process",
         path.display()
     )]
     Busy {
-        /// The file that is locked.
+        /// The lock file.
         path: PathBuf,
     },
-    /// Somebody has removed the files of living processes.
+    /// Another program removed files of running processes.
     #[error(
         "the files in {} were removed by another program; this process joins the directory again \
-         within seconds: retry, and exempt the directory from cleaning",
+         within seconds; retry, and exclude the directory from cleanup of temporary files",
         path.display()
     )]
     Removed {
         /// The directory.
         path: PathBuf,
     },
-    /// There are more files than processes can make.
+    /// The directory has more files than any number of processes creates.
     #[error("too many files in {}; remove those that are no longer used", path.display())]
     TooManyFiles {
         /// The directory.
@@ -321,14 +319,14 @@ pub enum HostError {
         /// The file.
         path: PathBuf,
     },
-    /// The system refused something.
+    /// A system call failed.
     #[error("cannot {what} {}: {source}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation, as a verb.
         what: &'static str,
-        /// On which file.
+        /// The path of the operation.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: io::Error,
     },
     /// The events of the directory cannot be read.
@@ -336,7 +334,7 @@ pub enum HostError {
     Watch {
         /// The directory.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: io::Error,
     },
     /// An entry to be published is not valid.
@@ -344,14 +342,14 @@ pub enum HostError {
     Entry {
         /// Its name.
         name: Arc<str>,
-        /// What is wrong.
+        /// The violated limit.
         error: EntryError,
     },
-    /// There is too much to be published.
+    /// The entries to publish exceed a limit.
     #[error("the directory is full: {0}")]
     Full(String),
     /// Only a gateway publishes agents of other hosts.
-    #[error("this process is no gateway and cannot publish agents of other hosts")]
+    #[error("this process is not a gateway; only a gateway can publish agents of other hosts")]
     NoGateway,
     /// The directory has been closed.
     #[error("the directory has been closed")]
@@ -359,7 +357,7 @@ pub enum HostError {
     /// This process is a forked child of the one that opened the directory.
     #[error(transparent)]
     Forked(#[from] Forked),
-    /// A task is needed, and there is nobody to run it.
-    #[error("the host's directory must be opened within a tokio runtime")]
+    /// No tokio runtime is running.
+    #[error("no tokio runtime is running; open the host's directory within one")]
     NoRuntime,
 }

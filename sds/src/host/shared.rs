@@ -1,4 +1,4 @@
-//! What this process knows of the others, and how it changes what they know of it.
+//! State of a host's directory: the entries of other processes, and those that this process writes.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use tokio::sync::{Notify, watch};
 use super::HostError;
 use super::SocketId;
 use super::file::{self, Entries, FileError};
-use super::place::{Guard, Id, MAX_ENTRIES_FILE, Name, Place, Version};
+use super::host_dir::{Guard, HostDir, Id, MAX_ENTRIES_FILE, Name, Version};
 use crate::table::Table;
 use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
 
@@ -20,39 +20,38 @@ use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
 /// Locks are taken in this order: the domain's, `own`, `others`, the table's.
 #[derive(Debug)]
 pub(super) struct Shared {
-    /// Another one after the directory was removed and joined again.
-    place: ArcSwap<Place>,
+    /// Replaced when the directory was removed and joined again.
+    host_dir: ArcSwap<HostDir>,
     pub(super) table: Table<Id>,
     mts: Mts,
-    own: Mutex<Own>,
-    others: Mutex<Others>,
-    /// Counts processes that have ended.
+    own: Mutex<OwnEntries>,
+    others: Mutex<OtherProcesses>,
+    /// Number of processes that have ended.
     ended: watch::Sender<u64>,
     sockets: watch::Sender<Vec<SocketId>>,
-    /// Is notified when the directory may have been removed.
+    /// Notified when the directory may have been removed.
     disturbed: Notify,
 }
 
-/// What this process tells the others.
+/// The entries that this process writes.
 #[derive(Debug, Default)]
-struct Own {
+struct OwnEntries {
     closed: bool,
     agents: Entries,
-    /// Agents of other hosts, published by a gateway. Not in its own table: it knows them
-    /// better than through itself.
+    /// Agents of other hosts that this gateway publishes. They are not in its own table, because it
+    /// has them from other back ends.
     remote: Vec<Arc<Entry>>,
 }
 
-/// What the others have told.
+/// The entries of the other processes.
 #[derive(Debug, Default)]
-struct Others {
+struct OtherProcesses {
     generation: u64,
     processes: HashMap<Id, Process>,
 }
 
-impl Others {
-    /// Whether another process has registered an agent of this name, according to the files that
-    /// are there now.
+impl OtherProcesses {
+    /// Whether another process has registered an agent of this name in a file that exists now.
     fn has_registered(&self, name: &str) -> bool {
         self.processes.values().any(|process| {
             let entry = process.entries.get(name);
@@ -68,9 +67,9 @@ struct Process {
 }
 
 impl Shared {
-    pub(super) fn new(place: Place, mts: Mts) -> Self {
+    pub(super) fn new(host_dir: HostDir, mts: Mts) -> Self {
         Self {
-            place: ArcSwap::from_pointee(place),
+            host_dir: ArcSwap::from_pointee(host_dir),
             table: Table::new(),
             mts,
             own: Mutex::default(),
@@ -81,12 +80,12 @@ impl Shared {
         }
     }
 
-    pub(super) fn place(&self) -> Arc<Place> {
-        self.place.load_full()
+    pub(super) fn host_dir(&self) -> Arc<HostDir> {
+        self.host_dir.load_full()
     }
 
-    /// Says that the directory may have been removed.
-    pub(super) fn say_disturbed(&self) {
+    /// Reports that the directory may have been removed.
+    pub(super) fn report_disturbed(&self) {
         self.disturbed.notify_one();
     }
 
@@ -94,40 +93,40 @@ impl Shared {
         self.disturbed.notified().await;
     }
 
-    /// Whether others can find what this process has written.
+    /// Whether other processes can find the entries of this one.
     pub(super) fn is_there(&self) -> Result<bool, HostError> {
         let own = self.own.lock();
         if own.closed {
             return Ok(true);
         }
-        let place = self.place();
+        let host_dir = self.host_dir();
         let nothing = own.agents.is_empty() && own.remote.is_empty();
-        Ok(place.is_there()? && (nothing || place.version(place.id())?.is_some()))
+        Ok(host_dir.is_there()? && (nothing || host_dir.version(host_dir.id())?.is_some()))
     }
 
-    /// Joins the directory again after it, or files of this process in it, were removed. Says
+    /// Joins the directory again after it, or files of this process in it, were removed; returns
     /// whether that was necessary.
     ///
-    /// What others have registered stays known until [`rescan`](Self::rescan): they need a moment
-    /// to join again.
+    /// Entries of other processes stay until [`rescan`](Self::rescan): these processes need time to
+    /// join again.
     pub(super) fn rejoin(&self) -> Result<bool, HostError> {
         if self.is_there()? {
             return Ok(false);
         }
-        let before = self.place();
-        let place = Arc::new(Place::join(before.path(), before.id())?);
-        let guard = place.lock()?;
+        let before = self.host_dir();
+        let host_dir = Arc::new(HostDir::join(before.path(), before.id())?);
+        let guard = host_dir.lock()?;
         let mut own = self.own.lock();
         if own.closed {
             drop(own);
             guard.leave()?;
             return Ok(false);
         }
-        self.place.store(Arc::clone(&place));
+        self.host_dir.store(Arc::clone(&host_dir));
         let mut others = self.others.lock();
         others.generation = 0;
         for process in others.processes.values_mut() {
-            // A new file may have the version of the one that was removed.
+            // A new file may have the version of the removed one.
             process.version = None;
         }
         self.scan(&mut others)?;
@@ -145,7 +144,7 @@ impl Shared {
                     "another process registered the name while the directory was gone; this agent \
                      is no longer registered"
                 );
-                self.table.release(place.id(), &name, entry.incarnation);
+                self.table.release(host_dir.id(), &name, entry.incarnation);
             }
         }
         self.write(&guard, &own).map_err(|error| match error {
@@ -161,8 +160,8 @@ impl Shared {
         self.ended.subscribe()
     }
 
-    /// Says that processes have ended.
-    pub(super) fn say_ended(&self) {
+    /// Reports that processes have ended.
+    pub(super) fn report_ended(&self) {
         self.ended.send_modify(|count| *count += 1);
     }
 
@@ -170,13 +169,13 @@ impl Shared {
         self.sockets.subscribe()
     }
 
-    /// Sees which processes have a socket.
+    /// Updates the list of processes that have a socket.
     pub(super) fn find_sockets(&self) -> Result<(), HostError> {
-        let names = self.place().names()?;
+        let names = self.host_dir().names()?;
         let mut found: Vec<SocketId> = names
             .into_iter()
             .filter_map(|name| match name {
-                Name::Socket(id) if id != self.place().id() => Some(SocketId(id)),
+                Name::Socket(id) if id != self.host_dir().id() => Some(SocketId(id)),
                 _ => None,
             })
             .collect();
@@ -189,40 +188,39 @@ impl Shared {
         Ok(())
     }
 
-    /// Reads what others have written, if anybody has since the last time: one system call when
-    /// nobody has.
+    /// Reads the changes of other processes; takes one system call when there are none.
     pub(super) fn refresh(&self) -> Result<(), HostError> {
-        let generation = self.place().generation()?;
+        let generation = self.host_dir().generation()?;
         let mut others = self.others.lock();
         if others.generation == generation {
             return Ok(());
         }
         self.scan(&mut others)?;
-        // The number was read before the files: what was written in between is read again.
+        // Read before the files, so that a change in between causes another read.
         others.generation = generation;
         Ok(())
     }
 
-    /// Reads everything again and checks who lives, whatever the generation says.
+    /// Reads all files again and checks which processes are running, regardless of the generation.
     pub(super) fn rescan(&self) -> Result<(), HostError> {
         let mut others = self.others.lock();
         let known: Vec<Id> = others.processes.keys().copied().collect();
         for id in known {
-            if !self.place().lives(id)? {
+            if !self.host_dir().is_running(id)? {
                 self.forget(&mut others, id);
             }
         }
-        // Among those of whom nothing was heard there may be some who have ended.
-        self.say_ended();
+        // A process may have ended before its files were read for the first time.
+        self.report_ended();
         self.scan(&mut others)?;
         drop(others);
         self.find_sockets()
     }
 
-    fn scan(&self, others: &mut Others) -> Result<(), HostError> {
-        for name in self.place().names()? {
+    fn scan(&self, others: &mut OtherProcesses) -> Result<(), HostError> {
+        for name in self.host_dir().names()? {
             if let Name::Entries(id) = name
-                && id != self.place().id()
+                && id != self.host_dir().id()
             {
                 self.read(others, id)?;
             }
@@ -230,32 +228,32 @@ impl Shared {
         Ok(())
     }
 
-    /// Reads what a process has written, if it has written anything new.
+    /// Reads the process's entries file if it has changed.
     pub(super) fn process_wrote(&self, id: Id) -> Result<(), HostError> {
-        if id == self.place().id() {
+        if id == self.host_dir().id() {
             return Ok(());
         }
         self.read(&mut self.others.lock(), id)
     }
 
-    fn read(&self, others: &mut Others, id: Id) -> Result<(), HostError> {
+    fn read(&self, others: &mut OtherProcesses, id: Id) -> Result<(), HostError> {
         let known = others.processes.get(&id);
-        let version = self.place().version(id)?;
+        let version = self.host_dir().version(id)?;
         if known.is_some_and(|process| process.version == version) {
             return Ok(());
         }
-        // Somebody new may be somebody dead, whose files nobody has removed yet.
-        if known.is_none() && !self.place().lives(id)? {
+        // The files of an unknown process may be leftovers of a dead one.
+        if known.is_none() && !self.host_dir().is_running(id)? {
             return Ok(());
         }
         let entries = self.read_file(id).unwrap_or_else(|error| {
-            // Its agents are not there for us, as if it had none; its next file may be better.
-            let path = self.place().path().join(Name::Entries(id).to_string());
+            // Treated as empty; the process's next file may be valid.
+            let path = self.host_dir().path().join(Name::Entries(id).to_string());
             tracing::error!(path = %path.display(), %error, "entries file ignored");
             Entries::new()
         });
         let process = others.processes.entry(id).or_default();
-        // Taken before reading: what was replaced in between is read again.
+        // Taken before reading, so that a replacement in between causes another read.
         process.version = version;
         let before = std::mem::replace(&mut process.entries, entries);
         self.tell(id, &before, &process.entries);
@@ -263,7 +261,7 @@ impl Shared {
     }
 
     fn read_file(&self, id: Id) -> Result<Entries, ReadError> {
-        match self.place().read_entries(id)? {
+        match self.host_dir().read_entries(id)? {
             Some(bytes) => Ok(file::read(&bytes)?),
             None => Ok(Entries::new()),
         }
@@ -279,37 +277,37 @@ impl Shared {
         self.table.update(left.chain(changed));
     }
 
-    /// Forgets a process if it is dead. False when it lives.
+    /// Drops the entries of a process if it is dead. Returns false if it is running.
     pub(super) fn process_ended(&self, id: Id) -> Result<bool, HostError> {
-        if self.place().lives(id)? {
+        if self.host_dir().is_running(id)? {
             return Ok(false);
         }
         self.forget(&mut self.others.lock(), id);
         Ok(true)
     }
 
-    fn forget(&self, others: &mut Others, id: Id) {
+    fn forget(&self, others: &mut OtherProcesses, id: Id) {
         if let Some(process) = others.processes.remove(&id) {
             self.tell(id, &process.entries, &Entries::new());
         }
     }
 
-    /// Removes the files of a process if it is dead. False when somebody else is just changing
-    /// the directory.
-    pub(super) fn try_bury(&self, id: Id) -> Result<bool, HostError> {
-        let place = self.place();
-        let Some(guard) = place.try_lock()? else {
+    /// Removes the files of a process if it is dead. Returns false if another process holds the
+    /// lock.
+    pub(super) fn try_remove_files(&self, id: Id) -> Result<bool, HostError> {
+        let host_dir = self.host_dir();
+        let Some(guard) = host_dir.try_lock()? else {
             return Ok(false);
         };
-        if !self.place().lives(id)? {
-            guard.bury(id)?;
+        if !self.host_dir().is_running(id)? {
+            guard.remove_files(id)?;
         }
         Ok(true)
     }
 
     pub(super) fn register(&self, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
-        let place = self.place();
-        let guard = place.lock().map_err(failed)?;
+        let host_dir = self.host_dir();
+        let guard = host_dir.lock().map_err(failed)?;
         self.free(&guard, &entry)?;
         let mut own = self.own.lock();
         if own.closed {
@@ -324,7 +322,7 @@ impl Shared {
             };
             return Err(error.into());
         }
-        self.table.put(self.place().id(), Arc::clone(&entry));
+        self.table.put(self.host_dir().id(), Arc::clone(&entry));
         Ok(entry)
     }
 
@@ -333,8 +331,8 @@ impl Shared {
         entries: Vec<Entry>,
         leaving: &[(&str, Incarnation)],
     ) -> Result<(), RegisterError> {
-        let place = self.place();
-        let guard = place.lock().map_err(failed)?;
+        let host_dir = self.host_dir();
+        let guard = host_dir.lock().map_err(failed)?;
         for entry in &entries {
             self.free(&guard, entry)?;
         }
@@ -359,23 +357,23 @@ impl Shared {
             own.agents = before;
             return Err(error.into());
         }
-        self.tell(self.place().id(), &before, &own.agents);
+        self.tell(self.host_dir().id(), &before, &own.agents);
         Ok(())
     }
 
-    /// Sees to it that nobody who lives has the name.
+    /// Checks that no running process holds the name, and removes the files of dead ones that do.
     fn free(&self, guard: &Guard<'_>, entry: &Entry) -> Result<(), RegisterError> {
         self.refresh().map_err(failed)?;
         while let Some((id, holder)) = self.table.holder(&entry.name) {
-            let ours = id == self.place().id();
+            let ours = id == self.host_dir().id();
             if ours && holder.incarnation == entry.incarnation {
                 break;
             }
-            if ours || self.place().lives(id).map_err(failed)? {
+            if ours || self.host_dir().is_running(id).map_err(failed)? {
                 return Err(RegisterError::AlreadyRegistered { holder });
             }
             self.forget(&mut self.others.lock(), id);
-            guard.bury(id).map_err(failed)?;
+            guard.remove_files(id).map_err(failed)?;
         }
         Ok(())
     }
@@ -398,13 +396,13 @@ impl Shared {
                 own.agents.insert(entry.name.clone(), entry);
                 return Err(failed(error));
             }
-            let id = self.place().id();
+            let id = self.host_dir().id();
             self.table.release(id, name, entry.incarnation);
             Ok(())
         })
     }
 
-    /// Replaces what this gateway publishes of other hosts.
+    /// Replaces the agents of other hosts that this gateway publishes.
     pub(super) fn publish(&self, remote: Vec<Arc<Entry>>) -> Result<(), HostError> {
         self.change(|guard, own| {
             if own.closed {
@@ -424,50 +422,54 @@ impl Shared {
         })
     }
 
-    /// Changes what this process tells the others, under the lock of the domain unless the
-    /// directory was removed.
-    fn change<T>(&self, change: impl FnOnce(Result<Guard<'_>, HostError>, &mut Own) -> T) -> T {
+    /// Changes this process's entries under the lock of the domain, or without it if the directory
+    /// was removed.
+    fn change<T>(
+        &self,
+        change: impl FnOnce(Result<Guard<'_>, HostError>, &mut OwnEntries) -> T,
+    ) -> T {
         loop {
-            let place = self.place();
-            let guard = place.lock();
+            let host_dir = self.host_dir();
+            let guard = host_dir.lock();
             let mut own = self.own.lock();
-            // Joined again meanwhile, the place is another one. Under this lock it stays.
-            if Arc::ptr_eq(&place, &self.place()) {
+            // After a rejoin, this is a different directory. `own` is locked, so it cannot change
+            // below.
+            if Arc::ptr_eq(&host_dir, &self.host_dir()) {
                 return change(guard, &mut own);
             }
         }
     }
 
-    /// Writes what this process tells the others; when the directory was removed,
-    /// [`rejoin`](Self::rejoin) will.
+    /// Writes this process's entries. If the directory was removed, [`rejoin`](Self::rejoin) writes
+    /// them later.
     fn write_now_or_later(
         &self,
         guard: Result<Guard<'_>, HostError>,
-        own: &Own,
+        own: &OwnEntries,
     ) -> Result<(), WriteError> {
         let written = guard.map_err(WriteError::from);
         let written = written.and_then(|guard| self.write(&guard, own));
         match written {
-            Err(WriteError::Host(_)) if matches!(self.place().is_there(), Ok(false)) => Ok(()),
+            Err(WriteError::Host(_)) if matches!(self.host_dir().is_there(), Ok(false)) => Ok(()),
             written => written,
         }
     }
 
-    fn write(&self, guard: &Guard<'_>, own: &Own) -> Result<(), WriteError> {
-        // A name that is registered here is not also published as somebody else's.
+    fn write(&self, guard: &Guard<'_>, own: &OwnEntries) -> Result<(), WriteError> {
+        // A name that is registered here is not also published as a remote agent.
         let remote = own.remote.iter();
         let remote = remote.filter(|entry| !own.agents.contains_key(&entry.name));
         let count = own.agents.len() + own.remote.len();
         if count > file::MAX_ENTRIES {
             let most = file::MAX_ENTRIES;
-            let why = format!("{count} entries in one process, and at most {most} are allowed");
+            let why = format!("this process has {count} entries; at most {most} are allowed");
             return Err(WriteError::Full(why));
         }
         let bytes = file::write(&self.mts, own.agents.values().chain(remote));
         if bytes.len() > MAX_ENTRIES_FILE {
             let len = bytes.len();
             let why = format!(
-                "the entries of this process take {len} bytes, and at most {MAX_ENTRIES_FILE} are allowed"
+                "the entries of this process take {len} bytes, but at most {MAX_ENTRIES_FILE} are allowed"
             );
             return Err(WriteError::Full(why));
         }
@@ -475,16 +477,16 @@ impl Shared {
         Ok(())
     }
 
-    /// Leaves the directory. Doing it again does nothing.
+    /// Leaves the directory. A repeated call does nothing.
     pub(super) fn close(&self) -> Result<(), HostError> {
-        let place = self.place();
-        let guard = place.lock();
+        let host_dir = self.host_dir();
+        let guard = host_dir.lock();
         let mut own = self.own.lock();
         if std::mem::replace(&mut own.closed, true) {
             return Ok(());
         }
         let agents = std::mem::take(&mut own.agents);
-        self.tell(self.place().id(), &agents, &Entries::new());
+        self.tell(self.host_dir().id(), &agents, &Entries::new());
         guard?.leave()
     }
 }

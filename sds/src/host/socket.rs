@@ -1,4 +1,4 @@
-//! Sockets in the directory: how processes of a domain that find each other there can talk.
+//! Sockets in the directory, for connections between processes of a domain.
 
 use std::os::fd::OwnedFd;
 
@@ -10,24 +10,24 @@ use rustix::net::{
 };
 
 use super::HostError;
-use super::place::{Guard, Id, Name, Place};
+use super::host_dir::{Guard, HostDir, Id, Name};
 
-/// Connections that wait to be accepted.
+/// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 1024;
 
 impl Guard<'_> {
     pub(super) fn listen(&self) -> Result<OwnedFd, HostError> {
-        let place = self.place;
-        let temporary = Name::Temporary(place.id());
-        place.remove(temporary)?;
+        let host_dir = self.host_dir;
+        let temporary = Name::Temporary(host_dir.id());
+        host_dir.remove(temporary)?;
         let socket = new_socket()
             .and_then(|socket| {
-                // The path of the directory may be longer than that of a socket can be.
-                let path = place.pinned_path().join(temporary.to_string());
+                // The full path may exceed the length limit of a socket's path.
+                let path = host_dir.pinned_path().join(temporary.to_string());
                 bind(&socket, &SocketAddrUnix::new(&path)?)?;
                 let private = Mode::RUSR | Mode::WUSR;
                 rustix::fs::chmodat(
-                    place.dir(),
+                    host_dir.dir(),
                     temporary.to_string(),
                     private,
                     AtFlags::empty(),
@@ -35,19 +35,20 @@ impl Guard<'_> {
                 listen(&socket, BACKLOG)?;
                 Ok(socket)
             })
-            .map_err(|error| place.io("listen at", temporary)(error.into()))?;
-        // Seen only now, when it can be connected to.
-        place.rename(temporary, Name::Socket(place.id()))?;
+            .map_err(|error| host_dir.io("listen at", temporary)(error.into()))?;
+        // Appears under its name only now that it accepts connections.
+        host_dir.rename(temporary, Name::Socket(host_dir.id()))?;
         Ok(socket)
     }
 }
 
-impl Place {
+impl HostDir {
     pub(super) fn connect(&self, id: Id) -> Result<OwnedFd, HostError> {
         use std::os::fd::AsRawFd as _;
         let name = Name::Socket(id);
         let failed = |error: Errno| self.io("connect to", name)(error.into());
-        // What is examined here is what is connected to below, whatever the name is given to.
+        // Opened first: the connection below is to the file that was examined, even if the name is
+        // reassigned.
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(self.dir(), name.to_string(), flags, Mode::empty());
         let file = file.map_err(failed)?;

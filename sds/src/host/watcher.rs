@@ -1,8 +1,8 @@
-//! The task that listens to what happens in the directory.
+//! The task that watches the directory.
 //!
-//! A process that ends, in whatever way, closes its lock file, which it had open for writing; the
-//! kernel reports that to everybody who watches the directory. A process that cannot get an inotify
-//! instance, of which the kernel limits the number per user, polls the directory instead.
+//! When a process ends, in any way, the kernel closes its lock file, which was open for writing,
+//! and reports that to every watcher. A process that cannot get an inotify instance, of which the
+//! kernel limits the number per user, polls the directory instead.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
@@ -19,14 +19,14 @@ use inotify::{EventMask, EventStream, Inotify, WatchMask};
 use tokio::time::Instant;
 
 use super::HostError;
-use super::place::{Id, Name, Place};
+use super::host_dir::{HostDir, Id, Name};
 use super::shared::Shared;
 
 pub(super) struct Watcher {
     events: Events,
 }
 
-/// Source of the news about the directory.
+/// Source of changes of the directory.
 enum Events {
     Inotify(EventStream<Vec<u8>>),
     Polling(Poller),
@@ -34,15 +34,15 @@ enum Events {
 
 impl Watcher {
     /// Watches from now on. Must be called within a tokio runtime.
-    pub(super) fn new(place: &Place) -> Self {
-        let events = match Self::inotify(place) {
+    pub(super) fn new(host_dir: &HostDir) -> Self {
+        let events = match Self::inotify(host_dir) {
             Ok(events) => Events::Inotify(events),
             Err(error) => {
                 tracing::warn!(
                     %error,
                     "no inotify watch for {}: polling it every {} ms; raise \
                      fs.inotify.max_user_instances (sysctl)",
-                    place.path().display(),
+                    host_dir.path().display(),
                     POLL_EVERY.as_millis()
                 );
                 Events::Polling(Poller::default())
@@ -51,7 +51,7 @@ impl Watcher {
         Self { events }
     }
 
-    fn inotify(place: &Place) -> io::Result<EventStream<Vec<u8>>> {
+    fn inotify(host_dir: &HostDir) -> io::Result<EventStream<Vec<u8>>> {
         let inotify = Inotify::init()?;
         let mask = WatchMask::CLOSE_WRITE
             | WatchMask::MOVED_TO
@@ -59,38 +59,38 @@ impl Watcher {
             | WatchMask::DELETE_SELF
             | WatchMask::ONLYDIR;
         let mut watches = inotify.watches();
-        watches.add(place.pinned_path(), mask)?;
+        watches.add(host_dir.pinned_path(), mask)?;
         inotify.into_event_stream(vec![0; 16 * 1024])
     }
 
-    /// Keeps the view up to date, for ever. What others had registered when the directory was
-    /// removed is forgotten at `settled`, unless they have joined again.
+    /// Keeps the view up to date until it is aborted. At `settled`, entries from before a removal
+    /// of the directory are dropped, unless their process has joined again.
     ///
-    /// The first change is read at once, and what follows it together after a pause: a process that
-    /// registers a hundred agents replaces its file a hundred times, and everybody who read it each
-    /// time would read for as long as the square of that.
+    /// The first change is read at once, and later ones are collected during a pause: a process
+    /// that registers a hundred agents replaces its file a hundred times, and reading each version
+    /// would take quadratic time.
     pub(super) async fn run(mut self, shared: Arc<Shared>, mut settled: Option<Instant>) {
-        let mut ending = Ending::default();
+        let mut ending = EndingProcesses::default();
         loop {
-            let news = tokio::select! {
-                news = self.news(&shared) => news,
-                () = ending.due() => Ok(News::default()),
+            let changes = tokio::select! {
+                changes = self.changes(&shared) => changes,
+                () = ending.due() => Ok(DirChanges::default()),
                 () = sleep_until(settled) => {
                     settled = None;
                     ending.rescan = true;
-                    Ok(News::default())
+                    Ok(DirChanges::default())
                 }
             };
             let began = Instant::now();
-            let handled = news.and_then(|news| handle(&shared, news, &mut ending));
+            let handled = changes.and_then(|changes| handle(&shared, changes, &mut ending));
             if let Err(error) = handled {
                 if matches!(shared.is_there(), Ok(false)) {
-                    // Joining it again ends this watcher.
-                    shared.say_disturbed();
+                    // A rejoin ends this watcher.
+                    shared.report_disturbed();
                 } else {
                     tracing::error!(%error, "the view of the host's directory may be out of date");
                 }
-                // Whatever it is (no descriptors left, say), not in a tight loop.
+                // The error may persist (for example `EMFILE`); the pause prevents a busy loop.
                 tokio::time::sleep(Duration::from_millis(100)).await;
                 ending.rescan = true;
             }
@@ -98,57 +98,58 @@ impl Watcher {
         }
     }
 
-    /// Everything that has happened since the last time, at least one thing.
-    async fn news(&mut self, shared: &Shared) -> Result<News, HostError> {
+    /// Waits for at least one change, and returns all since the last call.
+    async fn changes(&mut self, shared: &Shared) -> Result<DirChanges, HostError> {
         match &mut self.events {
             Events::Inotify(events) => {
                 next_events(events)
                     .await
                     .map_err(|source| HostError::Watch {
-                        path: shared.place().path().to_owned(),
+                        path: shared.host_dir().path().to_owned(),
                         source,
                     })
             }
             Events::Polling(poller) => loop {
                 tokio::time::sleep(POLL_EVERY).await;
-                let news = poller.poll(&shared.place())?;
-                if !news.is_empty() {
-                    return Ok(news);
+                let changes = poller.poll(&shared.host_dir())?;
+                if !changes.is_empty() {
+                    return Ok(changes);
                 }
             },
         }
     }
 }
 
-async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<News> {
-    let mut news = News::default();
+async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<DirChanges> {
+    let mut changes = DirChanges::default();
     poll_fn(|context| {
-        // So many at most, to let others run.
+        // Bounded, so that other tasks can run.
         for _ in 0..4096 {
             match Pin::new(&mut *events).poll_next(context) {
                 Poll::Ready(Some(event)) => {
                     let event = event?;
-                    news.add(event.mask, event.name.as_deref().and_then(OsStr::to_str));
+                    changes.add(event.mask, event.name.as_deref().and_then(OsStr::to_str));
                 }
-                // The kernel does not end this.
+                // The stream does not end.
                 Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
-                Poll::Pending if news.is_empty() => return Poll::Pending,
+                Poll::Pending if changes.is_empty() => return Poll::Pending,
                 Poll::Pending => break,
             }
         }
-        Poll::Ready(Ok(std::mem::take(&mut news)))
+        Poll::Ready(Ok(std::mem::take(&mut changes)))
     })
     .await
 }
 
-/// Time between two looks at the directory without inotify.
+/// Interval between polls of the directory without inotify.
 const POLL_EVERY: Duration = Duration::from_millis(100);
 
-/// Maximum number of processes whose lock is tried in one poll. Each costs four system calls. When
-/// another process has an inotify instance, it removes the files of the dead, which one poll finds.
+/// Maximum number of processes whose lock is tried in one poll. Each costs four system calls.
+/// Another process with an inotify instance removes the files of dead processes, which one poll
+/// detects.
 const LOCKS_PER_POLL: usize = 8;
 
-/// Finds out what inotify would report.
+/// Detects what inotify would report.
 #[derive(Debug, Default)]
 struct Poller {
     /// Generation and time of the last change, as of the last poll.
@@ -163,44 +164,44 @@ struct Poller {
 }
 
 impl Poller {
-    fn poll(&mut self, place: &Place) -> Result<News, HostError> {
-        let mut news = News::default();
-        let now = Some((place.generation()?, place.changed()?));
+    fn poll(&mut self, host_dir: &HostDir) -> Result<DirChanges, HostError> {
+        let mut changes = DirChanges::default();
+        let now = Some((host_dir.generation()?, host_dir.changed()?));
         let changed = self.seen != now;
         if changed || !self.settled {
-            self.read(place, &mut news)?;
+            self.read(host_dir, &mut changes)?;
         }
         (self.seen, self.settled) = (now, !changed);
-        self.try_locks(place, &mut news)?;
-        Ok(news)
+        self.try_locks(host_dir, &mut changes)?;
+        Ok(changes)
     }
 
-    fn read(&mut self, place: &Place, news: &mut News) -> Result<(), HostError> {
+    fn read(&mut self, host_dir: &HostDir, changes: &mut DirChanges) -> Result<(), HostError> {
         let mut processes = BTreeSet::new();
-        for name in place.names()? {
+        for name in host_dir.names()? {
             match name {
                 Name::Process(id) => drop(processes.insert(id)),
-                Name::Entries(id) => drop(news.wrote.insert(id)),
+                Name::Entries(id) => drop(changes.wrote.insert(id)),
                 _ => {}
             }
         }
-        news.sockets = true;
-        news.ended = self.processes.difference(&processes).copied().collect();
+        changes.sockets = true;
+        changes.ended = self.processes.difference(&processes).copied().collect();
         self.processes = processes;
         Ok(())
     }
 
-    /// Looks for processes that were killed, which changes nothing in the directory.
-    fn try_locks(&mut self, place: &Place, news: &mut News) -> Result<(), HostError> {
+    /// Detects processes that were killed, which changes nothing in the directory.
+    fn try_locks(&mut self, host_dir: &HostDir, changes: &mut DirChanges) -> Result<(), HostError> {
         let after = self.tried.map_or(Bound::Unbounded, Bound::Excluded);
         let later = self.processes.range((after, Bound::Unbounded));
         let ids: Vec<Id> = later.take(LOCKS_PER_POLL).copied().collect();
         for id in &ids {
-            if *id != place.id() && !place.lives(*id)? {
-                news.ended.insert(*id);
+            if *id != host_dir.id() && !host_dir.is_running(*id)? {
+                changes.ended.insert(*id);
             }
         }
-        // At the end, the next poll begins again.
+        // After the last process, the next poll starts over.
         self.tried = (ids.len() == LOCKS_PER_POLL)
             .then(|| ids.last().copied())
             .flatten();
@@ -208,25 +209,25 @@ impl Poller {
     }
 }
 
-/// How long to let changes gather, after those before took so long to read: where there are many of
-/// them, or little of the processor, reading leaves most of it to those who make them. Whoever
-/// looks for a name that is not there yet does not wait for this.
+/// Time to collect changes after a read of this duration. With many changes or little CPU time,
+/// reading leaves most of the time to the writers. A lookup of an unknown name does not wait for
+/// this pause.
 fn pause_after(reading: Duration) -> Duration {
     const LEAST: Duration = Duration::from_millis(5);
     const MOST: Duration = Duration::from_millis(100);
     (reading * 8).clamp(LEAST, MOST)
 }
 
-/// What has happened, each thing once however often it did.
+/// Collected changes, without duplicates.
 #[derive(Debug, Default)]
-struct News {
+struct DirChanges {
     wrote: BTreeSet<Id>,
     ended: BTreeSet<Id>,
     sockets: bool,
     lost: bool,
 }
 
-impl News {
+impl DirChanges {
     fn add(&mut self, mask: EventMask, name: Option<&str>) {
         if mask.intersects(EventMask::Q_OVERFLOW | EventMask::DELETE_SELF | EventMask::IGNORED) {
             self.lost = true;
@@ -257,23 +258,27 @@ async fn sleep_until(time: Option<Instant>) {
     }
 }
 
-fn handle(shared: &Shared, news: News, ending: &mut Ending) -> Result<(), HostError> {
-    // Files that vanish together with the directory are no end of their processes.
-    if (news.lost || ending.rescan || !news.ended.is_empty()) && !shared.is_there()? {
+fn handle(
+    shared: &Shared,
+    changes: DirChanges,
+    ending: &mut EndingProcesses,
+) -> Result<(), HostError> {
+    // Files that disappear together with the directory do not mean that their processes ended.
+    if (changes.lost || ending.rescan || !changes.ended.is_empty()) && !shared.is_there()? {
         return Err(HostError::Removed {
-            path: shared.place().path().to_owned(),
+            path: shared.host_dir().path().to_owned(),
         });
     }
-    if news.lost || std::mem::take(&mut ending.rescan) {
+    if changes.lost || std::mem::take(&mut ending.rescan) {
         shared.rescan()?;
     }
-    if news.sockets {
+    if changes.sockets {
         shared.find_sockets()?;
     }
-    for id in news.wrote {
+    for id in changes.wrote {
         shared.process_wrote(id)?;
     }
-    for id in news.ended {
+    for id in changes.ended {
         ending.add(id);
     }
     ending.handle(shared)
@@ -281,28 +286,27 @@ fn handle(shared: &Shared, news: News, ending: &mut Ending) -> Result<(), HostEr
 
 /// Processes that are ending.
 ///
-/// The kernel reports the closing of a file just before it lets go of the lock, and somebody else
-/// may be changing the directory when the remains are to be removed; so both are tried again,
-/// some times.
+/// The kernel reports the closing of a file just before it releases the lock, and another process
+/// may hold the domain's lock when the files are to be removed; both are retried a few times.
 #[derive(Debug, Default)]
-struct Ending {
-    processes: BTreeMap<Id, End>,
+struct EndingProcesses {
+    processes: BTreeMap<Id, EndingProcess>,
     rescan: bool,
 }
 
 #[derive(Debug)]
-struct End {
+struct EndingProcess {
     pause: Duration,
     due: Instant,
 }
 
-impl Ending {
+impl EndingProcesses {
     const FIRST_PAUSE: Duration = Duration::from_millis(1);
-    /// After about a second it is not ending: somebody has only touched its lock file.
+    /// After about a second, the process is not ending: a program has only touched its lock file.
     const LAST_PAUSE: Duration = Duration::from_millis(512);
 
     fn add(&mut self, id: Id) {
-        let end = End {
+        let end = EndingProcess {
             pause: Self::FIRST_PAUSE,
             due: Instant::now(),
         };
@@ -325,12 +329,12 @@ impl Ending {
             .map(|(id, _)| *id)
             .collect();
         for id in due {
-            let done = shared.process_ended(id)? && shared.try_bury(id)?;
+            let done = shared.process_ended(id)? && shared.try_remove_files(id)?;
             let Some(end) = self.processes.get_mut(&id) else {
                 continue;
             };
             if done {
-                shared.say_ended();
+                shared.report_ended();
             }
             if done || end.pause > Self::LAST_PAUSE {
                 self.processes.remove(&id);

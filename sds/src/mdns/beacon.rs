@@ -1,20 +1,20 @@
-//! Beacons: how gateways notice that they have missed something of each other.
+//! Beacons: gateways detect with them that they missed announcements of each other.
 //!
-//! An announcement or a goodbye is said once or twice. Who was out of range then never hears of
-//! it: the next question is asked within the hour, and a record that is gone is believed in for
-//! minutes. So every gateway says every two seconds how many agents it announces and a digest of
-//! them, and the same of the coalitions among them, in a packet of 150 bytes that old peers pass
-//! over:
+//! An announcement or a goodbye is sent once or twice. A host that was out of range misses it: the
+//! next query may come up to an hour later, and a removed record stays in caches for minutes. Every
+//! gateway therefore sends, every two seconds, the number and a digest of the agents that it
+//! announces, and the same of the coalitions among them, in a packet of 150 bytes that legacy peers
+//! ignore:
 //!
 //! `<incarnation>._fipa_gateway._udp.local. TXT "agents=500" "digest=0123456789abcdef"
 //! "coalitions=2:0123456789abcdef"`
 //!
-//! with a PTR record that introduces it.
+//! together with a PTR record that introduces it.
 //!
-//! Whoever holds something else of that gateway asks the network, first for what it has not got,
-//! then for what it should not have any more. Who is not heard for some seconds is asked, too.
-//! Nothing new is believed because of a beacon: it makes others ask, or, when they hold just what
-//! it says, spares them asking whether that is still so.
+//! A gateway whose records of the sender differ queries the network, first for missing records,
+//! then for surplus ones. It also queries for a gateway whose beacons stop for some seconds. A
+//! beacon never adds an entry: it triggers queries, or, when it matches the stored records, makes
+//! queries for their renewal unnecessary.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -26,24 +26,24 @@ use simple_dns::{CLASS, Label, Name, Packet, PacketFlag, ResourceRecord};
 use super::packet::parse_answer;
 use super::record::Properties;
 
-/// How often a gateway says what it has.
+/// Interval between beacons.
 pub(super) const INTERVAL: Duration = Duration::from_secs(2);
-/// For how long it counts; no more than that is remembered by others' caches.
+/// TTL in seconds; other hosts cache a beacon for no longer.
 const TTL: u32 = 10;
-/// How long a gateway that said something is silent before it is asked.
+/// Time without a beacon after which a gateway is queried.
 pub(super) const SILENCE: Duration = Duration::from_secs(8);
-/// How long what is held of a gateway has to be unchanged before it is compared: what is under
-/// way need not be asked for.
+/// Time for which the stored records of a gateway must be unchanged before they are compared:
+/// records that are still arriving need no query.
 const QUIET: Duration = Duration::from_secs(1);
-/// Pauses between two repairs of the same gateway.
+/// Pauses between two queries for the same gateway.
 const FIRST_PAUSE: Duration = Duration::from_secs(2);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
-/// Most gateways that are listened to.
+/// Maximum number of gateways whose beacons are processed.
 const MAX_GATEWAYS: usize = 1024;
 
 const TYPE_LABELS: [&str; 3] = ["_fipa_gateway", "_udp", "local"];
 
-/// What a gateway announces, in short.
+/// Number and digest of the records that a gateway announces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Digest {
     agents: u32,
@@ -51,9 +51,9 @@ pub(super) struct Digest {
 }
 
 impl Digest {
-    /// The digest of one record.
+    /// Computes the digest of one record.
     pub(super) fn of(properties: &Properties) -> Self {
-        // Fowler, Noll and Vo: nobody gains by forging it, being the same everywhere is the point.
+        // FNV-1a: all hosts must compute the same value, and a forged digest gains nothing.
         let strings = properties.iter().flat_map(|(key, value)| {
             let ends = [0xff_u8, u8::try_from(value.len()).unwrap_or(u8::MAX)];
             key.bytes().chain(ends).chain(value.iter().copied())
@@ -75,97 +75,98 @@ impl Digest {
     }
 }
 
-/// What a beacon says that its gateway announces.
+/// The content of a beacon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Announced {
-    /// All of it.
+pub(super) struct BeaconContent {
+    /// All agents of the gateway.
     pub(super) all: Digest,
-    /// The coalitions, which are seen to change [together](super::together).
+    /// The coalitions, which change [atomically](super::coalition_sync).
     pub(super) coalitions: Digest,
 }
 
-/// What is held of one gateway, and since when.
+/// Digest of the stored records of one gateway, and the time of its last change.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Held {
+pub(super) struct StoredDigest {
     pub(super) digest: Digest,
     pub(super) changed: Instant,
 }
 
-/// What there is to be asked.
+/// A query that a beacon triggers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Repair {
-    /// For whatever is not held.
+    /// For records that are missing.
     Missing,
-    /// Whether all that is held of this gateway is still so.
+    /// For all stored records of this gateway, because some may be outdated.
     Surplus(Incarnation),
-    /// Whether this gateway is still there.
+    /// For this gateway, which sends no beacons any more.
     Silent(Incarnation),
 }
 
-/// Others' beacons.
+/// Beacons of other gateways.
 #[derive(Debug, Default)]
 pub(super) struct Beacons {
-    heard: HashMap<Incarnation, Heard>,
+    gateways: HashMap<Incarnation, BeaconState>,
 }
 
 #[derive(Debug)]
-struct Heard {
+struct BeaconState {
     digest: Digest,
     last: Instant,
-    /// How often in a row what is held was different.
+    /// Number of consecutive mismatches that led to a query.
     repairs: u32,
-    /// When it may be repaired next.
+    /// Earliest time of the next query.
     due: Instant,
 }
 
 impl Beacons {
-    /// A gateway has said what it has. What follows from that, given what is held of it.
+    /// Handles a beacon, and returns the query that it triggers, given the stored records of the
+    /// gateway.
     pub(super) fn handle(
         &mut self,
         now: Instant,
         gateway: Incarnation,
         digest: Digest,
-        held: Option<Held>,
+        stored: Option<StoredDigest>,
     ) -> Option<Repair> {
-        if self.heard.len() >= MAX_GATEWAYS && !self.heard.contains_key(&gateway) {
+        if self.gateways.len() >= MAX_GATEWAYS && !self.gateways.contains_key(&gateway) {
             return None;
         }
-        let heard = self.heard.entry(gateway).or_insert_with(|| Heard {
+        let state = self.gateways.entry(gateway).or_insert_with(|| BeaconState {
             digest,
             last: now,
             repairs: 0,
             due: now + QUIET,
         });
-        if heard.digest != digest {
-            // What has just changed is announced at this moment.
-            heard.due = heard.due.max(now + QUIET);
+        if state.digest != digest {
+            // The gateway is still announcing its latest change.
+            state.due = state.due.max(now + QUIET);
         }
-        heard.digest = digest;
-        heard.last = now;
-        let is = held.map(|held| held.digest).unwrap_or_default();
-        if is == digest {
-            heard.repairs = 0;
+        state.digest = digest;
+        state.last = now;
+        let current = stored.map(|stored| stored.digest).unwrap_or_default();
+        if current == digest {
+            state.repairs = 0;
             return None;
         }
-        if heard.due > now || held.is_some_and(|held| held.changed + QUIET > now) {
+        if state.due > now || stored.is_some_and(|stored| stored.changed + QUIET > now) {
             return None;
         }
-        let nothing_missing = is.agents >= digest.agents;
-        let pause = FIRST_PAUSE * 2_u32.saturating_pow((heard.repairs / 2).min(8));
-        heard.due = now + pause.min(LONGEST_PAUSE);
-        heard.repairs += 1;
-        // In turns, beginning with what is more likely: both may be true.
-        Some(match (nothing_missing, heard.repairs % 2) {
+        let nothing_missing = current.agents >= digest.agents;
+        let pause = FIRST_PAUSE * 2_u32.saturating_pow((state.repairs / 2).min(8));
+        state.due = now + pause.min(LONGEST_PAUSE);
+        state.repairs += 1;
+        // Alternates, starting with the likelier cause, because both may apply.
+        Some(match (nothing_missing, state.repairs % 2) {
             (true, 1) | (false, 0) => Repair::Surplus(gateway),
             _ => Repair::Missing,
         })
     }
 
-    /// Gateways that have been silent for a while. Each is told once.
+    /// Returns the gateways whose beacons have stopped, each once.
     pub(super) fn silent(&mut self, now: Instant) -> Vec<Repair> {
         let mut silent = Vec::new();
-        self.heard.retain(|gateway, heard| {
-            let stays = now < heard.last + SILENCE;
+        self.gateways.retain(|gateway, state| {
+            let stays = now < state.last + SILENCE;
             if !stays {
                 silent.push(Repair::Silent(*gateway));
             }
@@ -175,12 +176,12 @@ impl Beacons {
     }
 }
 
-/// The packet with the beacon of a gateway.
-pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u8>> {
+/// Builds the packet with the beacon of a gateway.
+pub(super) fn packet(gateway: Incarnation, announced: BeaconContent) -> Option<Vec<u8>> {
     let label = gateway.to_string();
     let mut labels = vec![Label::new(label.as_bytes()).ok()?];
     labels.extend(TYPE_LABELS.map(|label| Label::new_unchecked(label.as_bytes())));
-    let Announced { all, coalitions } = announced;
+    let BeaconContent { all, coalitions } = announced;
     let strings = [
         format!("agents={}", all.agents),
         format!("digest={:016x}", all.digest),
@@ -198,8 +199,8 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
     let mut packet = Packet::new_reply(0);
     packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
     packet.answers.push(record.with_cache_flush(true));
-    // The mDNS library keeps what belongs to no service that is introduced, and every change of it,
-    // for ever.
+    // The mDNS library keeps records of a service that is not introduced, and every version of
+    // them, forever.
     let service = Name::new_with_labels(&labels[1..]);
     let introduced = RData::PTR(PTR(Name::new_with_labels(&labels)));
     let record = ResourceRecord::new(service, CLASS::IN, TTL, introduced);
@@ -207,9 +208,9 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
     packet.build_bytes_vec_compressed().ok()
 }
 
-/// The beacon that a packet is, if it is one.
-pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
-    // Nearly all packets are none: that is seen without reading them.
+/// Parses a beacon; `None` if the packet is not one.
+pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, BeaconContent)> {
+    // Most packets are not beacons; this search rejects them without parsing.
     memchr::memmem::find(packet, TYPE_LABELS[0].as_bytes())?;
     let packet = parse_answer(packet)?;
     let mut answers = packet.answers.iter();
@@ -236,7 +237,7 @@ pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
         })
     };
     let (coalitions, of_coalitions) = text("coalitions")?.split_once(':')?;
-    let announced = Announced {
+    let announced = BeaconContent {
         all: digest(text("agents")?, text("digest")?)?,
         coalitions: digest(coalitions, of_coalitions)?,
     };
@@ -273,9 +274,9 @@ mod tests {
     }
 
     #[test]
-    fn beacons_are_read_as_they_were_written() {
+    fn beacons_survive_a_round_trip() {
         for numbers in [&[][..], &[7], &[1, 2, 3]] {
-            let announced = Announced {
+            let announced = BeaconContent {
                 all: digest(numbers),
                 coalitions: digest(&numbers[numbers.len() / 2..]),
             };
@@ -285,8 +286,9 @@ mod tests {
         }
         assert_eq!(read(b""), None);
         assert_eq!(read(&question_for_all(&[])[0]), None);
-        // It introduces itself, or the mDNS library would keep it for ever.
-        let written = packet(gateway(0xab), Announced::default()).unwrap();
+        // The PTR record is needed because the mDNS library would otherwise keep the beacon
+        // forever.
+        let written = packet(gateway(0xab), BeaconContent::default()).unwrap();
         let answers = parse_answer(&written).unwrap().answers;
         let (of, introduced) = match &answers[..] {
             [of, pointer] => (of.name.clone(), pointer),
@@ -297,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_asked_for_in_turns_with_what_is_too_much() {
+    fn queries_for_missing_and_surplus_records_alternate() {
         let mut beacons = Beacons::default();
         let start = Instant::now();
         let mut asked = Vec::new();
@@ -314,34 +316,34 @@ mod tests {
             ]
         );
         assert!((4..=6).contains(&asked.len()), "{asked:?}");
-        // What is held now is right, and then more than right.
+        // The stored records first match, and then include a surplus.
         let now = start + Duration::from_secs(100);
-        let held = |numbers: &[u64]| {
-            Some(Held {
+        let stored = |numbers: &[u64]| {
+            Some(StoredDigest {
                 digest: digest(numbers),
                 changed: start,
             })
         };
-        let mut hear = |millis, beacon: &[u64], held| {
+        let mut handle = |millis, beacon: &[u64], stored| {
             let now = now + Duration::from_millis(millis);
-            beacons.handle(now, gateway(1), digest(beacon), held)
+            beacons.handle(now, gateway(1), digest(beacon), stored)
         };
-        assert_eq!(hear(0, &[1, 2], held(&[1, 2])), None);
-        // It has just changed; a moment later it counts.
-        assert_eq!(hear(0, &[1], held(&[1, 2])), None);
+        assert_eq!(handle(0, &[1, 2], stored(&[1, 2])), None);
+        // A change counts only after the quiet time.
+        assert_eq!(handle(0, &[1], stored(&[1, 2])), None);
         assert_eq!(
-            hear(2000, &[1], held(&[1, 2])),
+            handle(2000, &[1], stored(&[1, 2])),
             Some(Repair::Surplus(gateway(1)))
         );
-        let changing = Some(Held {
+        let changing = Some(StoredDigest {
             digest: digest(&[1, 2]),
             changed: now + Duration::from_secs(9),
         });
-        assert_eq!(hear(9500, &[1], changing), None);
+        assert_eq!(handle(9500, &[1], changing), None);
     }
 
     #[test]
-    fn the_silent_are_told_once() {
+    fn a_silent_gateway_is_reported_once() {
         let mut beacons = Beacons::default();
         let now = Instant::now();
         beacons.handle(now, gateway(1), digest(&[1]), None);
@@ -351,13 +353,13 @@ mod tests {
         for number in 0..MAX_GATEWAYS as u64 + 10 {
             beacons.handle(now, gateway(number + 1), digest(&[]), None);
         }
-        assert_eq!(beacons.heard.len(), MAX_GATEWAYS);
+        assert_eq!(beacons.gateways.len(), MAX_GATEWAYS);
     }
 
     proptest! {
         #[test]
-        fn broken_beacons_do_no_harm(at in 0_usize..140, byte: u8) {
-            let mut written = packet(gateway(1), Announced::default()).unwrap();
+        fn a_corrupted_beacon_does_not_panic(at in 0_usize..140, byte: u8) {
+            let mut written = packet(gateway(1), BeaconContent::default()).unwrap();
             if let Some(broken) = written.get_mut(at) {
                 *broken = byte;
             }

@@ -1,20 +1,21 @@
-//! Who there is on the network: the records of our type, found, kept as long as they are good, and
-//! asked for when they might not be any more.
+//! Browses for records of this service type: finds records, keeps them while they are valid, and
+//! queries for those that may be outdated.
 //!
-//! This is the part of DNS-SD that browses. The mDNS library could do it, too, and only announces
-//! and answers for us, for three reasons. Of several strings with one key it keeps the first (RFC
-//! 6763 clause 6.4), but fipa_services splits long values so. It looks through all that it knows
-//! whenever a packet comes. And it asks for every record again before the record's two minutes are
-//! over, which is not needed among gateways: each says every two seconds what it announces
-//! ([`super::beacon`]), and as long as that is what is held of it, [all of it is
-//! good](Browser::confirm).
+//! This module implements the browsing half of DNS-SD. The mDNS library only announces and answers,
+//! for three reasons. Of several strings with one key the library keeps the first (RFC 6763 clause
+//! 6.4), but fipa_services splits long values that way. It searches all its records for every
+//! packet. And it queries for every record again within the record's two minutes, which is not
+//! necessary among gateways: each sends a digest of its announcements every two seconds
+//! ([`super::beacon`]), and while the digest matches the stored records, [all of them are
+//! valid](Browser::confirm).
 //!
-//! A record is introduced by a PTR record, and known from when its SRV and its TXT record have been
-//! heard. These keep it alive; whether it has an address is no matter, locations stand in its text.
+//! A PTR record introduces a record; it is known when its SRV and TXT records have arrived. These
+//! two keep it valid. Its address records do not matter, because the TXT record lists the
+//! locations.
 //!
-//! No input or output, and no clock: packets and the time go in, packets and news come out.
+//! This module has no I/O and no clock: packets and the time go in, packets and changes come out.
 
-mod everything;
+mod full_query;
 #[cfg(test)]
 mod tests;
 
@@ -27,82 +28,86 @@ use fipa_transport::Incarnation;
 use simple_dns::rdata::RData;
 use simple_dns::{CLASS, Name, Packet, PacketFlag, QTYPE, TYPE};
 
-use self::everything::Everything;
+use self::full_query::FullQuery;
 use super::beacon::Digest;
 use super::packet::{self, KNOWN};
-use super::record::Properties;
+use super::record::{self, Properties};
 use super::{MdnsDirectory, SERVICE_TYPE};
 
-/// Most records that are introduced and not known yet. Each is asked for a few times.
+/// Maximum number of records that are introduced but not yet known. Each is queried for a few
+/// times.
 const MAX_UNKNOWN: usize = 4096;
-/// Of all that is kept, the share of one source address: a quarter. One source cannot fill the tables.
+/// Maximum share of one source address in the tables: a quarter, so that one source cannot fill
+/// them.
 const MAX_SHARE: usize = MdnsDirectory::MAX_RECORDS / 4;
 const MAX_SHARE_BYTES: usize = MdnsDirectory::MAX_BYTES / 4;
 const MAX_SHARE_UNKNOWN: usize = MAX_UNKNOWN / 4;
-/// When what is missing of a record is asked for, each after the one before: who has just said it
-/// must not repeat it within a second (RFC 6762 clause 6).
+/// Delays of the queries for missing parts of a record, each after the previous query. A host that
+/// has just sent a record must not repeat it within a second (RFC 6762 clause 6).
 const MISSING: &[Duration] = &[
     Duration::from_millis(20),
     Duration::from_millis(1200),
     Duration::from_secs(3),
     Duration::from_secs(9),
 ];
-/// For how long a record is introduced without being known: that, and time for the last answer.
+/// Time for which a record may stay introduced without being known: the sum of `MISSING`, and time
+/// for the last answer.
 const INTRODUCED: Duration = Duration::from_secs(15);
-/// When a record that is in doubt is asked for, likewise, and how long it has to answer.
+/// Delays of the queries for a record in doubt, and the time it has to be confirmed.
 const DOUBTED: &[Duration] = &[Duration::ZERO, Duration::from_millis(1100)];
 const PATIENCE: Duration = Duration::from_secs(2);
-/// For how long a record is still known after its goodbye, so that it can be taken back (RFC 6762
-/// clause 10.1).
+/// Time for which a record stays known after its goodbye, so that the goodbye can be revoked (RFC
+/// 6762 clause 10.1).
 const GOODBYE: Duration = Duration::from_secs(1);
-/// Up to how much is added to the first pause, so that not all ask at the same moment.
+/// Maximum jitter of the first delay, so that hosts do not query simultaneously.
 const JITTER: Duration = Duration::from_millis(100);
 
-/// At which part of its life a record is asked for again. The first comes earlier than others ask
-/// (RFC 6762 clause 5.2), because what is asked for together takes fewer packets; the others are
-/// theirs.
+/// Fractions of a record's TTL at which it is queried for again. The first is earlier than RFC 6762
+/// clause 5.2 recommends, because batched queries take fewer packets; the others are the
+/// recommended ones.
 const RENEWED: [f64; 4] = [0.55, 0.80, 0.90, 0.95];
-/// Up to how much is added to the first, so that one host asks and the others hear the answer.
+/// Maximum jitter of the first fraction, so that one host queries and the others receive the
+/// answer.
 const RENEWED_JITTER: f64 = 0.12;
-/// What becomes due within that part of its life is asked for along with others.
+/// A record that is due within this fraction (1/24) of its TTL is queried for together with others.
 const ALONG: u32 = 24;
-/// A record is not believed in for longer than that, whatever it says.
-const MAX_LIFE: Duration = Duration::from_secs(4500);
-/// The shortest time between two looks at all records: that, and so much for each.
+/// Upper bound of a TTL.
+const MAX_LIFETIME: Duration = Duration::from_secs(4500);
+/// Minimum time between two scans of all records: a constant, and an amount per record.
 const GRAIN: Duration = Duration::from_millis(20);
 const GRAIN_EACH: Duration = Duration::from_micros(10);
 
-/// Most known answers to a question for everything that take packets of their own.
+/// Maximum number of known answers that take extra packets in a query for all records.
 const MAX_KNOWN: usize = 50 * KNOWN;
 
 /// The records on the network.
 #[derive(Debug)]
 pub(super) struct Browser {
-    /// Our gateway, whose records come back to us, and are no news.
+    /// This host's own gateway; its records are looped back and need no renewal.
     own: Incarnation,
-    /// By label, as it is spelt: others are asked and answer by that.
+    /// By label with its original spelling, which queries must repeat.
     records: HashMap<String, Record>,
-    /// How many of them are not known yet.
+    /// Number of records that are not yet known.
     unknown: usize,
-    /// How many bytes the others say.
+    /// Total bytes of their TXT records.
     bytes: usize,
-    /// What of that each source address has introduced.
+    /// Share of each source address in these.
     shares: HashMap<IpAddr, Share>,
-    /// When the beacons of a gateway last said what is held of it.
+    /// Time at which the beacon of a gateway last matched its stored records.
     confirmed: HashMap<Incarnation, Instant>,
-    everything: Everything,
-    /// The jitter of the next renewals, from 0 to 1.
+    full_query: FullQuery,
+    /// Jitter of the next renewals, from 0 to 1.
     share: f64,
-    /// When all records were looked at, and when they are to be looked at next.
+    /// Time of the last scan of all records, and of the next.
     looked: Option<Instant>,
     next: Option<Instant>,
 }
 
-/// The records that one source address has introduced.
+/// The records that one source address introduced.
 #[derive(Debug, Clone, Copy, Default)]
 struct Share {
     records: usize,
-    /// How many of them are not known yet.
+    /// Number of these that are not yet known.
     unknown: usize,
     bytes: usize,
 }
@@ -112,26 +117,25 @@ struct Record {
     fullname: Arc<str>,
     /// The address that introduced it.
     from: IpAddr,
-    /// Who announces it, if that is one of our gateways.
+    /// The gateway that announces it, if it is not a legacy peer's record.
     gateway: Incarnation,
-    /// Its SRV record, and the host that says.
-    place: Option<Life>,
+    /// TTL of its SRV record, and the host in it.
+    place: Option<Lifetime>,
     host: String,
-    /// Its TXT record, in short, and how long it is.
-    text: Option<Life>,
+    /// TTL of its TXT record, its digest and its length in bytes.
+    text: Option<Lifetime>,
     digest: Digest,
     len: usize,
-    /// What it says and has not been told.
+    /// Properties that have not been reported yet.
     news: Option<Properties>,
-    /// Whether both have been heard.
+    /// Whether both its SRV and TXT record have arrived.
     known: bool,
-    /// When it is gone if it is not heard of again: it is not known yet, in doubt, or has said
-    /// goodbye.
+    /// Expiry if nothing more arrives: the record is not known yet, is in doubt, or had a goodbye.
     ends: Option<Instant>,
     questions: Option<Questions>,
 }
 
-/// Questions for all of a record.
+/// Queries for both parts of a record.
 #[derive(Debug)]
 struct Questions {
     pauses: &'static [Duration],
@@ -139,42 +143,42 @@ struct Questions {
     due: Instant,
 }
 
-/// How long a DNS record is good.
+/// Lifetime of a DNS record.
 #[derive(Debug, Clone, Copy)]
-struct Life {
-    heard: Instant,
+struct Lifetime {
+    received: Instant,
     ttl: Duration,
-    /// How often it has been asked for since.
+    /// Number of renewal queries since then.
     asked: usize,
 }
 
-/// What became of a record that was introduced.
+/// Result of introducing a record.
 enum Introduced {
     New,
     Already,
     Refused,
 }
 
-/// What a packet said.
+/// Content of a packet.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct Heard {
-    /// Full names of records that are new or have changed, and all that they say.
+pub(super) struct ParsedPacket {
+    /// Full names and properties of records that are new or have changed.
     pub(super) found: Vec<(Arc<str>, Properties)>,
-    /// How many found no room.
+    /// Number of records that were refused for lack of space.
     pub(super) refused: u64,
 }
 
-/// What there is to be done.
+/// Actions that are due.
 #[derive(Debug, Default)]
 pub(super) struct Due {
-    /// Packets to be sent.
+    /// Packets to send.
     pub(super) packets: Vec<Vec<u8>>,
-    /// Full names of records that are gone.
+    /// Full names of records that were removed.
     pub(super) gone: Vec<Arc<str>>,
 }
 
 impl Browser {
-    /// Knows nothing, and asks for everything. `chance`, from 0 to 1, says how much jitter there is.
+    /// Starts without records and with a query for all. `chance`, from 0 to 1, scales the jitter.
     pub(super) fn new(now: Instant, own: Incarnation, chance: f64) -> Self {
         Self {
             own,
@@ -183,35 +187,34 @@ impl Browser {
             bytes: 0,
             shares: HashMap::new(),
             confirmed: HashMap::new(),
-            everything: Everything::new(now, chance),
+            full_query: FullQuery::new(now, chance),
             share: 0.0,
             looked: None,
             next: None,
         }
     }
 
-    /// There is an interface on which nobody has been asked: everything is asked for, as in the
-    /// beginning.
+    /// Restarts the queries for all records, because a new interface has not been queried yet.
     pub(super) fn start_again(&mut self, now: Instant, chance: f64) {
-        self.everything = Everything::new(now, chance);
+        self.full_query = FullQuery::new(now, chance);
     }
 
-    /// A packet has been heard from this address. `chance`, from 0 to 1, says how much jitter there is.
+    /// Handles a packet from this address. `chance`, from 0 to 1, scales the jitter.
     pub(super) fn handle_packet(
         &mut self,
         now: Instant,
         from: IpAddr,
         packet: &[u8],
         chance: f64,
-    ) -> Heard {
-        let mut heard = Heard::default();
+    ) -> ParsedPacket {
+        let mut received = ParsedPacket::default();
         let ours = packet::may_name_our_type(packet);
         let Some(packet) = ours.then(|| packet::parse(packet)).flatten() else {
-            return heard;
+            return received;
         };
         if !packet.has_flags(PacketFlag::RESPONSE) {
             self.handle_question(now, &packet);
-            return heard;
+            return received;
         }
         let all = packet.answers.iter().chain(&packet.additional_records);
         let all = all.filter(|record| record.class == CLASS::IN);
@@ -221,7 +224,7 @@ impl Browser {
             if let Some(label) = introduced(&record.name, &record.rdata) {
                 match self.introduce(now, from, label, chance) {
                     Introduced::New => new.push(label),
-                    Introduced::Refused => heard.refused += 1,
+                    Introduced::Refused => received.refused += 1,
                     Introduced::Already => {}
                 }
             }
@@ -231,31 +234,31 @@ impl Browser {
             let Some(known) = label.and_then(|label| self.records.get_mut(label)) else {
                 continue;
             };
-            let life = Life::new(now, record.ttl);
+            let lifetime = Lifetime::new(now, record.ttl);
             match &record.rdata {
                 RData::SRV(srv) => {
                     known.host = srv.target.to_string();
-                    known.place = Some(life);
+                    known.place = Some(lifetime);
                 }
                 RData::TXT(txt) => {
-                    let said = packet::properties(txt);
-                    let digest = Digest::of(&said);
+                    let properties = packet::properties(txt);
+                    let digest = Digest::of(&properties);
                     if known.text.is_none() || known.digest != digest {
-                        let len = len_of(&said);
+                        let len = record::len_of(&properties);
                         let others = self.bytes - known.len;
                         let share = self.shares.entry(known.from).or_default();
                         let others_of_share = share.bytes - known.len;
                         if others + len > MdnsDirectory::MAX_BYTES
                             || others_of_share + len > MAX_SHARE_BYTES
                         {
-                            heard.refused += 1;
+                            received.refused += 1;
                             continue;
                         }
                         (self.bytes, share.bytes) = (others + len, others_of_share + len);
                         (known.digest, known.len) = (digest, len);
-                        known.news = Some(said);
+                        known.news = Some(properties);
                     }
-                    known.text = Some(life);
+                    known.text = Some(lifetime);
                 }
                 _ => continue,
             }
@@ -269,19 +272,19 @@ impl Browser {
             known.known = true;
             known.is_there();
             if let Some(news) = known.news.take() {
-                heard.found.push((Arc::clone(&known.fullname), news));
+                received.found.push((Arc::clone(&known.fullname), news));
             }
             if let Some(due) = known.due(self.share, self.own) {
                 self.wake(due);
             }
         }
-        // What comes with all that it says is not waited for.
+        // A new record that is complete in one packet does not count as unknown.
         for label in new {
             let share = self.shares.get(&from).copied().unwrap_or_default();
             let are_too_many = self.unknown > MAX_UNKNOWN || share.unknown > MAX_SHARE_UNKNOWN;
             if are_too_many && self.records.get(label).is_some_and(|it| !it.known) {
                 self.remove(label);
-                heard.refused += 1;
+                received.refused += 1;
             }
         }
         for record in &goodbyes {
@@ -289,10 +292,10 @@ impl Browser {
                 self.handle_goodbye(now, label, &goodbyes);
             }
         }
-        heard
+        received
     }
 
-    /// There is such a record.
+    /// Handles the introduction of a record.
     fn introduce(&mut self, now: Instant, from: IpAddr, label: &str, chance: f64) -> Introduced {
         if let Some(known) = self.records.get_mut(label) {
             if known.known {
@@ -337,7 +340,7 @@ impl Browser {
         }
     }
 
-    /// Its owner takes leave of it, unless that is another one than the one we know.
+    /// Handles a goodbye, unless it comes from another host than the one of the stored record.
     fn handle_goodbye(
         &mut self,
         now: Instant,
@@ -360,8 +363,8 @@ impl Browser {
         }
     }
 
-    /// Somebody asks. If it is what we would ask, the answers are for us as well (RFC 6762 clause
-    /// 7.3).
+    /// Handles another host's query. If it is the one that this host would send, the multicast
+    /// answers serve this host as well (RFC 6762 clause 7.3).
     fn handle_question(&mut self, now: Instant, packet: &Packet<'_>) {
         let mut questions = packet.questions.iter();
         let for_all = questions.any(|one| {
@@ -378,24 +381,24 @@ impl Browser {
         let all_known = known_answers
             .all(|answer| introduced(&answer.name, &answer.rdata).is_some_and(is_known));
         if for_all && !more_to_come && all_known {
-            self.everything.asked_by_others(now, self.records.len());
+            self.full_query.asked_by_others(now, self.records.len());
         }
     }
 
-    /// The record with this full name is announced by that gateway.
+    /// Records that this gateway announces the record with this full name.
     pub(super) fn belongs(&mut self, fullname: &str, gateway: Incarnation) {
         if let Some(known) = self.records.get_mut(label_of(fullname)) {
             known.gateway = gateway;
         }
     }
 
-    /// The gateway has said that it announces what is held of it: so all of that is good.
+    /// Records that the gateway's beacon matches its stored records, so that all of them are valid.
     pub(super) fn confirm(&mut self, now: Instant, gateway: Incarnation) {
-        // When its records are looked at next, this is seen.
+        // The next scan of the records applies it.
         self.confirmed.insert(gateway, now);
     }
 
-    /// These records are of a gateway that has ended. They are gone, unless that is said again.
+    /// Removes these records of a gateway that has ended, unless they are announced again.
     pub(super) fn end(&mut self, now: Instant, fullnames: &[Arc<str>]) {
         for fullname in fullnames {
             if let Some(known) = self.records.get_mut(label_of(fullname)) {
@@ -405,7 +408,7 @@ impl Browser {
         }
     }
 
-    /// Asks whether these records are still there. Who does not answer is gone.
+    /// Queries for these records; a record that is not confirmed in time is removed.
     pub(super) fn doubt(&mut self, now: Instant, fullnames: &[Arc<str>]) {
         for fullname in fullnames {
             let Some(known) = self.records.get_mut(label_of(fullname)) else {
@@ -419,12 +422,12 @@ impl Browser {
         }
     }
 
-    /// Asks at once for what is not known, unless somebody just has.
+    /// Queries for all unknown records at once, unless such a query was sent just now.
     pub(super) fn ask_for_missing(&mut self, now: Instant) -> Vec<Vec<u8>> {
-        if !self.everything.may_be_asked(now) {
+        if !self.full_query.may_be_asked(now) {
             return Vec::new();
         }
-        self.everything.last = Some(now);
+        self.full_query.last = Some(now);
         self.question_for_all()
     }
 
@@ -435,27 +438,27 @@ impl Browser {
             known.partition(|(_, record)| record.gateway.is_known());
         let mut labels: Vec<&str> = peers.iter().map(|(label, _)| label.as_str()).collect();
         labels.truncate(MAX_KNOWN);
-        // The library regards what stands in the first packet of a question only, so more would
-        // be in vain.
+        // The mDNS library honors known answers in the first packet of a query only, so more of
+        // them are useless.
         let room = KNOWN.saturating_sub(labels.len());
         labels.extend(ours.iter().take(room).map(|(label, _)| label.as_str()));
         packet::question_for_all(&labels)
     }
 
-    /// What is to be asked now, and who is gone. `chance`, from 0 to 1, says how much jitter there
-    /// is.
+    /// Returns the queries that are due, and the records that were removed. `chance`, from 0 to 1,
+    /// scales the jitter.
     pub(super) fn handle_timeout(&mut self, now: Instant, chance: f64) -> Due {
         let mut due = Due::default();
-        if self.everything.next <= now {
+        if self.full_query.next <= now {
             due.packets = self.question_for_all();
-            self.everything.asked(now, self.records.len(), chance);
+            self.full_query.asked(now, self.records.len(), chance);
         }
         if self.next.is_none_or(|next| now < next) {
             return due;
         }
         self.looked = Some(now);
         self.next = None;
-        self.confirmed.retain(|_, at| now < *at + MAX_LIFE);
+        self.confirmed.retain(|_, at| now < *at + MAX_LIFETIME);
         let (mut all, mut places, mut texts) = (Vec::new(), Vec::new(), Vec::new());
         let mut next: Option<Instant> = None;
         self.records.retain(|label, record| {
@@ -475,12 +478,12 @@ impl Browser {
                 all.push(label.clone());
             }
             if record.is_renewed(self.own) {
-                for (life, labels) in [
+                for (lifetime, labels) in [
                     (&mut record.place, &mut places),
                     (&mut record.text, &mut texts),
                 ] {
-                    if let Some(life) = life
-                        && life.renew(now, self.share)
+                    if let Some(lifetime) = lifetime
+                        && lifetime.renew(now, self.share)
                     {
                         labels.push(label.clone());
                     }
@@ -506,7 +509,7 @@ impl Browser {
         due
     }
 
-    /// What is counted is what is kept, within the bounds.
+    /// Asserts that the counters match the records and are within bounds.
     #[cfg(feature = "fuzzing")]
     pub(super) fn check(&self) {
         let records = || self.records.values();
@@ -524,10 +527,10 @@ impl Browser {
         assert!(self.bytes <= MdnsDirectory::MAX_BYTES);
     }
 
-    /// When there is something to be done next.
+    /// Time of the next action.
     pub(super) fn poll_timeout(&self) -> Instant {
-        let next = self.next.unwrap_or(self.everything.next);
-        next.min(self.everything.next)
+        let next = self.next.unwrap_or(self.full_query.next);
+        next.min(self.full_query.next)
     }
 
     fn wake(&mut self, at: Instant) {
@@ -539,16 +542,16 @@ impl Browser {
 }
 
 impl Record {
-    /// Its gateway announced it then.
+    /// The beacon of its gateway matched at that time.
     fn confirm(&mut self, at: Instant) {
-        for life in [&mut self.place, &mut self.text].into_iter().flatten() {
-            if at > life.heard {
-                (life.heard, life.asked) = (at, 0);
+        for lifetime in [&mut self.place, &mut self.text].into_iter().flatten() {
+            if at > lifetime.received {
+                (lifetime.received, lifetime.asked) = (at, 0);
             }
         }
     }
 
-    /// Somebody has said so.
+    /// A packet confirmed the record.
     fn is_there(&mut self) {
         (self.ends, self.questions) = (None, None);
     }
@@ -557,7 +560,7 @@ impl Record {
         self.ends = Some(self.ends.map_or(end, |ends| ends.min(end)));
     }
 
-    /// Whether all of it is to be asked for now.
+    /// Whether to query for both parts now.
     fn ask(&mut self, now: Instant) -> bool {
         let Some(questions) = self.questions.as_mut().filter(|it| it.due <= now) else {
             return false;
@@ -570,23 +573,23 @@ impl Record {
         true
     }
 
-    /// Whether it is asked for before it ends.
+    /// Whether to query for the record before it expires.
     fn is_renewed(&self, own: Incarnation) -> bool {
         self.known && self.gateway != own
     }
 
-    /// When it is gone if nothing is heard of it.
+    /// Time at which the record expires without further packets.
     fn end(&self) -> Option<Instant> {
-        let lives = [self.place, self.text].into_iter().flatten();
-        lives.map(Life::end).chain(self.ends).min()
+        let lifetimes = [self.place, self.text].into_iter().flatten();
+        lifetimes.map(Lifetime::end).chain(self.ends).min()
     }
 
-    /// When it is to be looked at.
+    /// Time of the next action for this record.
     fn due(&self, share: f64, own: Incarnation) -> Option<Instant> {
-        let lives = [self.place, self.text].into_iter().flatten();
-        let renewed = lives
+        let lifetimes = [self.place, self.text].into_iter().flatten();
+        let renewed = lifetimes
             .filter(|_| self.is_renewed(own))
-            .map(|life| life.due(share));
+            .map(|lifetime| lifetime.due(share));
         let asked = self.questions.as_ref().map(|it| it.due);
         renewed.chain(asked).chain(self.end()).min()
     }
@@ -602,21 +605,21 @@ impl Questions {
     }
 }
 
-impl Life {
-    fn new(heard: Instant, ttl: u32) -> Self {
-        let ttl = Duration::from_secs(ttl.into()).min(MAX_LIFE);
+impl Lifetime {
+    fn new(received: Instant, ttl: u32) -> Self {
+        let ttl = Duration::from_secs(ttl.into()).min(MAX_LIFETIME);
         Self {
-            heard,
+            received,
             ttl,
             asked: 0,
         }
     }
 
     fn end(self) -> Instant {
-        self.heard + self.ttl
+        self.received + self.ttl
     }
 
-    /// When it is asked for next, or ends.
+    /// Time of the next renewal query, or of expiry.
     fn due(self, share: f64) -> Instant {
         let jitter = if self.asked == 0 {
             RENEWED_JITTER * share
@@ -624,10 +627,10 @@ impl Life {
             0.0
         };
         let part = RENEWED.get(self.asked).map_or(1.0, |part| part + jitter);
-        self.heard + self.ttl.mul_f64(part)
+        self.received + self.ttl.mul_f64(part)
     }
 
-    /// Whether it is to be asked for now, or along with what is.
+    /// Whether to query now, either because it is due or together with others.
     fn renew(&mut self, now: Instant, share: f64) -> bool {
         let due = self.asked < RENEWED.len() && self.due(share) <= now + self.ttl / ALONG;
         self.asked += usize::from(due);
@@ -635,7 +638,7 @@ impl Life {
     }
 }
 
-/// Takes a record that is gone out of the share of its source.
+/// Subtracts a removed record from the share of its source.
 fn forget(shares: &mut HashMap<IpAddr, Share>, gone: &Record) {
     if let Some(share) = shares.get_mut(&gone.from) {
         share.records -= 1;
@@ -661,10 +664,4 @@ pub(super) fn label_of(fullname: &str) -> &str {
     label
         .and_then(|label| label.strip_suffix('.'))
         .unwrap_or(fullname)
-}
-
-fn len_of(said: &Properties) -> usize {
-    said.iter()
-        .map(|(key, value)| key.len() + value.len() + 2)
-        .sum()
 }

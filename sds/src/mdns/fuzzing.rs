@@ -1,4 +1,5 @@
-//! The network's records for fuzz targets: packets of any source in, and what must hold of what is kept.
+//! Network records for the fuzz targets: handles packets of any source and checks the invariants of
+//! the stored state.
 
 use std::collections::BTreeSet;
 use std::net::IpAddr;
@@ -9,23 +10,23 @@ use fipa_transport::Incarnation;
 
 use super::beacon::{self, Beacons};
 use super::browse::{Browser, label_of};
-use super::held::Holdings;
-use super::together::Together;
+use super::coalition_sync::CoalitionSync;
+use super::peer_records::PeerRecords;
 use super::{packet, record};
 use crate::{Entry, Reach, Source};
 
-/// A host that hears multicast DNS, without its sockets.
+/// A host that receives multicast DNS, without its sockets.
 #[derive(Debug)]
-pub struct Ear {
+pub struct Listener {
     browser: Browser,
     beacons: Beacons,
-    held: Holdings,
-    together: Together,
-    /// Full names that were found and are not gone.
+    peer_records: PeerRecords,
+    coalition_sync: CoalitionSync,
+    /// Full names that were found and not removed.
     found: BTreeSet<String>,
 }
 
-/// The packets that announce this entry: its record and its gateway's beacon.
+/// Builds the packets that announce this entry.
 #[must_use]
 pub fn announced(entry: &Entry) -> Vec<Vec<u8>> {
     let label = record::label(&entry.name, 0);
@@ -35,72 +36,76 @@ pub fn announced(entry: &Entry) -> Vec<Vec<u8>> {
         .collect()
 }
 
-impl Ear {
-    /// A host whose own gateway has incarnation 1.
+impl Listener {
+    /// Creates a host whose own gateway has incarnation 1.
     #[must_use]
     pub fn new(now: Instant) -> Self {
         Self {
             browser: Browser::new(now, Incarnation::from_u64(1), 0.5),
             beacons: Beacons::default(),
-            held: Holdings::default(),
-            together: Together::default(),
+            peer_records: PeerRecords::default(),
+            coalition_sync: CoalitionSync::default(),
             found: BTreeSet::new(),
         }
     }
 
-    /// A packet arrives from this address.
+    /// Handles a packet from this address.
     pub fn arrive(&mut self, now: Instant, from: IpAddr, bytes: &[u8]) {
-        if let Some((gateway, said)) = beacon::read(bytes) {
-            let _ = self.together.said(now, gateway, said.coalitions);
-            let held = self.held.of(gateway);
-            let _ = self.beacons.handle(now, gateway, said.all, held);
+        if let Some((gateway, content)) = beacon::read(bytes) {
+            let _ = self
+                .coalition_sync
+                .handle_beacon(now, gateway, content.coalitions);
+            let stored = self.peer_records.of(gateway);
+            let _ = self.beacons.handle(now, gateway, content.all, stored);
             self.browser.confirm(now, gateway);
         }
-        let heard = self.browser.handle_packet(now, from, bytes, 0.5);
+        let received = self.browser.handle_packet(now, from, bytes, 0.5);
         self.browser.check();
         let at = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
-        for (fullname, properties) in heard.found {
+        for (fullname, properties) in received.found {
             self.found.insert(fullname.to_string());
             let entry = match record::decode(label_of(&fullname), &properties, at) {
                 Ok(entry) => entry,
                 Err(error) => {
-                    self.held.put(now, &fullname, None);
-                    let _ = self.together.put(now, &fullname, None);
+                    self.peer_records.put(now, &fullname, None);
+                    let _ = self.coalition_sync.put(now, &fullname, None);
                     drop(error.to_string());
                     continue;
                 }
             };
-            entry.check().expect("what is read keeps to the limits");
+            entry.check().expect("a decoded entry is within the limits");
             assert!(entry.source == Source::Mdns && entry.reach != Reach::Local);
             if entry.incarnation.is_known() {
                 survives(&entry, at);
             }
             self.browser.belongs(&fullname, entry.mts.incarnation);
-            self.held.put(now, &fullname, Some(&entry));
-            let _ = self.together.put(now, &fullname, Some(Arc::new(entry)));
+            self.peer_records.put(now, &fullname, Some(&entry));
+            let _ = self
+                .coalition_sync
+                .put(now, &fullname, Some(Arc::new(entry)));
         }
     }
 
-    /// Time passes; what is due happens when it is.
+    /// Advances the time and runs every timer when it is due.
     pub fn pass(&mut self, now: &mut Instant, time: Duration) {
         let until = *now + time;
         let mut last = None;
         while let Some(due) = Some(self.browser.poll_timeout()).filter(|due| *due <= until) {
-            assert_ne!(last.replace(due), Some(due), "time stands still");
+            assert_ne!(last.replace(due), Some(due), "the timeout did not advance");
             *now = due.max(*now);
             let due = self.browser.handle_timeout(*now, 0.5);
             self.browser.check();
             for packet in due.packets {
                 assert!(packet.len() <= packet::MAX_PACKET);
-                assert!(packet::parse(&packet).is_some(), "a question that is none");
+                assert!(packet::parse(&packet).is_some(), "an invalid query");
             }
             for fullname in due.gone {
                 let was_found = self.found.remove(&*fullname);
-                assert!(was_found, "{fullname} is gone, and was never found");
-                self.held.put(*now, &fullname, None);
-                let _ = self.together.put(*now, &fullname, None);
+                assert!(was_found, "{fullname} was removed but never found");
+                self.peer_records.put(*now, &fullname, None);
+                let _ = self.coalition_sync.put(*now, &fullname, None);
             }
-            let _ = self.together.handle_timeout(*now);
+            let _ = self.coalition_sync.handle_timeout(*now);
             let silent = self.beacons.silent(*now);
             assert!(silent.len() <= 1024);
         }
@@ -108,12 +113,12 @@ impl Ear {
     }
 }
 
-/// An entry that was read is the same when it is written and read again.
+/// Asserts that a decoded entry is equal after encoding and decoding it again.
 fn survives(entry: &Entry, at: SystemTime) {
     let says = record::encode(entry);
     let label = record::label(&entry.name, 0);
     match record::decode(&label, &says, at) {
         Ok(again) => assert_eq!(&again, entry),
-        Err(error) => panic!("{entry:?} cannot be read again: {error}"),
+        Err(error) => panic!("{entry:?} cannot be decoded again: {error}"),
     }
 }

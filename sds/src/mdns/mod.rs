@@ -1,29 +1,29 @@
 //! The directory of the local network: DNS-SD over multicast DNS.
 //!
 //! Every agent that a gateway announces is one record of the service type
-//! `_fipa_service_directory._udp`, which Avahi's tools and the C++ peers read as well; the format
-//! is in `record`. Multicast that fails, or is blocked, is never fatal: the
-//! [status](MdnsDirectory::status) says so.
+//! `_fipa_service_directory._udp`, which Avahi's tools and the C++ peers read as well; module
+//! `record` defines the format. Failed or blocked multicast is never fatal; it is reported in the
+//! [status](MdnsDirectory::status).
 //!
-//! A name belongs to the earlier registration. The directory whose registration is the later one
-//! withdraws it and [tells](MdnsDirectory::withdrawals); nothing is ever renamed. The instance
-//! label of a record, on the other hand, means nothing between us: if it is taken by another
-//! name, another one is used.
+//! A name belongs to the earlier registration. The directory with the later registration withdraws
+//! it and [reports](MdnsDirectory::withdrawals) that; agents are never renamed. The instance label
+//! of a record has no meaning between gateways: a label in use by another name is replaced by a
+//! different one.
 
-mod anew;
 mod beacon;
 mod browse;
-mod ear;
+mod coalition_sync;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
-mod held;
+mod listener;
 mod pace;
 mod packet;
+mod peer_records;
 mod probe;
 mod record;
+mod restart;
 mod sockets;
 mod task;
-mod together;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -36,10 +36,10 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast};
 
 use self::beacon::Digest;
-use self::held::Holdings;
+use self::coalition_sync::{CoalitionSync, Updates};
 use self::pace::Pace;
+use self::peer_records::PeerRecords;
 pub use self::probe::{Multicast, probe};
-use self::together::{Together, Updates};
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Role, Source, Subscriber,
@@ -48,27 +48,28 @@ use crate::{
 
 /// The type of the records, 22 characters long.
 const SERVICE_TYPE: &str = "_fipa_service_directory._udp.local.";
-/// More than the 15 that DNS-SD allows; without asking for it nothing is announced.
+/// Exceeds the 15 characters that DNS-SD allows; without this setting the library refuses to
+/// announce.
 const SERVICE_NAME_LEN: u8 = 22;
 /// The port of multicast DNS.
 const MDNS_PORT: u16 = 5353;
-/// Largest TXT record announced, in bytes: it has to fit one packet of 9000 bytes with the rest
-/// (RFC 6762 clause 17).
+/// Largest TXT record that is announced, in bytes: with the other records it must fit a packet of
+/// 9000 bytes (RFC 6762 clause 17).
 const MAX_TXT: usize = 8000;
 
-/// How a gateway takes part in the directory of the network.
+/// Configuration of [`MdnsDirectory`].
 #[derive(Debug, Clone)]
 pub struct MdnsConfig {
-    /// The gateway that announces, and takes letters for, what is registered.
+    /// The gateway that announces the registrations and accepts letters for them.
     pub mts: Mts,
-    /// The interfaces used, by name or address; none means all of them, loopback included.
+    /// Interfaces to use, by name or address; an empty list means all, including loopback.
     pub interfaces: Vec<String>,
-    /// The UDP port, 5353; another one makes a directory of its own.
+    /// The UDP port, by default 5353; another port makes a separate directory.
     pub port: u16,
 }
 
 impl MdnsConfig {
-    /// All interfaces, and the usual port.
+    /// Creates a configuration with all interfaces and the standard port.
     #[must_use]
     pub fn new(mts: Mts) -> Self {
         Self {
@@ -79,56 +80,57 @@ impl MdnsConfig {
     }
 }
 
-/// The agents that other gateways announce on the local network, and what this one announces.
+/// The agents that other gateways announce on the local network, and the announcements of this
+/// gateway.
 ///
-/// Its view has the others' only: a gateway knows its own better. Takes back what it has
-/// announced when dropped.
+/// The view contains only agents of other gateways, because other back ends have this gateway's
+/// own. Dropping the directory withdraws its announcements.
 #[derive(Debug)]
 pub struct MdnsDirectory {
     shared: Arc<Shared>,
     task: tokio::task::JoinHandle<()>,
 }
 
-/// A registration that was taken back because somebody else has had the name for longer.
+/// A registration that was withdrawn because another agent registered the name earlier.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Withdrawal {
-    /// What was registered here.
+    /// The withdrawn registration.
     pub withdrawn: Arc<Entry>,
-    /// Who has the name.
+    /// The entry that holds the name.
     pub holder: Arc<Entry>,
 }
 
-/// How the directory of the network fares.
+/// Status of [`MdnsDirectory`].
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct MdnsStatus {
-    /// How many registrations are announced.
+    /// Number of registrations that are announced.
     pub announced: usize,
-    /// How many records of others are known.
+    /// Number of known records of other hosts.
     pub known: usize,
-    /// How many records of others were not used: malformed, or too many.
+    /// Number of refused records of other hosts: malformed, or beyond the limits.
     pub refused: u64,
-    /// How often the mDNS library was started anew because it kept too much of what it heard.
+    /// Number of restarts of the mDNS library because its cache was too large.
     pub restarts: u64,
-    /// What went wrong last, if anything did.
+    /// The latest error, if any.
     pub last_error: Option<String>,
 }
 
 impl MdnsDirectory {
-    /// Most records of others that are kept.
+    /// Maximum number of records of other hosts.
     pub const MAX_RECORDS: usize = 20_000;
-    /// Most bytes that they say, all together.
+    /// Maximum total size of their TXT records, in bytes.
     pub const MAX_BYTES: usize = 16 << 20;
-    /// Most DNS records that the mDNS library keeps, each of at most 9,000 bytes. It keeps what
-    /// comes in packets that introduce no service, for ever. It is looked at every two seconds.
-    /// When there are more the library is started anew: our own agents are announced again without
-    /// having said goodbye.
-    pub const MAX_CACHED: u64 = anew::MAX_CACHED;
+    /// Maximum number of DNS records in the cache of the mDNS library, each of at most 9,000 bytes.
+    /// The library keeps records of packets that introduce no service forever. The cache is checked
+    /// every two seconds; beyond this limit the library is restarted, and this gateway's agents are
+    /// announced again without a goodbye.
+    pub const MAX_CACHED: u64 = restart::MAX_CACHED;
 
-    /// Starts to listen; a task of the current tokio runtime keeps the view up to date. That
-    /// multicast does not work is not an error here but part of the [status](Self::status).
+    /// Opens the directory; a task of the current tokio runtime keeps the view up to date. Failing
+    /// multicast is not an error but part of the [status](Self::status).
     ///
     /// # Errors
-    /// When there is no tokio runtime.
+    /// Fails when no tokio runtime is running.
     pub fn open(config: MdnsConfig) -> Result<Self, MdnsError> {
         let runtime = tokio::runtime::Handle::try_current().map_err(|_| MdnsError::NoRuntime)?;
         let daemon = ServiceDaemon::new_with_port(config.port);
@@ -143,8 +145,8 @@ impl MdnsDirectory {
             daemon: Mutex::new(daemon),
             config,
             table: Table::new(),
-            held: Mutex::default(),
-            together: Mutex::default(),
+            peer_records: Mutex::default(),
+            coalition_sync: Mutex::default(),
             coalitions_changed: AtomicBool::new(false),
             interfaces_changed: AtomicBool::new(false),
             own: Mutex::default(),
@@ -162,14 +164,14 @@ impl MdnsDirectory {
         Ok(Self { shared, task })
     }
 
-    /// Tells of every registration that is withdrawn from now on. Who does not read for more
-    /// than 64 of them misses the oldest.
+    /// Returns a receiver of every later withdrawal. With more than 64 unread withdrawals, the
+    /// oldest are lost.
     #[must_use]
     pub fn withdrawals(&self) -> broadcast::Receiver<Withdrawal> {
         self.shared.withdrawals.subscribe()
     }
 
-    /// How it fares.
+    /// Returns the current status.
     #[must_use]
     pub fn status(&self) -> MdnsStatus {
         let mut status = self.shared.status.lock().clone();
@@ -178,40 +180,43 @@ impl MdnsDirectory {
         status
     }
 
-    /// Asks the network whether the record of this name is still there, because letters to it do
-    /// not arrive. If nobody answers, it leaves within a few seconds, and with it all others of
-    /// its gateway.
+    /// Queries the network for the record of this name, because letters to it do not arrive.
+    /// Without an answer the entry is removed within a few seconds, together with all others of its
+    /// gateway.
     pub fn verify(&self, name: &str) {
         let Some((fullname, entry)) = self.shared.table.holder(name) else {
             return;
         };
         match entry.mts.incarnation {
             Incarnation::UNKNOWN => {
-                self.shared.held.lock().verify(&fullname);
+                self.shared.peer_records.lock().verify(&fullname);
                 self.shared.postponed.notify_one();
             }
             gateway => self.verify_gateway(gateway),
         }
     }
 
-    /// Asks the network whether this gateway is still there; see [`verify`](Self::verify). Asking
-    /// again within a few seconds does nothing.
+    /// Queries the network for this gateway; see [`verify`](Self::verify). A repeated call within a
+    /// few seconds does nothing.
     pub fn verify_gateway(&self, gateway: Incarnation) {
-        let doubted = self.shared.held.lock().doubt(Instant::now(), gateway);
+        let doubted = self
+            .shared
+            .peer_records
+            .lock()
+            .doubt(Instant::now(), gateway);
         if doubted {
             self.shared.postponed.notify_one();
         }
     }
 
-    /// This gateway has ended without a goodbye, and another one has its place: all that it announced is
-    /// forgotten at once.
+    /// Removes all entries of this gateway at once, because it ended without a goodbye and another
+    /// one took its place.
     pub fn gateway_has_ended(&self, gateway: Incarnation) {
-        self.shared.held.lock().end(gateway);
+        self.shared.peer_records.lock().end(gateway);
         self.shared.postponed.notify_one();
     }
 
-    /// The interfaces of this host have changed: speaks and listens on the new ones at once, rather
-    /// than when it looks next.
+    /// Sends and receives on changed interfaces at once, instead of at the next poll.
     pub fn interfaces_changed(&self) {
         self.shared
             .interfaces_changed
@@ -219,8 +224,8 @@ impl MdnsDirectory {
         self.shared.postponed.notify_one();
     }
 
-    /// Takes back everything that was announced, with a goodbye, and stops listening. Blocks for
-    /// as long as it takes to send that. Doing it again does nothing.
+    /// Withdraws all announcements with a goodbye, and stops listening. Blocks until the goodbye is
+    /// sent, for about 10 s at most. A repeated call does nothing.
     pub fn close(&self) {
         {
             let mut own = self.shared.own.lock();
@@ -230,8 +235,8 @@ impl MdnsDirectory {
             own.agents.clear();
         }
         self.task.abort();
-        // Whose coalitions are gone, too, says so: others wait for that.
-        let (config, nothing) = (&self.shared.config, beacon::Announced::default());
+        // The last beacon reports that the coalitions are gone; other gateways wait for that.
+        let (config, nothing) = (&self.shared.config, beacon::BeaconContent::default());
         if let Some(beacon) = beacon::packet(config.mts.incarnation, nothing)
             && let Err(error) = sockets::send_once(config, &beacon)
         {
@@ -241,7 +246,9 @@ impl MdnsDirectory {
             return;
         };
         if ended.recv_timeout(Duration::from_secs(5)).is_err() {
-            tracing::error!("multicast DNS did not say goodbye in time");
+            tracing::error!(
+                "timed out after 5 s waiting for the mDNS library to send its goodbyes; other hosts keep the records until they expire"
+            );
         }
     }
 }
@@ -255,7 +262,7 @@ impl Drop for MdnsDirectory {
 impl Directory for MdnsDirectory {
     reads_its_table!(shared.table);
 
-    /// Announces the agent. Its locations are those at which this gateway takes letters for it.
+    /// Announces the agent. Its locations are those at which this gateway accepts letters for it.
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         let entry = registration.into_entry(&self.shared.config.mts, Source::Mdns)?;
         self.shared.register(&mut self.shared.own.lock(), entry)
@@ -266,7 +273,7 @@ impl Directory for MdnsDirectory {
         self.shared.deregister(&mut own, name, incarnation)
     }
 
-    /// All in one go: coalitions among them are seen to change together.
+    /// Applies the update atomically: coalitions in it change together.
     fn update(&self, leaving: &[(Arc<str>, Incarnation)], joining: Vec<Registration>) -> Updated {
         let mut own = self.shared.own.lock();
         let left = leaving
@@ -284,33 +291,33 @@ impl Directory for MdnsDirectory {
     }
 }
 
-/// Why the directory of the network was not opened.
+/// Error of [`MdnsDirectory::open`].
 #[derive(Debug, Clone, thiserror::Error)]
 #[non_exhaustive]
 pub enum MdnsError {
-    /// A task is needed, and there is nobody to run it.
-    #[error("the network's directory must be opened within a tokio runtime")]
+    /// No tokio runtime is running.
+    #[error("no tokio runtime is running; open the network's directory within one")]
     NoRuntime,
 }
 
 struct Shared {
-    /// None when it could not be started, and while it rests after a flood.
+    /// `None` when it could not be started, or is stopped after a flood.
     daemon: Mutex<Option<ServiceDaemon>>,
     config: MdnsConfig,
-    /// The others' entries, by the full name of their record, spelt as they spell it.
+    /// Entries of other gateways, by the full name of their record with its original spelling.
     table: Table<Arc<str>>,
     /// The same records, by the gateways that announce them.
-    held: Mutex<Holdings>,
-    /// What of that is not in the table yet.
-    together: Mutex<Together>,
-    /// Whether others are to be told at once what coalitions there are.
+    peer_records: Mutex<PeerRecords>,
+    /// Records that are not in the table yet.
+    coalition_sync: Mutex<CoalitionSync>,
+    /// Whether to send a beacon at once because coalitions changed.
     coalitions_changed: AtomicBool,
-    /// Whether to look at the interfaces at once.
+    /// Whether to check the interfaces at once.
     interfaces_changed: AtomicBool,
-    own: Mutex<Own>,
+    own: Mutex<OwnAgents>,
     withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
-    /// Tells the task that there is something to be announced later.
+    /// Wakes the task for work that is due later or now.
     postponed: Notify,
 }
 
@@ -324,29 +331,30 @@ impl std::fmt::Debug for Shared {
 }
 
 #[derive(Debug, Default)]
-struct Own {
+struct OwnAgents {
     closed: bool,
-    agents: HashMap<Arc<str>, Announced>,
+    agents: HashMap<Arc<str>, Announcement>,
     pace: Pace,
-    /// Full names of which the daemon has just said goodbye, and until when they rest. It says so
-    /// twice, and would take the second goodbye for somebody else's claim to the name.
+    /// Full names for which the library has just sent a goodbye, and the end of their rest. The
+    /// library sends a goodbye twice, and would take its second one for a conflicting claim to the
+    /// name.
     resting: HashMap<Arc<str>, Instant>,
-    /// Full names that the daemon has renamed, and will rename ever after.
+    /// Full names that the library has renamed, and will always rename again.
     spoilt: HashSet<Arc<str>>,
-    /// What was announced when the daemon was ended, until there is another one: nobody hears of
-    /// what changes meanwhile, and who was told of it would ask in vain.
-    meanwhile: Option<beacon::Announced>,
-    /// The names of records of which only the locations have changed, and which are announced at
-    /// once: the daemon needs about two seconds for that.
+    /// The announcements at the time the library was stopped, until the next one starts. Later changes
+    /// are not announced meanwhile, so a beacon with them would cause unanswered queries.
+    while_stopped: Option<beacon::BeaconContent>,
+    /// Names of records in which only the locations changed. They are announced at once, because
+    /// the library needs about two seconds.
     moved: Vec<Arc<str>>,
 }
 
-/// Most records that are announced at once; the others are by the daemon.
+/// Maximum number of records that are announced at once; the library announces the others.
 const MAX_MOVED: usize = 256;
 
-impl Own {
-    fn announced(&self) -> beacon::Announced {
-        let mut announced = beacon::Announced::default();
+impl OwnAgents {
+    fn announced(&self) -> beacon::BeaconContent {
+        let mut announced = beacon::BeaconContent::default();
         for one in self.agents.values() {
             if let Some((_, told)) = one.told {
                 announced.all.add(told);
@@ -360,49 +368,50 @@ impl Own {
 }
 
 #[derive(Debug)]
-struct Announced {
+struct Announcement {
     entry: Arc<Entry>,
     /// The full name of its record, in lower case.
     fullname: Arc<str>,
-    /// The host of its record. Each has its own, because the daemon says goodbye to the host
-    /// with the record.
+    /// The host of its record. Each record has its own, because the library sends a goodbye for the
+    /// host together with the record.
     host: Incarnation,
-    /// How many labels have been tried.
+    /// Number of labels tried before this one.
     attempt: u32,
-    /// When this is to be announced, if it is not yet.
+    /// Time at which it is to be announced, if it is not yet.
     due: Option<Instant>,
     digest: Digest,
-    /// What the daemon has been told last, and when.
+    /// Time and digest of the last registration with the library.
     told: Option<(Instant, Digest)>,
 }
 
-impl Announced {
+impl Announcement {
     fn host_name(&self) -> String {
         format!("fipa-{}.local.", self.host)
     }
 }
 
-/// How long a record stays as it is before it is changed again (RFC 6762 clause 8.4). It is probed
-/// for most of a second, announced twice a second apart, and only a second after that has the record
-/// before left the caches: one that came back earlier would be taken for the one that leaves.
+/// Time for which a record stays unchanged before it is changed again (RFC 6762 clause 8.4).
+/// Probing takes most of a second, the two announcements are a second apart, and the previous
+/// record leaves the caches only a second later. A record that returned earlier would be mistaken
+/// for the one that is leaving.
 const SETTLING: Duration = Duration::from_secs(3);
 
-/// The same for a record of which only the locations change: letters do not arrive until others know
-/// them. It may be announced before the record before has left all caches.
+/// The same for a record in which only the locations change: letters do not arrive until other
+/// gateways have it. It may be announced before the previous record has left all caches.
 const MOVING: Duration = Duration::from_secs(1);
 
-/// How often the daemon looks at the interfaces: usually, and while they change.
-const LOOKS: u32 = mdns_sd::IP_CHECK_INTERVAL_IN_SECS_DEFAULT;
-const LOOKS_SOON: u32 = 1;
+/// Intervals in seconds at which the library polls the interfaces: normally, and while they change.
+const NORMAL_POLL: u32 = mdns_sd::IP_CHECK_INTERVAL_IN_SECS_DEFAULT;
+const FAST_POLL: u32 = 1;
 
-/// How long a full name rests after a goodbye.
+/// Time for which a full name rests after a goodbye.
 const REST: Duration = Duration::from_secs(1);
 
-/// Most full names remembered as spoilt.
+/// Maximum number of full names remembered as spoilt.
 const MAX_SPOILT: usize = 1024;
 
 impl Shared {
-    fn register(&self, own: &mut Own, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
+    fn register(&self, own: &mut OwnAgents, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
         if own.closed {
             return Err(RegisterError::Closed);
         }
@@ -413,12 +422,9 @@ impl Shared {
         {
             return Err(RegisterError::AlreadyRegistered { holder });
         }
-        let len: usize = record::encode(&entry)
-            .iter()
-            .map(|(key, value)| key.len() + value.len() + 2)
-            .sum();
+        let len = record::len_of(&record::encode(&entry));
         if len > MAX_TXT {
-            let why = format!("the record would have {len} bytes, and at most {MAX_TXT} fit");
+            let why = format!("the record has {len} bytes; at most {MAX_TXT} are allowed");
             return Err(RegisterError::Full(why));
         }
         let entry = Arc::new(entry);
@@ -428,11 +434,11 @@ impl Shared {
         Ok(entry)
     }
 
-    /// Announces the entry under the first label, from this attempt on, that is free; at once, or
-    /// when the label has rested and it is its turn.
+    /// Announces the entry under the first free label, starting with this attempt; either at once,
+    /// or when the label has rested and the pace allows it.
     fn announce(
         &self,
-        own: &mut Own,
+        own: &mut OwnAgents,
         entry: &Arc<Entry>,
         mut attempt: u32,
     ) -> Result<(), mdns_sd::Error> {
@@ -450,8 +456,8 @@ impl Shared {
         let before = before.filter(|announced| announced.fullname == fullname);
         let now = Instant::now();
         let turn = match before {
-            // What is announced already is changed when it has settled.
-            Some(Announced {
+            // An announced record is changed only after it has settled.
+            Some(Announcement {
                 entry: before,
                 told: Some((when, _)),
                 ..
@@ -469,7 +475,7 @@ impl Shared {
             Some(waiting) => waiting.due,
             None => own.pace.turn(now, fastrand::f64()),
         };
-        let mut announced = Announced {
+        let mut announced = Announcement {
             entry: Arc::clone(entry),
             digest: Digest::of(&record::encode(entry)),
             host: before.map_or_else(Incarnation::random, |announced| announced.host),
@@ -481,7 +487,7 @@ impl Shared {
         if announced.due.is_some() {
             self.postponed.notify_one();
         } else {
-            self.tell_daemon(&announced)?;
+            self.register_with_daemon(&announced)?;
             announced.told = Some((now, announced.digest));
         }
         own.agents.insert(entry.name.clone(), announced);
@@ -489,32 +495,32 @@ impl Shared {
         Ok(())
     }
 
-    fn tell_daemon(&self, announced: &Announced) -> Result<(), mdns_sd::Error> {
+    fn register_with_daemon(&self, announced: &Announcement) -> Result<(), mdns_sd::Error> {
         let label = record::label(&announced.entry.name, announced.attempt);
         let host = announced.host_name();
         let properties = record::encode(&announced.entry);
         let properties: Vec<TxtProperty> = properties.into_iter().map(TxtProperty::from).collect();
-        // The port stands in the locations; the addresses are those of this host.
+        // The locations contain the port; the addresses are those of this host.
         let service = ServiceInfo::new(SERVICE_TYPE, &label, &host, "", 0, properties)?;
         let service = service.enable_addr_auto();
         self.ask(|daemon| daemon.register(service.clone()))?;
         Ok(())
     }
 
-    /// Packets that announce the records of which only the locations have changed.
+    /// Builds packets for the records in which only the locations changed.
     fn moved(&self) -> Vec<Vec<u8>> {
         let mut own = self.own.lock();
         let moved = std::mem::take(&mut own.moved);
         let packets = moved.iter().filter_map(|name| {
             let announced = own.agents.get(name)?;
             let label = record::label(name, announced.attempt);
-            let says = record::encode(&announced.entry);
-            packet::announcement(&label, &announced.host_name(), &says)
+            let properties = record::encode(&announced.entry);
+            packet::announcement(&label, &announced.host_name(), &properties)
         });
         packets.collect()
     }
 
-    /// Announces what has been postponed and is due, and says when the next is.
+    /// Announces postponed records that are due, and returns the time of the next.
     fn announce_due(&self) -> Option<Instant> {
         let mut own = self.own.lock();
         let now = Instant::now();
@@ -523,7 +529,7 @@ impl Shared {
             if announced.due.is_some_and(|due| due <= now) {
                 announced.due = None;
                 announced.told = Some((now, announced.digest));
-                if let Err(error) = self.tell_daemon(announced) {
+                if let Err(error) = self.register_with_daemon(announced) {
                     let name = &announced.entry.name;
                     self.failed(format!("cannot announce {name:?}: {error}"));
                 }
@@ -532,8 +538,8 @@ impl Shared {
         own.agents.values().filter_map(|one| one.due).min()
     }
 
-    /// Takes the record back, with a goodbye.
-    fn take_back(&self, own: &mut Own, name: &str) -> Result<(), mdns_sd::Error> {
+    /// Withdraws the record with a goodbye.
+    fn withdraw(&self, own: &mut OwnAgents, name: &str) -> Result<(), mdns_sd::Error> {
         let Some(announced) = own.agents.get(name) else {
             return Ok(());
         };
@@ -552,7 +558,7 @@ impl Shared {
 
     fn deregister(
         &self,
-        own: &mut Own,
+        own: &mut OwnAgents,
         name: &str,
         incarnation: Incarnation,
     ) -> Result<(), DeregisterError> {
@@ -563,18 +569,20 @@ impl Shared {
         if announced.is_none_or(|one| one.entry.incarnation != incarnation) {
             return Err(DeregisterError::NotRegistered(name.into()));
         }
-        self.take_back(own, name)
+        self.withdraw(own, name)
             .map_err(|error| DeregisterError::Failed(Arc::new(error)))
     }
 
-    /// Has the daemon look at the interfaces so often, the first time after that.
-    fn daemon_looks(&self, seconds: u32) {
+    /// Sets the interval at which the library polls the interfaces; it applies after the next poll.
+    fn set_poll_interval(&self, seconds: u32) {
         if let Err(error) = self.ask(|daemon| daemon.set_ip_check_interval(seconds)) {
-            self.failed(format!("cannot look at the interfaces: {error}"));
+            self.failed(format!(
+                "cannot set the interval for polling the interfaces: {error}"
+            ));
         }
     }
 
-    /// Has the daemon use interfaces that are new, without waiting until it looks.
+    /// Makes the library use new interfaces at once, instead of after its next poll.
     fn daemon_adds_interfaces(&self) {
         let none = || Vec::<IfKind>::new();
         if let Err(error) = self.ask(|daemon| daemon.enable_interface(none())) {
@@ -582,8 +590,8 @@ impl Shared {
         }
     }
 
-    /// Gives the daemon something to do. It takes so many things at a time and asks others to
-    /// come again, which is waited for; nothing at all happens when there is no daemon.
+    /// Sends a command to the library, with retries for up to 5 s while its command queue is full.
+    /// Does nothing when the library is stopped.
     fn ask<T>(
         &self,
         what: impl Fn(&ServiceDaemon) -> Result<T, mdns_sd::Error>,
@@ -602,29 +610,29 @@ impl Shared {
         }
     }
 
-    /// Ends the daemon, without a goodbye for what is announced, and gives what tells when that
-    /// is done. Until another one is started nothing is announced or answered.
+    /// Stops the library without a goodbye for the announced records, and returns a channel that
+    /// reports completion. Nothing is announced or answered until the next start.
     fn end_daemon(&self) -> Result<Option<Receiver<DaemonStatus>>, mdns_sd::Error> {
         let Some(daemon) = self.daemon.lock().clone() else {
             return Ok(None);
         };
-        // It says goodbye on the interfaces that it has.
+        // The library sends goodbyes on its enabled interfaces.
         let ended = daemon.disable_interface(IfKind::All);
         let ended = match ended.and_then(|()| daemon.shutdown()) {
-            // It has ended by itself.
+            // The library has already ended.
             Err(mdns_sd::Error::DaemonShutdown) => None,
             ended => Some(ended?),
         };
         let mut own = self.own.lock();
         *self.daemon.lock() = None;
-        own.meanwhile = Some(own.announced());
+        own.while_stopped = Some(own.announced());
         Ok(ended)
     }
 
-    /// Starts another daemon, and announces to it, at the usual pace, what was announced before.
-    /// Says whether there is one now.
+    /// Starts the library again, and registers the previous announcements at the usual pace.
+    /// Returns whether it is running.
     fn start_daemon(&self) -> bool {
-        // Whoever closes meanwhile waits, and then ends the new one.
+        // A concurrent close waits for this lock, and then stops the new library.
         let mut own = self.own.lock();
         let own = &mut *own;
         if own.closed {
@@ -639,11 +647,12 @@ impl Shared {
         };
         self.choose(&daemon);
         *self.daemon.lock() = Some(daemon);
-        own.meanwhile = None;
+        own.while_stopped = None;
         let now = Instant::now();
         let agents = own.agents.values_mut();
         let mut before: Vec<_> = agents.filter(|one| one.told.is_some()).collect();
-        // Another flood may end this one before it has told all: the next begins with the rest.
+        // Another flood may stop the library before all records are registered; the next start
+        // begins with the rest.
         before.sort_by_key(|one| one.told.map(|(when, _)| when));
         for announced in before {
             let turn = own.pace.turn(now, fastrand::f64());
@@ -658,31 +667,33 @@ impl Shared {
         }
     }
 
-    /// What the network says of a record now: this, or that it is gone.
+    /// Stores the current state of a record, or its removal.
     fn put(&self, fullname: &Arc<str>, entry: Option<Arc<Entry>>) {
         let now = Instant::now();
-        self.held.lock().put(now, fullname, entry.as_deref());
-        self.show(|together| together.put(now, fullname, entry));
+        self.peer_records
+            .lock()
+            .put(now, fullname, entry.as_deref());
+        self.show(|coalition_sync| coalition_sync.put(now, fullname, entry));
     }
 
-    /// Shows what is to be shown now, in one go.
-    fn show(&self, what: impl FnOnce(&mut Together) -> Updates) {
-        // Held until it is done, so that nothing overtakes.
-        let mut together = self.together.lock();
-        let updates = what(&mut together);
+    /// Applies the updates that are visible now, atomically.
+    fn show(&self, what: impl FnOnce(&mut CoalitionSync) -> Updates) {
+        // StoredDigest until the table is updated, so that updates stay in order.
+        let mut coalition_sync = self.coalition_sync.lock();
+        let updates = what(&mut coalition_sync);
         if !updates.is_empty() {
             self.table.replace(updates);
         }
     }
 
-    /// What this gateway announces; of the coalitions also what it will in a moment, because
-    /// others are to wait for that.
-    fn announced(&self) -> beacon::Announced {
+    /// The announcements of this gateway. Includes coalitions that will be announced soon, because
+    /// other gateways must wait for them.
+    fn announced(&self) -> beacon::BeaconContent {
         let own = self.own.lock();
-        own.meanwhile.unwrap_or_else(|| own.announced())
+        own.while_stopped.unwrap_or_else(|| own.announced())
     }
 
-    /// Others are told at once, if this is about a coalition.
+    /// Sends a beacon at once if the entry is a coalition.
     fn coalition_changed(&self, entry: &Entry) {
         if matches!(entry.role, Role::Coalition(_)) {
             self.coalitions_changed.store(true, Ordering::Relaxed);
@@ -706,8 +717,8 @@ fn moves(before: &Entry, now: &Entry) -> bool {
             }
 }
 
-/// The full name of a record with this label, in lower case. Labels have no dots and no
-/// backslashes, which would have to be escaped.
+/// The full name of a record with this label, in lower case. Labels have no dots or backslashes, so
+/// nothing needs escaping.
 fn fullname(label: &str) -> Arc<str> {
     format!("{label}.{SERVICE_TYPE}").to_lowercase().into()
 }

@@ -1,26 +1,26 @@
-//! How fast records are announced: hundreds of agents that start at once must not make a storm,
-//! because each record is probed three times and announced twice (RFC 6762 clause 8), and radios
-//! send multicast at their slowest rate.
+//! Rate limit for announcements. Each record is probed three times and announced twice (RFC 6762
+//! clause 8), and radios send multicast at their slowest rate, so hundreds of agents that start at
+//! once must not be announced at once.
 
 use std::time::{Duration, Instant};
 
-/// One record every so often, in the long run.
+/// Long-term interval between records.
 const SPACING: Duration = Duration::from_millis(5);
-/// So many are announced at once, before anybody has to wait.
+/// Number of records that are announced without waiting.
 const BURST: u32 = 25;
-/// Up to how much is added to every wait, so that hosts that start together do not speak together.
+/// Maximum jitter of every wait, so that hosts that start together do not send simultaneously.
 const JITTER: Duration = Duration::from_millis(50);
 
-/// When the next record may be announced.
+/// Computes the time at which the next record may be announced.
 #[derive(Debug, Default)]
 pub(super) struct Pace {
-    /// When it could be if there were no burst.
+    /// The time without a burst.
     next: Option<Instant>,
 }
 
 impl Pace {
-    /// Takes a turn: none when it is now, else when it comes. The share of the jitter is between 0
-    /// and 1.
+    /// Takes a turn: returns `None` if it is now, otherwise its time. `share`, from 0 to 1, scales
+    /// the jitter.
     pub(super) fn turn(&mut self, now: Instant, share: f64) -> Option<Instant> {
         let slot = self.next.map_or(now, |next| next.max(now));
         self.next = Some(slot + SPACING);
@@ -34,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_few_go_at_once_and_hundreds_one_after_the_other() {
+    fn a_burst_is_announced_at_once_and_the_rest_at_a_limited_rate() {
         let (mut pace, now) = (Pace::default(), Instant::now());
         let turns: Vec<_> = (0..500).map(|_| pace.turn(now, 0.0)).collect();
         let at_once = turns.iter().filter(|turn| turn.is_none()).count();
@@ -42,7 +42,7 @@ mod tests {
         let waits: Vec<Duration> = turns.iter().flatten().map(|turn| *turn - now).collect();
         assert!(waits.is_sorted());
         assert_eq!(waits.last(), Some(&(SPACING * (499 - BURST))));
-        // Later there is room again.
+        // After the backlog, a record is announced at once again.
         let later = now + SPACING * 500;
         assert_eq!(pace.turn(later, 0.5), None);
         let mut others = (0..30).filter_map(|_| pace.turn(later, 1.0));

@@ -1,4 +1,5 @@
-//! Packets of multicast DNS about records of our type: questions written, answers taken apart.
+//! Packets of multicast DNS for records of this service type: builds queries and announcements,
+//! parses packets.
 
 use simple_dns::ResourceRecord;
 use simple_dns::rdata::{PTR, RData, SRV, TXT};
@@ -11,16 +12,16 @@ use super::record::Properties;
 
 /// Largest packet of multicast DNS (RFC 6762 clause 17).
 pub(super) const MAX_PACKET: usize = 9000;
-/// Lifetimes of records that name a host, and of others, in seconds (RFC 6762 clause 10).
+/// TTLs of records that name a host, and of others, in seconds (RFC 6762 clause 10).
 const HOST_TTL: u32 = 120;
 const OTHER_TTL: u32 = 4500;
-/// Most questions in one packet: they fit the smallest packet every network carries.
+/// Maximum number of questions in one packet, so that it fits the smallest MTU.
 const QUESTIONS: usize = 12;
-/// Known answers in one packet, likewise.
+/// Maximum number of known answers in one packet, for the same reason.
 pub(super) const KNOWN: usize = 14;
 
-/// What a packet says, unless it is none. One is not taken apart that is too short for as many
-/// records as it claims to have: the library takes memory for them before it looks.
+/// Parses a packet. A packet that is too short for the number of records in its header is rejected
+/// first, because the library allocates memory for them before it checks.
 pub(super) fn parse(packet: &[u8]) -> Option<Packet<'_>> {
     let header = packet.first_chunk::<12>()?;
     let count = |at: usize| usize::from(u16::from_be_bytes([header[at], header[at + 1]]));
@@ -29,12 +30,12 @@ pub(super) fn parse(packet: &[u8]) -> Option<Packet<'_>> {
     fits.then(|| Packet::parse(packet).ok())?
 }
 
-/// The same if it is an answer.
+/// Parses a packet if it is a response.
 pub(super) fn parse_answer(packet: &[u8]) -> Option<Packet<'_>> {
     parse(packet).filter(|packet| packet.has_flags(PacketFlag::RESPONSE))
 }
 
-/// Whether the packet may name our type. Most do not, which is seen without taking them apart.
+/// Whether the packet may name this service type. Rejects most packets without parsing.
 pub(super) fn may_name_our_type(packet: &[u8]) -> bool {
     let name = service_labels().next().unwrap_or_default().as_bytes();
     memchr::memchr_iter(b'_', packet).any(|at| {
@@ -43,13 +44,13 @@ pub(super) fn may_name_our_type(packet: &[u8]) -> bool {
     })
 }
 
-/// The label of a record of our type, as it is spelt.
+/// The label of a record of this type, with its original spelling.
 pub(super) fn label_of<'a>(name: &'a Name<'_>) -> Option<&'a str> {
     let (label, rest) = name.get_labels().split_first()?;
     is_of_our_type(rest).then(|| std::str::from_utf8(label.as_ref()).ok())?
 }
 
-/// Whether it is the name of our type.
+/// Whether it is the name of this service type.
 pub(super) fn is_service(name: &Name<'_>) -> bool {
     is_of_our_type(name.get_labels())
 }
@@ -60,7 +61,7 @@ fn is_of_our_type(labels: &[Label<'_>]) -> bool {
     labels.len() == service_labels().count() && labels.iter().zip(service_labels()).all(same)
 }
 
-/// The strings of a TXT record, in order, all of them.
+/// All strings of a TXT record, in order.
 pub(super) fn properties(txt: &TXT<'_>) -> Properties {
     let properties = txt.iter_raw().filter_map(|(key, value)| {
         let key = std::str::from_utf8(key).ok()?;
@@ -69,8 +70,7 @@ pub(super) fn properties(txt: &TXT<'_>) -> Properties {
     properties.collect()
 }
 
-/// Packets that ask for the records of these kinds with these labels. A label that is none is left
-/// out.
+/// Builds queries for records of these kinds with these labels. Invalid labels are skipped.
 pub(super) fn questions<'a>(
     labels: &'a [impl AsRef<str>],
     kinds: &'a [TYPE],
@@ -93,7 +93,8 @@ pub(super) fn questions<'a>(
         })
 }
 
-/// Packets that ask for all records of our type but those with these labels (RFC 6762 clause 7.1).
+/// Builds a query for all records of this type except those with these labels (RFC 6762 clause
+/// 7.1).
 pub(super) fn question_for_all(known: &[&str]) -> Vec<Vec<u8>> {
     let service = Name::new_unchecked(SERVICE_TYPE);
     let mut chunks = known.chunks(KNOWN);
@@ -126,8 +127,8 @@ fn name_of(label: &str) -> Option<Name<'_>> {
     Some(Name::new_with_labels(&name))
 }
 
-/// A packet that announces a record of our type: its label, its host and what it says. Others
-/// replace what they hold of it (RFC 6762 clause 10.2). None when that does not fit a packet.
+/// Builds a packet that announces a record of this type: its label, host and properties. Receivers
+/// replace their stored version (RFC 6762 clause 10.2). Returns `None` if it does not fit a packet.
 pub(super) fn announcement(label: &str, host: &str, says: &Properties) -> Option<Vec<u8>> {
     let strings: Vec<Vec<u8>> = says
         .iter()
@@ -168,13 +169,13 @@ pub(super) mod tests {
     /// A record of a packet.
     pub(in crate::mdns) enum Part<'a> {
         Ptr,
-        /// With the host.
+        /// SRV record with this host.
         Srv(&'a str),
-        /// With the strings.
+        /// TXT record with these strings.
         Txt(&'a [&'a [u8]]),
     }
 
-    /// An answer with these records of the instance with this label.
+    /// Builds an answer with these records of the instance with this label.
     pub(in crate::mdns) fn answer(label: &str, parts: &[Part<'_>], ttl: u32) -> Vec<u8> {
         let mut packet = Packet::new_reply(0);
         packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
@@ -205,7 +206,7 @@ pub(super) mod tests {
         packet.build_bytes_vec_compressed().unwrap()
     }
 
-    /// The labels and kinds that packets ask for.
+    /// The labels and kinds that packets query for.
     pub(in crate::mdns) fn asked(packets: &[Vec<u8>]) -> Vec<(String, QTYPE)> {
         let mut asked = Vec::new();
         for packet in packets {
@@ -219,7 +220,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn an_announcement_says_what_the_record_says() {
+    fn an_announcement_contains_the_properties_of_the_record() {
         let says: Properties = vec![
             ("fipa-name".into(), b"arm".to_vec()),
             ("fipa-locations".into(), b"tcp://10.0.0.2:7788".to_vec()),
@@ -251,12 +252,12 @@ pub(super) mod tests {
             let packets: Vec<_> = questions(&labels, kinds).collect();
             let asked = asked(&packets);
             assert_eq!(asked.len(), labels.len() * kinds.len());
-            assert_eq!(asked[0].0, labels[0], "as it is spelt");
+            assert_eq!(asked[0].0, labels[0], "the spelling is kept");
         }
     }
 
     #[test]
-    fn what_is_known_need_not_be_said() {
+    fn known_answers_are_listed_in_a_query_for_all() {
         let labels: Vec<String> = (0..30).map(|number| format!("agent {number}")).collect();
         let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
         let packets = question_for_all(&labels);
@@ -278,7 +279,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn packets_that_claim_more_than_they_have_are_not_read() {
+    fn packets_with_fewer_records_than_claimed_are_rejected() {
         let good = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
         assert!(parse_answer(&good).is_some());
         for at in [4, 6, 8, 10] {

@@ -1,9 +1,8 @@
-//! What the network does with multicast, found out interface by interface, for people who wonder
-//! why nobody is found.
+//! Diagnoses multicast on each interface, for a user whose gateways do not find each other.
 //!
-//! A question goes out by multicast from the port of multicast DNS, which others answer by
-//! multicast, and the same from a port of its own, which they answer directly (RFC 6762 clause
-//! 6.7). The answers tell both directions apart. Nothing is registered, and nobody is changed.
+//! A query is sent by multicast from the mDNS port, which other hosts answer by multicast, and from
+//! an ephemeral port, which they answer by unicast (RFC 6762 clause 6.7). The answers distinguish
+//! the two directions. The probe registers nothing and changes no other host.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -18,23 +17,24 @@ use super::packet::{self, MAX_PACKET};
 use super::sockets::{group_v4, group_v6, interfaces};
 use super::{MdnsConfig, SERVICE_TYPE};
 
-/// Asked for beside our own type: anybody with any service answers (RFC 6763 clause 9).
+/// Queried in addition to this project's service type: any host with any service answers (RFC 6763
+/// clause 9).
 const ANY_SERVICE: &str = "_services._dns-sd._udp.local.";
-/// When the question is asked. Who has just multicast an answer may rest for a second (RFC 6762
-/// clause 6).
+/// Times of the queries. A host that has just multicast an answer may stay silent for a second (RFC
+/// 6762 clause 6).
 const ASKED: [Duration; 3] = [
     Duration::ZERO,
     Duration::from_millis(300),
     Duration::from_millis(1300),
 ];
-/// How long answers are waited for in all. Gateways speak every two to two and a half seconds.
+/// Total time to wait for answers. Gateways send a beacon every 2 to 2.5 s.
 const PATIENCE: Duration = Duration::from_millis(2700);
-/// How long nobody is looked at.
+/// Interval between polls of the sockets.
 const TICK: Duration = Duration::from_millis(5);
-/// Most others that are remembered of one interface.
+/// Maximum number of hosts remembered per interface.
 const MAX_OTHERS: usize = 1000;
 
-/// What was found out on one interface, for one family of addresses.
+/// Result for one interface and address family.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Multicast {
@@ -42,21 +42,22 @@ pub struct Multicast {
     pub interface: String,
     /// The address of this host on it.
     pub address: IpAddr,
-    /// Why nothing could be sent or heard, if that is so.
+    /// The error that prevented sending or receiving, if any.
     pub error: Option<String>,
-    /// Whether this host heard its own question: the system lets multicast out, and in.
+    /// Whether this host received its own query, which shows that the system lets multicast out and
+    /// in.
     pub heard_itself: bool,
-    /// Others that were heard by multicast, whatever they said.
+    /// Hosts from which any multicast packet arrived.
     pub heard: BTreeSet<IpAddr>,
-    /// Others that answered directly what was asked by multicast.
+    /// Hosts that answered the query by unicast.
     pub answered: BTreeSet<IpAddr>,
 }
 
-/// Finds out what the network does with multicast, on all interfaces that the configuration names,
-/// loopback only when it is named. Blocks for about three seconds.
+/// Probes multicast on all interfaces in the configuration; loopback only when it is named. Blocks
+/// for about three seconds.
 ///
 /// # Errors
-/// When the interfaces of this machine are not to be had.
+/// Fails when the interfaces of this machine cannot be listed.
 pub fn probe(config: &MdnsConfig) -> io::Result<Vec<Multicast>> {
     let mut own: Vec<IpAddr> = Vec::new();
     let mut probes: Vec<Probe> = Vec::new();
@@ -92,18 +93,18 @@ pub fn probe(config: &MdnsConfig) -> io::Result<Vec<Multicast>> {
     Ok(probes.into_iter().map(|probe| probe.found).collect())
 }
 
-/// One interface, for one family.
+/// One interface and address family.
 struct Probe {
     found: Multicast,
     sockets: Option<Sockets>,
 }
 
 struct Sockets {
-    /// In the group.
+    /// Socket in the group.
     group: UdpSocket,
-    /// On a port of its own.
+    /// Socket on an ephemeral port.
     direct: UdpSocket,
-    /// The group.
+    /// Address of the group.
     to: SocketAddr,
 }
 
@@ -143,7 +144,7 @@ impl Probe {
         }
     }
 
-    /// Takes in what has come.
+    /// Processes the packets that have arrived.
     fn listen(&mut self, buffer: &mut [u8], question: &[u8], own: &[IpAddr]) {
         let Some(sockets) = &self.sockets else {
             return;
@@ -193,17 +194,17 @@ impl Sockets {
     }
 }
 
-/// Hands over every packet that is there, with the address it came from.
+/// Passes every packet that has arrived to `packet`, with its source address.
 fn receive(socket: &UdpSocket, buffer: &mut [u8], mut packet: impl FnMut(&[u8], IpAddr)) {
-    // Nothing there is an error, too; and what is wrong with one packet is no matter.
+    // An empty queue also ends the loop with an error; errors of single packets do not matter.
     while let Ok((len, from)) = socket.recv_from(buffer) {
         packet(buffer.get(..len).unwrap_or_default(), from.ip());
     }
 }
 
-/// Asks who offers our service, or any.
+/// Builds a query for this service type and for any service.
 fn question() -> Result<Vec<u8>, simple_dns::SimpleDnsError> {
-    // Nobody reads the number of a question; it tells this one from others of this host.
+    // Receivers ignore the ID of a query; it distinguishes this query from others of this host.
     let mut packet = Packet::new_query(fastrand::u16(1..));
     for name in [SERVICE_TYPE, ANY_SERVICE] {
         packet.questions.push(Question::new(

@@ -1,14 +1,14 @@
-//! A directory entry as a DNS-SD record, and back.
+//! Conversion between a directory entry and a DNS-SD record.
 //!
-//! The record is that of the peers (fipa_services, JADE's proxy), to which keys of our own are
-//! added. In this order:
+//! The record has the keys of the legacy peers (fipa_services, JADE's proxy), followed by keys of
+//! this project. In this order:
 //!
 //! | key | value |
 //! |---|---|
 //! | `TYPE` | the agent's type |
 //! | `LOCATOR` | `tcp://a.b.c.d:port fipa::services::transports::MessageTransport;`, repeated |
 //! | `DESCRIPTION` | the description |
-//! | `TIMESTAMP` | when it was registered, `%Y%m%d-%H:%M:%S:usec` |
+//! | `TIMESTAMP` | time of registration, `%Y%m%d-%H:%M:%S:usec` |
 //! | `fipa-version` | `1` |
 //! | `fipa-name` | the exact name |
 //! | `fipa-id` | the incarnation |
@@ -16,20 +16,22 @@
 //! | `fipa-role` | `gateway` or `coalition`, absent for an agent |
 //! | `fipa-members` | names of the members of a coalition, with a line feed between two |
 //! | `fipa-leader` | the name of its leader, if it has one |
-//! | `fipa-time` | when it was registered, in milliseconds since 1970, UTC |
+//! | `fipa-time` | time of registration, in milliseconds since 1970, UTC |
 //! | `fipa-locations` | all locations that lead to this host, in order, with a space between two |
-//! | `fipa-type`, `fipa-description` | in full, when the peers' key has only the beginning |
+//! | `fipa-type`, `fipa-description` | full text, when the legacy key has only its beginning |
 //!
-//! What the peers read keeps to what they can take: at most 200 bytes in a value, no scheme but
-//! `tcp`, and numeric IPv4 addresses; the rest is left out for them. A value of ours that is
-//! longer goes on in `key.1`, `key.2` and so on. No key ever occurs twice in a record of ours; the
-//! peers split a long value over several strings with one key, which are joined again.
+//! Values for legacy peers stay within the limits of those: at most 200 bytes per value, only the
+//! scheme `tcp`, and numeric IPv4 addresses; other locations are left out. A longer value of this
+//! project continues in `key.1`, `key.2` and so on. No key occurs twice in a record of this
+//! project. The legacy peers split a long value over several strings with one key, which are joined
+//! when read.
 //!
-//! `TIMESTAMP` has no zone. The peers write local time; we write UTC, and take theirs for UTC,
-//! too: among ourselves `fipa-time` counts, which knows no zones.
+//! `TIMESTAMP` has no time zone. The legacy peers write local time; this project writes UTC, and
+//! reads theirs as UTC too. Between gateways of this project `fipa-time` counts, which is always
+//! UTC.
 //!
-//! The instance label is the name with `?` for every `.`, as the peers have it, whenever that can
-//! be turned back; see [`label`].
+//! The instance label is the name with `?` for every `.`, as the legacy peers write it, whenever
+//! that is reversible; see [`label`].
 
 use std::time::SystemTime;
 
@@ -38,19 +40,20 @@ use fipa_transport::{Incarnation, Kind, Location, LocationError, Signature};
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::{Entry, EntryError, Members, Mts, Reach, Role, Source};
 
-/// Longest value that the peers write, and that we write into one string.
+/// Maximum length in bytes of a value that the legacy peers write, and of one string in a record of
+/// this project.
 const MAX_VALUE: usize = 200;
 
-/// Most strings over which a value of ours is spread: enough for the longest legal one.
+/// Maximum number of strings for one value of this project: enough for the longest valid one.
 const MAX_PARTS: usize = 32;
 
-/// Longest label of a DNS name, in bytes.
+/// Maximum length of a DNS label, in bytes.
 const MAX_LABEL: usize = 63;
 
 /// The strings of a TXT record, in order: keys and values.
 pub(super) type Properties = Vec<(String, Vec<u8>)>;
 
-/// The TXT record of an entry.
+/// Converts an entry to a TXT record.
 pub(super) fn encode(entry: &Entry) -> Properties {
     let mut properties = Properties::new();
     let time = millis_of_time(entry.registered);
@@ -64,7 +67,7 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     }
     let mut own = |key: &str, value: &str| {
         let value = value.as_bytes();
-        // An empty value is one part, too.
+        // An empty value also has one part.
         let parts = value
             .chunks(MAX_VALUE)
             .chain(value.is_empty().then_some(value));
@@ -82,7 +85,7 @@ pub(super) fn encode(entry: &Entry) -> Properties {
         Role::Gateway => own("fipa-role", "gateway"),
         Role::Coalition(members) => {
             own("fipa-role", "coalition");
-            // No name has control characters.
+            // Names have no control characters, so a line feed separates them.
             own("fipa-members", &members.names().join("\n"));
             if let Some(leader) = members.leader() {
                 own("fipa-leader", leader);
@@ -105,10 +108,10 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     properties
 }
 
-/// The entry of a record found on the network.
+/// Converts a record from the network to an entry.
 ///
-/// With `fipa-version` the record is one of ours, and has to be right. Without, it is a peer's,
-/// of which is taken what there is; `now` stands in for a time that it does not tell.
+/// A record with `fipa-version` is one of this project and must be valid. Any other is a legacy
+/// peer's, of which the valid parts are used; `now` replaces a missing time.
 pub(super) fn decode(
     label: &str,
     properties: &Properties,
@@ -116,19 +119,19 @@ pub(super) fn decode(
 ) -> Result<Entry, RecordError> {
     let record = Record(properties);
     let entry = match record.text("fipa-version")? {
-        Some(version) if version == "1" => ours(&record)?,
+        Some(version) if version == "1" => own_entry(&record)?,
         Some(version) => return Err(RecordError::Version(version.chars().take(40).collect())),
-        None => theirs(label, &record, now),
+        None => legacy_entry(label, &record, now),
     };
     entry.check()?;
     Ok(entry)
 }
 
-/// The instance label of a name: at most 63 bytes, neither dots nor backslashes.
+/// The instance label of a name: at most 63 bytes, without dots and backslashes.
 ///
-/// It is the name with `?` for `.` when a peer can turn that back into the name, else the
-/// beginning of it with a hash of the name, which `attempt` changes: labels that differ only in
-/// the case of letters are the same on the network, so the first may be taken by another name.
+/// The label is the name with `?` for `.` if a legacy peer can convert it back, otherwise a prefix
+/// of the name and a hash of it. `attempt` changes the hash: labels that differ only in case are
+/// equal on the network, so another name may already use the first label.
 pub(super) fn label(name: &str, attempt: u32) -> String {
     let plain = name.replace('.', "?");
     let faithful = plain.len() <= MAX_LABEL && !name.contains(['?', '\\']);
@@ -141,15 +144,15 @@ pub(super) fn label(name: &str, attempt: u32) -> String {
     format!("{beginning}{hash}")
 }
 
-/// What is wrong with a record.
+/// Error of [`decode`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub(super) enum RecordError {
-    #[error("version {0:?} of the record is not understood")]
+    #[error("version {0:?} of the record is not supported")]
     Version(String),
     #[error("the key {0} is missing")]
     Missing(&'static str),
-    #[error("the value of {0} makes no sense")]
+    #[error("the value of {0} is not valid")]
     Value(&'static str),
     #[error("the value of {0} is too long")]
     TooLong(&'static str),
@@ -157,17 +160,17 @@ pub(super) enum RecordError {
     Entry(#[from] EntryError),
 }
 
-/// Reads the strings of a record by key.
+/// Looks up the strings of a record by key.
 struct Record<'a>(&'a Properties);
 
 impl Record<'_> {
-    /// The first value of that key, whatever the case of its letters (RFC 6763 clause 6.4).
+    /// The first value of that key, ignoring case (RFC 6763 clause 6.4).
     fn value(&self, key: &str) -> Option<&[u8]> {
         let found = self.0.iter().find(|(k, _)| k.eq_ignore_ascii_case(key));
         found.map(|(_, value)| value.as_slice())
     }
 
-    /// The value of one of our keys, with all its parts.
+    /// The value of a key of this project, with all its parts.
     fn text(&self, key: &'static str) -> Result<Option<String>, RecordError> {
         let mut parts = (0..MAX_PARTS + 1).map_while(|number| self.value(&part_key(key, number)));
         let Some(first) = parts.next() else {
@@ -189,14 +192,14 @@ impl Record<'_> {
         text.parse().map_err(|_| RecordError::Value(key))
     }
 
-    /// All values of one of the peers' keys, in order: they are parts of one.
+    /// All values of a legacy peer's key, joined in order.
     fn joined(&self, key: &str) -> Vec<u8> {
         let parts = self.0.iter().filter(|(k, _)| k.eq_ignore_ascii_case(key));
         parts.flat_map(|(_, value)| value.iter().copied()).collect()
     }
 
-    /// A text of the peers: what of it is legal.
-    fn their_text(&self, key: &str, max: usize) -> String {
+    /// A text of a legacy peer, without control characters and truncated to `max` bytes.
+    fn legacy_text(&self, key: &str, max: usize) -> String {
         let value = self.joined(key);
         let text = String::from_utf8_lossy(&value);
         let mut text: String = text.chars().filter(|c| !c.is_control()).collect();
@@ -205,17 +208,17 @@ impl Record<'_> {
     }
 }
 
-fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
+fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
     let key = "fipa-locations";
     let locations = record.text(key)?.ok_or(RecordError::Missing(key))?;
     let mut known = Vec::new();
     for location in locations.split(' ').filter(|location| !location.is_empty()) {
         match location.parse() {
-            // Another host's shared memory and sockets are not reached from here, and this host's
-            // own are not told by others.
+            // Shared memory and sockets of another host are unreachable from here, and other hosts
+            // must not announce those of this host.
             Ok(location) if Location::kind(&location).is_host_local() => {}
             Ok(location) => known.push(location),
-            // What a later version has is no reason not to use the others.
+            // An unknown transport of a later version does not invalidate the other locations.
             Err(LocationError::UnknownKind(_) | LocationError::UnknownSignature(_)) => {}
             Err(_) => return Err(RecordError::Value(key)),
         }
@@ -255,7 +258,7 @@ fn members(record: &Record<'_>) -> Result<Members, RecordError> {
     Members::new(names.split('\n'), leader).map_err(|_| RecordError::Value(key))
 }
 
-fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
+fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
     let name = label.replace('?', ".");
     let registered = record
         .value("TIMESTAMP")
@@ -265,13 +268,13 @@ fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
     let locator = record.joined("LOCATOR");
     let locator = String::from_utf8_lossy(&locator);
     Entry {
-        agent_type: record.their_text("TYPE", Entry::MAX_TYPE),
+        agent_type: record.legacy_text("TYPE", Entry::MAX_TYPE),
         incarnation: Incarnation::UNKNOWN,
         locations: locations_of_locator(&locator),
-        // Peers do not say which service it is; each agent might have its own.
+        // Legacy records do not name the service; each agent may have its own.
         mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
         name: name.into(),
-        description: record.their_text("DESCRIPTION", Entry::MAX_DESCRIPTION),
+        description: record.legacy_text("DESCRIPTION", Entry::MAX_DESCRIPTION),
         registered: time_of_millis(registered),
         source: Source::Mdns,
         reach: Reach::Remote {
@@ -281,7 +284,7 @@ fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
     }
 }
 
-/// The locations that the peers can parse (an unknown scheme makes them throw), as many as fit.
+/// The locations that legacy peers can parse (an unknown scheme makes them throw), as many as fit.
 fn locator(locations: &[Location]) -> String {
     let mut locator = String::new();
     for location in locations {
@@ -298,9 +301,9 @@ fn locator(locations: &[Location]) -> String {
     locator
 }
 
-/// `address signature[ service-signature];`, repeated. Unknown schemes and signatures are left out.
-/// Locations without a supported transport are left out when there is another one; else they show
-/// why letters to the agent fail.
+/// Parses `address signature[ service-signature];`, repeated. Unknown schemes and signatures are
+/// skipped. Locations without a supported transport are used only when there is no other; they then
+/// show why letters to the agent fail.
 fn locations_of_locator(locator: &str) -> Vec<Location> {
     let location = |one: &str| {
         let mut words = one.split_ascii_whitespace();
@@ -348,11 +351,19 @@ fn part_key(key: &str, number: usize) -> String {
     }
 }
 
+/// Length of the strings in a TXT record, in bytes.
+pub(super) fn len_of(properties: &Properties) -> usize {
+    properties
+        .iter()
+        .map(|(key, value)| key.len() + value.len() + 2)
+        .sum()
+}
+
 fn cut(text: &str) -> &str {
     &text[..text.floor_char_boundary(MAX_VALUE)]
 }
 
-/// Fowler, Noll and Vo: not to be guessed is not the point, being the same everywhere is.
+/// FNV-1a: all hosts must compute the same value; it need not be unpredictable.
 fn fnv1a(name: &str, attempt: u32) -> u64 {
     let bytes = name.bytes().chain(attempt.to_be_bytes());
     bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
@@ -377,7 +388,7 @@ mod tests {
         decode(label, properties, UNIX_EPOCH)
     }
 
-    fn said(pairs: &[(&str, &[u8])]) -> Properties {
+    fn strings(pairs: &[(&str, &[u8])]) -> Properties {
         let pairs = pairs.iter();
         pairs
             .map(|(key, value)| ((*key).to_owned(), value.to_vec()))
@@ -405,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn peers_find_what_they_expect() {
+    fn a_record_has_the_keys_that_legacy_peers_read() {
         let properties = encode(&example());
         let texts: Vec<String> = properties
             .iter()
@@ -424,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn what_leads_to_processes_of_a_host_is_neither_announced_nor_believed() {
+    fn host_local_locations_are_neither_announced_nor_accepted() {
         let mut entry = example();
         let locations = entry.locations.clone();
         for local in ["shm://00000000000000ab", "unix://00000000000000ab"] {
@@ -441,8 +452,8 @@ mod tests {
     }
 
     #[test]
-    fn what_peers_announce_is_read() {
-        let properties = said(&[
+    fn records_of_legacy_peers_are_decoded() {
+        let properties = strings(&[
             ("timestamp", b"20261120-11:00:00:123456"),
             (
                 "LOCATOR",
@@ -467,15 +478,15 @@ mod tests {
         assert!(!entry.incarnation.is_known());
 
         let now = UNIX_EPOCH + Duration::from_secs(5);
-        let bare = decode("bare", &said(&[]), now).unwrap();
+        let bare = decode("bare", &strings(&[]), now).unwrap();
         assert_eq!(bare.registered, now);
-        assert!(decode("", &said(&[]), now).is_err());
+        assert!(decode("", &strings(&[]), now).is_err());
     }
 
     #[test]
-    fn an_agent_that_has_udt_only_is_shown_with_it() {
+    fn an_agent_with_udt_only_keeps_its_location() {
         let locator = format!("udt://10.0.0.2:1 {SIGNATURE};http://10.0.0.2:2 {SIGNATURE};");
-        let entry = read("cpp", &said(&[("LOCATOR", locator.as_bytes())])).unwrap();
+        let entry = read("cpp", &strings(&[("LOCATOR", locator.as_bytes())])).unwrap();
         assert_eq!(
             entry.locations,
             ["udt://10.0.0.2:1;fipa-services".parse().unwrap()]
@@ -483,9 +494,9 @@ mod tests {
         assert!(entry.is_unsupported());
     }
 
-    /// As fipa_services splits it: at 200 bytes, wherever that is.
+    /// fipa_services splits at 200 bytes, at any position.
     #[test]
-    fn values_that_peers_have_split_are_joined() {
+    fn values_split_by_legacy_peers_are_joined() {
         let location = |number: u16| {
             format!("udt://10.0.0.{number}:1 {SIGNATURE};tcp://10.0.0.{number}:7788 {SIGNATURE};")
         };
@@ -494,7 +505,7 @@ mod tests {
         let parts = locator.as_bytes().chunks(200 - "LOCATOR=".len());
         let mut properties: Vec<(&str, &[u8])> = parts.map(|part| ("LOCATOR", part)).collect();
         properties.insert(1, ("TYPE", b"arm"));
-        let entry = read("arm", &said(&properties)).unwrap();
+        let entry = read("arm", &strings(&properties)).unwrap();
         assert_eq!(entry.agent_type, "arm");
         let addresses = entry.locations.iter().map(|one| one.address().to_owned());
         let addresses: Vec<String> = addresses.collect();
@@ -505,7 +516,7 @@ mod tests {
     }
 
     #[test]
-    fn times_without_sense_are_not_times() {
+    fn invalid_timestamps_are_rejected() {
         let time = millis_of_timestamp;
         assert_eq!(time("19700101-00:00:01"), Some(1000));
         assert_eq!(time("19700101-00:00:01:002999"), Some(1002));
@@ -536,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_of_ours_has_to_be_right() {
+    fn an_invalid_record_of_this_project_is_rejected() {
         let good = encode(&example());
         for (key, wrong) in [
             ("fipa-version", "2"),
@@ -634,7 +645,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_legal_entry_survives(entry in any_entry(), label in any_text(63)) {
+        fn every_valid_entry_survives_a_round_trip(entry in any_entry(), label in any_text(63)) {
             prop_assert_eq!(entry.check(), Ok(()));
             let properties = encode(&entry);
             let mut keys = std::collections::HashSet::new();
@@ -646,7 +657,7 @@ mod tests {
         }
 
         #[test]
-        fn labels_are_legal_and_can_be_turned_back(name in any_name(), attempt in 0..3_u32) {
+        fn labels_are_valid_and_reversible(name in any_name(), attempt in 0..3_u32) {
             let label = label(&name, attempt);
             prop_assert!(!label.is_empty() && label.len() <= MAX_LABEL);
             prop_assert!(!label.contains(['.', '\\']));
@@ -655,7 +666,7 @@ mod tests {
         }
 
         #[test]
-        fn arbitrary_records_do_no_harm(
+        fn arbitrary_records_decode_to_valid_entries_or_fail(
             label in any_text(63),
             mut properties in prop::collection::vec(
                 (
@@ -679,7 +690,7 @@ mod tests {
         }
 
         #[test]
-        fn arbitrary_locators_and_times_do_no_harm(text in any_text(300)) {
+        fn arbitrary_locators_and_timestamps_do_not_panic(text in any_text(300)) {
             let _ = locations_of_locator(&text);
             let _ = millis_of_timestamp(&text);
         }

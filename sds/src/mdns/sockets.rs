@@ -1,8 +1,8 @@
 //! Sockets of multicast DNS.
 //!
-//! They are bound to the group's address: they take nothing away from others on this port, to whom
-//! somebody answers directly. Questions are ordinary multicast ones, because Avahi cuts what it
-//! answers to one host alone at 512 bytes.
+//! The sockets are bound to the group's address, so that they do not take unicast answers away from
+//! other sockets on this port. Queries request multicast answers, because Avahi truncates a unicast
+//! answer at 512 bytes.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
@@ -16,29 +16,29 @@ use tokio::net::UdpSocket;
 use super::MdnsConfig;
 use super::packet::MAX_PACKET;
 
-/// Most interfaces that are asked on.
+/// Maximum number of interfaces in use.
 const MAX_INTERFACES: usize = 32;
 
 /// Sockets of the multicast group, one for each interface and family of addresses.
 #[derive(Debug)]
 pub(super) struct Sockets {
     open: Vec<(UdpSocket, SocketAddr)>,
-    /// Those they are for.
+    /// The interfaces of these sockets.
     interfaces: Vec<Interface>,
     buffer: Vec<u8>,
 }
 
-/// How the addresses of interfaces differ from those before.
+/// Differences between the current and previous addresses of interfaces.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Changed {
-    /// There are some that there were not.
+    /// At least one address is new.
     pub(super) more: bool,
-    /// Some are gone.
+    /// At least one address is gone.
     pub(super) fewer: bool,
 }
 
 impl Sockets {
-    /// None yet.
+    /// Creates an empty set.
     pub(super) fn new() -> Self {
         Self {
             open: Vec::new(),
@@ -47,8 +47,8 @@ impl Sockets {
         }
     }
 
-    /// Opens what can be opened of the interfaces that the configuration names, if they are not
-    /// the same as before. Says what has become of them.
+    /// Opens sockets on the interfaces in the configuration, if they changed since the last call.
+    /// Returns the differences.
     pub(super) fn refresh(&mut self, config: &MdnsConfig) -> io::Result<Changed> {
         let interfaces = interfaces(config)?;
         if interfaces == self.interfaces {
@@ -64,7 +64,7 @@ impl Sockets {
             }
         }
         match last_error {
-            // An address that is not usable yet may be in a moment.
+            // An address that is not usable yet may become usable soon; the next call retries.
             Some(error) if self.open.is_empty() => Err(error),
             _ => {
                 let (mut now, mut before) = (interfaces.iter(), self.interfaces.iter());
@@ -78,22 +78,23 @@ impl Sockets {
         }
     }
 
-    /// Sends the packet on all interfaces. One that fails is no reason not to ask on the others.
+    /// Sends the packet on all interfaces; a failure on one does not affect the others.
     pub(super) fn send(&self, packet: &[u8]) {
         for (socket, group) in &self.open {
             if let Err(error) = SockRef::from(socket).send_to(packet, &(*group).into()) {
-                tracing::debug!(%error, %group, "an mDNS question was not sent");
+                tracing::debug!(%error, %group, "cannot send an mDNS packet");
             }
         }
     }
 
-    /// The next packet, and the address and port it came from. Cancelling the future loses nothing.
+    /// Waits for the next packet, and returns it with its source address and port. This method is
+    /// cancel-safe.
     pub(super) async fn receive(&mut self) -> (&[u8], SocketAddr) {
         let Self { open, buffer, .. } = self;
         let (len, from) = std::future::poll_fn(|context| {
             for (socket, _) in open.iter() {
                 let mut packet = ReadBuf::new(buffer);
-                // An error is told once, and stands for a packet that did not come.
+                // A socket error is reported once, in place of a packet.
                 while let Poll::Ready(received) = socket.poll_recv_from(context, &mut packet) {
                     if let Ok(from) = received {
                         return Poll::Ready((packet.filled().len(), from));
@@ -107,8 +108,8 @@ impl Sockets {
     }
 }
 
-/// Sends one packet on all interfaces, for who has no sockets any more. One that fails is no reason
-/// not to send on the others.
+/// Sends one packet on all interfaces with temporary sockets; a failure on one does not affect the
+/// others.
 pub(super) fn send_once(config: &MdnsConfig, packet: &[u8]) -> io::Result<()> {
     let mut last_error = None;
     for opened in groups(&interfaces(config)?, config.port) {
@@ -118,7 +119,7 @@ pub(super) fn send_once(config: &MdnsConfig, packet: &[u8]) -> io::Result<()> {
     last_error.map_or(Ok(()), Err)
 }
 
-/// The addresses of those that are up and that the configuration names.
+/// Lists the addresses of interfaces that are up and match the configuration.
 pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
     let mut interfaces = if_addrs::get_if_addrs()?;
     interfaces.retain(|interface| {
@@ -133,10 +134,10 @@ pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
     Ok(interfaces)
 }
 
-/// A socket in the group of an interface, which is not waited for, and the group.
+/// A non-blocking socket in the group of an interface, and the group's address.
 pub(super) type Grouped = (std::net::UdpSocket, SocketAddr);
 
-/// Opens one for each address of these interfaces: with IPv6 one for all of an interface.
+/// Opens one socket for each IPv4 address, and one for each interface with IPv6.
 fn groups(interfaces: &[Interface], port: u16) -> impl Iterator<Item = io::Result<Grouped>> {
     let mut indices = Vec::new();
     let open = move |interface: &Interface| match interface.ip() {

@@ -1,4 +1,4 @@
-//! The task that listens to the network.
+//! The background task of the mDNS directory.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -6,44 +6,44 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
-use super::anew::{self, Pauses};
-use super::browse::{Heard, label_of};
-use super::ear::Ear;
+use super::browse::{ParsedPacket, label_of};
+use super::listener::Listener;
 use super::record::{self, Properties};
+use super::restart::{self, Pauses};
 use super::{MAX_SPOILT, Shared, Withdrawal};
 use crate::Entry;
 
-/// How long a daemon that is busy has until it is told again that it is to end.
+/// Delay before the stop command is repeated to a busy library.
 const RETRY: Duration = Duration::from_millis(50);
 
-/// Keeps the view up to date and our names unambiguous, for ever.
+/// Keeps the view up to date and this gateway's names unambiguous, until it is aborted.
 pub(super) async fn run(shared: Arc<Shared>) {
-    let mut ear = Ear::new(&shared);
+    let mut listener = Listener::new(&shared);
     let mut pauses = Pauses::new(Instant::now());
     while let Some(monitor) = monitor(&shared) {
-        let why = listen(&shared, Some(&monitor), &mut ear).await;
-        // What it says from now on counts no more.
+        let why = listen(&shared, Some(&monitor), &mut listener).await;
+        // Later events of this library are ignored.
         drop(monitor);
         let pause = pauses.ended(Instant::now());
         shared.status.lock().restarts += 1;
-        shared.failed(format!("{why}: it starts anew in {pause:?}"));
+        shared.failed(format!("restarting the mDNS library in {pause:?}: {why}"));
         tokio::select! {
-            () = start_anew(&shared, pause) => {}
-            // Others are heard, and beacons said, without a daemon.
-            _ = listen(&shared, None, &mut ear) => {}
+            () = restart_daemon(&shared, pause) => {}
+            // Receiving and beacons continue without the library.
+            _ = listen(&shared, None, &mut listener) => {}
         }
         pauses.started(Instant::now());
     }
 }
 
-/// Ends the daemon, and starts another one when the pause is over.
-async fn start_anew(shared: &Shared, pause: Duration) {
+/// Stops the library, and starts it again after the pause.
+async fn restart_daemon(shared: &Shared, pause: Duration) {
     let ended = loop {
         match shared.end_daemon() {
-            // Too busy to listen.
+            // Its command queue is full.
             Err(Error::Again) => tokio::time::sleep(RETRY).await,
             Err(error) => {
-                shared.failed(format!("cannot end the mDNS library: {error}"));
+                shared.failed(format!("cannot stop the mDNS library: {error}"));
                 tokio::time::sleep(pause).await;
             }
             Ok(ended) => break ended,
@@ -51,8 +51,8 @@ async fn start_anew(shared: &Shared, pause: Duration) {
     };
     tokio::time::sleep(pause).await;
     if let Some(ended) = ended {
-        // While it reads it does not listen. Two of them would keep twice as much. That it has
-        // gone without a word is as good.
+        // The library handles commands only between packets. Two running libraries would need twice
+        // the memory, so this waits. A closed channel also means that it has ended.
         let _: Result<DaemonStatus, _> = ended.recv_async().await;
     }
     while !shared.start_daemon() {
@@ -60,42 +60,47 @@ async fn start_anew(shared: &Shared, pause: Duration) {
     }
 }
 
-/// What the daemon tells, if there is one.
+/// Subscribes to the events of the library, if it is running.
 fn monitor(shared: &Shared) -> Option<Receiver<DaemonEvent>> {
     match shared.ask(ServiceDaemon::monitor) {
         Ok(receiver) => receiver,
         Err(error) => {
-            shared.failed(format!("cannot listen: {error}"));
+            shared.failed(format!(
+                "cannot receive events of the mDNS library: {error}"
+            ));
             None
         }
     }
 }
 
-/// Handles what happens until the daemon has to be started anew, if there is a daemon, and says why
-/// it has.
-async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, ear: &mut Ear) -> String {
-    let mut look = monitor.map(|_| Instant::now() + anew::INTERVAL);
+/// Processes events until the library, if there is one, must be restarted; returns the reason.
+async fn listen(
+    shared: &Shared,
+    monitor: Option<&Receiver<DaemonEvent>>,
+    listener: &mut Listener,
+) -> String {
+    let mut look = monitor.map(|_| Instant::now() + restart::INTERVAL);
     let mut metrics: Option<Receiver<Metrics>> = None;
     loop {
         let now = Instant::now();
-        shared.show(|together| together.handle_timeout(now));
+        shared.show(|coalition_sync| coalition_sync.handle_timeout(now));
         if look.is_some_and(|look| look <= now) {
             look = None;
-            // Whether it keeps too much. A daemon that is busy is asked again.
+            // Requests the cache size; a busy library is asked again later.
             let daemon = shared.daemon.lock().clone();
             metrics = daemon.and_then(|daemon| daemon.get_metrics().ok());
             if metrics.is_none() {
-                look = Some(now + anew::INTERVAL);
+                look = Some(now + restart::INTERVAL);
             }
         }
-        let waiting = shared.together.lock().poll_timeout();
+        let waiting = shared.coalition_sync.lock().poll_timeout();
         let announcing = shared.announce_due();
-        let due = [announcing, Some(ear.speak(shared)), waiting, look];
+        let due = [announcing, Some(listener.send_due(shared)), waiting, look];
         let due = due.into_iter().flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}
             () = until(due), if due.is_some() => {}
-            heard = ear.listen(shared) => handle(shared, ear, heard),
+            received = listener.listen(shared) => handle(shared, listener, received),
             event = next(monitor) => match event {
                 Some(DaemonEvent::NameChange(change)) => renamed(shared, &change.original),
                 Some(DaemonEvent::Error(error)) => shared.failed(error.to_string()),
@@ -104,12 +109,12 @@ async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, ear: &
             },
             answer = next(metrics.as_ref()) => {
                 metrics = None;
-                look = Some(Instant::now() + anew::INTERVAL);
-                if let Some(kept) = answer.as_ref().and_then(anew::is_too_much) {
+                look = Some(Instant::now() + restart::INTERVAL);
+                if let Some(kept) = answer.as_ref().and_then(restart::is_too_much) {
                     return format!(
-                        "the mDNS library kept {kept}, so somebody floods the network; agents of \
-                         ours that register meanwhile are found a little later, and who sends so \
-                         much to UDP port {} should be found",
+                        "the mDNS library cached {kept}, because a host floods the network; new \
+                         registrations are announced with a delay; find the host that sends so \
+                         many packets to UDP port {}",
                         shared.config.port
                     );
                 }
@@ -118,7 +123,8 @@ async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, ear: &
     }
 }
 
-/// The next that is told; none when there will not be any more. Without a teller it never comes.
+/// Returns the next value, or `None` when the channel is closed. Without a channel it never
+/// returns.
 async fn next<T>(of: Option<&Receiver<T>>) -> Option<T> {
     match of {
         Some(receiver) => receiver.recv_async().await.ok(),
@@ -132,20 +138,21 @@ async fn until(due: Option<Instant>) {
     }
 }
 
-fn handle(shared: &Shared, ear: &mut Ear, heard: Heard) {
-    for (fullname, properties) in heard.found {
+fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
+    for (fullname, properties) in received.found {
         if let Some(gateway) = found(shared, &fullname, &properties) {
-            ear.browser.belongs(&fullname, gateway);
+            listener.browser.belongs(&fullname, gateway);
         }
     }
-    if heard.refused > 0 {
+    if received.refused > 0 {
         let mut status = shared.status.lock();
-        status.refused += heard.refused;
-        status.last_error = Some("too many records on the network".to_owned());
+        status.refused += received.refused;
+        status.last_error =
+            Some("refused records of other hosts: too many on the network".to_owned());
     }
 }
 
-/// What is known of a record now. The gateway that announces it, if it is one of ours.
+/// Decodes and stores a record. Returns the gateway that announces it, if it is valid.
 fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Option<Incarnation> {
     let label = label_of(fullname);
     let entry = match record::decode(label, properties, SystemTime::now()) {
@@ -153,7 +160,7 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Optio
         Err(error) => {
             shared.status.lock().refused += 1;
             tracing::debug!(record = label, %error, "record not used");
-            // It may have been right before.
+            // An earlier version of the record may have been valid and stored.
             shared.put(fullname, None);
             return None;
         }
@@ -167,14 +174,14 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Optio
     Some(entry.mts.incarnation)
 }
 
-/// One of our own records has come back, perhaps by another name than we have given it: then the
-/// daemon has renamed it, and its telling so was lost.
+/// Handles one of this gateway's own records. A different label means that the library renamed it
+/// and the notification was lost.
 fn own_found(shared: &Shared, fullname: &str, entry: &Entry) {
     let original = {
         let own = shared.own.lock();
         let announced = own.agents.get(&entry.name);
         let announced = announced.filter(|one| one.entry.incarnation == entry.incarnation);
-        // The rest is what the network still remembers of labels we have given up.
+        // Other differences come from caches that still have abandoned labels.
         announced
             .filter(|one| is_renamed(&fullname.to_lowercase(), &one.fullname))
             .map(|one| Arc::clone(&one.fullname))
@@ -184,7 +191,7 @@ fn own_found(shared: &Shared, fullname: &str, entry: &Entry) {
     }
 }
 
-/// Whether the one full name is the other with ` (2)` or the like behind its label.
+/// Whether the full name is the original with ` (2)` or a similar suffix after its label.
 fn is_renamed(fullname: &str, original: &str) -> bool {
     let label = label_of(original);
     label_of(fullname)
@@ -198,9 +205,10 @@ fn is_renamed(fullname: &str, original: &str) -> bool {
         .is_some()
 }
 
-/// The label of one of our records was taken, and the daemon has chosen another one. Whose name
-/// it is, is not known yet: it may be another name with the same label. We choose our own label;
-/// if the name is the same, both will see that and the later gives way.
+/// Handles a conflict over the label of an own record, for which the library chose another label.
+/// The conflicting record may be of the same name or of another one. Announces the record under the
+/// next label; if the names are equal, both gateways detect that, and the later registration is
+/// withdrawn.
 fn renamed(shared: &Shared, original: &str) {
     let original = original.to_lowercase();
     let mut own = shared.own.lock();
@@ -210,11 +218,11 @@ fn renamed(shared: &Shared, original: &str) {
     };
     let (entry, attempt) = (Arc::clone(&announced.entry), announced.attempt + 1);
     if own.spoilt.len() >= MAX_SPOILT {
-        // What is forgotten is noticed again, just a little later.
+        // A dropped label causes another conflict, which is handled the same way.
         own.spoilt.clear();
     }
     own.spoilt.insert(original.into());
-    let withdrawn = shared.take_back(&mut own, &entry.name);
+    let withdrawn = shared.withdraw(&mut own, &entry.name);
     let announced = withdrawn.and_then(|()| shared.announce(&mut own, &entry, attempt));
     if let Err(error) = announced {
         let name = &entry.name;
@@ -224,7 +232,7 @@ fn renamed(shared: &Shared, original: &str) {
     }
 }
 
-/// If we announce the same name, the later registration is withdrawn: by us when it is ours.
+/// If this gateway announces the same name with a later registration, withdraws it.
 fn contested(shared: &Shared, theirs: &Arc<Entry>) {
     let mut own = shared.own.lock();
     let Some(ours) = own.agents.get(&theirs.name) else {
@@ -235,14 +243,14 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
         return;
     }
     let withdrawn = Arc::clone(&ours.entry);
-    if let Err(error) = shared.take_back(&mut own, &withdrawn.name) {
+    if let Err(error) = shared.withdraw(&mut own, &withdrawn.name) {
         let name = &withdrawn.name;
         shared.failed(format!("cannot withdraw {name:?}: {error}"));
     }
     drop(own);
     let name = &withdrawn.name;
-    tracing::warn!(%name, holder = %theirs.mts.name, "an earlier registration has the name");
-    // That nobody listens is up to the owner.
+    tracing::warn!(%name, holder = %theirs.mts.name, "withdrawing a registration: another gateway registered the name earlier");
+    // The owner may have no receiver.
     let _ = shared.withdrawals.send(Withdrawal {
         withdrawn,
         holder: Arc::clone(theirs),
@@ -254,48 +262,48 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::super::SERVICE_TYPE;
-    use super::super::anew::tests::directory;
-    use super::super::beacon::{Announced, Digest};
+    use super::super::beacon::{BeaconContent, Digest};
     use super::super::packet::tests::{Part, answer};
+    use super::super::restart::tests::directory;
     use super::*;
     use crate::{Directory, Mts, Registration, Source};
 
     #[tokio::test]
-    async fn what_is_found_of_a_gateway_is_good_as_long_as_its_beacons_say_so() {
+    async fn records_of_a_gateway_stay_valid_while_its_beacons_match() {
         let directory = directory();
         let shared = &directory.shared;
         let gateway = Mts::new("theirs", Incarnation::random());
         let at = "tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap();
         let arm = Registration::new("arm", Incarnation::random(), vec![at]);
-        let said = record::encode(&arm.into_entry(&gateway, Source::Mdns).unwrap());
-        let strings = said
+        let properties = record::encode(&arm.into_entry(&gateway, Source::Mdns).unwrap());
+        let strings = properties
             .iter()
             .map(|(key, value)| [key.as_bytes(), b"=", value].concat());
         let strings: Vec<Vec<u8>> = strings.collect();
         let strings: Vec<&[u8]> = strings.iter().map(Vec::as_slice).collect();
         let parts = [Part::Ptr, Part::Srv("theirs.local"), Part::Txt(&strings)];
 
-        let (mut ear, now) = (Ear::new(shared), Instant::now());
+        let (mut listener, now) = (Listener::new(shared), Instant::now());
         let at = |seconds| now + Duration::from_secs(seconds);
-        let heard = ear.browser.handle_packet(
+        let received = listener.browser.handle_packet(
             now,
             Ipv4Addr::LOCALHOST.into(),
             &answer("arm", &parts, 120),
             0.0,
         );
-        handle(shared, &mut ear, heard);
+        handle(shared, &mut listener, received);
         assert!(directory.lookup("arm").is_some());
         let mut all = Digest::default();
-        all.add(Digest::of(&said));
+        all.add(Digest::of(&properties));
         let coalitions = Digest::default();
-        let beacon = Announced { all, coalitions };
-        ear.handle_beacon(at(100), shared, gateway.incarnation, beacon);
-        assert_eq!(ear.browser.handle_timeout(at(150), 0.0).gone.len(), 0);
-        assert_eq!(ear.browser.handle_timeout(at(221), 0.0).gone.len(), 1);
+        let beacon = BeaconContent { all, coalitions };
+        listener.handle_beacon(at(100), shared, gateway.incarnation, beacon);
+        assert_eq!(listener.browser.handle_timeout(at(150), 0.0).gone.len(), 0);
+        assert_eq!(listener.browser.handle_timeout(at(221), 0.0).gone.len(), 1);
     }
 
     #[test]
-    fn renamed_records_are_recognised() {
+    fn renamed_records_are_recognized() {
         let full = |label: &str| format!("{label}.{SERVICE_TYPE}");
         assert_eq!(label_of(&full("arm?left")), "arm?left");
         assert_eq!(label_of(&full("arm.left")), "arm.left");

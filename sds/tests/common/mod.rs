@@ -1,6 +1,6 @@
-//! What every back end that can be written has to do, whoever implements it.
+//! Conformance suite of writable back ends.
 
-// Each test binary uses its part of this.
+// Each test binary uses only a part of this.
 #![allow(dead_code, unreachable_pub)]
 
 use std::collections::BTreeSet;
@@ -13,10 +13,10 @@ use fipa_sds::{
 };
 use fipa_transport::Incarnation;
 
-/// Ends a test that hangs; no condition below takes anywhere near as long.
+/// Ends a test that hangs; no condition below takes nearly as long.
 pub const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// Waits until the condition gives something.
+/// Waits until the condition returns a value.
 pub async fn eventually<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let waiting = async {
         loop {
@@ -53,7 +53,7 @@ pub fn registration(name: &str) -> Registration {
     registration
 }
 
-/// The parts of an entry that its owner has given.
+/// The parts of an entry that its owner supplied.
 fn said(entry: &Entry) -> Registration {
     Registration {
         name: entry.name.clone(),
@@ -66,7 +66,8 @@ fn said(entry: &Entry) -> Registration {
     }
 }
 
-/// The suite: `writer` registers, `reader` sees it, sooner or later; they may be the same.
+/// Runs the suite: `writer` registers, and `reader` sees it, at once or later; they may be the
+/// same.
 pub async fn conforms(writer: &dyn Directory, reader: &dyn Directory) {
     entries_arrive_as_they_were_registered(writer, reader).await;
     names_survive_whatever_they_contain(writer, reader).await;
@@ -80,7 +81,7 @@ async fn entries_arrive_as_they_were_registered(writer: &dyn Directory, reader: 
     let mut asked = registration("arm_left");
     asked.role = Role::Gateway;
     let registered = writer.register(asked.clone()).unwrap();
-    // Times are kept in whole milliseconds.
+    // Times have whole milliseconds.
     let lost = asked.registered.duration_since(registered.registered);
     assert!(lost.unwrap() < Duration::from_millis(1));
     asked.registered = registered.registered;
@@ -88,7 +89,7 @@ async fn entries_arrive_as_they_were_registered(writer: &dyn Directory, reader: 
 
     let found = eventually("lookup", || reader.lookup("arm_left")).await;
     if found.source == Source::Mdns {
-        // Other hosts are not told of routes within this one.
+        // Other hosts do not get routes within this one.
         asked.locations.retain(|it| !it.kind().is_host_local());
     }
     assert_eq!(said(&found), asked);
@@ -144,7 +145,10 @@ async fn names_survive_whatever_they_contain(writer: &dyn Directory, reader: &dy
         let (name, incarnation) = (&registration.name, registration.incarnation);
         writer.deregister(name, incarnation).unwrap();
     }
-    eventually("nobody left", || reader.entries().is_empty().then_some(())).await;
+    eventually("all entries left", || {
+        reader.entries().is_empty().then_some(())
+    })
+    .await;
 }
 
 async fn a_name_has_one_owner(writer: &dyn Directory, reader: &dyn Directory) {
@@ -158,7 +162,7 @@ async fn a_name_has_one_owner(writer: &dyn Directory, reader: &dyn Directory) {
     }
     for (name, incarnation) in [
         ("camera", Incarnation::random()),
-        ("nobody", first.incarnation),
+        ("absent", first.incarnation),
     ] {
         assert!(matches!(
             writer.deregister(name, incarnation),
@@ -294,7 +298,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         ),
         (
             Query {
-                mts: matcher("nobody.*"),
+                mts: matcher("absent.*"),
                 ..all.clone()
             },
             "",

@@ -1,5 +1,4 @@
-//! What a lane does with answers, with the end of attempts, with reports of custodians, and with
-//! changes of the directory.
+//! Handling of answers, ends of attempts, reports of custodians, and changes of the directory.
 
 use std::time::{Duration, Instant};
 
@@ -9,22 +8,22 @@ use fipa_transport::{
     Report, Signature, WayError, WayFault,
 };
 
-use super::super::desk::{Desk, Settlement};
+use super::super::attempts::{AttemptTable, Settlement};
 use super::super::routes::Tally;
-use super::super::rules::{self, Belief, End, Told};
+use super::super::rules::{self, AttemptEnd, Belief, CustodyReport};
 use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::State;
 use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
 
 impl Lane {
-    /// What became of an attempt.
+    /// Handles the conclusion of an attempt.
     pub(crate) fn concluded(
         &mut self,
         now: Instant,
         sequence: u64,
         attempt: AttemptId,
         conclusion: Conclusion,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
@@ -38,9 +37,9 @@ impl Lane {
             _ => return,
         };
         self.back();
-        self.heard(now);
+        self.record_event(now);
         self.letters[index].progress.state = State::Waiting;
-        // The clock decides about the letter again, also when its deadline has passed meanwhile.
+        // The timer visits the letter again, also if its deadline passed in the meantime.
         self.due_at(self.letters[index].deadline);
         match conclusion {
             Conclusion::Answered(answer) => {
@@ -50,39 +49,39 @@ impl Lane {
                         _ => &tally.turned_back,
                     });
                 }
-                desk.way_worked(&location);
+                table.route_worked(&location);
                 self.route_worked(&location);
-                self.answered(now, index, (attempt, location), answer, desk);
+                self.answered(now, index, (attempt, location), answer, table);
             }
             Conclusion::Handed => {
                 if let Some(tally) = self.tally() {
                     Tally::add(&tally.taken);
                 }
-                desk.way_worked(&location);
+                table.route_worked(&location);
                 self.route_worked(&location);
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
                 let outcome = Outcome::Sent { via, attempts };
-                self.settle(now, index, Settlement::Outcome(outcome), desk);
+                self.settle(now, index, Settlement::Outcome(outcome), table);
             }
-            Conclusion::NotSent(error) => self.came_back(now, index, &location, error, desk),
+            Conclusion::NotSent(error) => self.came_back(now, index, &location, error, table),
             Conclusion::Unconfirmed(error) if location.signature() != Signature::Frames => {
-                // A legacy peer takes a copy for another letter.
+                // A legacy peer would take a copy for a new letter.
                 self.letters[index].failed_at(&location, error);
-                self.fail(now, index, FailureReason::Unconfirmed, desk);
+                self.fail(now, index, FailureReason::Unconfirmed, table);
             }
             Conclusion::Unconfirmed(error) => {
-                self.letters[index].ended(End::Unknown);
-                self.came_back(now, index, &location, error, desk);
+                self.letters[index].ended(AttemptEnd::Unknown);
+                self.came_back(now, index, &location, error, table);
             }
             other => {
                 let text = format!("unknown conclusion of the attempt: {other:?}");
-                self.letters[index].ended(End::Unknown);
+                self.letters[index].ended(AttemptEnd::Unknown);
                 let error = WayError::new(WayFault::Incompatible, text);
-                self.came_back(now, index, &location, error, desk);
+                self.came_back(now, index, &location, error, table);
             }
         }
-        self.pump(now, desk);
+        self.pump(now, table);
     }
 
     fn answered(
@@ -91,7 +90,7 @@ impl Lane {
         index: usize,
         (attempt, location): (AttemptId, Location),
         answer: Answer,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         match answer {
             Answer::Accepted => {
@@ -101,7 +100,7 @@ impl Lane {
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
                 let outcome = Outcome::Delivered { via, attempts };
-                self.settle(now, index, Settlement::Outcome(outcome), desk);
+                self.settle(now, index, Settlement::Outcome(outcome), table);
             }
             Answer::Custody => {
                 let delivery = &mut self.letters[index];
@@ -111,9 +110,9 @@ impl Lane {
                     since: now,
                 };
                 self.ask_custodian_at(now + ASK_CUSTODIAN_AFTER);
-                // A letter before it may have failed since this copy left.
+                // A letter before it may have failed since this copy was dispatched.
                 if !self.is_custody() {
-                    self.tell_predecessor(index, desk);
+                    self.send_predecessor(index, table);
                 }
             }
             Answer::Busy => {
@@ -122,56 +121,56 @@ impl Lane {
                 let delivery = &mut self.letters[index];
                 delivery.progress.busy = true;
                 delivery.progress.tried.clear();
-                delivery.custody_taken(desk);
+                delivery.custody_taken(table);
                 self.recovering = true;
                 self.pause_until(now + BUSY_PAUSE);
             }
             Answer::OutOfOrder { last } => {
-                let patience = self.predecessor_patience(index, desk);
-                self.came_early(now, index, (last, patience), desk);
+                let patience = self.predecessor_patience(index, table);
+                self.came_early(now, index, (last, patience), table);
             }
             Answer::Returned { uncertain } => {
                 self.letters[index].ended(end_of(uncertain));
-                self.came_early(now, index, (0, Duration::ZERO), desk);
+                self.came_early(now, index, (0, Duration::ZERO), table);
             }
-            Answer::Moved => self.receiver_moved(now, index, desk),
+            Answer::Moved => self.receiver_moved(now, index, table),
             Answer::Failed {
                 reason: FailureReason::NoSuchAgent,
                 detail,
             } => {
-                if self.is_registered_no_more(index, desk) {
+                if self.is_registered_no_more(index, table) {
                     self.recovering = true;
-                    self.receiver_left(now, index, desk);
+                    self.receiver_left(now, index, table);
                 } else {
                     let reason = FailureReason::NoSuchAgent;
-                    self.refused(now, index, &location, (reason, detail), desk);
+                    self.refused(now, index, &location, (reason, detail), table);
                 }
             }
             Answer::Failed { reason, detail } => {
-                self.refused(now, index, &location, (reason, detail), desk);
+                self.refused(now, index, &location, (reason, detail), table);
             }
             other => {
                 let detail = format!("unknown answer: {other:?}");
                 let refused = (FailureReason::Refused, detail);
-                self.refused(now, index, &location, refused, desk);
+                self.refused(now, index, &location, refused, table);
             }
         }
     }
 
-    /// The letter came back because an earlier one is missing at the other side, where `last` was
-    /// taken, if that is known. The way is not at fault.
+    /// Handles a letter that came back because an earlier one is missing at the other side. `last`
+    /// is the last letter taken there, or 0 if unknown. The route has not failed.
     fn came_early(
         &mut self,
         now: Instant,
         index: usize,
         (last, patience): (u64, Duration),
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         self.recovering = true;
         self.letters[index].progress.tried.clear();
         if self.is_custody() {
             if !rules::goes_again(self.letters[index].after, last) {
-                self.hold(now, index, patience, desk);
+                self.hold(now, index, patience, table);
             }
             return;
         }
@@ -186,15 +185,15 @@ impl Lane {
         }
     }
 
-    /// A service says that this registration of the receiver has left its host a moment ago.
-    fn receiver_moved(&mut self, now: Instant, index: usize, desk: &mut Desk) {
+    /// Handles an answer that this registration of the receiver recently left its host.
+    fn receiver_moved(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
         self.recovering = true;
         let delivery = &self.letters[index];
         let registration = delivery.registration;
         if self.is_custody() {
             match rules::may_move(delivery.progress.uncertain) {
-                true => self.settle(now, index, Settlement::Moved, desk),
-                false => self.fail(now, index, FailureReason::Unconfirmed, desk),
+                true => self.settle(now, index, Settlement::Moved, table),
+                false => self.fail(now, index, FailureReason::Unconfirmed, table),
             }
             return;
         }
@@ -203,69 +202,71 @@ impl Lane {
             self.moving = Some((registration, until));
             self.due_at(until);
         }
-        self.receiver_left(now, index, desk);
+        self.receiver_left(now, index, table);
     }
 
-    /// Whether the registration that the letter is for, of which others say that it is not there,
-    /// is not in the directory either: it may have ended a moment ago.
-    fn is_registered_no_more(&self, index: usize, desk: &Desk) -> bool {
-        desk.directory.refresh();
-        self.entry(self.letters[index].registration, desk).is_none()
+    /// Whether the letter's registration, which another service reports as unknown, is not in the
+    /// directory either: it may have just ended.
+    fn is_registered_no_more(&self, index: usize, table: &AttemptTable) -> bool {
+        table.directory.refresh();
+        self.entry(self.letters[index].registration, table)
+            .is_none()
     }
 
-    /// The other side said finally that it does not take the letter.
+    /// Handles the final refusal of a letter by the other side.
     fn refused(
         &mut self,
         now: Instant,
         index: usize,
         location: &Location,
         (reason, detail): (FailureReason, String),
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let fault = WayFault::Refused;
         self.letters[index].failed_at(location, WayError { fault, detail });
-        self.fail(now, index, reason, desk);
+        self.fail(now, index, reason, table);
     }
 
-    /// An attempt did not reach the other side, or may not have.
+    /// Handles an attempt that did not reach the other side, or may not have.
     pub(super) fn came_back(
         &mut self,
         now: Instant,
         index: usize,
         location: &Location,
         error: WayError,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         self.recovering = true;
         if let Some(tally) = self.tally() {
             tally.fail(now, &error);
         }
         if error.fault == WayFault::Congested && self.congested < CONGESTED_TRIES {
-            // What is under way, in this lane or in another, makes room.
+            // The end of another attempt, in this lane or another, makes room.
             self.congested += 1;
             self.letters[index]
                 .progress
                 .tried
                 .retain(|tried| tried != location);
-            desk.wait_for_room(location, self.id);
+            table.wait_for_room(location, self.id);
             self.pause_until(now + CONGESTED_PAUSE);
             return;
         }
         if !matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
-            desk.way_failed(now, location, error.fault);
+            table.route_failed(now, location, error.fault);
         }
         self.route_failed(location, &error);
         self.letters[index].failed_at(location, error);
     }
 
-    /// The custody of a letter has ended, as this service reports of the hand-over `transfer`.
+    /// Handles this service's report that the custody of a letter, from the hand-over `transfer`,
+    /// has ended.
     pub(crate) fn reported(
         &mut self,
         now: Instant,
         from: &Hop,
         (registration, sequence, transfer): (Incarnation, u64, u64),
         report: Report,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
@@ -275,16 +276,18 @@ impl Lane {
             return;
         }
         let told = match &report {
-            Report::Settled(Outcome::Delivered { .. } | Outcome::Sent { .. }) => Told::Delivered,
-            Report::Settled(Outcome::Failed { reason, .. }) => Told::NotDelivered {
+            Report::Settled(Outcome::Delivered { .. } | Outcome::Sent { .. }) => {
+                CustodyReport::Delivered
+            }
+            Report::Settled(Outcome::Failed { reason, .. }) => CustodyReport::NotDelivered {
                 uncertain: *reason == FailureReason::Unconfirmed,
             },
-            Report::Returned { uncertain } => Told::NotDelivered {
+            Report::Returned { uncertain } => CustodyReport::NotDelivered {
                 uncertain: *uncertain,
             },
-            Report::Moved => Told::NotDelivered { uncertain: false },
-            // What a later version knows says nothing to this one.
-            _ => Told::NotDelivered { uncertain: true },
+            Report::Moved => CustodyReport::NotDelivered { uncertain: false },
+            // An unknown report of a later version carries no information.
+            _ => CustodyReport::NotDelivered { uncertain: true },
         };
         let handed = delivery.was_handed_to(from);
         let current = delivery.progress.state.handed_over();
@@ -292,44 +295,45 @@ impl Lane {
         match rules::believe(handed, told, transfer, current.map(|(attempt, _)| attempt)) {
             Belief::Believed => {}
             Belief::OnlyUncertain => {
-                delivery.ended(End::Unknown);
+                delivery.ended(AttemptEnd::Unknown);
                 return;
             }
             Belief::Ignored => return,
         }
         let taken_by = match current {
             Some((_, kind)) => Some(kind),
-            // An attempt that nothing was heard of delivered it, the last one most likely.
+            // An attempt without an answer delivered it, most likely the last one.
             None => delivery.progress.attempts.last().map(|it| it.via),
         };
-        self.end_hand_over(index, transfer, desk);
-        self.heard(now);
+        self.end_hand_over(index, transfer, table);
+        self.record_event(now);
         match report {
             Report::Settled(outcome) => {
-                self.settled_by_report(now, index, taken_by, outcome, desk);
+                self.settled_by_report(now, index, taken_by, outcome, table);
             }
             Report::Returned { uncertain } => {
                 self.letters[index].ended(end_of(uncertain));
-                self.came_early(now, index, (0, Duration::ZERO), desk);
+                self.came_early(now, index, (0, Duration::ZERO), table);
             }
-            Report::Moved => self.receiver_moved(now, index, desk),
-            _ => self.fail(now, index, FailureReason::Unconfirmed, desk),
+            Report::Moved => self.receiver_moved(now, index, table),
+            _ => self.fail(now, index, FailureReason::Unconfirmed, table),
         }
-        self.pump(now, desk);
+        self.pump(now, table);
     }
 
-    /// The letter is here again: an attempt that a report overtook has ended.
-    fn end_hand_over(&mut self, index: usize, transfer: u64, desk: &mut Desk) {
+    /// Takes a letter back after a report, which may have arrived before the conclusion of the
+    /// attempt.
+    fn end_hand_over(&mut self, index: usize, transfer: u64, table: &mut AttemptTable) {
         let state = &mut self.letters[index].progress.state;
         let before = std::mem::replace(state, State::Waiting);
         if let State::UnderWay {
             attempt, location, ..
         } = before
         {
-            desk.drop_attempt(location.kind(), attempt);
-            // If the report is of an earlier hand-over, this way has not shown that it works.
+            table.drop_attempt(location.kind(), attempt);
+            // A report of an earlier hand-over does not show that this route works.
             if attempt.0 == transfer {
-                desk.way_worked(&location);
+                table.route_worked(&location);
                 if let Some(tally) = self.tally() {
                     Tally::add(&tally.taken);
                 }
@@ -344,10 +348,10 @@ impl Lane {
         index: usize,
         taken_by: Option<Kind>,
         outcome: Outcome,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
-        // The sender is told the way between the hosts, which only this side may have seen.
-        let way = |theirs| match taken_by {
+        // The sender is told the transport between the hosts, which only this side may know.
+        let route = |theirs| match taken_by {
             None => theirs,
             Some(ours) if ours.is_host_local() => theirs,
             Some(ours) => ours,
@@ -359,67 +363,70 @@ impl Lane {
             Outcome::Delivered { via, .. } => {
                 self.busy = false;
                 Outcome::Delivered {
-                    via: way(via),
+                    via: route(via),
                     attempts,
                 }
             }
             Outcome::Sent { via, .. } => Outcome::Sent {
-                via: way(via),
+                via: route(via),
                 attempts,
             },
             Outcome::Failed { reason, .. } => {
                 delivery.progress.attempts = attempts;
-                if reason == FailureReason::NoSuchAgent && self.is_registered_no_more(index, desk) {
+                if reason == FailureReason::NoSuchAgent && self.is_registered_no_more(index, table)
+                {
                     self.recovering = true;
-                    self.receiver_left(now, index, desk);
+                    self.receiver_left(now, index, table);
                 } else {
-                    self.fail(now, index, reason, desk);
+                    self.fail(now, index, reason, table);
                 }
                 return;
             }
-            _ => return self.fail(now, index, FailureReason::Unconfirmed, desk),
+            _ => return self.fail(now, index, FailureReason::Unconfirmed, table),
         };
-        self.settle(now, index, Settlement::Outcome(outcome), desk);
+        self.settle(now, index, Settlement::Outcome(outcome), table);
     }
 
-    /// The directory has changed: services that have letters in custody may be gone.
-    pub(crate) fn directory_changed(&mut self, now: Instant, desk: &mut Desk) {
-        self.check_next_hops(now, desk);
-        self.notice_end(now, desk);
-        self.pump(now, desk);
+    /// Handles a change of the directory: services with letters in custody may be gone.
+    pub(crate) fn directory_changed(&mut self, now: Instant, table: &mut AttemptTable) {
+        self.check_next_hops(now, table);
+        self.notice_end(now, table);
+        self.pump(now, table);
     }
 
-    /// Looks for letters that services have which lead to their receiver no more.
-    pub(super) fn check_next_hops(&mut self, now: Instant, desk: &mut Desk) {
+    /// Checks for letters that were handed to services through which their receiver cannot be
+    /// reached any more.
+    pub(super) fn check_next_hops(&mut self, now: Instant, table: &mut AttemptTable) {
         let mut entry: Option<(Incarnation, Option<std::sync::Arc<Entry>>)> = None;
         for index in 0..self.letters.len() {
             let registration = self.letters[index].registration;
             let known = match &entry {
                 Some((of, known)) if *of == registration => known.clone(),
                 _ => {
-                    let known = desk.receiver(registration, &self.receiver);
-                    let known = known.or_else(|| self.said.clone());
+                    let known = table.receiver(registration, &self.receiver);
+                    let known = known.or_else(|| self.stated.clone());
                     entry = Some((registration, known.clone()));
                     known
                 }
             };
-            // When the receiver itself is gone, its custodian says so, or the clock does.
+            // If the receiver itself is gone, its custodian reports that, or a timeout ends the
+            // letter.
             if let Some(entry) = known {
-                self.check_next_hop(now, index, &entry, desk);
+                self.check_next_hop(now, index, &entry, table);
             }
         }
     }
 
-    /// Notices that the registration which the first letters are for has left the directory:
-    /// letters for its successor do not wait for long.
-    fn notice_end(&mut self, now: Instant, desk: &Desk) {
+    /// Detects that the registration of the first letters has left the directory; letters for its
+    /// successor then wait only for a limited time.
+    fn notice_end(&mut self, now: Instant, table: &AttemptTable) {
         if self.is_custody() {
             return;
         }
         let Some(first) = self.letters.front().map(|first| first.registration) else {
             return;
         };
-        let is_there = self.said.is_some() || desk.receiver(first, &self.receiver).is_some();
+        let is_there = self.stated.is_some() || table.receiver(first, &self.receiver).is_some();
         match self.ended {
             _ if is_there => self.ended = None,
             Some((ended, _)) if ended == first => {}
@@ -430,23 +437,28 @@ impl Lane {
         }
     }
 
-    /// Something was heard of the letters: those for a registration that has ended are waited for
-    /// anew.
-    fn heard(&mut self, now: Instant) {
+    /// Restarts the wait for letters of an ended registration after an event of one of them.
+    fn record_event(&mut self, now: Instant) {
         if let Some((_, heard)) = &mut self.ended {
             *heard = now;
         }
     }
 
-    /// The receiver cannot be reached through the service any more that the letter was handed to: no
-    /// answer or report of that service is waited for.
-    fn check_next_hop(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) {
+    /// Checks whether the receiver can still be reached through the service that the letter was
+    /// handed to; if not, ends the wait for that service's answer or report.
+    fn check_next_hop(
+        &mut self,
+        now: Instant,
+        index: usize,
+        entry: &Entry,
+        table: &mut AttemptTable,
+    ) {
         let delivery = &mut self.letters[index];
         let Some((_, location)) = delivery.progress.state.handed_over() else {
             return;
         };
         let service = location.incarnation();
-        let stands = |way: &Location| way.incarnation() == service;
+        let stands = |route: &Location| route.incarnation() == service;
         if !service.is_known() || entry.locations.iter().any(stands) {
             return;
         }
@@ -458,24 +470,24 @@ impl Lane {
                 ..
             } => {
                 if !std::mem::replace(abandoned, true) {
-                    let text = "another service is there now";
+                    let text = "the service at this location was replaced";
                     let error = WayError::new(WayFault::Broken, text);
-                    desk.abandon(location.kind(), *attempt, error);
+                    table.abandon(location.kind(), *attempt, error);
                 }
             }
             State::Custody { .. } => {
                 let text = "the gateway that had the letter in custody is gone";
-                self.custodian_lost(now, index, text, desk);
+                self.custodian_lost(now, index, text, table);
             }
             State::Waiting => {}
         }
     }
 }
 
-/// The end of a custody that handed the letter back.
-fn end_of(uncertain: bool) -> End {
+/// The end of a custody that returned the letter.
+fn end_of(uncertain: bool) -> AttemptEnd {
     match uncertain {
-        true => End::Unknown,
-        false => End::NotTaken,
+        true => AttemptEnd::Unknown,
+        false => AttemptEnd::NotTaken,
     }
 }

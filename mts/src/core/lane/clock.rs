@@ -1,33 +1,33 @@
-//! What a lane does because time has passed.
+//! Timeouts of a lane.
 
 use std::time::Instant;
 
 use fipa_transport::{FailureReason, WayError, WayFault};
 
-use super::super::desk::Desk;
+use super::super::attempts::AttemptTable;
 use super::super::work;
 use super::delivery::{Holding, State};
 use super::{ENDED_PATIENCE, Lane};
 
 impl Lane {
-    /// What is due by the clock: deadlines, attempts without an answer, custody to be told, letters
-    /// to be handed back.
-    pub(super) fn expire(&mut self, now: Instant, desk: &mut Desk) {
+    /// Handles everything that is due: deadlines, attempts without an answer, custody reports, and
+    /// letters to return.
+    pub(super) fn expire(&mut self, now: Instant, table: &mut AttemptTable) {
         if self.due.is_none_or(|due| due > now) {
             return;
         }
-        self.ask_custodians(now, desk);
+        self.ask_custodians(now, table);
         let ended = self
             .ended
             .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
-        // For what is due, and for what will be.
+        // Once for due timers, and once for the next ones.
         work::steps(2 * self.letters.len());
         let mut index = 0;
         while let Some(delivery) = self.letters.get_mut(index) {
             let expired = delivery.deadline <= now;
             let abandoned = ended.is_some_and(|(gone, _)| gone == delivery.registration);
             if delivery.custody_due.is_some_and(|due| due <= now) {
-                delivery.custody_taken(desk);
+                delivery.custody_taken(table);
             }
             match &mut delivery.progress.state {
                 State::UnderWay {
@@ -44,26 +44,26 @@ impl Lane {
                             }
                             false => WayError::new(WayFault::TimedOut, ""),
                         };
-                        desk.abandon(location.kind(), *attempt, error);
+                        table.abandon(location.kind(), *attempt, error);
                     }
                 }
                 State::Custody { location, .. } if expired || abandoned => {
                     let location = location.clone();
                     let text = "the gateway that has the letter in custody has not reported";
                     delivery.failed_at(&location, WayError::new(WayFault::TimedOut, text));
-                    self.fail(now, index, FailureReason::Unconfirmed, desk);
+                    self.fail(now, index, FailureReason::Unconfirmed, table);
                     continue;
                 }
                 State::Waiting if expired => {
                     let reason = self.reason_while_waiting(index);
-                    self.fail(now, index, reason, desk);
+                    self.fail(now, index, reason, table);
                     continue;
                 }
                 State::Waiting => {
                     if let Some(Holding::Until(until)) = delivery.progress.hold
                         && until <= now
                     {
-                        self.return_letter(now, index, desk);
+                        self.return_letter(now, index, table);
                         continue;
                     }
                 }
@@ -77,7 +77,7 @@ impl Lane {
     fn next_due(&self, now: Instant) -> Option<Instant> {
         let letters = self.letters.iter().flat_map(|delivery| {
             let progress = &delivery.progress;
-            // The end of an abandoned attempt is on its way, and decides about the letter.
+            // The conclusion of an abandoned attempt follows at once, and decides about the letter.
             let (deadline, times_out) = match &progress.state {
                 State::UnderWay {
                     abandoned: true, ..

@@ -1,81 +1,83 @@
-//! What custodians do about predecessors: a letter waits for one that is in the lane, and is handed
-//! back when one does not arrive. Copies of held letters, and notes about predecessors, come here.
+//! Predecessors at custodians: a letter waits for a predecessor that is in the lane, and is
+//! returned when a predecessor does not arrive. This module also handles copies of held letters,
+//! and notes about predecessors.
 //!
-//! And what the service before a custodian does: it asks now and then whether the custodian has the
-//! letter. Whatever became of its report, a custodian without the letter has lost it.
+//! It also has the previous hop's checks: that service periodically asks a custodian whether it has
+//! the letter. A custodian without the letter has lost it, whatever became of its report.
 
 use std::time::{Duration, Instant};
 
 use fipa_transport::{Incarnation, WayError, WayFault};
 
-use super::super::desk::{Desk, Settlement, Upstream};
-use super::super::rules::{self, End, Hold};
+use super::super::attempts::{AttemptTable, Settlement, Upstream};
+use super::super::rules::{self, AttemptEnd, HoldDecision};
 use super::super::work;
 use super::Lane;
 use super::delivery::{Holding, State};
 
-/// How long a predecessor that is not here may take to arrive, at least and at most: two round trips to
-/// the service that handed the letter over. Where they take longer than this service has seen, a letter
-/// travels twice, and nothing is lost.
+/// Minimum and maximum time for a missing predecessor to arrive: two round trips to the service
+/// that handed the letter over. If the predecessor takes longer, the letter travels twice, and
+/// nothing is lost.
 const LEAST_PATIENCE: Duration = Duration::from_millis(50);
 const MOST_PATIENCE: Duration = Duration::from_secs(1);
-/// Time in custody after which the custodian is asked whether it has the letter, and the pause until it is
-/// asked again.
+/// Time in custody after which the custodian is asked whether it has the letter, and the pause
+/// until it is asked again.
 pub(super) const ASK_CUSTODIAN_AFTER: Duration = Duration::from_secs(1);
 const ASK_CUSTODIAN_AGAIN: Duration = Duration::from_secs(2);
-/// The same when the custodian did not have another letter of this lane.
+/// The pause when the custodian did not have another letter of this lane.
 const ASK_CUSTODIAN_ON: Duration = Duration::from_millis(10);
-/// Letters of one lane that are asked about at once.
+/// Maximum number of letters of one lane that are asked about at once.
 const ASKED_AT_ONCE: usize = 16;
-/// Letters that left a lane are remembered, at most this many.
+/// Maximum number of remembered letters that left a lane.
 const MAX_LEFT: usize = 64;
 
 impl Lane {
-    /// A copy of a letter that may be here already. Returns what it came with when it is not.
+    /// Handles a copy of a letter that may be in the lane already; returns `upstream` if it is not.
     pub(crate) fn adopt(
         &mut self,
         now: Instant,
         (sequence, after): (u64, u64),
         upstream: Upstream,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) -> Result<(), Upstream> {
         let Some(index) = self.index(sequence) else {
             return Err(upstream);
         };
         let delivery = &mut self.letters[index];
-        delivery.custody_taken(desk);
+        delivery.custody_taken(table);
         delivery.add_upstream(upstream);
-        self.lower_predecessor(index, after, desk);
-        self.pump(now, desk);
+        self.lower_predecessor(index, after, table);
+        self.pump(now, table);
         Ok(())
     }
 
-    /// A note says which predecessor this letter has now, and asks whether the letter of this hand-over
-    /// is here. Believed from the service that handed it over. Returns whether it is here.
-    pub(crate) fn predecessor_told(
+    /// Handles a note with the current predecessor of this letter, which also asks whether the
+    /// letter of this hand-over is here. Accepted only from the service that handed it over.
+    /// Returns whether the letter is here.
+    pub(crate) fn handle_predecessor_note(
         &mut self,
         now: Instant,
         from: Incarnation,
         (sequence, after, transfer): (u64, u64, u64),
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) -> bool {
         let index = self.index(sequence);
         let index = index.filter(|index| self.letters[*index].came_from(from, transfer));
         if let Some(index) = index {
-            self.lower_predecessor(index, after, desk);
-            self.pump(now, desk);
+            self.lower_predecessor(index, after, table);
+            self.pump(now, table);
         }
         index.is_some()
     }
 
-    /// How long the predecessor of the letter at `index` may take to arrive.
-    pub(super) fn predecessor_patience(&self, index: usize, desk: &Desk) -> Duration {
+    /// Maximum time for the predecessor of the letter at `index` to arrive.
+    pub(super) fn predecessor_patience(&self, index: usize, table: &AttemptTable) -> Duration {
         let upstreams = self.letters[index].upstreams();
-        let slowest = upstreams.filter_map(|it| desk.round_trip(it)).max();
+        let slowest = upstreams.filter_map(|it| table.round_trip(it)).max();
         (slowest.unwrap_or_default() * 2).clamp(LEAST_PATIENCE, MOST_PATIENCE)
     }
 
-    /// Custodians are asked at this time at the latest.
+    /// Schedules the question to custodians for this time at the latest.
     pub(super) fn ask_custodian_at(&mut self, at: Instant) {
         if self.ask_custodian.is_none_or(|due| at < due) {
             self.ask_custodian = Some(at);
@@ -83,10 +85,9 @@ impl Lane {
         }
     }
 
-    /// Asks the custodians of the letters that have been longest in custody whether they have them, and
-    /// tells them the present predecessors by the way. What the directory says of them is looked at
-    /// again, too.
-    pub(super) fn ask_custodians(&mut self, now: Instant, desk: &mut Desk) {
+    /// Asks the custodians of the letters that are longest in custody whether they have them, and
+    /// sends them the current predecessors with that. Checks the directory's data about them, too.
+    pub(super) fn ask_custodians(&mut self, now: Instant, table: &mut AttemptTable) {
         if self.ask_custodian.is_none_or(|due| due > now) {
             return;
         }
@@ -116,25 +117,25 @@ impl Lane {
             let stream = self.stream_of(delivery);
             let after = self.after(index);
             let letter = (delivery.sequence, after, attempt.0);
-            desk.predecessor(stream, self.receiver.clone(), letter, location);
+            table.predecessor(stream, self.receiver.clone(), letter, location);
             let delivery = &mut self.letters[index];
             delivery.after = delivery.after.min(after);
         }
         if asked > 0 {
             next = Some(now + ASK_CUSTODIAN_AGAIN);
-            self.check_next_hops(now, desk);
+            self.check_next_hops(now, table);
         }
         if let Some(next) = next {
             self.ask_custodian_at(next);
         }
     }
 
-    /// The custodian that was asked about this hand-over of a letter does not have it.
+    /// Handles the answer of a custodian that it does not have the letter of this hand-over.
     pub(crate) fn custodian_denied(
         &mut self,
         now: Instant,
         (registration, sequence, transfer): (Incarnation, u64, u64),
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
@@ -144,31 +145,31 @@ impl Lane {
             && matches!(delivery.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
         if is_meant {
             let text = "the gateway that had the letter in custody does not have it";
-            self.custodian_lost(now, index, text, desk);
+            self.custodian_lost(now, index, text, table);
             // It may have lost others, too.
             self.ask_custodian_at(now + ASK_CUSTODIAN_ON);
-            self.pump(now, desk);
+            self.pump(now, table);
         }
     }
 
-    /// The service that has the letter in custody is lost, or has lost it.
+    /// Handles the loss of the custodian, or of the letter at the custodian.
     pub(super) fn custodian_lost(
         &mut self,
         now: Instant,
         index: usize,
         text: &'static str,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let delivery = &mut self.letters[index];
         let before = std::mem::replace(&mut delivery.progress.state, State::Waiting);
         if let State::Custody { location, .. } = before {
-            delivery.ended(End::CustodianLost);
+            delivery.ended(AttemptEnd::CustodianLost);
             let error = WayError::new(WayFault::Broken, text);
-            self.came_back(now, index, &location, error, desk);
+            self.came_back(now, index, &location, error, table);
         }
     }
 
-    fn lower_predecessor(&mut self, index: usize, after: u64, desk: &mut Desk) {
+    fn lower_predecessor(&mut self, index: usize, after: u64, table: &mut AttemptTable) {
         let stream = self.stream_of(&self.letters[index]);
         let delivery = &mut self.letters[index];
         let lower = rules::lower(delivery.after, after);
@@ -186,7 +187,7 @@ impl Lane {
                 let transfer = delivery.progress.state.handed_over();
                 let transfer = transfer.map_or(0, |(attempt, _)| attempt.0);
                 let receiver = self.receiver.clone();
-                desk.predecessor(stream, receiver, (sequence, lower, transfer), location);
+                table.predecessor(stream, receiver, (sequence, lower, transfer), location);
             }
         }
     }
@@ -205,14 +206,20 @@ impl Lane {
         };
         match self.letters[predecessor].progress.state.handed_over() {
             None => true,
-            // What leaves on the same way arrives behind it, unless it came back from there already.
+            // A letter on the same route arrives behind it, unless it already came back from there.
             Some((attempt, _)) => delivery.progress.hold == Some(Holding::ForPredecessor(attempt)),
         }
     }
 
-    /// The letter came back because its predecessor was not taken, or was handed back by the next
-    /// custodian for that reason.
-    pub(super) fn hold(&mut self, now: Instant, index: usize, patience: Duration, desk: &mut Desk) {
+    /// Holds a letter that came back because its predecessor was not taken, or that the next
+    /// custodian returned for that reason.
+    pub(super) fn hold(
+        &mut self,
+        now: Instant,
+        index: usize,
+        patience: Duration,
+        table: &mut AttemptTable,
+    ) {
         let delivery = &self.letters[index];
         let after = delivery.after;
         work::steps(self.left.len());
@@ -221,29 +228,29 @@ impl Lane {
         let missing_for = now.saturating_duration_since(since);
         let here = self.index(after).is_some();
         match rules::hold(here, missing_for, patience) {
-            Hold::ForPredecessor => {
+            HoldDecision::ForPredecessor => {
                 let predecessor = self.index(after).map(|at| &self.letters[at]);
                 let attempt = predecessor.and_then(|it| it.progress.state.handed_over());
                 let hold = attempt.map(|(attempt, _)| Holding::ForPredecessor(attempt));
                 self.letters[index].progress.hold = hold;
             }
-            Hold::For(rest) => {
+            HoldDecision::For(rest) => {
                 let until = now + rest;
                 self.holds = true;
                 self.letters[index].progress.hold = Some(Holding::Until(until));
                 self.due_at(until);
             }
-            Hold::Return => self.return_letter(now, index, desk),
+            HoldDecision::Return => self.return_letter(now, index, table),
         }
     }
 
-    /// Hands a letter back to the services that handed it over.
-    pub(super) fn return_letter(&mut self, now: Instant, index: usize, desk: &mut Desk) {
+    /// Returns a letter to the services that handed it over.
+    pub(super) fn return_letter(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
         let uncertain = self.letters[index].progress.uncertain;
-        self.settle(now, index, Settlement::Returned { uncertain }, desk);
+        self.settle(now, index, Settlement::Returned { uncertain }, table);
     }
 
-    /// A letter came: those that wait for it to arrive wait for it in the lane now.
+    /// Lets letters that wait for the arrival of this one wait for it in the lane.
     pub(super) fn predecessor_came(&mut self, sequence: u64) {
         if !self.holds {
             return;
@@ -258,7 +265,7 @@ impl Lane {
         }
     }
 
-    /// A letter left the lane without being delivered.
+    /// Records a letter that left the lane without being delivered.
     pub(super) fn predecessor_failed(&mut self, now: Instant, sequence: u64) {
         if self.left.len() >= MAX_LEFT {
             self.left.pop_front();

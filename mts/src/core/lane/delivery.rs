@@ -1,4 +1,4 @@
-//! One letter on its way to one receiver, and how far it has come.
+//! The state of one letter to one receiver.
 
 use std::time::Instant;
 
@@ -8,17 +8,17 @@ use fipa_transport::{
 };
 use smallvec::SmallVec;
 
-use super::super::desk::{Action, Desk, Origin, Upstream};
-use super::super::rules::{self, End};
+use super::super::attempts::{Action, AttemptTable, Origin, Upstream};
+use super::super::rules::{self, AttemptEnd};
 
-/// Failed attempts that are remembered for one letter's outcome.
+/// Maximum number of failed attempts in one letter's outcome.
 const MAX_ATTEMPTS: usize = 16;
-/// Services that hand over copies of one letter and are told its outcome.
+/// Maximum number of services that hand over copies of one letter and get its outcome.
 const MAX_UPSTREAMS: usize = 4;
-/// Services that one letter was handed to, whose reports are believed.
+/// Maximum number of services that one letter was handed to, whose reports count.
 const MAX_HANDED: usize = 16;
 
-/// One letter on its way to one receiver.
+/// The delivery of one letter to one receiver.
 #[derive(Debug)]
 pub(crate) struct Delivery {
     pub(crate) origin: Origin,
@@ -26,50 +26,50 @@ pub(crate) struct Delivery {
     pub(crate) sequence: u64,
     /// The receiver's registration that the letter is for.
     pub(crate) registration: Incarnation,
-    /// The predecessor. At a custodian as the letter's sender told it; at the sender's process as
-    /// the latest copy says it.
+    /// The predecessor: at a custodian as received with the letter, at the sender's process as in
+    /// the latest copy.
     pub(crate) after: u64,
     pub(crate) deadline: Instant,
-    /// When the letter came here.
+    /// Time of arrival in this lane.
     pub(crate) since: Instant,
-    /// When the service that handed the letter over is told that it is in custody, unless its
-    /// outcome is known before.
+    /// Time at which the service that handed the letter over is told that it is in custody, unless
+    /// its outcome is known earlier.
     pub(crate) custody_due: Option<Instant>,
-    /// Not dispatched before this time.
+    /// Earliest time of dispatch.
     pub(crate) not_before: Option<Instant>,
     pub(super) progress: Progress,
 }
 
-/// How far a letter has come.
+/// Progress of a delivery.
 #[derive(Debug)]
 pub(super) struct Progress {
     pub(super) state: State,
     /// Failed attempts, for the outcome.
     pub(super) attempts: Vec<Attempt>,
-    /// The ways tried in this round.
+    /// Locations tried in this round.
     pub(super) tried: SmallVec<[Location; 1]>,
     /// The services that the letter was handed to, and whether over a route within the host.
     pub(super) handed: SmallVec<[(Incarnation, bool); 2]>,
-    /// An attempt may have delivered it. Never cleared.
+    /// Whether an attempt may have delivered it. Never cleared.
     pub(super) uncertain: bool,
-    /// The receiver's queue was full.
+    /// Whether the receiver's queue was full.
     pub(super) busy: bool,
-    /// Since when it fits none of the kinds that its receiver shows.
+    /// Time since which it fits none of the receiver's kinds of transport.
     pub(super) unfit_since: Option<Instant>,
-    /// The letter came back because its predecessor was not taken.
+    /// Set when the letter came back because its predecessor was not taken.
     pub(super) hold: Option<Holding>,
 }
 
-/// What a letter that came back as out of order waits for.
+/// The event that a letter which came back as out of order waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Holding {
     /// The end of this attempt or custody of its predecessor, which is in this lane.
     ForPredecessor(AttemptId),
-    /// The arrival of the predecessor, until this time; then the letter is handed back.
+    /// The arrival of the predecessor, until this time; then the letter is returned.
     Until(Instant),
 }
 
-/// Where a letter is.
+/// Position of a letter.
 #[derive(Debug)]
 pub(super) enum State {
     Waiting,
@@ -77,20 +77,20 @@ pub(super) enum State {
         attempt: AttemptId,
         location: Location,
         times_out: Instant,
-        /// The transport has been asked to end the attempt, and concludes it at once.
+        /// Whether the transport was asked to end the attempt, whose conclusion follows at once.
         abandoned: bool,
     },
     Custody {
         /// The attempt that handed it over.
         attempt: AttemptId,
         location: Location,
-        /// When the custodian said so.
+        /// Time of the custodian's answer.
         since: Instant,
     },
 }
 
 impl State {
-    /// The latest hand-over, and where it went, unless the letter is here.
+    /// The latest hand-over and its location, unless the letter is in this lane.
     pub(super) fn handed_over(&self) -> Option<(AttemptId, &Location)> {
         match self {
             Self::Waiting => None,
@@ -105,7 +105,7 @@ impl State {
 }
 
 impl Delivery {
-    /// A letter for this registration of its receiver.
+    /// Creates a delivery for this registration of its receiver.
     pub(crate) fn new(
         now: Instant,
         origin: Origin,
@@ -141,18 +141,19 @@ impl Delivery {
         matches!(self.progress.state, State::Waiting)
     }
 
-    /// An attempt, or a custody, has ended like this.
-    pub(super) fn ended(&mut self, end: End) {
+    /// Records the end of an attempt or a custody.
+    pub(super) fn ended(&mut self, end: AttemptEnd) {
         self.progress.uncertain = rules::stays_uncertain(self.progress.uncertain, end);
     }
 
-    /// Remembers a failed attempt. Of many, the first ones and the last one at each location stay.
+    /// Records a failed attempt. Of many, the first ones and the last one at each location are
+    /// kept.
     pub(super) fn failed_at(&mut self, location: &Location, error: WayError) {
         let attempts = &mut self.progress.attempts;
         if attempts.len() >= MAX_ATTEMPTS {
             let mut known = attempts.iter().rev();
             let same = known.position(|attempt| attempt.location == *location);
-            // Without one at this location, the newest gives way.
+            // Without one at this location, the newest is replaced.
             attempts.remove(attempts.len() - 1 - same.unwrap_or(0));
         }
         attempts.push(Attempt {
@@ -162,7 +163,7 @@ impl Delivery {
         });
     }
 
-    /// Remembers that reports of the service at this location are believed.
+    /// Records that reports of the service at this location count.
     pub(super) fn handed_to(&mut self, location: &Location) {
         let service = location.incarnation();
         let handed = &mut self.progress.handed;
@@ -172,8 +173,8 @@ impl Delivery {
         }
     }
 
-    /// Whether the letter was ever handed to this service. One of this host, which proves nothing to
-    /// others, is not believed to be on another.
+    /// Whether the letter was ever handed to this service. A service of this host has no proof on
+    /// the network, so a report from another host in its name does not count.
     pub(super) fn was_handed_to(&self, service: &Hop) -> bool {
         let mut handed = self.progress.handed.iter();
         handed.any(|(incarnation, local)| {
@@ -197,7 +198,7 @@ impl Delivery {
         reason
     }
 
-    /// The reason when its deadline has passed. `behind_full_queue` is whether a letter before it
+    /// The reason when its deadline has passed. `behind_full_queue` is whether an earlier letter
     /// met a full queue.
     pub(super) fn reason_at_deadline(&self, behind_full_queue: bool) -> FailureReason {
         let progress = &self.progress;
@@ -212,12 +213,12 @@ impl Delivery {
         }
     }
 
-    /// Tells the services that wait for an answer that the letter is in custody.
-    pub(super) fn custody_taken(&mut self, desk: &mut Desk) {
+    /// Answers the services that wait for an answer that the letter is in custody.
+    pub(super) fn custody_taken(&mut self, table: &mut AttemptTable) {
         if let Origin::Forwarded { upstreams } = &mut self.origin {
             for upstream in upstreams {
                 if let Some((kind, ticket)) = upstream.unanswered.take() {
-                    desk.actions.push_back(Action::Answer {
+                    table.actions.push_back(Action::Answer {
                         kind,
                         ticket,
                         answer: Answer::Custody,
@@ -228,8 +229,8 @@ impl Delivery {
         self.custody_due = None;
     }
 
-    /// Another copy has come: the service that handed it over is told the outcome of this letter,
-    /// for the latest copy that it handed over.
+    /// Adds a service that handed over another copy, or updates the hand-over of a known one: it
+    /// gets the outcome for its latest copy.
     pub(super) fn add_upstream(&mut self, upstream: Upstream) {
         let Origin::Forwarded { upstreams } = &mut self.origin else {
             return;
@@ -245,7 +246,7 @@ impl Delivery {
         }
     }
 
-    /// Whether this service has handed the letter over, this time at the latest.
+    /// Whether this service handed the letter over, in this hand-over or a later one.
     pub(super) fn came_from(&self, service: Incarnation, transfer: u64) -> bool {
         match &self.origin {
             Origin::Forwarded { upstreams } => upstreams.iter().any(|upstream| {
@@ -255,7 +256,7 @@ impl Delivery {
         }
     }
 
-    /// The services that have handed the letter over.
+    /// The services that handed the letter over.
     pub(super) fn upstreams(&self) -> impl Iterator<Item = Incarnation> {
         let upstreams = match &self.origin {
             Origin::Forwarded { upstreams } => upstreams.as_slice(),

@@ -1,16 +1,16 @@
-//! A lane: letters that have no outcome yet, in order, and where each of them stands.
+//! A lane: open letters in order, and the state of each.
 //!
 //! The sender's process has one lane for each pair of a sender and the *name* of a receiver, so
 //! that letters for a new registration wait for those of the old one. A custodian has one lane for
-//! each stream. [`rules`] has what the two must do and why; this is how they do it.
+//! each stream. The module [`rules`] states the rules; the lane applies them.
 //!
-//! Letters are dispatched in order and only along one way at a time. When one comes back, the
-//! lane waits until everything under way has been heard of, and goes on from the earliest letter
-//! that waits.
+//! Letters are dispatched in order and only on one route at a time. When a letter comes back, the
+//! lane waits until all letters in transit have ended, and continues with the earliest waiting
+//! letter.
 //!
-//! Here is what moves letters on; [`answers`] is what comes back, [`clock`] what time does,
-//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter, [`tried`] what
-//! letters tell that were never dispatched.
+//! This module dispatches letters; [`answers`] handles answers and reports, [`clock`] timeouts,
+//! [`custody`] predecessors at custodians, [`delivery`] the state of one letter, [`tried`] the
+//! attempts that are reported for letters that were never dispatched.
 //!
 //! [`rules`]: super::rules
 
@@ -32,44 +32,47 @@ use fipa_transport::{
 
 pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
-use super::desk::{Author, Desk, Origin, Purpose, Settlement, Undelivered, life_of};
+use super::attempts::{
+    AttemptTable, FailureTarget, Origin, Purpose, Settlement, Undelivered, registration_of,
+};
 use super::routes::Tally;
 use super::rules;
 use super::work;
 
-/// Pauses between rounds over all ways, and before a letter that was handed back goes out again.
+/// Pauses between rounds over all routes, and before a returned letter is dispatched again.
 const FIRST_PAUSE: Duration = Duration::from_millis(10);
 const LONGEST_PAUSE: Duration = Duration::from_millis(500);
-/// Pause towards a busy receiver when no credit comes.
+/// Pause for a busy receiver without a credit.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
-/// Pause of a lane that waits for room on its way, and how many in a row count as a failure of
-/// the way.
+/// Pause of a lane that waits for room on its route, and the number of consecutive pauses that
+/// count as a failure of the route.
 const CONGESTED_PAUSE: Duration = Duration::from_millis(20);
 const CONGESTED_TRIES: u32 = 25;
-/// A large letter may take longer: this many bytes a second are expected at least.
+/// Minimum expected throughput, which extends the timeout of large letters.
 const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
-/// What is taken off the remaining time at every hop, so that services further down the way give
-/// up first and can still say why.
+/// Subtracted from the remaining time at every hop, so that services further down the route time
+/// out first and can still report the reason.
 const HOP_MARGIN: Duration = Duration::from_millis(100);
-/// How long a letter waits for the new registration of a receiver that has moved.
+/// Time for which a letter waits for the new registration of a receiver that has moved.
 const MOVING_PATIENCE: Duration = Duration::from_secs(2);
-/// How long letters that were handed over for a registration that has ended are waited for.
+/// Time for which letters that were handed over for an ended registration are waited for.
 const ENDED_PATIENCE: Duration = Duration::from_secs(2);
-/// How long a letter that is too large for the kinds that its receiver shows waits for another kind.
+/// Time for which a letter that is too large for the receiver's current kinds of transport waits
+/// for another kind.
 const KIND_PATIENCE: Duration = Duration::from_secs(2);
 
 /// The number of a lane within its core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct LaneId(pub(crate) u64);
 
-/// What a lane is for.
+/// The letters of a lane.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) enum LaneKey {
-    /// Letters that this process sends: from this agent or service, to all registrations of this
+    /// Letters that this process sends, from this agent or service to all registrations of this
     /// name.
     Name(Incarnation, Arc<str>),
-    /// Letters that this process sends to this registration of a service, whose name others may
-    /// have too.
+    /// Letters that this process sends to this registration of a service, whose name other services
+    /// may have.
     Service(Stream),
     /// Letters of others in custody.
     Custody(Stream),
@@ -81,46 +84,45 @@ pub(crate) struct Lane {
     key: LaneKey,
     sender: Incarnation,
     receiver: Arc<str>,
-    /// Where the receiver says that it can be reached, if the directory does not know it.
-    said: Option<Arc<Entry>>,
+    /// The location that the receiver stated itself, if it is not in the directory.
+    stated: Option<Arc<Entry>>,
     letters: VecDeque<Delivery>,
     bytes: usize,
     under_way: usize,
-    /// The way that letters under way go.
-    way: Option<Location>,
-    /// Where it is counted what happens on that way, also when it was the last one.
+    /// The route of the letters in transit.
+    route: Option<Location>,
+    /// Counters of the current or last route.
     tally: Option<(Location, Arc<Tally>)>,
-    /// The last error of each route that has failed since the lane was empty, and has not worked since.
-    /// Letters that never had an attempt of their own tell them.
+    /// The latest error of each route that failed since the lane was empty and has not worked
+    /// since. Reported for letters without an attempt of their own.
     failed: Vec<Attempt>,
-    /// Something came back: nothing is dispatched until all that is under way has been heard of.
+    /// Whether a letter came back: nothing is dispatched until all letters in transit have ended.
     recovering: bool,
     paused_until: Option<Instant>,
-    /// The pause is for a lower letter, and ends with it.
+    /// Whether the pause is for a lower letter, with whose end it ends.
     paused_for_lower: bool,
     pauses: u32,
-    /// The receiver's queue was full when it was last heard of.
+    /// Whether the receiver's queue was full at its last answer.
     busy: bool,
-    /// When it was last full.
+    /// Time at which it was last full.
     was_busy: Option<Instant>,
-    /// A registration that has moved, and until when its successor is waited for.
+    /// A registration that has moved, and the end of the wait for its successor.
     moving: Option<(Incarnation, Instant)>,
-    /// A registration that has left the directory, and when something was last heard about
-    /// letters for it.
+    /// A registration that left the directory, and the time of the last event of letters for it.
     ended: Option<(Incarnation, Instant)>,
-    /// When custodians are asked whether they have letters of this lane.
+    /// Time at which custodians are asked whether they have letters of this lane.
     ask_custodian: Option<Instant>,
     /// Whether a letter may wait for its predecessor to arrive.
     holds: bool,
     /// Letters that left this lane without being delivered, and when.
     left: VecDeque<(u64, Instant)>,
-    /// When something is due by the clock at the earliest.
+    /// Earliest time at which a timer of this lane is due.
     due: Option<Instant>,
-    /// When the core's timer will look at this lane next.
+    /// Time at which the core's timer visits this lane next.
     pub(crate) scheduled: Option<Instant>,
-    /// How often in a row the way had no room.
+    /// Number of consecutive attempts that found no room on the route.
     congested: u32,
-    /// When something last happened here.
+    /// Time of the last activity.
     pub(crate) active: Instant,
     /// The service that was told that the lane is full, and waits for a credit.
     waiting: Option<Location>,
@@ -137,11 +139,11 @@ impl Lane {
             key,
             sender,
             receiver,
-            said: None,
+            stated: None,
             letters: VecDeque::new(),
             bytes: 0,
             under_way: 0,
-            way: None,
+            route: None,
             tally: None,
             failed: Vec::new(),
             recovering: false,
@@ -176,12 +178,12 @@ impl Lane {
         self.letters.is_empty()
     }
 
-    /// Nothing more to do.
+    /// Whether nothing is left to do.
     pub(crate) fn is_idle(&self) -> bool {
         self.letters.is_empty() && self.waiting.is_none()
     }
 
-    /// Whether what becomes of letters that are still to come depends on this lane.
+    /// Whether later letters depend on the state of this lane.
     pub(crate) fn remembers(&self) -> bool {
         !self.left.is_empty()
     }
@@ -197,27 +199,27 @@ impl Lane {
         }
     }
 
-    /// The way that a letter is going at the moment.
-    pub(crate) fn way_of(&self, sequence: u64) -> Option<&Location> {
+    /// The current route of a letter in transit.
+    pub(crate) fn route_of(&self, sequence: u64) -> Option<&Location> {
         match &self.letters[self.index(sequence)?].progress.state {
             State::UnderWay { location, .. } => Some(location),
             _ => None,
         }
     }
 
-    /// Whether there is room for another letter of this process, of this many bytes.
-    pub(crate) fn has_room(&self, len: usize, desk: &Desk) -> bool {
-        let config = &desk.config;
+    /// Whether there is room for another letter of this process with this many bytes.
+    pub(crate) fn has_room(&self, len: usize, table: &AttemptTable) -> bool {
+        let config = &table.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
     }
 
-    /// Whether a custodian takes this letter. A letter below one that waits for it is taken beyond
-    /// the bounds, up to twice as far.
-    pub(crate) fn admits(&self, sequence: u64, len: usize, desk: &Desk) -> bool {
-        let config = &desk.config;
-        let held = desk.held.saturating_add(len);
-        if self.has_room(len, desk) && (held <= config.custody_bytes || desk.held == 0) {
+    /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
+    /// limits, up to twice as much.
+    pub(crate) fn admits(&self, sequence: u64, len: usize, table: &AttemptTable) -> bool {
+        let config = &table.config;
+        let held = table.held.saturating_add(len);
+        if self.has_room(len, table) && (held <= config.custody_bytes || table.held == 0) {
             return true;
         }
         let highest = self.letters.back().map(|delivery| delivery.sequence);
@@ -230,15 +232,15 @@ impl Lane {
     /// Whether letters wait for a pause to end, and the receiver has such a location.
     pub(crate) fn is_paused_towards(
         &self,
-        desk: &Desk,
+        table: &AttemptTable,
         is_meant: impl Fn(&Location) -> bool,
     ) -> bool {
         let first = self.letters.front().filter(|_| self.paused_until.is_some());
-        let entry = first.and_then(|first| self.entry(first.registration, desk));
+        let entry = first.and_then(|first| self.entry(first.registration, table));
         entry.is_some_and(|entry| entry.locations.iter().any(is_meant))
     }
 
-    /// When the lane must be looked at again at the latest.
+    /// Latest time of the next visit.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.due
     }
@@ -249,25 +251,25 @@ impl Lane {
         }
     }
 
-    /// Where this registration of the receiver can be reached: as the directory has it, or as it
-    /// said itself when the directory does not know it. None when it has moved.
-    fn entry(&self, registration: Incarnation, desk: &Desk) -> Option<Arc<Entry>> {
+    /// The entry of this registration of the receiver: from the directory, or as the receiver
+    /// stated it. `None` when it has moved.
+    fn entry(&self, registration: Incarnation, table: &AttemptTable) -> Option<Arc<Entry>> {
         if self.moving.is_some_and(|(moved, _)| moved == registration) {
             return None;
         }
-        let known = desk.receiver(registration, &self.receiver);
-        known.or_else(|| self.said.clone())
+        let known = table.receiver(registration, &self.receiver);
+        known.or_else(|| self.stated.clone())
     }
 
-    /// The receiver is not in the directory, but has said where it can be reached.
-    pub(crate) fn said(&mut self, entry: Arc<Entry>) {
-        self.said = Some(entry);
+    /// Sets the entry that a receiver outside the directory stated.
+    pub(crate) fn set_stated(&mut self, entry: Arc<Entry>) {
+        self.stated = Some(entry);
     }
 
-    /// Puts a letter in, at its place in the order.
-    pub(crate) fn push(&mut self, delivery: Delivery, desk: &mut Desk) {
+    /// Inserts a letter at its position in the order.
+    pub(crate) fn push(&mut self, delivery: Delivery, table: &mut AttemptTable) {
         let len = delivery.letter.len();
-        desk.held += len;
+        table.held += len;
         self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
@@ -285,28 +287,29 @@ impl Lane {
         self.waiting = Some(back);
     }
 
-    /// Dispatches what can be dispatched.
-    pub(crate) fn pump(&mut self, now: Instant, desk: &mut Desk) {
+    /// Dispatches all letters that can be dispatched.
+    pub(crate) fn pump(&mut self, now: Instant, table: &mut AttemptTable) {
         self.active = now;
-        self.expire(now, desk);
+        self.expire(now, table);
         if self.recovering && self.under_way == 0 {
             self.recovering = false;
-            self.way = None;
+            self.route = None;
         }
         if !self.recovering && self.paused_until.is_none_or(|until| until <= now) {
             self.paused_until = None;
             self.paused_for_lower = false;
-            self.dispatch_waiting(now, desk);
+            self.dispatch_waiting(now, table);
         }
-        self.give_credit(desk);
+        self.give_credit(table);
     }
 
-    fn dispatch_waiting(&mut self, now: Instant, desk: &mut Desk) {
+    fn dispatch_waiting(&mut self, now: Instant, table: &mut AttemptTable) {
         let mut index = 0;
-        while index < self.letters.len() && self.under_way < desk.config.window {
+        while index < self.letters.len() && self.under_way < table.config.window {
             work::steps(1);
             let registration = self.letters[index].registration;
-            // All between have the same, or the loop would not have come here.
+            // All letters in between have the same registration, or the loop would have ended
+            // earlier.
             if !rules::may_dispatch(self.first_registration(), registration) {
                 break;
             }
@@ -320,22 +323,23 @@ impl Lane {
                 self.due_at(until);
                 break;
             }
-            let Some(entry) = self.entry(registration, desk) else {
-                if self.receiver_left(now, index, desk) {
+            let Some(entry) = self.entry(registration, table) else {
+                if self.receiver_left(now, index, table) {
                     continue;
                 }
                 break;
             };
-            match desk.choose(now, &entry, &self.letters[index].progress.tried) {
-                Some(way) if self.under_way == 0 || self.way.as_ref() == Some(&way) => {
-                    self.dispatch(now, index, way, desk);
+            match table.choose(now, &entry, &self.letters[index].progress.tried) {
+                Some(route) if self.under_way == 0 || self.route.as_ref() == Some(&route) => {
+                    self.dispatch(now, index, route, table);
                     index += 1;
                 }
-                // Another way than the letters before it: not before they have arrived.
+                // A different route than that of earlier letters must wait until those have
+                // arrived.
                 Some(_) => break,
                 None if self.under_way > 0 => break,
                 None => {
-                    if !self.end_of_round(now, index, &entry, desk) {
+                    if !self.end_of_round(now, index, &entry, table) {
                         break;
                     }
                 }
@@ -350,12 +354,12 @@ impl Lane {
             .into_iter()
     }
 
-    fn dispatch(&mut self, now: Instant, index: usize, way: Location, desk: &mut Desk) {
+    fn dispatch(&mut self, now: Instant, index: usize, route: Location, table: &mut AttemptTable) {
         let after = self.after(index);
-        if let Some(tally) = self.tally_of(&way, desk) {
+        if let Some(tally) = self.tally_of(&route, table) {
             Tally::add(&tally.tried);
         }
-        let attempt = desk.next_attempt();
+        let attempt = table.next_attempt();
         let stream = self.stream_of(&self.letters[index]);
         let delivery = &mut self.letters[index];
         delivery.after = after;
@@ -371,46 +375,46 @@ impl Lane {
         };
         let size = delivery.letter.len() as u64;
         let allowance = Duration::from_millis(size.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND);
-        let times_out = now + desk.config.attempt_timeout + allowance;
+        let times_out = now + table.config.attempt_timeout + allowance;
         let purpose = Purpose::Letter {
             lane: self.id,
             sequence: delivery.sequence,
         };
-        desk.dispatch(attempt, purpose, way.clone(), parcel);
-        delivery.handed_to(&way);
-        delivery.progress.tried.push(way.clone());
+        table.dispatch(attempt, purpose, route.clone(), parcel);
+        delivery.handed_to(&route);
+        delivery.progress.tried.push(route.clone());
         delivery.progress.hold = None;
         delivery.progress.state = State::UnderWay {
             attempt,
-            location: way.clone(),
+            location: route.clone(),
             times_out,
             abandoned: false,
         };
         self.due_at(times_out);
         self.under_way += 1;
-        self.way = Some(way);
+        self.route = Some(route);
     }
 
-    /// The predecessor that the letter at `index` is dispatched with: at a custodian the one it
-    /// came with, at the sender's process the nearest open one before it.
+    /// The predecessor with which the letter at `index` is dispatched: at a custodian the one it
+    /// came with, at the sender's process the nearest open letter before it.
     fn after(&self, index: usize) -> u64 {
         let delivery = &self.letters[index];
         if self.is_custody() {
             return delivery.after;
         }
-        // Of all registrations: a letter that waits for a new one must not be passed over, either.
+        // Of all registrations: a letter that waits for a new one must not be passed over either.
         let open = self.letters.iter().take(index);
         rules::predecessor(open.map(|other| other.sequence), delivery.sequence)
     }
 
-    /// The tally of the way that letters take now: looked up when the way changes, not for each.
-    fn tally_of(&mut self, way: &Location, desk: &mut Desk) -> Option<&Tally> {
+    /// The counters of the current route, looked up only when the route changes.
+    fn tally_of(&mut self, route: &Location, table: &mut AttemptTable) -> Option<&Tally> {
         if self
             .tally
             .as_ref()
-            .is_none_or(|(counted, _)| counted != way)
+            .is_none_or(|(counted, _)| counted != route)
         {
-            self.tally = Some((way.clone(), desk.tallies.of(way)));
+            self.tally = Some((route.clone(), table.tallies.of(route)));
         }
         self.tally()
     }
@@ -419,7 +423,7 @@ impl Lane {
         self.tally.as_ref().map(|(_, tally)| &**tally)
     }
 
-    /// A letter is not under way any more.
+    /// Records that a letter is no longer in transit.
     fn back(&mut self) {
         self.under_way -= 1;
         if let Some(tally) = self.tally() {
@@ -427,8 +431,14 @@ impl Lane {
         }
     }
 
-    /// Every way was tried. Says whether the letter was settled.
-    fn end_of_round(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) -> bool {
+    /// Handles a letter for which every route was tried. Returns whether it was settled.
+    fn end_of_round(
+        &mut self,
+        now: Instant,
+        index: usize,
+        entry: &Entry,
+        table: &mut AttemptTable,
+    ) -> bool {
         let delivery = &mut self.letters[index];
         if delivery.progress.tried.is_empty() {
             let reason = match entry.is_unsupported() {
@@ -441,12 +451,12 @@ impl Lane {
                 }
                 false => FailureReason::Unreachable,
             };
-            self.fail(now, index, reason, desk);
+            self.fail(now, index, reason, table);
             return true;
         }
         delivery.progress.tried.clear();
-        if let Some(reason) = self.never_fits(now, index, desk) {
-            self.fail(now, index, reason, desk);
+        if let Some(reason) = self.never_fits(now, index, table) {
+            self.fail(now, index, reason, table);
             return true;
         }
         self.pause(now);
@@ -455,16 +465,21 @@ impl Lane {
 
     /// The reason why no repetition can succeed, after all routes of the receiver were tried.
     ///
-    /// A letter that is too large for all of them waits for a while for a kind that the directory does
-    /// not show at present and that may return. Later letters wait behind it. Kinds within a host are
-    /// left out, because they do not lead to other hosts. A letter that a legacy peer's dialect cannot
-    /// express waits for nothing.
-    fn never_fits(&mut self, now: Instant, index: usize, desk: &Desk) -> Option<FailureReason> {
+    /// A letter that is too large for all of them waits for a while for a kind of transport that the
+    /// directory does not show at present and that may return; later letters wait behind it. Kinds
+    /// within a host are excluded, because they do not lead to other hosts. A letter that a legacy
+    /// peer's dialect cannot express does not wait.
+    fn never_fits(
+        &mut self,
+        now: Instant,
+        index: usize,
+        table: &AttemptTable,
+    ) -> Option<FailureReason> {
         let delivery = &mut self.letters[index];
         let reason = delivery.unfit()?;
         let since = *delivery.progress.unfit_since.get_or_insert(now);
         let attempts = &delivery.progress.attempts;
-        let mut order = desk.config.order_for(&self.receiver).iter();
+        let mut order = table.config.order_for(&self.receiver).iter();
         let waits = reason == FailureReason::TooLarge
             && now < since + KIND_PATIENCE
             && !order.all(|kind| {
@@ -487,25 +502,25 @@ impl Lane {
         self.due_at(until);
     }
 
-    /// The registration that the letter is for has ended. Says whether the lane may go on with the
-    /// letter at this index: another one, or the same for the new registration.
-    fn receiver_left(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
+    /// Handles the end of the registration that the letter is for. Returns whether the lane may
+    /// continue with the letter at this index: another one, or the same for the new registration.
+    fn receiver_left(&mut self, now: Instant, index: usize, table: &mut AttemptTable) -> bool {
         let delivery = &self.letters[index];
         let registration = delivery.registration;
         if !rules::may_move(delivery.progress.uncertain) {
-            self.fail(now, index, FailureReason::Unconfirmed, desk);
+            self.fail(now, index, FailureReason::Unconfirmed, table);
             return true;
         }
         if self.is_custody() {
             // Only the sender's process moves letters to another registration.
-            match desk.departed.contains(now, registration) {
-                true => self.settle(now, index, Settlement::Moved, desk),
-                false => self.fail(now, index, FailureReason::NoSuchAgent, desk),
+            match table.departed.contains(now, registration) {
+                true => self.settle(now, index, Settlement::Moved, table),
+                false => self.fail(now, index, FailureReason::NoSuchAgent, table),
             }
             return true;
         }
-        let successor = desk.directory.lookup(&self.receiver);
-        let successor = successor.map(|entry| life_of(&entry));
+        let successor = table.directory.lookup(&self.receiver);
+        let successor = successor.map(|entry| registration_of(&entry));
         if let Some(successor) = successor.filter(|successor| *successor != registration) {
             let delivery = &mut self.letters[index];
             delivery.registration = successor;
@@ -519,22 +534,22 @@ impl Lane {
                 false
             }
             _ => {
-                self.fail(now, index, FailureReason::NoSuchAgent, desk);
+                self.fail(now, index, FailureReason::NoSuchAgent, table);
                 true
             }
         }
     }
 
-    /// There is room again, at the receiver or on the way to it.
-    pub(crate) fn resume(&mut self, now: Instant, desk: &mut Desk) {
+    /// Continues after room was made, at the receiver or on the route to it.
+    pub(crate) fn resume(&mut self, now: Instant, table: &mut AttemptTable) {
         self.paused_until = None;
         self.pauses = 0;
-        self.pump(now, desk);
+        self.pump(now, table);
     }
 
-    /// Gives up everything, when the sending agent goes away or the service ends. What is under
-    /// way has its outcome when its transport has concluded it, which is at once.
-    pub(crate) fn give_up(&mut self, now: Instant, desk: &mut Desk) {
+    /// Abandons all letters, when the sending agent goes away or the service ends. A letter in
+    /// transit gets its outcome from the conclusion of its transport, which follows at once.
+    pub(crate) fn give_up(&mut self, now: Instant, table: &mut AttemptTable) {
         self.recovering = true;
         work::steps(self.letters.len());
         let mut index = 0;
@@ -549,26 +564,32 @@ impl Lane {
                 } => {
                     if !std::mem::replace(abandoned, true) {
                         let error = WayError::new(WayFault::Closed, "the sender went away");
-                        desk.abandon(location.kind(), *attempt, error);
+                        table.abandon(location.kind(), *attempt, error);
                     }
                     index += 1;
                 }
                 State::Custody { .. } => {
-                    self.fail(now, index, FailureReason::Unconfirmed, desk);
+                    self.fail(now, index, FailureReason::Unconfirmed, table);
                 }
                 State::Waiting => {
                     let reason = match delivery.reason_at_deadline(false) {
                         FailureReason::TimedOut => FailureReason::Closed,
                         reason => reason,
                     };
-                    self.fail(now, index, reason, desk);
+                    self.fail(now, index, reason, table);
                 }
             }
         }
     }
 
-    /// Gives a letter up. If an attempt may have delivered it, its sender is told so.
-    fn fail(&mut self, now: Instant, index: usize, reason: FailureReason, desk: &mut Desk) {
+    /// Ends a letter as failed, or as unconfirmed if an attempt may have delivered it.
+    fn fail(
+        &mut self,
+        now: Instant,
+        index: usize,
+        reason: FailureReason,
+        table: &mut AttemptTable,
+    ) {
         let delivery = &mut self.letters[index];
         let reason = match delivery.progress.uncertain {
             true => FailureReason::Unconfirmed,
@@ -576,13 +597,13 @@ impl Lane {
         };
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
-            Origin::Local { .. } => Some(Author::Ours(self.sender)),
-            Origin::OldPeer { from } => Some(Author::Remote { from: Some(from) }),
-            Origin::Forwarded { .. } | Origin::Nobody => None,
+            Origin::Local { .. } => Some(FailureTarget::Ours(self.sender)),
+            Origin::LegacyPeer { from } => Some(FailureTarget::Remote { from: Some(from) }),
+            Origin::Forwarded { .. } | Origin::FailureMessage => None,
         };
         if let Some(sender) = sender {
             let detail = attempts.last().map(ToString::to_string).unwrap_or_default();
-            desk.undelivered.push_back(Undelivered {
+            table.undelivered.push_back(Undelivered {
                 sender,
                 receiver: Arc::clone(&self.receiver),
                 letter: delivery.letter.clone(),
@@ -591,19 +612,25 @@ impl Lane {
             });
         }
         let outcome = Outcome::Failed { reason, attempts };
-        self.settle(now, index, Settlement::Outcome(outcome), desk);
+        self.settle(now, index, Settlement::Outcome(outcome), table);
     }
 
-    /// Takes a letter out of the lane, and tells those it came from.
-    fn settle(&mut self, now: Instant, index: usize, settlement: Settlement, desk: &mut Desk) {
+    /// Removes a letter from the lane, and reports its end to its origin.
+    fn settle(
+        &mut self,
+        now: Instant,
+        index: usize,
+        settlement: Settlement,
+        table: &mut AttemptTable,
+    ) {
         let Some(delivery) = self.letters.remove(index) else {
             return;
         };
         let len = delivery.letter.len();
-        desk.held -= len;
+        table.held -= len;
         self.bytes -= len;
         if self.letters.is_empty() {
-            self.way = None;
+            self.route = None;
             self.busy = false;
             self.ended = None;
             self.moving = None;
@@ -621,15 +648,15 @@ impl Lane {
         match self.is_custody() {
             _ if delivered => {}
             true => self.predecessor_failed(now, delivery.sequence),
-            false => self.tell_predecessor(index, desk),
+            false => self.send_predecessor(index, table),
         }
         let stream = self.stream_of(&delivery);
-        desk.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
+        table.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
     }
 
-    /// The letter before the one at `index` has failed at its sender's process: the service that
-    /// holds this one is told the predecessor that it has now.
-    fn tell_predecessor(&mut self, index: usize, desk: &mut Desk) {
+    /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
+    /// failed at the sender's process.
+    fn send_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
         let Some(delivery) = self.letters.get(index) else {
             return;
         };
@@ -643,20 +670,20 @@ impl Lane {
         if after < delivery.after {
             let stream = self.stream_of(delivery);
             let letter = (delivery.sequence, after, attempt.0);
-            desk.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
+            table.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
             self.letters[index].after = after;
         }
     }
 
-    fn give_credit(&mut self, desk: &mut Desk) {
-        let config = &desk.config;
+    fn give_credit(&mut self, table: &mut AttemptTable) {
+        let config = &table.config;
         if self.letters.len() * 2 <= config.lane
             && self.bytes <= config.lane_bytes / 2
             && let Some(back) = self.waiting.take()
         {
-            // Only custodians tell that they are full.
+            // Only custodians answer that they are full.
             if let LaneKey::Custody(stream) = &self.key {
-                desk.credit(*stream, Arc::clone(&self.receiver), back);
+                table.credit(*stream, Arc::clone(&self.receiver), back);
             }
         }
     }

@@ -1,4 +1,4 @@
-//! What is told of letters whose deadline passed before they were dispatched: what was tried with the
+//! Reasons for letters whose deadline passed before they were dispatched: the attempts of the
 //! letters before them.
 
 use fipa_sds::Entry;
@@ -7,7 +7,7 @@ use fipa_transport::{Attempt, FailureReason, Location, WayError, WayFault};
 use super::Lane;
 
 impl Lane {
-    /// Notes an error of a route, unless it is about one letter only.
+    /// Records an error of a route, unless it concerns one letter only.
     pub(super) fn route_failed(&mut self, location: &Location, error: &WayError) {
         if matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
             return;
@@ -23,7 +23,7 @@ impl Lane {
         });
     }
 
-    /// Notes that a route works.
+    /// Records that a route works.
     pub(super) fn route_worked(&mut self, location: &Location) {
         if !self.failed.is_empty() {
             self.failed.retain(|attempt| attempt.location != *location);
@@ -33,7 +33,7 @@ impl Lane {
     /// The reason for the letter at `index`, which waits and whose deadline has passed. A letter
     /// without attempts of its own gets those of the letters before it.
     pub(super) fn reason_while_waiting(&mut self, index: usize) -> FailureReason {
-        // Full since the letter came: what waits behind others has met no full queue itself.
+        // Only a queue that was full since the letter arrived counts.
         let since = self.letters[index].since;
         let busy = self.busy || self.was_busy.is_some_and(|at| at >= since);
         let waits_behind = self.waits_behind();
@@ -50,7 +50,7 @@ impl Lane {
 
     /// The route on which letters have no answer yet.
     fn waits_behind(&self) -> Option<Attempt> {
-        let location = self.way.as_ref().filter(|_| self.under_way > 0)?;
+        let location = self.route.as_ref().filter(|_| self.under_way > 0)?;
         let detail = format!("letters before it have no answer ({})", self.under_way);
         Some(Attempt {
             via: location.kind(),

@@ -89,12 +89,12 @@ fn only(mut events: Vec<Event>) -> Arc<Passage> {
 }
 
 #[test]
-fn sender_and_receiver_tell_of_one_letter() {
+fn records_of_sender_and_receiver_are_one_letter() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
     joiner.handle(now, B, seen(2, id(7, 1), Seen::Taken(Some(Kind::Shm))));
     joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(Some(4))));
     joiner.handle(now, A, settled(3, id(7, 1), delivered(Kind::Shm), true));
-    assert!(joiner.poll_event(now).is_none(), "held back for a moment");
+    assert!(joiner.poll_event(now).is_none(), "held back");
     assert_eq!(joiner.poll_timeout(), Some(now + HOLD));
     let passage = only(all(&mut joiner, now + HOLD));
     assert_eq!(
@@ -109,7 +109,7 @@ fn sender_and_receiver_tell_of_one_letter() {
     joiner.handle(now, B, seen(2, id(7, 1), Seen::Taken(Some(Kind::Shm))));
     assert!(
         all(&mut joiner, now + PATIENCE * 2).is_empty(),
-        "told already"
+        "reported already"
     );
 }
 
@@ -124,9 +124,9 @@ fn a_late_outcome_is_an_event_of_its_own() {
 }
 
 #[test]
-fn letters_are_told_in_the_order_in_which_they_were_sent() {
+fn letters_are_reported_in_the_order_of_sending() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
-    // The answer's process was quicker to tell than the question's.
+    // The record of the answer arrives before that of the question.
     joiner.handle(now, B, seen(5, id(8, 1), Seen::Sent(None)));
     joiner.handle(now, B, settled(6, id(8, 1), delivered(Kind::Shm), true));
     let soon = now + HOLD / 2;
@@ -134,7 +134,7 @@ fn letters_are_told_in_the_order_in_which_they_were_sent() {
     joiner.handle(soon, A, settled(7, id(7, 1), delivered(Kind::Shm), true));
     assert!(
         all(&mut joiner, now + HOLD).is_empty(),
-        "the first is waited for"
+        "the first letter is still held back"
     );
     let senders: Vec<u64> = all(&mut joiner, soon + HOLD)
         .iter()
@@ -147,7 +147,7 @@ fn letters_are_told_in_the_order_in_which_they_were_sent() {
 }
 
 #[test]
-fn a_letter_through_the_gateway_has_the_way_between_the_hosts() {
+fn a_letter_through_the_gateway_has_the_transport_between_the_hosts() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
     let hello = RecordBody::Hello {
         name: "rover-mts".into(),
@@ -156,7 +156,7 @@ fn a_letter_through_the_gateway_has_the_way_between_the_hosts() {
     };
     joiner.handle_begin(GATEWAY, "process 3");
     joiner.handle(now, GATEWAY, record(0, hello));
-    // Out.
+    // Outgoing.
     joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(None)));
     joiner.handle(
         now,
@@ -172,7 +172,7 @@ fn a_letter_through_the_gateway_has_the_way_between_the_hosts() {
     let out = only(all(&mut joiner, now + HOLD));
     assert_eq!(out.via, Some(Kind::Tcp));
     assert_eq!(out.gateway.as_deref(), Some("rover-mts"));
-    // In.
+    // Incoming.
     joiner.handle(
         now,
         GATEWAY,
@@ -190,7 +190,7 @@ fn a_letter_through_the_gateway_has_the_way_between_the_hosts() {
 }
 
 #[test]
-fn what_is_lost_is_told_once() {
+fn lost_records_are_reported_once() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
     joiner.handle_begin(A, "process 1");
     for lost in [0, 3, 3, 10] {
@@ -211,7 +211,7 @@ fn what_is_lost_is_told_once() {
 }
 
 #[test]
-fn who_tells_nonsense_is_named() {
+fn a_process_that_sends_invalid_data_is_named() {
     let mut joiner = Joiner::new();
     joiner.handle_begin(A, "process 1");
     joiner.handle_malformed(A, RecordError::Version(9));
@@ -223,24 +223,24 @@ fn who_tells_nonsense_is_named() {
 }
 
 #[test]
-fn what_nobody_settles_does_not_take_more_and_more_memory() {
+fn memory_for_letters_without_an_outcome_is_bounded() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
-    let mut told = 0;
-    for sequence in 0..(MAX_WAITING + MAX_TOLD + 5000) as u64 {
+    let mut reported = 0;
+    for sequence in 0..(MAX_WAITING + MAX_REPORTED + 5000) as u64 {
         joiner.handle(now, A, seen(sequence, id(7, sequence), Seen::Sent(None)));
         joiner.handle(now, A, settled(1, id(8, sequence), failed(), true));
-        told += all(&mut joiner, now).len();
+        reported += all(&mut joiner, now).len();
     }
-    assert_eq!(told, MAX_TOLD + 5000);
-    assert!(joiner.waiting.len() <= MAX_WAITING && joiner.told.len() <= MAX_TOLD);
-    assert!(joiner.letters.len() <= MAX_WAITING + MAX_TOLD && joiner.early.len() <= MAX_EARLY);
+    assert_eq!(reported, MAX_REPORTED + 5000);
+    assert!(joiner.waiting.len() <= MAX_WAITING && joiner.reported.len() <= MAX_REPORTED);
+    assert!(joiner.letters.len() <= MAX_WAITING + MAX_REPORTED && joiner.early.len() <= MAX_EARLY);
 }
 
-/// Letters of several senders, told by up to four records each that arrive late, in any order,
-/// twice or not at all: each letter of which anything was seen is told once, in the order of
-/// sending, with the outcome that its sender knows.
+/// Letters of several senders, with up to four records each that arrive late, in any order, twice
+/// or not at all: each letter with at least one record is reported once, in the order of sending,
+/// with the outcome that its sender knows.
 #[test]
-fn whatever_arrives_each_letter_is_told_once_and_in_order() {
+fn each_letter_is_reported_once_and_in_order() {
     for seed in 0..300 {
         let mut random = fastrand::Rng::with_seed(seed);
         let start = Instant::now();
@@ -254,7 +254,7 @@ fn whatever_arrives_each_letter_is_told_once_and_in_order() {
             } else {
                 failed()
             };
-            let told = random.u8(..);
+            let reported = random.u8(..);
             let records = [
                 (A, seen(ms, letter(), Seen::Sent(Some(sequence)))),
                 (B, seen(ms, letter(), Seen::Taken(Some(Kind::Shm)))),
@@ -265,7 +265,7 @@ fn whatever_arrives_each_letter_is_told_once_and_in_order() {
                 (A, settled(ms, letter(), outcome.clone(), true)),
             ];
             for (bit, (source, record)) in records.into_iter().enumerate() {
-                if told & (1 << bit) == 0 {
+                if reported & (1 << bit) == 0 {
                     continue;
                 }
                 for _ in 0..random.u8(1..3) {
@@ -273,25 +273,27 @@ fn whatever_arrives_each_letter_is_told_once_and_in_order() {
                     arrivals.push((late, source, record.clone()));
                 }
             }
-            if told & 0b0111 != 0 {
-                let known = (told & 0b1000 != 0).then_some(outcome);
+            if reported & 0b0111 != 0 {
+                let known = (reported & 0b1000 != 0).then_some(outcome);
                 expected.insert((Incarnation::from_u64(sender), sequence), known);
             }
         }
         random.shuffle(&mut arrivals);
         arrivals.sort_by_key(|(ms, ..)| *ms);
         let mut joiner = Joiner::new();
-        let mut told: Vec<(SystemTime, Key, Fate)> = Vec::new();
+        let mut reported: Vec<(SystemTime, Key, Fate)> = Vec::new();
         let mut take = |joiner: &mut Joiner, now| {
             while let Some(event) = joiner.poll_event(now) {
                 match event {
                     Event::Letter(it) => {
-                        told.push((it.at, (it.stream.sender, it.sequence), it.fate.clone()));
+                        reported.push((it.at, (it.stream.sender, it.sequence), it.fate.clone()));
                     }
                     Event::Later(it) => {
                         let key = (it.stream.sender, it.sequence);
-                        let first = told.iter_mut().find(|(_, told, _)| *told == key);
-                        first.expect("told before").2 = it.fate.clone();
+                        let first = reported
+                            .iter_mut()
+                            .find(|(_, reported, _)| *reported == key);
+                        first.expect("reported before").2 = it.fate.clone();
                     }
                     other => panic!("{other:?}"),
                 }
@@ -304,15 +306,15 @@ fn whatever_arrives_each_letter_is_told_once_and_in_order() {
         }
         take(&mut joiner, start + Duration::from_secs(10));
         assert!(
-            told.is_sorted_by_key(|(at, ..)| *at),
-            "seed {seed}: {told:?}"
+            reported.is_sorted_by_key(|(at, ..)| *at),
+            "seed {seed}: {reported:?}"
         );
-        assert_eq!(told.len(), expected.len(), "seed {seed}");
-        for (_, key, fate) in &told {
+        assert_eq!(reported.len(), expected.len(), "seed {seed}");
+        for (_, key, fate) in &reported {
             match expected.remove(key) {
                 Some(Some(outcome)) => assert_eq!(*fate, Fate::Settled(outcome), "seed {seed}"),
                 Some(None) => assert!(!matches!(fate, Fate::Settled(_)), "seed {seed}"),
-                None => panic!("seed {seed}: {key:?} was told twice, or never sent"),
+                None => panic!("seed {seed}: {key:?} was reported twice, or never sent"),
             }
         }
         assert!(joiner.finish().is_none() && joiner.poll_timeout().is_none());

@@ -68,14 +68,14 @@ fn at() -> SystemTime {
     UNIX_EPOCH + Duration::from_nanos(1_700_000_000_123_456_789)
 }
 
-fn written(news: News, wish: Wish) -> Bytes {
-    let mut bytes = of(&notice(news), wish, at());
+fn written(news: News, request: Wish) -> Bytes {
+    let mut bytes = of(&notice(news), request, at());
     set_lost(&mut bytes, 5);
     bytes.into()
 }
 
 #[test]
-fn what_was_written_is_read() {
+fn records_survive_a_round_trip() {
     for news in all() {
         let record = Record::parse(&written(news.clone(), Wish { content: 2 })).unwrap();
         assert_eq!((record.at, record.lost), (at(), 5));
@@ -113,7 +113,7 @@ fn what_was_written_is_read() {
 }
 
 #[test]
-fn content_is_not_told_unless_asked_for() {
+fn content_is_not_included_unless_requested() {
     let News::Sent { send, .. } = all().remove(0) else {
         panic!("not the first");
     };
@@ -130,7 +130,7 @@ fn content_is_not_told_unless_asked_for() {
 }
 
 #[test]
-fn a_greeting_and_a_loss_are_read() {
+fn a_greeting_and_a_loss_survive_a_round_trip() {
     let bytes = hello("rover-mts", Incarnation::from_u64(3), true, at()).into();
     let hello = RecordBody::Hello {
         name: "rover-mts".into(),
@@ -145,7 +145,7 @@ fn a_greeting_and_a_loss_are_read() {
 }
 
 #[test]
-fn a_letter_that_cannot_be_read_is_told_all_the_same() {
+fn a_letter_that_cannot_be_decoded_is_recorded() {
     let garbage = Letter::new(
         Bytes::from_static(b"\xfe\xff"),
         Bytes::from_static(b"\xfa\x10"),
@@ -175,8 +175,8 @@ fn long_parts_are_left_out_and_every_record_fits_a_datagram() {
         .build()
         .unwrap();
     let letter = letter_for(&message, at()).unwrap();
-    let wish = Wish { content: u32::MAX };
-    let bytes = written(News::Sent { send: None, letter }, wish);
+    let request = Wish { content: u32::MAX };
+    let bytes = written(News::Sent { send: None, letter }, request);
     assert!(bytes.len() <= MAX_LEN);
     let RecordBody::Letter { letter, .. } = Record::parse(&bytes).unwrap().body else {
         panic!("not a letter");
@@ -187,7 +187,7 @@ fn long_parts_are_left_out_and_every_record_fits_a_datagram() {
 }
 
 #[test]
-fn truncations_and_changed_bytes_are_refused_or_harmless() {
+fn corrupted_records_are_rejected_or_parsed_without_panic() {
     let mut records: Vec<Bytes> = all()
         .into_iter()
         .map(|news| written(news, Wish { content: 100 }))
@@ -204,14 +204,14 @@ fn truncations_and_changed_bytes_are_refused_or_harmless() {
                 let place = random.usize(..changed.len());
                 changed[place] = random.u8(..);
             }
-            // Whether it can be read or not: nothing else happens.
+            // Only a panic would be a failure.
             let _ = Record::parse(&changed.into());
         }
     }
 }
 
 #[test]
-fn each_thing_that_is_wrong_is_told() {
+fn each_kind_of_error_is_reported() {
     let whole = written(all().remove(0), Wish::default()).to_vec();
     let with = |place: usize, value: u8| {
         let mut changed = whole.clone();
@@ -234,14 +234,14 @@ fn written_bytes(header: Header) -> Bytes {
 }
 
 #[test]
-fn a_wish_is_read_and_nothing_else_is() {
-    let wish = Wish { content: 513 };
-    assert_eq!(Wish::parse(&wish.to_bytes()), Some(wish));
+fn a_request_survives_a_round_trip_and_other_bytes_are_rejected() {
+    let request = Wish { content: 513 };
+    assert_eq!(Wish::parse(&request.to_bytes()), Some(request));
     for len in 0..Wish::LEN {
-        assert_eq!(Wish::parse(&wish.to_bytes()[..len]), None);
+        assert_eq!(Wish::parse(&request.to_bytes()[..len]), None);
     }
     assert_eq!(
-        Wish::parse(&[wish.to_bytes().as_slice(), b"x"].concat()),
+        Wish::parse(&[request.to_bytes().as_slice(), b"x"].concat()),
         None
     );
     assert_eq!(Wish::parse(b"fipw\x02\x00\x00\x00\x00\x00"), None);

@@ -1,4 +1,4 @@
-//! What a browser does with packets and time.
+//! Reactions of a browser to packets and time.
 
 use std::net::Ipv4Addr;
 
@@ -8,7 +8,7 @@ use super::super::packet::tests::{Part, answer, asked};
 use super::*;
 
 const HOST: &str = "host.local";
-/// Where packets come from.
+/// Source address of the packets.
 const FROM: IpAddr = IpAddr::V4(Ipv4Addr::new(192, 0, 2, 9));
 const OWN: Incarnation = Incarnation::from_u64(1);
 const OTHER: Incarnation = Incarnation::from_u64(7);
@@ -25,30 +25,30 @@ fn announced(label: &str, text: &[u8], ttl: u32) -> Vec<u8> {
     )
 }
 
-/// A browser that has heard these announced by nobody in particular.
+/// A browser that received records with these labels from one host.
 fn browser(now: Instant, labels: &[&str]) -> Browser {
     let mut browser = Browser::new(now, OWN, 0.0);
     for label in labels {
-        let heard = browser.handle_packet(now, FROM, &announced(label, b"TYPE=x", 120), 0.0);
-        assert_eq!(names(&heard), [*label]);
+        let received = browser.handle_packet(now, FROM, &announced(label, b"TYPE=x", 120), 0.0);
+        assert_eq!(names(&received), [*label]);
     }
     browser
 }
 
-fn names(heard: &Heard) -> Vec<&str> {
-    let found = heard.found.iter();
+fn names(received: &ParsedPacket) -> Vec<&str> {
+    let found = received.found.iter();
     found.map(|(fullname, _)| label_of(fullname)).collect()
 }
 
-/// What is asked for, but for the question for everything, and what is gone, until then; with
-/// the time of each in seconds.
-fn goes_on(browser: &mut Browser, start: Instant, until: f64) -> (Vec<(u64, String)>, Vec<u64>) {
+/// Runs the timers until then. Returns the queries, except those for all records, and the removals,
+/// each with its time in tenths of a second.
+fn run_timers(browser: &mut Browser, start: Instant, until: f64) -> (Vec<(u64, String)>, Vec<u64>) {
     let (mut questions, mut gone) = (Vec::new(), Vec::new());
     let mut last = None;
     while let now = browser.poll_timeout()
         && now < start + seconds(until)
     {
-        assert_ne!(last.replace(now), Some(now), "time goes on");
+        assert_ne!(last.replace(now), Some(now), "the timeout did not advance");
         let due = browser.handle_timeout(now, 0.0);
         let at = (now - start).as_millis() as u64 / 100;
         for (label, kind) in asked(&due.packets) {
@@ -67,7 +67,7 @@ fn goes_on(browser: &mut Browser, start: Instant, until: f64) -> (Vec<(u64, Stri
 }
 
 #[test]
-fn what_is_announced_is_found_once_with_all_its_strings() {
+fn an_announced_record_is_reported_once_with_all_its_strings() {
     let (mut browser, now) = (Browser::new(Instant::now(), OWN, 0.0), Instant::now());
     let strings: [&[u8]; 5] = [
         b"LOCATOR=tcp://a",
@@ -77,9 +77,9 @@ fn what_is_announced_is_found_once_with_all_its_strings() {
         b"=",
     ];
     let parts = [Part::Txt(&strings), Part::Srv(HOST), Part::Ptr];
-    let heard = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
-    let [(fullname, properties)] = &heard.found[..] else {
-        panic!("{heard:?}");
+    let received = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
+    let [(fullname, properties)] = &received.found[..] else {
+        panic!("{received:?}");
     };
     assert_eq!(**fullname, format!("Arm.left.{SERVICE_TYPE}"));
     let expected: [(&str, &[u8]); 4] = [
@@ -90,55 +90,55 @@ fn what_is_announced_is_found_once_with_all_its_strings() {
     ];
     let expected = expected.map(|(key, value)| (key.to_owned(), value.to_vec()));
     assert_eq!(*properties, expected);
-    // The same is no news, something else is.
+    // An identical record is not reported again; a changed one is.
     let again = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
-    assert_eq!(again, Heard::default());
+    assert_eq!(again, ParsedPacket::default());
     let other = answer("Arm.left", &[Part::Txt(&[b"TYPE=x"])], 120);
     assert_eq!(
         names(&browser.handle_packet(now, FROM, &other, 0.0)),
         ["Arm.left"]
     );
-    // What nobody has introduced is of no interest.
+    // A record that was not introduced is ignored.
     let stranger = answer("leg", &[Part::Srv(HOST), Part::Txt(&strings)], 120);
     assert_eq!(
         browser.handle_packet(now, FROM, &stranger, 0.0),
-        Heard::default()
+        ParsedPacket::default()
     );
     assert_eq!(browser.records.len(), 1);
 }
 
 #[test]
-fn what_is_missing_is_asked_for_a_few_times() {
+fn missing_parts_are_queried_a_few_times() {
     let (mut browser, start) = (browser(Instant::now(), &[]), Instant::now());
     for label in ["arm", "leg"] {
         browser.handle_packet(start, FROM, &answer(label, &[Part::Ptr], 4500), 0.0);
     }
-    let (questions, _) = goes_on(&mut browser, start, 0.5);
+    let (questions, _) = run_timers(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let half = answer("arm", &[Part::Srv(HOST)], 120);
     assert_eq!(
         browser.handle_packet(start, FROM, &half, 0.0),
-        Heard::default()
+        ParsedPacket::default()
     );
     let half = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
     assert_eq!(
         names(&browser.handle_packet(start, FROM, &half, 0.0)),
         ["arm"]
     );
-    let (questions, gone) = goes_on(&mut browser, start, 30.0);
+    let (questions, gone) = run_timers(&mut browser, start, 30.0);
     let times: Vec<u64> = questions.iter().map(|(at, _)| *at).collect();
     assert_eq!(times, [12, 12, 42, 42, 132, 132]);
     assert!(questions.iter().all(|(_, what)| what.starts_with("leg")));
-    // Who was never known is not gone either.
+    // A record that was never known is not reported as removed.
     assert_eq!(gone, [0; 0]);
     assert_eq!((browser.records.len(), browser.unknown), (1, 0));
 }
 
 #[test]
-fn what_is_not_heard_of_is_asked_for_and_gone_in_the_end() {
+fn an_expiring_record_is_queried_and_finally_removed() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg"]);
-    let (questions, gone) = goes_on(&mut browser, start, 80.0);
+    let (questions, gone) = run_timers(&mut browser, start, 80.0);
     let expected = ["arm SRV", "arm TXT", "leg SRV", "leg TXT"];
     let mut asked: Vec<&str> = questions.iter().map(|(_, what)| what.as_str()).collect();
     asked.sort_unstable();
@@ -147,7 +147,7 @@ fn what_is_not_heard_of_is_asked_for_and_gone_in_the_end() {
         let now = start + seconds(80.0);
         browser.handle_packet(now, FROM, &answer("arm", &[part], 120), 0.0);
     }
-    let (questions, gone) = goes_on(&mut browser, start, 130.0);
+    let (questions, gone) = run_timers(&mut browser, start, 130.0);
     let of_leg = questions.iter().filter(|(_, what)| what == "leg SRV");
     let times: Vec<u64> = of_leg.map(|(at, _)| *at).collect();
     assert_eq!((times, gone), (vec![960, 1080, 1140], vec![1200]));
@@ -155,7 +155,7 @@ fn what_is_not_heard_of_is_asked_for_and_gone_in_the_end() {
 }
 
 #[test]
-fn hosts_ask_at_different_times_and_for_many_at_once() {
+fn renewals_are_batched_and_jittered() {
     let start = Instant::now();
     let mut first = browser(start, &[]);
     for number in 0..30 {
@@ -163,85 +163,85 @@ fn hosts_ask_at_different_times_and_for_many_at_once() {
         let label = format!("agent {number}");
         first.handle_packet(now, FROM, &announced(&label, b"TYPE=x", 120), 0.0);
     }
-    let (questions, _) = goes_on(&mut first, start, 75.0);
+    let (questions, _) = run_timers(&mut first, start, 75.0);
     let times: std::collections::HashSet<u64> = questions.iter().map(|(at, _)| *at).collect();
     assert_eq!((questions.len(), times.len()), (60, 1), "{questions:?}");
-    // With the most jitter it is later, and well below what others wait for.
-    let life = Life::new(start, 120);
-    assert_eq!(life.due(0.0), start + seconds(66.0));
-    assert!(life.due(1.0) > start + seconds(80.0));
-    assert!(life.due(1.0) < start + seconds(120.0 * 0.75));
+    // Maximum jitter delays the query, but still before other implementations renew.
+    let lifetime = Lifetime::new(start, 120);
+    assert_eq!(lifetime.due(0.0), start + seconds(66.0));
+    assert!(lifetime.due(1.0) > start + seconds(80.0));
+    assert!(lifetime.due(1.0) < start + seconds(120.0 * 0.75));
 }
 
 #[test]
-fn beacons_keep_what_is_held_good() {
+fn matching_beacons_keep_records_valid() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "peer"]);
     browser.belongs(&format!("arm.{SERVICE_TYPE}"), OTHER);
     for second in 1..600 {
         let now = start + Duration::from_secs(second);
         browser.confirm(now, OTHER);
-        let (questions, _) = goes_on(&mut browser, start, second as f64 + 1.0);
+        let (questions, _) = run_timers(&mut browser, start, second as f64 + 1.0);
         assert!(questions.iter().all(|(_, what)| what.starts_with("peer")));
     }
     assert_eq!(browser.records.len(), 1, "the peer has no beacons");
-    // They end, and nobody answers any more.
-    let (questions, gone) = goes_on(&mut browser, start, 800.0);
+    // The beacons stop, and no query is answered.
+    let (questions, gone) = run_timers(&mut browser, start, 800.0);
     assert_eq!((questions[0].0, gone), (5990 + 660, vec![5990 + 1200]));
 }
 
 #[test]
-fn own_records_are_not_asked_for() {
+fn own_records_are_not_queried() {
     let start = Instant::now();
     let mut browser = browser(start, &["own"]);
     browser.belongs(&format!("own.{SERVICE_TYPE}"), OWN);
-    let (questions, gone) = goes_on(&mut browser, start, 200.0);
+    let (questions, gone) = run_timers(&mut browser, start, 200.0);
     assert_eq!((questions, gone), (vec![], vec![1200]));
 }
 
 #[test]
-fn goodbyes_count_after_a_second_unless_they_are_taken_back() {
+fn a_goodbye_takes_effect_after_a_second_unless_it_is_revoked() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg", "eye"]);
     for label in ["arm", "leg"] {
         browser.handle_packet(start, FROM, &announced(label, b"TYPE=x", 0), 0.0);
     }
-    // Somebody else has had that label, and leaves.
+    // A goodbye from another host with the same label.
     let parts = [Part::Ptr, Part::Srv("other.local"), Part::Txt(&[b"TYPE=y"])];
     browser.handle_packet(start, FROM, &answer("eye", &parts, 0), 0.0);
     let back = start + seconds(0.5);
-    let heard = browser.handle_packet(back, FROM, &announced("leg", b"TYPE=x", 120), 0.0);
-    assert_eq!(heard, Heard::default());
-    let (_, gone) = goes_on(&mut browser, start, 5.0);
+    let received = browser.handle_packet(back, FROM, &announced("leg", b"TYPE=x", 120), 0.0);
+    assert_eq!(received, ParsedPacket::default());
+    let (_, gone) = run_timers(&mut browser, start, 5.0);
     assert_eq!(gone, [10]);
     assert!(browser.records.contains_key("leg") && browser.records.contains_key("eye"));
 }
 
 #[test]
-fn who_is_doubted_answers_or_is_gone() {
+fn a_doubted_record_is_confirmed_or_removed() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg"]);
     let doubted = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
     browser.doubt(start, &doubted);
-    let (questions, _) = goes_on(&mut browser, start, 0.5);
+    let (questions, _) = run_timers(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let now = start + seconds(0.5);
     browser.handle_packet(now, FROM, &answer("leg", &[Part::Srv(HOST)], 120), 0.0);
-    let (questions, gone) = goes_on(&mut browser, start, 5.0);
+    let (questions, gone) = run_timers(&mut browser, start, 5.0);
     let mut again = questions.iter().map(|(at, what)| (*at, what.as_str()));
     assert_eq!(again.next(), Some((11, "arm SRV")));
     assert!(again.all(|(_, what)| what.starts_with("arm")));
     assert_eq!(gone, [20]);
-    // A beacon is no answer.
+    // A beacon is not an answer.
     browser.belongs(&doubted[1], OTHER);
     browser.doubt(now, &doubted);
     browser.confirm(now + seconds(0.1), OTHER);
-    let (_, gone) = goes_on(&mut browser, start, 5.0);
+    let (_, gone) = run_timers(&mut browser, start, 5.0);
     assert_eq!(gone, [25]);
 }
 
 #[test]
-fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
+fn queries_for_all_records_back_off_and_are_shared_between_hosts() {
     let start = Instant::now();
     let mut hosts = [0.3, 0.7].map(|chance| Browser::new(start, OWN, chance));
     let mut times = [Vec::new(), Vec::new()];
@@ -264,16 +264,16 @@ fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
     let [first, second] = &times;
     let mut all: Vec<u64> = first.iter().chain(second).copied().collect();
     all.sort_unstable();
-    assert_eq!(all[..2], [0, 0], "each asks once in any case");
+    assert_eq!(all[..2], [0, 0], "each host queries once at the start");
     let pauses: Vec<u64> = all.windows(2).skip(1).map(|two| two[1] - two[0]).collect();
     assert!(pauses.len() <= 9, "{all:?}");
     assert!(pauses.iter().all(|pause| *pause <= 3600 * 9 / 8), "{all:?}");
-    // Who has just heard the question need not ask because something is missing.
+    // A host that has just received the query does not repeat it for missing records.
     let now = start + Duration::from_secs(9000);
     assert_eq!(hosts[0].ask_for_missing(now).len(), 1);
     assert_eq!(hosts[0].ask_for_missing(now + seconds(0.5)).len(), 0);
     assert_eq!(hosts[0].ask_for_missing(now + seconds(1.0)).len(), 1);
-    // A question that leaves out what we do not know does not help us.
+    // A query with unknown known-answers does not serve this host.
     let knows_more = &packet::question_for_all(&["stranger"])[0];
     let mut host = Browser::new(start, OWN, 0.0);
     host.handle_timeout(start + seconds(0.2), 0.0);
@@ -286,7 +286,7 @@ fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
 }
 
 #[test]
-fn the_more_would_answer_the_longer_are_the_pauses() {
+fn pauses_between_queries_grow_with_the_number_of_records() {
     let start = Instant::now();
     let labels: Vec<String> = (0..100).map(|number| format!("agent {number}")).collect();
     let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
@@ -306,7 +306,7 @@ fn the_more_would_answer_the_longer_are_the_pauses() {
 }
 
 #[test]
-fn peers_are_known_answers_before_others() {
+fn legacy_peers_are_listed_first_as_known_answers() {
     let now = Instant::now();
     let labels: Vec<String> = (0..40).map(|number| format!("agent {number}")).collect();
     let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
@@ -332,19 +332,19 @@ fn one_of_many(number: usize) -> IpAddr {
 }
 
 #[test]
-fn what_is_remembered_is_bounded() {
+fn the_stored_state_is_bounded() {
     let now = Instant::now();
     let mut browser = Browser::new(now, OWN, 0.0);
     for number in 0..MAX_UNKNOWN + 10 {
         let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
-        let heard = browser.handle_packet(now, one_of_many(number), &introduced, 1.0);
-        assert_eq!(heard.refused, u64::from(number >= MAX_UNKNOWN));
+        let received = browser.handle_packet(now, one_of_many(number), &introduced, 1.0);
+        assert_eq!(received.refused, u64::from(number >= MAX_UNKNOWN));
     }
     assert_eq!(browser.unknown, MAX_UNKNOWN);
-    // They are not in the way of who says all at once.
-    let heard = browser.handle_packet(now, FROM, &announced("arm", b"TYPE=x", 10), 0.0);
-    assert_eq!((names(&heard), heard.refused), (vec!["arm"], 0));
-    goes_on(&mut browser, now, 20.0);
+    // Unknown records do not prevent complete ones from being stored.
+    let received = browser.handle_packet(now, FROM, &announced("arm", b"TYPE=x", 10), 0.0);
+    assert_eq!((names(&received), received.refused), (vec!["arm"], 0));
+    run_timers(&mut browser, now, 20.0);
     assert_eq!((browser.records.len(), browser.unknown), (0, 0));
 
     let long = [b'x'; 255];
@@ -358,8 +358,8 @@ fn what_is_remembered_is_bounded() {
         assert!(browser.bytes <= MdnsDirectory::MAX_BYTES);
     }
     assert_eq!(browser.records.len(), MdnsDirectory::MAX_RECORDS);
-    assert!(browser.unknown >= 5, "for some there was no room");
-    goes_on(&mut browser, now, 200.0);
+    assert!(browser.unknown >= 5, "some records were refused");
+    run_timers(&mut browser, now, 200.0);
     assert_eq!(
         (browser.records.len(), browser.unknown, browser.bytes),
         (0, 0, 0)
@@ -368,7 +368,7 @@ fn what_is_remembered_is_bounded() {
 }
 
 #[test]
-fn one_source_cannot_fill_the_table() {
+fn one_source_cannot_fill_the_tables() {
     let now = Instant::now();
     let mut browser = Browser::new(now, OWN, 0.0);
     let others = one_of_many(1);
@@ -379,7 +379,7 @@ fn one_source_cannot_fill_the_table() {
     assert_eq!(browser.unknown, MAX_SHARE_UNKNOWN);
     browser.handle_packet(now, others, &answer("late", &[Part::Ptr], 120), 1.0);
     assert_eq!(browser.unknown, MAX_SHARE_UNKNOWN + 1);
-    goes_on(&mut browser, now, 20.0);
+    run_timers(&mut browser, now, 20.0);
 
     let long = [b'x'; 255];
     let long: Vec<&[u8]> = vec![&long; 33];
@@ -393,16 +393,16 @@ fn one_source_cannot_fill_the_table() {
         }
         assert!(refused > 0);
         assert!(browser.records.len() <= MAX_SHARE && browser.bytes <= MAX_SHARE_BYTES);
-        let heard = browser.handle_packet(now, others, &answer("arm", &parts, 120), 0.0);
-        assert_eq!(names(&heard), ["arm"]);
-        goes_on(&mut browser, now, 200.0);
+        let received = browser.handle_packet(now, others, &answer("arm", &parts, 120), 0.0);
+        assert_eq!(names(&received), ["arm"]);
+        run_timers(&mut browser, now, 200.0);
         assert!(browser.shares.is_empty());
     }
 }
 
 proptest! {
     #[test]
-    fn arbitrary_packets_do_no_harm(
+    fn arbitrary_packets_do_not_panic(
         mut packet in prop::collection::vec(any::<u8>(), 0..600),
         answers in 0..8_u8,
     ) {
@@ -414,7 +414,7 @@ proptest! {
     }
 
     #[test]
-    fn broken_packets_do_no_harm(at in 0_usize..160, byte: u8) {
+    fn corrupted_packets_do_not_panic(at in 0_usize..160, byte: u8) {
         let mut browser = Browser::new(Instant::now(), OWN, 0.0);
         for mut packet in [announced("arm", b"TYPE=x", 120), announced("arm", b"TYPE=x", 0)] {
             if let Some(broken) = packet.get_mut(at) {

@@ -1,5 +1,5 @@
-//! A view of the directory that is a moment behind: the receiver was registered anew, and whoever
-//! looks into the directory again sees it.
+//! A view of the directory that is out of date: the receiver was registered again, and a refresh
+//! shows that.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -13,7 +13,7 @@ use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Registration, Subscriber}
 use fipa_transport::{Answer, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome};
 use parking_lot::Mutex;
 
-/// Shows an earlier life until it is refreshed.
+/// Shows an earlier registration until it is refreshed.
 struct Behind {
     shown: MemoryDirectory,
     news: Mutex<Option<Registration>>,
@@ -50,7 +50,7 @@ impl Directory for Behind {
 }
 
 #[test]
-fn a_letter_to_an_earlier_life_goes_to_the_one_that_is_there_now() {
+fn a_letter_to_an_earlier_registration_goes_to_the_current_one() {
     let [own, first, second, rover] = [1, 2, 3, 4].map(Incarnation::from_u64);
     let location: Location = "shm://0000000000000009#0000000000000009".parse().unwrap();
     let arm = |life| Registration::new("arm", life, vec![location.clone()]);

@@ -1,5 +1,5 @@
-//! What is heard on the network, and what is asked and said there beside what the mDNS library
-//! says: who there is ([`super::browse`]), and beacons ([`super::beacon`]).
+//! Receives from the network, and sends the packets that the mDNS library does not send: the
+//! queries of [`super::browse`] and the beacons of [`super::beacon`].
 
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -8,26 +8,26 @@ use fipa_transport::Incarnation;
 
 use super::Shared;
 use super::beacon::{self, Beacons, Digest, Repair};
-use super::browse::{Browser, Heard};
+use super::browse::{Browser, ParsedPacket};
 use super::sockets::Sockets;
 
-/// Up to how much is added to the time between two beacons, so that not all speak at once.
+/// Maximum jitter of the beacon interval, so that gateways do not send simultaneously.
 const JITTER: Duration = Duration::from_millis(500);
-/// Least time between two beacons, however fast coalitions change.
+/// Minimum time between two beacons, however fast coalitions change.
 const BREATH: Duration = Duration::from_millis(200);
 
-pub(super) struct Ear {
+pub(super) struct Listener {
     sockets: Sockets,
     pub(super) browser: Browser,
     beacons: Beacons,
     next_beacon: Instant,
-    /// When one may be said that cannot wait until then.
+    /// Earliest time of the next urgent beacon.
     next_urgent: Instant,
-    /// Until when the mDNS library looks at the interfaces more often than usual.
-    looks_soon: Option<Instant>,
+    /// Until this time the mDNS library polls the interfaces at a shorter interval.
+    fast_poll_until: Option<Instant>,
 }
 
-impl Ear {
+impl Listener {
     pub(super) fn new(shared: &Shared) -> Self {
         let now = Instant::now();
         Self {
@@ -36,37 +36,37 @@ impl Ear {
             beacons: Beacons::default(),
             next_beacon: now,
             next_urgent: now,
-            looks_soon: None,
+            fast_poll_until: None,
         }
     }
 
-    /// Says and asks what is due, and says when there is more.
-    pub(super) fn speak(&mut self, shared: &Shared) -> Instant {
+    /// Sends everything that is due, and returns the time of the next call.
+    pub(super) fn send_due(&mut self, shared: &Shared) -> Instant {
         let now = Instant::now();
         if shared.coalitions_changed.swap(false, Ordering::Relaxed) {
-            // Others wait for it.
+            // Other gateways delay coalition changes until they receive the beacon.
             self.next_beacon = self.next_beacon.min(self.next_urgent.max(now));
         }
         if shared.interfaces_changed.swap(false, Ordering::Relaxed) {
             self.next_beacon = now;
-            self.looks_soon = Some(now + beacon::INTERVAL);
-            shared.daemon_looks(super::LOOKS_SOON);
+            self.fast_poll_until = Some(now + beacon::INTERVAL);
+            shared.set_poll_interval(super::FAST_POLL);
         }
-        if self.looks_soon.is_some_and(|until| until <= now) {
-            self.looks_soon = None;
-            shared.daemon_looks(super::LOOKS);
+        if self.fast_poll_until.is_some_and(|until| until <= now) {
+            self.fast_poll_until = None;
+            shared.set_poll_interval(super::NORMAL_POLL);
         }
         if now >= self.next_beacon {
             self.next_beacon = now + beacon::INTERVAL + JITTER.mul_f64(fastrand::f64());
             self.next_urgent = now + BREATH;
-            // Interfaces come and go.
+            // Interfaces may have appeared or disappeared.
             match self.sockets.refresh(&shared.config) {
                 Ok(changed) => {
                     if changed.more {
                         self.browser.start_again(now, fastrand::f64());
                     }
-                    // An address that is gone is noticed by the daemon when it looks next. Until
-                    // then it would use that one instead of the new one.
+                    // The library notices a removed address only at its next poll, and until then
+                    // would use it instead of the new one.
                     if changed.more && !changed.fewer {
                         shared.daemon_adds_interfaces();
                     }
@@ -81,8 +81,8 @@ impl Ear {
         }
         self.send(shared.moved());
         let (ended, doubtful) = {
-            let mut held = shared.held.lock();
-            (held.take_ended(), held.due(now))
+            let mut stored = shared.peer_records.lock();
+            (stored.take_ended(), stored.due(now))
         };
         self.browser.end(now, &ended);
         self.browser.doubt(now, &doubtful);
@@ -91,8 +91,12 @@ impl Ear {
         for fullname in due.gone {
             shared.put(&fullname, None);
         }
-        let later = shared.held.lock().poll_timeout(now);
-        let due = [Some(self.browser.poll_timeout()), later, self.looks_soon];
+        let later = shared.peer_records.lock().poll_timeout(now);
+        let due = [
+            Some(self.browser.poll_timeout()),
+            later,
+            self.fast_poll_until,
+        ];
         let due = due.into_iter().flatten().min();
         due.map_or(self.next_beacon, |due| due.min(self.next_beacon))
     }
@@ -103,20 +107,21 @@ impl Ear {
         }
     }
 
-    /// Hears one packet.
-    pub(super) async fn listen(&mut self, shared: &Shared) -> Heard {
+    /// Receives one packet and processes it.
+    pub(super) async fn listen(&mut self, shared: &Shared) -> ParsedPacket {
         let (packet, from) = self.sockets.receive().await;
         let now = Instant::now();
         let is_question = packet.get(2).is_some_and(|flags| flags & 0x80 == 0);
         if is_question && from.port() != shared.config.port {
-            // Who asks so is answered directly (RFC 6762 clause 6.7), which we do not hear.
-            return Heard::default();
+            // A query from another port gets a unicast answer (RFC 6762 clause 6.7), which does not
+            // arrive here.
+            return ParsedPacket::default();
         }
-        if let Some((gateway, said)) = beacon::read(packet) {
+        if let Some((gateway, content)) = beacon::read(packet) {
             if gateway != shared.config.mts.incarnation {
-                self.handle_beacon(now, shared, gateway, said);
+                self.handle_beacon(now, shared, gateway, content);
             }
-            return Heard::default();
+            return ParsedPacket::default();
         }
         self.browser
             .handle_packet(now, from.ip(), packet, fastrand::f64())
@@ -127,31 +132,35 @@ impl Ear {
         now: Instant,
         shared: &Shared,
         gateway: Incarnation,
-        said: beacon::Announced,
+        content: beacon::BeaconContent,
     ) {
-        shared.show(|together| together.said(now, gateway, said.coalitions));
-        let held = shared.held.lock().of(gateway);
-        if let Some(held) = held
-            && held.digest == said.all
-            && held.digest != Digest::default()
+        shared
+            .show(|coalition_sync| coalition_sync.handle_beacon(now, gateway, content.coalitions));
+        let stored = shared.peer_records.lock().of(gateway);
+        if let Some(stored) = stored
+            && stored.digest == content.all
+            && stored.digest != Digest::default()
         {
             self.browser.confirm(now, gateway);
         }
-        if let Some(repair) = self.beacons.handle(now, gateway, said.all, held) {
+        if let Some(repair) = self.beacons.handle(now, gateway, content.all, stored) {
             self.repair(shared, repair);
         }
     }
 
     fn repair(&mut self, shared: &Shared, repair: Repair) {
-        tracing::debug!(?repair, "what is held of others is not what they have");
+        tracing::debug!(
+            ?repair,
+            "stored records of another gateway differ from its beacon"
+        );
         match repair {
             Repair::Missing => {
                 let question = self.browser.ask_for_missing(Instant::now());
                 self.send(question);
             }
-            Repair::Surplus(gateway) => shared.held.lock().verify_all(gateway),
+            Repair::Surplus(gateway) => shared.peer_records.lock().verify_all(gateway),
             Repair::Silent(gateway) => {
-                shared.held.lock().doubt(Instant::now(), gateway);
+                shared.peer_records.lock().doubt(Instant::now(), gateway);
             }
         }
     }

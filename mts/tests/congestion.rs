@@ -1,4 +1,4 @@
-//! A mailbox that takes only so many letters at a time, and more receivers behind it than that.
+//! A mailbox with a limited number of letters, and more receivers behind it than that.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ const RECEIVERS: usize = 40;
 const WINDOW: usize = 16;
 
 #[test]
-fn only_what_has_ended_makes_room() {
+fn only_an_attempt_that_ended_frees_room() {
     let own = Incarnation::from_u64(1);
     let directory = MemoryDirectory::new(Mts::new("mts", own));
     let location: fipa_transport::Location =
@@ -50,7 +50,7 @@ fn only_what_has_ended_makes_room() {
 
     let mut under_way: VecDeque<AttemptId> = VecDeque::new();
     let (mut tries, mut delivered) = (0, 0);
-    // No time passes: whoever waits for room is told by those who make it.
+    // No time passes: lanes that wait for room are woken by the attempts that free it.
     loop {
         while let Some(action) = core.poll_action() {
             match action {
@@ -77,6 +77,6 @@ fn only_what_has_ended_makes_room() {
         core.handle_conclusion(now, first, Conclusion::Answered(Answer::Accepted));
     }
     assert_eq!(delivered, RECEIVERS);
-    // Everybody once, and those for whom there was no room once more.
+    // One attempt for each receiver, and a second one for those that found no room.
     assert_eq!(tries, RECEIVERS + (RECEIVERS - WINDOW));
 }

@@ -1,5 +1,4 @@
-//! What all lanes share: the list of things to be done, the attempts under way and the health of
-//! the ways.
+//! State that all lanes share: pending actions, attempts in progress and the health of routes.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -19,21 +18,21 @@ use super::routes::Tallies;
 use super::{CoreConfig, News, Notice, SendId};
 use crate::Map;
 
-/// Something the runtime has to do for the delivery core.
+/// An action that the runtime performs for the delivery core.
 #[derive(Debug)]
 pub enum Action {
-    /// Give this parcel to the transport of the location's kind. When the transport refuses at
-    /// once, the core is told as of any other conclusion.
+    /// Pass this parcel to the transport of the location's kind. An immediate refusal by the
+    /// transport is reported like any other conclusion.
     Dispatch {
-        /// The number under which the conclusion is reported.
+        /// Identifies the attempt in its conclusion.
         attempt: AttemptId,
-        /// Where to.
+        /// The receiver's location.
         location: Location,
-        /// What.
+        /// The parcel.
         parcel: Parcel,
     },
-    /// Have the transport [abandon](fipa_transport::Transport::abandon) this attempt. The core is
-    /// told at once how it ended, by [`Core::handle_conclusion`](super::Core::handle_conclusion).
+    /// Make the transport [abandon](fipa_transport::Transport::abandon) this attempt. Its end is
+    /// reported at once with [`Core::handle_conclusion`](super::Core::handle_conclusion).
     Abandon {
         /// The transport.
         kind: Kind,
@@ -42,125 +41,126 @@ pub enum Action {
         /// The error of the conclusion.
         error: WayError,
     },
-    /// Give the transport the answer to an arrival that was put off.
+    /// Pass the transport the answer to an arrival that was deferred.
     Answer {
-        /// Which transport.
+        /// The transport.
         kind: Kind,
-        /// Which arrival.
+        /// The arrival.
         ticket: Ticket,
         /// The answer.
         answer: Answer,
     },
     /// One receiver's outcome of a letter sent here.
     Outcome {
-        /// Which submission.
+        /// The submission.
         send: SendId,
         /// The receiver.
         receiver: Arc<str>,
-        /// What became of it.
+        /// The outcome.
         outcome: Outcome,
     },
-    /// An agent of another host that the directory does not know has written; letters for it can
-    /// be sent to where this one came from, or where it says that a legacy peer takes them. Comes before the letter is passed on.
+    /// An agent of another host that is not in the directory has sent a letter. Letters to it can
+    /// be sent to this location, from which its letter came or which a legacy peer states as its
+    /// own. Precedes the forwarding of the letter.
     Heard {
-        /// The name it writes under.
+        /// Its name in the letter.
         name: String,
-        /// This life of it; unknown for an agent of a legacy peer.
+        /// Its incarnation; unknown for an agent of a legacy peer.
         agent: Incarnation,
-        /// Where its message transport service can be reached.
+        /// Location of its message transport service.
         location: Location,
     },
-    /// An attempt at this location, of a known incarnation, has failed: the service may be gone without
-    /// having said so. Told by gateways only.
+    /// An attempt at this location, of a known incarnation, failed: the service may have ended
+    /// without a goodbye. Reported by gateways only.
     Doubtful {
         /// The location.
         location: Location,
-        /// Why the attempt failed.
+        /// Kind of the failure.
         fault: WayFault,
     },
-    /// Something was put into this agent's queue.
+    /// A letter was added to this agent's queue.
     Deliverable {
         /// The agent.
         agent: Incarnation,
     },
-    /// Tell whoever watches, before anything else is done; only while the core is watched.
+    /// Notify the watcher before performing later actions; only while the core is watched.
     Notice(Box<Notice>),
 }
 
-/// Where a delivery came from, and who is told its outcome.
+/// Origin of a delivery, which determines the receiver of its outcome.
 #[derive(Debug)]
 pub(crate) enum Origin {
-    /// An agent of this process.
+    /// Other message transport services, which get a late answer or a report.
     Local { send: SendId },
-    /// Other message transport services, which are told by a late answer or by a report.
+    /// The source at a legacy peer, which gets a failure message.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
-    /// An old peer, which has sent it from this source, and is told by a failure message.
-    OldPeer { from: LegacySource },
-    /// Nobody is told: it is a failure message.
-    Nobody,
+    /// A failure message; its outcome is not reported.
+    LegacyPeer { from: LegacySource },
+    /// A failure message; its outcome is not reported.
+    FailureMessage,
 }
 
-/// A service that handed a copy of a letter over.
+/// A service that handed over a copy of a letter.
 #[derive(Debug)]
 pub(crate) struct Upstream {
-    /// Where reports to it go.
+    /// Location for reports to it.
     pub(crate) back: Location,
-    /// Its latest hand-over of the letter, which a report names.
+    /// The attempt number of its latest hand-over of the letter, which a report names.
     pub(crate) transfer: u64,
-    /// The arrival that still has no answer.
+    /// Its arrival that has no answer yet.
     pub(crate) unanswered: Option<(Kind, Ticket)>,
 }
 
-/// How a letter leaves a lane.
+/// The way in which a letter leaves a lane.
 #[derive(Debug)]
 pub(crate) enum Settlement {
     /// It has an outcome.
     Outcome(Outcome),
-    /// A custodian hands it back, because its predecessor did not come.
+    /// A custodian returns it, because its predecessor did not arrive.
     Returned { uncertain: bool },
-    /// A custodian hands it back, because its receiver's registration has left this host.
+    /// A custodian returns it, because the receiver's registration has left this host.
     Moved,
 }
 
-/// Who is told of a failure by a message.
+/// Receiver of a failure message.
 #[derive(Debug)]
-pub(crate) enum Author {
+pub(crate) enum FailureTarget {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An agent of another service. A legacy peer's letter came from this source.
+    /// An agent of another service. `from` is the source of a legacy peer's letter.
     Remote { from: Option<LegacySource> },
 }
 
-/// A delivery that did not succeed, for the failure message.
+/// A failed delivery that a failure message reports.
 #[derive(Debug)]
 pub(crate) struct Undelivered {
-    pub(crate) sender: Author,
+    pub(crate) sender: FailureTarget,
     pub(crate) receiver: Arc<str>,
     pub(crate) letter: Letter,
     pub(crate) reason: FailureReason,
     pub(crate) detail: String,
 }
 
-/// What an attempt was for.
+/// Purpose of an attempt.
 #[derive(Debug)]
 pub(crate) enum Purpose {
     /// A letter of a lane.
     Letter { lane: LaneId, sequence: u64 },
     /// A report, a credit or a predecessor.
     Note(Box<Note>),
-    /// Whether a static peer is there.
-    Touch { peer: u64 },
+    /// Check of contact with a static peer.
+    PeerCheck { peer: u64 },
 }
 
-/// A note about letters on its way: a report, a credit or a predecessor.
+/// A message about a letter: a report, a credit or a predecessor.
 #[derive(Debug)]
 pub(crate) struct Note {
     pub(crate) location: Location,
     pub(crate) parcel: Parcel,
     pub(crate) tries: u32,
-    /// When it was sent last, if it is to be acknowledged.
+    /// Time of the last transmission, if an acknowledgment is expected.
     pub(crate) sent: Option<Instant>,
-    /// Until when it is repeated without an acknowledgment.
+    /// End of repetitions without an acknowledgment.
     pub(crate) until: Option<Instant>,
 }
 
@@ -181,27 +181,27 @@ impl Note {
     }
 }
 
-/// What all lanes share.
-pub(crate) struct Desk {
+/// State that all lanes share.
+pub(crate) struct AttemptTable {
     pub(crate) config: CoreConfig,
     pub(crate) directory: Arc<dyn Directory>,
     pub(crate) actions: VecDeque<Action>,
     pub(crate) attempts: Map<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
-    /// Notes that have been sent and are repeated if they are not acknowledged.
+    /// Notes that have been sent and are repeated unless they are acknowledged.
     pub(crate) repeated: VecDeque<AttemptId>,
     pub(crate) departed: Departed,
-    /// Bytes of all letters in lanes.
+    /// Total bytes of the letters in all lanes.
     pub(crate) held: usize,
     pub(super) tallies: Tallies,
-    /// Whether anybody is told of what happens to letters.
+    /// Whether a watcher is notified of events.
     pub(crate) watched: bool,
     health: Map<Location, Health>,
-    /// The time in which services acknowledge reports.
+    /// Smoothed time in which each service acknowledges reports.
     round_trips: Map<Incarnation, Duration>,
     /// Hand-overs whose end was reported and neither acknowledged nor refused yet.
     open_reports: Map<(Stream, u64, u64), ()>,
-    /// Lanes that found no room on the way to a location, in order.
+    /// Lanes that found no room on the route to a location, in order.
     waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
 }
@@ -212,13 +212,13 @@ struct Health {
     retry_at: Instant,
 }
 
-/// Longest time a failed way is left alone.
+/// Backoff of a failed route.
 const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 const FIRST_PENALTY: Duration = Duration::from_millis(100);
-/// Ways that are remembered as failed, at most.
+/// Maximum number of failed routes that are remembered.
 const MAX_HEALTH: usize = 4096;
 
-impl Desk {
+impl AttemptTable {
     pub(crate) fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
         Self {
             config,
@@ -239,7 +239,7 @@ impl Desk {
         }
     }
 
-    /// The number of the next attempt, which is also the number of its hand-over.
+    /// Returns the number of the next attempt, which is also the number of its hand-over.
     pub(crate) fn next_attempt(&mut self) -> AttemptId {
         let attempt = AttemptId(self.next_attempt);
         self.next_attempt += 1;
@@ -261,7 +261,7 @@ impl Desk {
         });
     }
 
-    /// Has the transport end an attempt, whose conclusion follows at once.
+    /// Makes the transport end an attempt, whose conclusion follows at once.
     pub(crate) fn abandon(&mut self, kind: Kind, attempt: AttemptId, error: WayError) {
         self.actions.push_back(Action::Abandon {
             kind,
@@ -270,7 +270,7 @@ impl Desk {
         });
     }
 
-    /// Has the transport end an attempt whose conclusion does not matter any more.
+    /// Makes the transport end an attempt whose conclusion is ignored.
     pub(crate) fn drop_attempt(&mut self, kind: Kind, attempt: AttemptId) {
         if self.attempts.remove(&attempt).is_some() {
             let error = WayError::new(WayFault::TimedOut, "");
@@ -278,8 +278,7 @@ impl Desk {
         }
     }
 
-    /// Sends a note. It is repeated when it says so, each time to another of the locations at which
-    /// the service is reached at present.
+    /// Sends a note. A repetition goes to the next of the current locations of the service.
     pub(crate) fn note(&mut self, mut note: Note) {
         if note.tries > 0 {
             note.location = self.present_location(&note);
@@ -296,8 +295,9 @@ impl Desk {
         self.dispatch(attempt, Purpose::Note(Box::new(note)), location, parcel);
     }
 
-    /// Where the service that a note goes to is reached: it may have another address by now. The
-    /// directory has the locations of the letters' sender, which is behind that service.
+    /// Returns the current location of the service to which a note goes; its address may have
+    /// changed. The directory has the locations of the letter's sender, which is behind that
+    /// service.
     fn present_location(&self, note: &Note) -> Location {
         let service = note.location.incarnation();
         let sender = self.directory.known_incarnation(note.parcel.stream.sender);
@@ -324,9 +324,9 @@ impl Desk {
         });
     }
 
-    /// Tells a service the present predecessor of a letter that was handed to it in this transfer, and
-    /// asks whether it has the letter. A lost note costs time only: the service hands the letter back
-    /// when it waits too long, and is asked again.
+    /// Sends a service the current predecessor of a letter that was handed over in this transfer,
+    /// and asks whether it has the letter. A lost note only costs time: the service returns the
+    /// letter after waiting, or is asked again.
     pub(crate) fn predecessor(
         &mut self,
         stream: Stream,
@@ -348,7 +348,7 @@ impl Desk {
         });
     }
 
-    /// Tells whoever watches, if anybody does.
+    /// Notifies the watcher, if there is one.
     pub(crate) fn notice(
         &mut self,
         stream: Stream,
@@ -366,7 +366,7 @@ impl Desk {
         }
     }
 
-    /// Tells the letter's sender, or the services that handed it over, how it left its lane.
+    /// Reports the end of a letter to its sender, or to the services that handed it over.
     pub(crate) fn settle(
         &mut self,
         delivery: Delivery,
@@ -395,18 +395,18 @@ impl Desk {
                 });
             }
             (Origin::Forwarded { upstreams }, settlement) => {
-                let (brief, report) = tidings(settlement);
+                let (brief, report) = answer_and_report(settlement);
                 for upstream in upstreams {
                     let letter = (stream, sequence);
-                    self.tell(upstream, letter, &receiver, (&brief, &report), deadline);
+                    self.report_to(upstream, letter, &receiver, (&brief, &report), deadline);
                 }
             }
-            // Only custodians hand letters back; failure messages have no sender to be told.
-            (Origin::Local { .. } | Origin::OldPeer { .. } | Origin::Nobody, _) => {}
+            // Only custodians return letters; a failed failure message is not reported.
+            (Origin::Local { .. } | Origin::LegacyPeer { .. } | Origin::FailureMessage, _) => {}
         }
     }
 
-    fn tell(
+    fn report_to(
         &mut self,
         upstream: Upstream,
         (stream, sequence): (Stream, u64),
@@ -444,17 +444,17 @@ impl Desk {
         });
     }
 
-    /// Who is meant by this stream and this name, if the directory still has such an agent.
-    pub(crate) fn receiver(&self, life: Incarnation, name: &str) -> Option<Arc<Entry>> {
-        self.directory.by_incarnation(life).or_else(|| {
-            let nameless = life == life_by_name(name);
+    /// Resolves the receiver of a stream, if it is still in the directory.
+    pub(crate) fn receiver(&self, registration: Incarnation, name: &str) -> Option<Arc<Entry>> {
+        self.directory.by_incarnation(registration).or_else(|| {
+            let nameless = registration == registration_by_name(name);
             let entry = nameless.then(|| self.directory.lookup(name)).flatten();
             entry.filter(|entry| !entry.incarnation.is_known())
         })
     }
 
-    /// The best way to this receiver that was not tried yet: the configured order, cut to what
-    /// the receiver offers, ways that failed recently moved to the end.
+    /// Returns the best location of this receiver that is not in `tried`: by the configured order,
+    /// with recently failed ones last.
     pub(crate) fn choose(
         &self,
         now: Instant,
@@ -469,7 +469,7 @@ impl Desk {
                 .filter(move |location| location.kind() == *kind)
         });
         let untried = ways.filter(|location| !tried.contains(location));
-        // The first healthy one; among the others, the one that may be tried again soonest.
+        // The first healthy route; without one, the route that may be retried soonest.
         let mut fallback: Option<(&Location, Instant)> = None;
         for location in untried {
             match self.health.get(location) {
@@ -491,7 +491,7 @@ impl Desk {
         }
     }
 
-    /// The lane that may try this location now that something under way there has ended.
+    /// Returns the lane that may use this location now that an attempt there has ended.
     pub(crate) fn room_for(&mut self, location: &Location) -> Option<LaneId> {
         if self.waiting_for_room.is_empty() {
             return None;
@@ -504,7 +504,8 @@ impl Desk {
         lane
     }
 
-    /// How often in a row this way has failed and until when it is put back, if it is.
+    /// Number of consecutive failures of this route, and the end of its backoff, if it is in
+    /// backoff.
     pub(super) fn failing(&self, now: Instant, location: &Location) -> Option<(u32, Instant)> {
         let health = self.health.get(location)?;
         (health.retry_at > now).then_some((health.failures, health.retry_at))
@@ -524,7 +525,7 @@ impl Desk {
             .contains_key(&(stream, sequence, transfer))
     }
 
-    /// A service has acknowledged a report within this time.
+    /// Records the time in which a service acknowledged a report.
     pub(crate) fn acknowledged(&mut self, service: Incarnation, took: Duration) {
         if let Some(known) = self.round_trips.get_mut(&service) {
             // Smoothed, as TCP does (RFC 6298 section 2).
@@ -537,23 +538,23 @@ impl Desk {
         self.round_trips.insert(service, took);
     }
 
-    /// The time in which this service acknowledges reports, if it has.
+    /// The smoothed time in which this service acknowledges reports, if known.
     pub(crate) fn round_trip(&self, service: Incarnation) -> Option<Duration> {
         self.round_trips.get(&service).copied()
     }
 
-    pub(crate) fn way_worked(&mut self, location: &Location) {
+    pub(crate) fn route_worked(&mut self, location: &Location) {
         if !self.health.is_empty() {
             self.health.remove(location);
         }
     }
 
-    /// Forgets the failures of these ways.
+    /// Drops the recorded failures of these routes.
     pub(super) fn forget_failures(&mut self, which: impl Fn(&Location) -> bool) {
         self.health.retain(|location, _| !which(location));
     }
 
-    pub(crate) fn way_failed(&mut self, now: Instant, location: &Location, fault: WayFault) {
+    pub(crate) fn route_failed(&mut self, now: Instant, location: &Location, fault: WayFault) {
         if self.config.forwards && location.incarnation().is_known() {
             self.actions.push_back(Action::Doubtful {
                 location: location.clone(),
@@ -576,18 +577,18 @@ impl Desk {
     }
 }
 
-/// The life that letters to this agent are for. An old peer's agent has no incarnation; all of its
-/// lives are one, which its name stands for.
-pub(crate) fn life_of(entry: &Entry) -> Incarnation {
+/// The registration that letters to this agent are for. A legacy peer's agent has no incarnation;
+/// one that is derived from its name stands for all its registrations.
+pub(crate) fn registration_of(entry: &Entry) -> Incarnation {
     if entry.incarnation.is_known() {
         entry.incarnation
     } else {
-        life_by_name(&entry.name)
+        registration_by_name(&entry.name)
     }
 }
 
-/// The same in every process, so that reports find their letters: the 64-bit FNV-1a hash.
-fn life_by_name(name: &str) -> Incarnation {
+/// The 64-bit FNV-1a hash: equal in every process, so that reports match their letters.
+fn registration_by_name(name: &str) -> Incarnation {
     let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
     let hash = name.as_bytes().iter().fold(0xcbf2_9ce4_8422_2325, step);
     Incarnation::from_u64(hash.max(1))
@@ -605,9 +606,9 @@ pub(super) fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, bod
     }
 }
 
-/// How services that handed a letter over are told: by this answer when it says everything, else
-/// by this report.
-fn tidings(settlement: Settlement) -> (Option<Answer>, Report) {
+/// The answer to services that handed a letter over, if an answer can express the end, and the
+/// report otherwise.
+fn answer_and_report(settlement: Settlement) -> (Option<Answer>, Report) {
     match settlement {
         Settlement::Outcome(outcome) => {
             let brief = match &outcome {

@@ -1,7 +1,7 @@
-//! The private directory of a domain: opening it, its files, its lock.
+//! The private directory of a domain: its files and its lock.
 //!
-//! Everything is done relative to the directory's descriptor and without following symbolic
-//! links, so that what was checked is what is used.
+//! All operations are relative to the directory's descriptor and do not follow symbolic links, so
+//! that the directory that was checked is the one that is used.
 
 use std::fs::{DirBuilder, File, TryLockError};
 use std::io::{self, Read as _, Write as _};
@@ -16,7 +16,7 @@ use rustix::io::Errno;
 
 use super::HostError;
 
-/// What tells the files of one process from those of the others.
+/// Identifies the files of one process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Id(pub(super) u64);
 
@@ -25,13 +25,13 @@ pub(super) struct Id(pub(super) u64);
 pub(super) enum Name {
     /// `lock`: held while the directory is changed; its first eight bytes are the generation.
     Domain,
-    /// `<id>.lock`: held by a process as long as it lives.
+    /// `<id>.lock`: locked by its process while that runs.
     Process(Id),
-    /// `<id>.entries`: what the process has registered.
+    /// `<id>.entries`: the registrations of the process.
     Entries(Id),
-    /// `<id>.socket`: where the process can be connected to, if it wants to be.
+    /// `<id>.socket`: the socket of the process, if it accepts connections.
     Socket(Id),
-    /// `<id>.tmp`: what will be renamed to one of the others.
+    /// `<id>.tmp`: a file that will be renamed to one of the others.
     Temporary(Id),
 }
 
@@ -67,51 +67,51 @@ impl std::fmt::Display for Name {
     }
 }
 
-/// The directory, joined by this process.
+/// The directory after this process has joined.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct HostDir {
     path: PathBuf,
     dir: OwnedFd,
     domain: File,
-    /// An advisory lock belongs to the open file, which the threads of this process share. Within
-    /// is when the turn of this process began.
+    /// An advisory lock belongs to the open file, which the threads of this process share; this
+    /// mutex excludes them from each other. It holds the start of this process's turn.
     threads: Mutex<Option<Instant>>,
     id: Id,
-    /// Never read: holding it, open for writing, says that this process lives.
+    /// Never read: the lock on it, open for writing, shows that this process is running.
     process: Mutex<Option<File>>,
 }
 
-/// How long to wait for the lock of the domain while nothing changes in the directory. It is held
-/// for some milliseconds, unless its holder has been stopped, or waits for the disk: a file system
-/// that lets go of much at once, or a worn card, can hold up a rename for more than ten seconds.
+/// Timeout for the lock of the domain while nothing changes in the directory. A process holds the
+/// lock for milliseconds unless it was stopped or waits for the disk: a file system that frees much
+/// space at once, or a worn SD card, can delay a rename for more than ten seconds.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// How long to wait while others have their turn: some processes of a robot with hundreds may
-/// start at the same time on a machine that is busy.
+/// Timeout for the lock while other processes take turns: on a busy robot many processes may start
+/// at the same time.
 const LONGEST: Duration = Duration::from_secs(60);
 
-/// How long a process that does not take its turn holds up the others.
+/// Time after which waiting processes bypass a process that does not use its turn.
 const SKIPPED: Duration = Duration::from_secs(1);
 
-/// How long to wait before asking for the lock again, of whoever has the turn.
+/// Pause of the process that has the turn, between attempts to lock.
 const FIRST_PAUSE: Duration = Duration::from_micros(200);
 
-/// The same, of the others, who ask less and less often: fifty of them would otherwise take more of
-/// the processor than those they wait for.
+/// Maximum pause of the others, which poll at a decreasing rate: fifty of them would otherwise use
+/// more CPU time than the processes they wait for.
 const LAST_PAUSE: Duration = Duration::from_millis(8);
 
-/// How long a turn lasts, in which a process may take the lock more than once: after each turn of
-/// another there is something to read, which takes longer than to register.
+/// Duration of a turn, in which a process may lock several times: after another process's turn it
+/// must read that one's changes, which takes longer than a registration.
 const TURN: Duration = Duration::from_millis(20);
 
-impl Place {
-    /// Opens the directory, creates it if need be, checks it, and joins as a process with this
-    /// id.
+impl HostDir {
+    /// Opens the directory, creates it if necessary, checks it, and joins as the process with this
+    /// ID.
     pub(super) fn join(path: &Path, id: Id) -> Result<Self, HostError> {
-        // A trailing slash would make the kernel follow a symbolic link.
+        // With a trailing slash, the kernel would follow a symbolic link.
         let path: PathBuf = path.components().collect();
         let dir = open_private(&path)?;
-        let mut place = Self {
+        let mut host_dir = Self {
             domain: open_domain(&dir, &path)?,
             path,
             dir,
@@ -120,14 +120,16 @@ impl Place {
             process: Mutex::new(None),
         };
         let deadline = Instant::now() + LONGEST;
-        while !place.try_join()? {
-            // The last process has left in between, and taken the lock file with it.
-            place.domain = open_domain(&place.dir, &place.path)?;
+        while !host_dir.try_join()? {
+            // The last process left in between and removed the lock file.
+            host_dir.domain = open_domain(&host_dir.dir, &host_dir.path)?;
             if Instant::now() > deadline {
-                return Err(HostError::Busy { path: place.path });
+                return Err(HostError::Busy {
+                    path: host_dir.path,
+                });
             }
         }
-        Ok(place)
+        Ok(host_dir)
     }
 
     fn try_join(&self) -> Result<bool, HostError> {
@@ -138,7 +140,8 @@ impl Place {
         guard.sweep()?;
         let temporary = Name::Temporary(self.id);
         let file = self.create(temporary)?;
-        // Locked before it is seen by that name: a lock file that is not held is a dead process.
+        // Locked before it appears under its name, because an unlocked lock file indicates a dead
+        // process.
         file.try_lock().map_err(|error| match error {
             TryLockError::Error(source) => self.io("lock", temporary)(source),
             TryLockError::WouldBlock => HostError::Busy {
@@ -154,8 +157,7 @@ impl Place {
         self.id
     }
 
-    /// Whether the directory, and the files with which this process takes part, can still be found
-    /// by others.
+    /// Whether other processes can still find the directory and the files of this process.
     pub(super) fn is_there(&self) -> Result<bool, HostError> {
         let examined = |found: Result<rustix::fs::Stat, Errno>| match found {
             Ok(stat) => Ok(Some((stat.st_dev, stat.st_ino))),
@@ -172,7 +174,7 @@ impl Place {
         };
         let process = self.process.lock();
         let Some(process) = process.as_ref() else {
-            // Left in order.
+            // Closed.
             return Ok(true);
         };
         let dir = examined(rustix::fs::fstat(&self.dir))?;
@@ -190,13 +192,13 @@ impl Place {
         &self.dir
     }
 
-    /// A path to the directory that no rename can lead elsewhere.
+    /// A path to the directory that is valid even after a rename.
     pub(super) fn pinned_path(&self) -> PathBuf {
         use std::os::fd::AsRawFd as _;
         PathBuf::from(format!("/proc/self/fd/{}", self.dir.as_raw_fd()))
     }
 
-    /// The number that grows with every change. Zero when there was none.
+    /// The number that grows with every change; 0 before the first.
     pub(super) fn generation(&self) -> Result<u64, HostError> {
         let mut number = [0; 8];
         match self.domain.read_exact_at(&mut number, 0) {
@@ -206,7 +208,7 @@ impl Place {
         }
     }
 
-    /// The lock of the domain. Others wait while it is held.
+    /// Waits for the lock of the domain.
     pub(super) fn lock(&self) -> Result<Guard<'_>, HostError> {
         let guard = self.lock_any()?;
         if guard.is_current()? {
@@ -218,23 +220,22 @@ impl Place {
         }
     }
 
-    /// The lock of the domain if it is free.
+    /// Takes the lock of the domain if it is free.
     pub(super) fn try_lock(&self) -> Result<Option<Guard<'_>>, HostError> {
         let Some(threads) = self.threads.try_lock() else {
             return Ok(None);
         };
         Ok(self.try_domain()?.then(|| Guard {
-            place: self,
+            host_dir: self,
             _threads: threads,
         }))
     }
 
     /// Waits for the lock of the domain, in turn.
     ///
-    /// Nothing hands an advisory lock on: whoever asks at the right moment has it, and that is
-    /// whoever has just let go and asks again. So a second lock, that on the directory itself,
-    /// says whose turn it is: one process waits for the domain, and the others, with equal
-    /// chances however long they have waited, for being next.
+    /// An advisory lock is not fair: a process that has just unlocked it is the likeliest to lock
+    /// it again. A second lock, on the directory itself, therefore grants turns: its holder waits
+    /// for the domain's lock, and the other processes compete for the next turn with equal chances.
     fn lock_any(&self) -> Result<Guard<'_>, HostError> {
         let busy = || HostError::Busy {
             path: self.path.join(Name::Domain.to_string()),
@@ -244,7 +245,7 @@ impl Place {
         let in_turn = threads.is_some_and(|began| began.elapsed() < TURN);
         if in_turn && self.try_domain()? {
             return Ok(Guard {
-                place: self,
+                host_dir: self,
                 _threads: threads,
             });
         }
@@ -255,12 +256,12 @@ impl Place {
             if turn.is_none() {
                 turn = self.try_turn()?;
             }
-            // Who has the turn may have been stopped, and the domain be free all the same.
+            // The holder of the turn may have been stopped, so bypass it after a while.
             let waited = moved.elapsed();
             if (turn.is_some() || waited > SKIPPED) && self.try_domain()? {
                 *threads = Some(Instant::now());
                 return Ok(Guard {
-                    place: self,
+                    host_dir: self,
                     _threads: threads,
                 });
             }
@@ -303,7 +304,7 @@ impl Place {
         }
     }
 
-    /// When a file has come, gone or been replaced for the last time.
+    /// Time of the last creation, removal or replacement of a file.
     pub(super) fn changed(&self) -> Result<(i64, u64), HostError> {
         match rustix::fs::fstat(&self.dir) {
             Ok(stat) => Ok((stat.st_mtime, stat.st_mtime_nsec)),
@@ -315,10 +316,11 @@ impl Place {
         }
     }
 
-    /// Whether a process holds its lock file.
-    pub(super) fn lives(&self, id: Id) -> Result<bool, HostError> {
+    /// Whether the process is running, that is, holds its lock file.
+    pub(super) fn is_running(&self, id: Id) -> Result<bool, HostError> {
         let name = Name::Process(id);
-        // Not for writing: closing it again would look like the end of that process.
+        // Opened for reading only: closing a writable descriptor would look like the end of that
+        // process.
         let Some(file) = self.open(name)? else {
             return Ok(false);
         };
@@ -329,7 +331,7 @@ impl Place {
         }
     }
 
-    /// What our files there are, in no order. Anything else in the directory is left alone.
+    /// Lists the known files, in no particular order. Other files are ignored.
     pub(super) fn names(&self) -> Result<Vec<Name>, HostError> {
         let io = |error: Errno| self.io("list", Name::Domain)(error.into());
         let mut names = Vec::new();
@@ -346,7 +348,7 @@ impl Place {
         Ok(names)
     }
 
-    /// Which entries file the process has; none when it has not written any.
+    /// Version of the process's entries file; `None` if there is no such file.
     pub(super) fn version(&self, id: Id) -> Result<Option<Version>, HostError> {
         let name = Name::Entries(id);
         match rustix::fs::statat(&self.dir, name.to_string(), AtFlags::SYMLINK_NOFOLLOW) {
@@ -360,7 +362,7 @@ impl Place {
         }
     }
 
-    /// The entries file of a process; none when there is none.
+    /// Content of the process's entries file; `None` if there is no such file.
     pub(super) fn read_entries(&self, id: Id) -> Result<Option<Vec<u8>>, HostError> {
         let name = Name::Entries(id);
         let Some(file) = self.open(name)? else {
@@ -368,7 +370,7 @@ impl Place {
         };
         let mut bytes = Vec::new();
         let limit = MAX_ENTRIES_FILE as u64;
-        // The length may be a lie by the time it is read, so reading is limited, too.
+        // The size may change before the read, so the read is limited too.
         file.take(limit + 1)
             .read_to_end(&mut bytes)
             .map_err(self.io("read", name))?;
@@ -380,10 +382,10 @@ impl Place {
         Ok(Some(bytes))
     }
 
-    /// One of our files, for reading; none when there is none. Refuses what is not a file of
-    /// ours.
+    /// Opens a file for reading; `None` if it does not exist. Fails when it is not a regular file
+    /// of this user.
     fn open(&self, name: Name) -> Result<Option<File>, HostError> {
-        // Without waiting, in case somebody has put a pipe there.
+        // Non-blocking, in case the name refers to a pipe.
         let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
         match rustix::fs::openat(&self.dir, name.to_string(), flags, Mode::empty()) {
             Ok(file) => check_file(file, &self.path, name).map(Some),
@@ -417,7 +419,7 @@ impl Place {
     }
 }
 
-/// What tells an entries file from the one before.
+/// Distinguishes an entries file from its predecessor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Version {
     /// Not a time: see [`Guard::write_entries`].
@@ -426,7 +428,7 @@ pub(super) struct Version {
     len: i64,
 }
 
-/// Most files in a directory: four per process, and there are not more processes on a host.
+/// Maximum number of files in a directory: four per process, for more processes than a host runs.
 const MAX_FILES: usize = 100_000;
 
 /// Largest entries file, in bytes.
@@ -434,61 +436,61 @@ pub(super) const MAX_ENTRIES_FILE: usize = 32 * 1024 * 1024;
 
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
-/// The turn to wait for the lock of the domain; passed on when dropped.
-struct Turn<'a>(&'a Place);
+/// The turn to wait for the lock of the domain; dropping it releases the turn.
+struct Turn<'a>(&'a HostDir);
 
 impl Drop for Turn<'_> {
     fn drop(&mut self) {
         if let Err(error) = rustix::fs::flock(&self.0.dir, FlockOperation::Unlock) {
-            tracing::error!(%error, path = %self.0.path.display(), "cannot pass the turn on");
+            tracing::error!(%error, path = %self.0.path.display(), "cannot unlock the turn lock");
         }
     }
 }
 
-/// The lock of the domain, held.
+/// The locked domain.
 pub(super) struct Guard<'a> {
-    pub(super) place: &'a Place,
+    pub(super) host_dir: &'a HostDir,
     _threads: MutexGuard<'a, Option<Instant>>,
 }
 
 impl Drop for Guard<'_> {
     fn drop(&mut self) {
-        if let Err(error) = self.place.domain.unlock() {
-            tracing::error!(%error, path = %self.place.path.display(), "cannot unlock the directory");
+        if let Err(error) = self.host_dir.domain.unlock() {
+            tracing::error!(%error, path = %self.host_dir.path.display(), "cannot unlock the directory");
         }
     }
 }
 
 impl Guard<'_> {
-    /// Whether the file that is locked is still the one that newcomers will lock.
+    /// Whether the locked file is still the one that a joining process locks.
     fn is_current(&self) -> Result<bool, HostError> {
-        let place = self.place;
-        let io = |error: Errno| place.io("examine", Name::Domain)(error.into());
-        let held = rustix::fs::fstat(&place.domain).map_err(io)?;
+        let host_dir = self.host_dir;
+        let io = |error: Errno| host_dir.io("examine", Name::Domain)(error.into());
+        let held = rustix::fs::fstat(&host_dir.domain).map_err(io)?;
         let name = Name::Domain.to_string();
-        match rustix::fs::statat(&place.dir, name, AtFlags::SYMLINK_NOFOLLOW) {
+        match rustix::fs::statat(&host_dir.dir, name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(found) => Ok((held.st_dev, held.st_ino) == (found.st_dev, found.st_ino)),
             Err(Errno::NOENT) => Ok(false),
             Err(error) => Err(io(error)),
         }
     }
 
-    /// Replaces this process's entries file, and lets everybody know. Returns the new generation.
+    /// Replaces this process's entries file and increments the generation, which it returns.
     pub(super) fn write_entries(&self, bytes: &[u8]) -> Result<u64, HostError> {
-        let place = self.place;
-        let generation = place.generation()?.wrapping_add(1);
-        let temporary = Name::Temporary(place.id);
-        place.remove(temporary)?;
-        let mut file = place.create(temporary)?;
+        let host_dir = self.host_dir;
+        let generation = host_dir.generation()?.wrapping_add(1);
+        let temporary = Name::Temporary(host_dir.id);
+        host_dir.remove(temporary)?;
+        let mut file = host_dir.create(temporary)?;
         let written = file.write_all(bytes).and_then(|()| {
-            // The time of modification is the version: clocks are too coarse and inodes are
-            // reused, so neither tells two files of one process apart.
+            // The modification time is the version: clocks are too coarse and inodes are reused, so
+            // neither distinguishes two files of one process.
             let version = Timespec {
                 tv_sec: i64::try_from(generation & 0x7fff_ffff).unwrap_or(0),
                 tv_nsec: 0,
             };
             let times = Timestamps {
-                // Cleaners of temporary files go by it.
+                // Cleaners of temporary files check the access time.
                 last_access: Timespec {
                     tv_sec: 0,
                     tv_nsec: rustix::fs::UTIME_NOW,
@@ -498,61 +500,61 @@ impl Guard<'_> {
             rustix::fs::futimens(&file, &times).map_err(io::Error::from)
         });
         let renamed = written
-            .map_err(place.io("write", temporary))
-            .and_then(|()| place.rename(temporary, Name::Entries(place.id)));
+            .map_err(host_dir.io("write", temporary))
+            .and_then(|()| host_dir.rename(temporary, Name::Entries(host_dir.id)));
         if let Err(error) = renamed {
-            // What matters is the first error; the remains are removed by the next sweep.
-            let _ = place.remove(temporary);
+            // The first error is returned; the next sweep removes the temporary file.
+            let _ = host_dir.remove(temporary);
             return Err(error);
         }
-        place
+        host_dir
             .domain
             .write_all_at(&generation.to_le_bytes(), 0)
-            .map_err(place.io("write", Name::Domain))?;
+            .map_err(host_dir.io("write", Name::Domain))?;
         Ok(generation)
     }
 
-    /// Removes what dead processes have left. Returns how many processes live, this one included
-    /// once it has joined.
+    /// Removes the files of dead processes. Returns the number of running processes, including this
+    /// one after it has joined.
     pub(super) fn sweep(&self) -> Result<usize, HostError> {
         let mut living = std::collections::HashMap::new();
-        for name in self.place.names()? {
+        for name in self.host_dir.names()? {
             let id = match name {
                 Name::Domain => continue,
-                // Written under this lock only, so nobody is about to rename it.
+                // Written under this lock only, so no process is about to rename it.
                 Name::Temporary(_) => {
-                    self.place.remove(name)?;
+                    self.host_dir.remove(name)?;
                     continue;
                 }
                 Name::Process(id) | Name::Entries(id) | Name::Socket(id) => id,
             };
             let lives = match living.get(&id) {
                 Some(lives) => *lives,
-                None => self.place.lives(id)?,
+                None => self.host_dir.is_running(id)?,
             };
             living.insert(id, lives);
             if !lives {
-                self.place.remove(name)?;
+                self.host_dir.remove(name)?;
             }
         }
         Ok(living.values().filter(|lives| **lives).count())
     }
 
-    /// Removes what a dead process has left.
-    pub(super) fn bury(&self, id: Id) -> Result<(), HostError> {
-        self.place.remove(Name::Entries(id))?;
-        self.place.remove(Name::Socket(id))?;
-        self.place.remove(Name::Temporary(id))?;
-        self.place.remove(Name::Process(id))
+    /// Removes the files of a dead process.
+    pub(super) fn remove_files(&self, id: Id) -> Result<(), HostError> {
+        self.host_dir.remove(Name::Entries(id))?;
+        self.host_dir.remove(Name::Socket(id))?;
+        self.host_dir.remove(Name::Temporary(id))?;
+        self.host_dir.remove(Name::Process(id))
     }
 
-    /// Leaves the directory, and leaves it empty if this was the last process.
+    /// Leaves the directory, and leaves it empty if this is the last process.
     pub(super) fn leave(self) -> Result<(), HostError> {
-        self.bury(self.place.id)?;
-        // Only now: as long as it is held, others take this process for alive.
-        drop(self.place.process.lock().take());
+        self.remove_files(self.host_dir.id)?;
+        // Last, because the lock shows that this process is running.
+        drop(self.host_dir.process.lock().take());
         if self.sweep()? == 0 && self.is_current()? {
-            self.place.remove(Name::Domain)?;
+            self.host_dir.remove(Name::Domain)?;
         }
         Ok(())
     }
@@ -568,7 +570,7 @@ fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
             return Err(io("create")(error));
         }
-        // What exists, perhaps as something else, is checked next.
+        // An existing path, of whatever type, is checked below.
         _ => {}
     }
     let refused = |why: String| HostError::NotPrivate {
@@ -579,7 +581,9 @@ fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
     let dir = match rustix::fs::open(path, flags, Mode::empty()) {
         Ok(dir) => dir,
         Err(Errno::LOOP | Errno::NOTDIR) => {
-            return Err(refused("it is not a directory but a link or a file".into()));
+            return Err(refused(
+                "it is a symbolic link or a file, not a directory".into(),
+            ));
         }
         Err(error) => return Err(io("open")(error.into())),
     };
@@ -623,7 +627,7 @@ fn check_file(file: OwnedFd, dir: &Path, name: Name) -> Result<File, HostError> 
     if is_file && stat.st_uid == rustix::process::geteuid().as_raw() {
         return Ok(File::from(file));
     }
-    let why = "it is not a file of this user".to_owned();
+    let why = "it is not a regular file of this user".to_owned();
     Err(HostError::NotPrivate { path, why })
 }
 
@@ -632,7 +636,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_our_names_are_names() {
+    fn only_known_file_names_are_parsed() {
         let id = Id(0x0123_4567_89ab_cdef);
         for name in [
             Name::Domain,
@@ -643,14 +647,14 @@ mod tests {
         ] {
             assert_eq!(Name::parse(&name.to_string()), Some(name));
         }
-        for stranger in [
+        for other in [
             "",
             "lock2",
             "x.lock",
             "0123456789ABCDEF.lock",
             "+123456789abcdef.lock",
         ] {
-            assert_eq!(Name::parse(stranger), None, "{stranger}");
+            assert_eq!(Name::parse(other), None, "{other}");
         }
     }
 }

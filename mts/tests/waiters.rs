@@ -1,4 +1,4 @@
-//! Who waits for letters of an agent that is gone.
+//! Tasks that wait for letters of an agent that is gone.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Barrier};
@@ -14,8 +14,8 @@ use fipa_transport::{
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
 
-/// Carries nothing. The first two who look for something, having seen that there is none, go on when
-/// the test does.
+/// A transport that carries nothing. The first two tasks that drive it, after finding no letter,
+/// continue when the test does.
 struct Slow {
     looks: AtomicUsize,
     together: Barrier,
@@ -39,7 +39,7 @@ impl Transport for Slow {
     }
 
     fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), WayError> {
-        Err(WayError::new(WayFault::Unreachable, "nobody is there"))
+        Err(WayError::new(WayFault::Unreachable, "no process is there"))
     }
 
     fn abandon(&self, _: AttemptId) -> Abandoned {
@@ -60,7 +60,7 @@ impl Transport for Slow {
 }
 
 #[test]
-fn all_who_were_about_to_wait_learn_that_the_agent_is_gone() {
+fn all_tasks_that_are_about_to_wait_are_told_that_the_agent_is_gone() {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(3)
         .enable_all()

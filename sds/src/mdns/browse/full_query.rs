@@ -1,30 +1,30 @@
-//! When everything is asked for.
+//! Schedule of the queries for all records.
 
 use std::time::{Duration, Instant};
 
 use super::JITTER;
 
-/// The time between the first two questions for everything, by what each following one grows, and
-/// the longest (RFC 6762 clause 5.2 asks for at least twofold).
+/// The pause between the first two queries for all records, its growth factor and its maximum (RFC
+/// 6762 clause 5.2 requires a factor of at least two).
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const GROWTH: u32 = 4;
 const LONGEST_PAUSE: Duration = Duration::from_secs(3600);
-/// The least of that for each record that is known. Every gateway answers in full, with half a
-/// kilobyte for each of its agents on IPv4 and as much on IPv6: so the answers take no more than
-/// 2 kB/s in the long run, until the pause is the longest.
+/// Minimum pause per known record. Every gateway answers in full, with half a kilobyte per agent on
+/// IPv4 and the same on IPv6: this pause limits the answers to 2 kB/s in the long run, until the
+/// maximum pause is reached.
 const PAUSE_EACH: Duration = Duration::from_millis(500);
 
-/// When the question for everything is asked.
+/// Times of the queries for all records.
 #[derive(Debug)]
-pub(super) struct Everything {
+pub(super) struct FullQuery {
     pub(super) last: Option<Instant>,
     pub(super) next: Instant,
     pause: Duration,
 }
 
-impl Everything {
-    /// At once, but for the jitter that keeps hosts that start together apart, of which there is
-    /// `chance`, from 0 to 1.
+impl FullQuery {
+    /// Schedules the first query at once, except for a jitter that separates hosts that start
+    /// together; `chance`, from 0 to 1, scales it.
     pub(super) fn new(now: Instant, chance: f64) -> Self {
         Self {
             last: None,
@@ -41,8 +41,8 @@ impl Everything {
         self.pause = pause * GROWTH;
     }
 
-    /// That counts when we would have asked soon. Our own question, which comes back to us, does
-    /// not: we have just asked.
+    /// Counts a query of another host as our own if ours would have been due soon. Our own
+    /// looped-back query does not count, because `last` is then too recent.
     pub(super) fn asked_by_others(&mut self, now: Instant, known: usize) {
         if let Some(last) = self.last
             && now >= last + self.next.saturating_duration_since(last) / 2
@@ -51,7 +51,7 @@ impl Everything {
         }
     }
 
-    /// What has been asked a moment ago is being answered.
+    /// Whether the previous query is old enough that its answers have arrived.
     pub(super) fn may_be_asked(&self, now: Instant) -> bool {
         self.last.is_none_or(|last| now >= last + FIRST_PAUSE)
     }

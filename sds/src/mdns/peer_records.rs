@@ -1,4 +1,4 @@
-//! What is held of each gateway, and what of it is in doubt.
+//! Stored records by gateway, and the queue of those to verify.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -6,48 +6,49 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
 
-use super::beacon::{Digest, Held};
+use super::beacon::{Digest, StoredDigest};
 use super::record;
 use crate::Entry;
 
-/// Most records that are verified at one time, and the pause after that: hundreds take seconds,
-/// rather than all at once what the network can carry.
+/// Maximum number of records that are verified at a time, and the pause afterwards: verifying
+/// hundreds takes seconds instead of flooding the network.
 const BATCH: usize = 25;
 const PAUSE: Duration = Duration::from_millis(100);
-/// For how long the end of a record that was in doubt speaks for its gateway, too.
+/// Time after the start of a doubt in which the removal of a queried record also casts doubt on the
+/// rest of its gateway.
 const DOUBT: Duration = Duration::from_secs(6);
 
-/// The records of others by gateway, and those to be verified.
+/// Records of other hosts by gateway, and the queue of those to verify.
 #[derive(Debug, Default)]
-pub(super) struct Holdings {
+pub(super) struct PeerRecords {
     records: HashMap<Arc<str>, (Incarnation, Digest)>,
     gateways: HashMap<Incarnation, Gateway>,
     queue: VecDeque<Arc<str>>,
-    /// Those in the queue that are of no gateway.
+    /// Records in the queue that have no gateway (legacy peers).
     peers: HashSet<Arc<str>>,
-    /// Those of gateways that have ended.
+    /// Records of gateways that have ended.
     ended: Vec<Arc<str>>,
     next: Option<Instant>,
 }
 
 #[derive(Debug)]
 struct Gateway {
-    held: Held,
+    stored: StoredDigest,
     records: HashSet<Arc<str>>,
-    /// Since when it is doubted, by this record of it.
+    /// Start of the current doubt, and the record that stands for the gateway.
     doubted: Option<(Instant, Arc<str>)>,
-    /// The records that are verified with it.
+    /// Records that are verified during this doubt.
     verified: HashSet<Arc<str>>,
 }
 
-impl Holdings {
-    /// The record with this full name is that now, or gone.
+impl PeerRecords {
+    /// Stores the record with this full name, or removes it if `entry` is `None`.
     pub(super) fn put(&mut self, now: Instant, fullname: &Arc<str>, entry: Option<&Entry>) {
         if let Some((gateway, digest)) = self.records.remove(fullname)
             && let Some(known) = self.gateways.get_mut(&gateway)
         {
-            known.held.digest.remove(digest);
-            known.held.changed = now;
+            known.stored.digest.remove(digest);
+            known.stored.changed = now;
             known.records.remove(fullname);
             let end = known
                 .doubted
@@ -55,8 +56,8 @@ impl Holdings {
             if let Some((since, _)) = end
                 && now < since + DOUBT
             {
-                // It did not answer for this one, so probably not for the others either: those that
-                // are not verified already.
+                // The gateway did not answer for this record, so it probably does not answer for
+                // the others either. Queues those that are not being verified yet.
                 let waiting: HashSet<&Arc<str>> = self.queue.iter().collect();
                 let rest = known.records.difference(&known.verified);
                 let rest: Vec<Arc<str>> =
@@ -73,7 +74,7 @@ impl Holdings {
         let digest = Digest::of(&record::encode(entry));
         let gateway = entry.mts.incarnation;
         let known = self.gateways.entry(gateway).or_insert_with(|| Gateway {
-            held: Held {
+            stored: StoredDigest {
                 digest: Digest::default(),
                 changed: now,
             },
@@ -81,20 +82,20 @@ impl Holdings {
             doubted: None,
             verified: HashSet::new(),
         });
-        known.held.digest.add(digest);
-        known.held.changed = now;
+        known.stored.digest.add(digest);
+        known.stored.changed = now;
         known.records.insert(Arc::clone(fullname));
         self.records.insert(Arc::clone(fullname), (gateway, digest));
     }
 
-    /// What is held of this gateway.
-    pub(super) fn of(&self, gateway: Incarnation) -> Option<Held> {
-        self.gateways.get(&gateway).map(|known| known.held)
+    /// Digest of the stored records of this gateway.
+    pub(super) fn of(&self, gateway: Incarnation) -> Option<StoredDigest> {
+        self.gateways.get(&gateway).map(|known| known.stored)
     }
 
-    /// Whether this gateway is there is doubted: its records are verified at once, as many as are at one
-    /// time. Where it has more, one of those stands for the rest. Says whether anything is held of it
-    /// that was not in doubt already.
+    /// Doubts the gateway: queues up to `BATCH` of its records for verification first. If it has
+    /// more, one of these stands for the rest. Returns false when there are no records, or a doubt
+    /// has already started.
     pub(super) fn doubt(&mut self, now: Instant, gateway: Incarnation) -> bool {
         let Some(known) = self.gateways.get_mut(&gateway) else {
             return false;
@@ -107,7 +108,8 @@ impl Holdings {
         let Some(first) = asked.first() else {
             return false;
         };
-        // Without more records, each of them is verified and ends by itself.
+        // A gateway with at most `BATCH` records has all of them verified, and each expires
+        // individually.
         known.doubted = Some((now, Arc::clone(first)));
         known.verified = asked.iter().cloned().collect();
         for fullname in asked.into_iter().rev() {
@@ -116,7 +118,7 @@ impl Holdings {
         true
     }
 
-    /// This gateway has ended without a goodbye: all its records end.
+    /// Ends all records of this gateway, which ended without a goodbye.
     pub(super) fn end(&mut self, gateway: Incarnation) {
         if let Some(known) = self.gateways.get(&gateway)
             && self.ended.len() <= self.records.len()
@@ -125,21 +127,21 @@ impl Holdings {
         }
     }
 
-    /// The full names of records that end now.
+    /// Takes the full names of records that end now.
     pub(super) fn take_ended(&mut self) -> Vec<Arc<str>> {
         std::mem::take(&mut self.ended)
     }
 
-    /// A record of an old peer, which has no gateway, is verified.
+    /// Queues a record of a legacy peer, which has no gateway, for verification.
     pub(super) fn verify(&mut self, fullname: &Arc<str>) {
         if self.peers.insert(Arc::clone(fullname)) {
             self.queue.push_front(Arc::clone(fullname));
         }
     }
 
-    /// All that is held of this gateway is verified.
+    /// Queues all records of this gateway for verification.
     pub(super) fn verify_all(&mut self, gateway: Incarnation) {
-        // What waits already need not wait twice.
+        // Bounds the queue: queued records need not be queued again.
         if let Some(known) = self.gateways.get(&gateway)
             && self.queue.len() <= self.records.len()
         {
@@ -147,7 +149,7 @@ impl Holdings {
         }
     }
 
-    /// The full names of records to be verified now.
+    /// Takes the full names of records to verify now.
     pub(super) fn due(&mut self, now: Instant) -> Vec<Arc<str>> {
         if self.queue.is_empty() || self.next.is_some_and(|next| now < next) {
             return Vec::new();
@@ -161,7 +163,7 @@ impl Holdings {
             .collect()
     }
 
-    /// When more is to be verified.
+    /// Time of the next verification.
     pub(super) fn poll_timeout(&self, now: Instant) -> Option<Instant> {
         (!self.queue.is_empty()).then(|| self.next.unwrap_or(now))
     }
@@ -188,15 +190,15 @@ mod tests {
         }
     }
 
-    fn put(holdings: &mut Holdings, now: Instant, number: u64, gateway: u64, there: bool) {
+    fn put(holdings: &mut PeerRecords, now: Instant, number: u64, gateway: u64, there: bool) {
         let entry = entry(number, gateway);
         let entry = there.then_some(&entry);
         holdings.put(now, &number.to_string().into(), entry);
     }
 
     #[test]
-    fn what_is_held_is_what_was_put() {
-        let mut holdings = Holdings::default();
+    fn the_digest_of_a_gateway_follows_its_records() {
+        let mut holdings = PeerRecords::default();
         let now = Instant::now();
         for number in 1..=3 {
             put(&mut holdings, now, number, 7, true);
@@ -207,36 +209,40 @@ mod tests {
             expected.add(Digest::of(&record::encode(&entry(number, 7))));
         }
         put(&mut holdings, now, 2, 7, false);
-        // Said again, it is the same.
+        // An identical update changes nothing.
         put(&mut holdings, now, 3, 7, true);
-        let held = holdings.of(Incarnation::from_u64(7)).unwrap();
-        assert_eq!(held.digest, expected);
+        let stored = holdings.of(Incarnation::from_u64(7)).unwrap();
+        assert_eq!(stored.digest, expected);
         for number in [1, 3, 9] {
             put(&mut holdings, now, number, 7, false);
         }
         assert!(holdings.of(Incarnation::from_u64(7)).is_none());
         assert!(holdings.gateways.is_empty() && holdings.records.is_empty());
         put(&mut holdings, now, 1, 0, true);
-        assert!(holdings.records.is_empty(), "old peers have no beacons");
+        assert!(holdings.records.is_empty(), "legacy peers have no beacons");
     }
 
     #[test]
-    fn with_one_record_of_a_doubted_gateway_go_all() {
-        let mut holdings = Holdings::default();
+    fn the_end_of_a_doubted_record_verifies_all_records_of_its_gateway() {
+        let mut holdings = PeerRecords::default();
         let (now, gateway) = (Instant::now(), Incarnation::from_u64(7));
         for number in 0..60 {
             put(&mut holdings, now, number, 7, true);
         }
         assert!(holdings.doubt(now, gateway));
         assert!(!holdings.doubt(now, gateway));
-        // As many as possible are asked for at once.
+        // The first batch is queried at once.
         let verified = holdings.due(now);
         assert_eq!(verified.len(), BATCH);
         let [doubted, others @ ..] = &verified[..] else {
-            panic!("some are asked for");
+            panic!("no record was queried");
         };
         put(&mut holdings, now, others[0].parse().unwrap(), 7, false);
-        assert_eq!(holdings.poll_timeout(now), None, "that one left by itself");
+        assert_eq!(
+            holdings.poll_timeout(now),
+            None,
+            "only one record was removed"
+        );
         put(&mut holdings, now, doubted.parse().unwrap(), 7, false);
         let mut asked = Vec::new();
         let mut now = now;
@@ -246,8 +252,12 @@ mod tests {
             assert!(batch.len() <= BATCH);
             asked.extend(batch);
         }
-        assert_eq!(asked.len(), 60 - BATCH, "those that were not asked for");
-        // Later, an end is an end and nothing more.
+        assert_eq!(
+            asked.len(),
+            60 - BATCH,
+            "the records that were not queried yet"
+        );
+        // After the doubt, the end of a record affects no others.
         assert!(holdings.doubt(now, gateway));
         let doubted = holdings.due(now + PAUSE);
         now += DOUBT;

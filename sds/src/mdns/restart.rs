@@ -1,31 +1,33 @@
-//! When the mDNS library is started anew.
+//! Restarts of the mDNS library.
 //!
-//! We do not browse with the library ([`super::browse`]), but it keeps what it hears all the same,
-//! if the packet introduces no service, and for ever. It has no bound, and no way to make it
-//! forget. So it is looked at every two seconds, and when it keeps too much it is ended, without a
-//! goodbye, and another one started, which is told of our own agents again. Between the two is a
-//! pause that grows while the flood goes on: what is bounded is the memory, and how often our
-//! agents are announced again. Others' agents have nothing to do with it.
+//! This crate does not browse with the library ([`super::browse`]), but the library caches received
+//! records all the same, and keeps those of packets that introduce no service forever. Its cache
+//! has no limit and cannot be cleared. The cache size is therefore checked every two seconds. A
+//! library whose cache is too large is stopped without a goodbye, and a new one is started, to
+//! which this gateway's own agents are registered again. The pause in between grows while the flood
+//! continues, which bounds the memory and the rate of repeated announcements. The entries of other
+//! gateways' agents are not affected.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-/// How often the library is asked how much it keeps.
+/// Interval between checks of the cache size.
 pub(super) const INTERVAL: Duration = Duration::from_secs(2);
-/// Most records that it may keep. None is longer than the packet it came in, which has at most
+/// Maximum number of cached records. A record is at most as long as its packet, which has at most
 /// [`MAX_PACKET`](super::packet::MAX_PACKET) bytes.
 pub(super) const MAX_CACHED: u64 = 40_000;
-/// Most times at which it has something to do; every record heard adds two, known or not, which
-/// stay for as long as the record says that it is good.
+/// Maximum number of timers in the library. Every received record, cached or not, adds two, which
+/// stay until the record expires.
 const MAX_TIMERS: u64 = 1_000_000;
-/// The first pause. What has been said goodbye to rests for as long.
+/// The first pause. A name also rests for this long after a goodbye.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// The longest: nobody's records of us expire in that time, and nobody asks for them twice.
+/// The longest pause: no cached record of this gateway expires in that time, and no other host
+/// queries for it twice.
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// A flood is over when the library has kept little for that long.
+/// A flood is over when the library ran for this long.
 const CALM: Duration = Duration::from_secs(120);
 
-/// What the library keeps, if that is too much.
+/// Describes the cache size if it is too large.
 pub(super) fn is_too_much(metrics: &HashMap<String, i64>) -> Option<String> {
     let count = |value: &i64| u64::try_from(*value).unwrap_or_default();
     let cached = metrics
@@ -39,7 +41,7 @@ pub(super) fn is_too_much(metrics: &HashMap<String, i64>) -> Option<String> {
     (timers > MAX_TIMERS).then(|| format!("{timers} timers, more than {MAX_TIMERS}"))
 }
 
-/// How long the pauses are.
+/// Computes the pauses between stop and restart of the library.
 #[derive(Debug)]
 pub(super) struct Pauses {
     started: Instant,
@@ -47,7 +49,7 @@ pub(super) struct Pauses {
 }
 
 impl Pauses {
-    /// The library is started for the first time.
+    /// Records the first start of the library.
     pub(super) fn new(now: Instant) -> Self {
         Self {
             started: now,
@@ -55,7 +57,7 @@ impl Pauses {
         }
     }
 
-    /// The library is ended: for how long it is to be without one.
+    /// Records the stop of the library, and returns the pause before the restart.
     pub(super) fn ended(&mut self, now: Instant) -> Duration {
         if now >= self.started + CALM {
             self.last = Duration::ZERO;
@@ -64,7 +66,7 @@ impl Pauses {
         self.last
     }
 
-    /// It is started again.
+    /// Records the restart.
     pub(super) fn started(&mut self, now: Instant) {
         self.started = now;
     }
@@ -80,8 +82,8 @@ pub(super) mod tests {
     use super::*;
     use crate::{Directory, Mts, Registration};
 
-    /// A directory on loopback, alone on its port. In a test with one thread its task does not run as
-    /// long as nothing is awaited.
+    /// Opens a directory on loopback with a port of its own. In a single-threaded test its task
+    /// does not run until the test awaits.
     pub(in crate::mdns) fn directory() -> MdnsDirectory {
         let free = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr();
         let config = MdnsConfig {
@@ -93,7 +95,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn all_kinds_of_records_count() {
+    fn records_of_all_types_are_counted() {
         let metrics = |of: &[(&str, u64)]| {
             let of = of.iter();
             of.map(|(name, value)| ((*name).to_owned(), i64::try_from(*value).unwrap()))
@@ -130,21 +132,21 @@ pub(super) mod tests {
     }
 
     #[tokio::test]
-    async fn beacons_say_what_they_said_last_while_there_is_no_library() {
+    async fn beacons_are_unchanged_while_the_library_is_stopped() {
         let directory = directory();
-        let life = Incarnation::random();
+        let incarnation = Incarnation::random();
         let at = || vec!["tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap()];
         directory
-            .register(Registration::new("arm", life, at()))
+            .register(Registration::new("arm", incarnation, at()))
             .unwrap();
-        let said = directory.shared.announced();
+        let before = directory.shared.announced();
         directory.shared.end_daemon().unwrap();
         let leg = Registration::new("leg", Incarnation::random(), at());
         directory.register(leg).unwrap();
-        directory.deregister("arm", life).unwrap();
-        assert_eq!(directory.shared.announced(), said);
-        // Then there is somebody to be asked about what has changed.
+        directory.deregister("arm", incarnation).unwrap();
+        assert_eq!(directory.shared.announced(), before);
+        // A running library can answer queries for the changes.
         assert!(directory.shared.start_daemon());
-        assert_ne!(directory.shared.announced(), said);
+        assert_ne!(directory.shared.announced(), before);
     }
 }
