@@ -27,20 +27,20 @@ mod hello;
 mod identity;
 #[cfg(feature = "ip")]
 mod interfaces;
+#[cfg_attr(
+    not(any(feature = "ip", test)),
+    expect(dead_code, reason = "only TCP resets connections")
+)]
+mod log_limit;
 #[cfg(feature = "quic")]
 mod quic;
 #[cfg_attr(
     not(any(feature = "ip", test)),
     expect(dead_code, reason = "the processes of this host may send any number")
 )]
-mod ration;
+mod rate_limit;
 #[cfg(feature = "secure")]
 pub mod secure;
-#[cfg_attr(
-    not(any(feature = "ip", test)),
-    expect(dead_code, reason = "only TCP resets connections")
-)]
-mod seldom;
 mod stream;
 #[cfg(feature = "ip")]
 mod tcp;

@@ -10,10 +10,10 @@ use tokio::time::timeout;
 
 use super::dial::ends;
 use super::sockets::{Sockets, why_lost};
-use crate::seldom::warn_seldom;
-use crate::stream::endpoint::{Endpoint, Stranger};
+use crate::log_limit::warn_limited;
+use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
-use crate::stream::link::Running;
+use crate::stream::link::LinkTask;
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 
@@ -32,21 +32,20 @@ pub(super) async fn accept(
             }
             continue;
         }
-        let Some(place) = endpoint.receive_stranger(Source::Address(incoming.remote_address()))
-        else {
+        let Some(slot) = endpoint.admit_unproved(Source::Address(incoming.remote_address())) else {
             return;
         };
-        let number = place.number;
-        let task = receive(endpoint.clone(), sockets.clone(), place, incoming);
+        let number = slot.number;
+        let task = receive(endpoint.clone(), sockets.clone(), slot, incoming);
         let task = tokio::spawn(task).abort_handle();
-        endpoint.stranger_started(number, task);
+        endpoint.unproved_started(number, task);
     }
 }
 
 async fn receive(
     endpoint: Arc<Endpoint>,
     sockets: Arc<Sockets>,
-    place: Stranger,
+    slot: UnprovedSlot,
     incoming: Incoming,
 ) {
     let from = incoming.remote_address();
@@ -66,7 +65,7 @@ async fn receive(
         Err(why) => {
             let counter = &endpoint.tally().refused_unproved;
             let before = counter.fetch_add(1, Ordering::Relaxed);
-            warn_seldom(before, format_args!("{from}: connection refused: {why}"));
+            warn_limited(before, format_args!("{from}: connection refused: {why}"));
             return;
         }
     };
@@ -78,8 +77,8 @@ async fn receive(
     let reader = FrameReader::new(max_letter, BytesMut::new());
     let ends = ends(&connection, send, receive, max_letter);
     drop(connection);
-    Running::new(endpoint, link, sink, None)
-        .serve(ends, proof, reader, Source::Address(from), || drop(place))
+    LinkTask::new(endpoint, link, sink, None)
+        .serve(ends, proof, reader, Source::Address(from), || drop(slot))
         .await;
 }
 

@@ -17,7 +17,7 @@ mod accept;
 mod dial;
 mod settings;
 mod sockets;
-pub(crate) mod streams;
+mod streams;
 
 use std::sync::Arc;
 

@@ -19,13 +19,13 @@ use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarI
 use super::settings;
 use super::sockets::why_lost;
 use crate::stream::frame::{self, FrameReader, Space};
-use crate::stream::place::Room;
+use crate::stream::wire::{BoxFuture, ControlStream, ParcelStreams, StreamWriter};
 
 /// Answers go before letters.
 const URGENT: i32 = 1;
 
 /// The stream of everything but letters, as it is read.
-pub(crate) struct Control {
+pub(super) struct Control {
     connection: Connection,
     stream: RecvStream,
 }
@@ -36,7 +36,7 @@ impl Control {
         Self { connection, stream }
     }
 
-    pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
+    async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match fill(&mut self.stream, space).await {
             Ok(Some(len)) => Ok(len),
             Ok(None) | Err(ReadError::ConnectionLost(ConnectionError::ApplicationClosed(_))) => {
@@ -46,17 +46,25 @@ impl Control {
             Err(error) => Err(error.into()),
         }
     }
+}
 
-    /// Gives the connection its whole window, if there is room for that many bytes.
-    pub(crate) fn widen(&self, take: impl FnOnce(usize) -> Option<Room>) -> Option<Room> {
-        let room = take(settings::WIDENING)?;
-        settings::widen(&self.connection);
-        Some(room)
+impl ControlStream for Control {
+    fn read<'a>(&'a mut self, space: &'a mut Space<'_>) -> BoxFuture<'a, io::Result<usize>> {
+        Box::pin(self.read(space))
     }
 
-    /// Waits until the peer has closed the connection.
-    pub(crate) async fn drain(&mut self) {
-        self.connection.closed().await;
+    fn extra_window(&self) -> usize {
+        settings::WIDENING
+    }
+
+    fn widen(&self) {
+        settings::widen(&self.connection);
+    }
+
+    fn drain(&mut self) -> BoxFuture<'_, ()> {
+        Box::pin(async {
+            self.connection.closed().await;
+        })
     }
 }
 
@@ -68,7 +76,7 @@ impl Drop for Control {
 }
 
 /// The streams of the peer's letters.
-pub(crate) struct Letters {
+pub(super) struct Letters {
     connection: Connection,
     stream: Option<RecvStream>,
     reader: FrameReader,
@@ -83,14 +91,9 @@ impl Letters {
         }
     }
 
-    /// The frames that are read.
-    pub(crate) fn reader(&mut self) -> &mut FrameReader {
-        &mut self.reader
-    }
-
     /// Reads what has arrived of the letter whose turn it is. Waits for ever when the connection is
     /// lost: why is read from the other stream, with what the peer said before.
-    pub(crate) async fn read(&mut self) -> io::Result<usize> {
+    async fn read(&mut self) -> io::Result<usize> {
         loop {
             let stream = match &mut self.stream {
                 Some(stream) => stream,
@@ -110,6 +113,16 @@ impl Letters {
                 Err(error) => return Err(error.into()),
             }
         }
+    }
+}
+
+impl ParcelStreams for Letters {
+    fn read(&mut self) -> BoxFuture<'_, io::Result<usize>> {
+        Box::pin(self.read())
+    }
+
+    fn reader(&mut self) -> &mut FrameReader {
+        &mut self.reader
     }
 }
 
@@ -133,7 +146,7 @@ fn not_written(error: WriteError) -> io::Error {
 
 /// Where a link writes its frames, one after the other.
 #[derive(Debug)]
-pub(crate) struct Outgoing {
+pub(super) struct Outgoing {
     connection: Connection,
     state: Mutex<State>,
 }
@@ -178,32 +191,6 @@ impl Outgoing {
                 blocked: Lane::Control,
             }),
         }
-    }
-
-    /// The address of this host that the peer dialled. A connection that this side dialled has none:
-    /// it goes on from another address (RFC 9000 section 9).
-    pub(crate) fn local_ip(&self) -> Option<IpAddr> {
-        self.connection.local_ip()
-    }
-
-    /// Takes what there is room for.
-    pub(crate) fn write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
-        let mut state = self.state.lock();
-        let mut taken = 0;
-        for slice in slices {
-            let mut rest: &[u8] = slice;
-            while !rest.is_empty() {
-                match self.put(&mut state, rest) {
-                    Ok(len) => {
-                        taken += len;
-                        rest = rest.get(len..).unwrap_or_default();
-                    }
-                    Err(_) if taken > 0 => return Ok(taken),
-                    Err(error) => return Err(error),
-                }
-            }
-        }
-        Ok(taken)
     }
 
     /// Takes some of these bytes, which are of one frame, and perhaps of those behind it.
@@ -252,7 +239,7 @@ impl Outgoing {
     }
 
     /// Waits until there is room for what was not taken.
-    pub(crate) async fn writable(&self) -> io::Result<()> {
+    async fn writable(&self) -> io::Result<()> {
         let opens = {
             let state = self.state.lock();
             state.blocked == Lane::Letter && state.letter.is_none()
@@ -280,6 +267,37 @@ impl Outgoing {
             }
         })
         .await
+    }
+}
+
+impl StreamWriter for Outgoing {
+    /// The address of this host that the peer dialled. A connection that this side dialled has none:
+    /// it goes on from another address (RFC 9000 section 9).
+    fn local_ip(&self) -> Option<IpAddr> {
+        self.connection.local_ip()
+    }
+
+    fn write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
+        let mut state = self.state.lock();
+        let mut taken = 0;
+        for slice in slices {
+            let mut rest: &[u8] = slice;
+            while !rest.is_empty() {
+                match self.put(&mut state, rest) {
+                    Ok(len) => {
+                        taken += len;
+                        rest = rest.get(len..).unwrap_or_default();
+                    }
+                    Err(_) if taken > 0 => return Ok(taken),
+                    Err(error) => return Err(error),
+                }
+            }
+        }
+        Ok(taken)
+    }
+
+    fn writable(&self) -> BoxFuture<'_, io::Result<()>> {
+        Box::pin(self.writable())
     }
 }
 

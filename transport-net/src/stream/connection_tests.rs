@@ -47,7 +47,7 @@ struct Side {
     concluded: BTreeMap<AttemptId, Vec<Conclusion>>,
     dispatched: Vec<u64>,
     abandoned: Vec<u64>,
-    end: Option<End>,
+    end: Option<ConnectionEnd>,
 }
 
 impl Side {
@@ -124,7 +124,7 @@ impl Side {
         }
     }
 
-    fn finish(&mut self, end: End) {
+    fn finish(&mut self, end: ConnectionEnd) {
         for (attempt, conclusion) in self.connection.end(&end) {
             self.concluded.entry(attempt).or_default().push(conclusion);
         }
@@ -258,10 +258,10 @@ proptest! {
     fn conclusions_are_honest_when_a_connection_ends(
         steps in prop::collection::vec(step(), 0..120),
         end in prop_oneof![
-            Just(End::Hangup),
-            Just(End::Closed),
-            Just(End::Idle),
-            Just(End::Silent),
+            Just(ConnectionEnd::Hangup),
+            Just(ConnectionEnd::Closed),
+            Just(ConnectionEnd::Idle),
+            Just(ConnectionEnd::Silent),
         ],
         lost in any::<bool>(),
         first in any::<bool>(),
@@ -283,7 +283,7 @@ proptest! {
                 other.receive(1000, now);
             }
         }
-        other.finish(End::Hangup);
+        other.finish(ConnectionEnd::Hangup);
         ending.check(other)?;
         other.check(ending)?;
     }
@@ -306,7 +306,10 @@ fn another_incarnation_ends_it_before_anything_is_sent() {
     a.dispatch(10).unwrap();
     settle(&mut a, &mut b, now);
     let found = Incarnation::from_u64(2);
-    assert_eq!(a.end, Some(End::WrongIncarnation { expected, found }));
+    assert_eq!(
+        a.end,
+        Some(ConnectionEnd::WrongIncarnation { expected, found })
+    );
     match &a.concluded[&AttemptId(0)][..] {
         [Conclusion::NotSent(error)] => assert_eq!(error.fault, WayFault::WrongIncarnation),
         other => panic!("{other:?}"),
@@ -370,7 +373,10 @@ fn what_a_peer_must_not_send_ends_the_connection() {
             .into_iter()
             .map(|frame| a.connection.handle_frame(frame, now))
             .last();
-        assert!(matches!(last, Some(Err(End::Nonsense(_)))), "{last:?}");
+        assert!(
+            matches!(last, Some(Err(ConnectionEnd::ProtocolViolation(_)))),
+            "{last:?}"
+        );
     };
     let arrive = |id, len| Frame::Parcel {
         id,
@@ -386,9 +392,9 @@ fn what_a_peer_must_not_send_ends_the_connection() {
     nonsense(vec![arrive(1, 5001)]);
     nonsense((1..=9).map(|id| arrive(id, 1)).collect());
     nonsense(vec![answer]);
-    let (_, mut stranger) = pair(now);
-    let end = stranger.connection.handle_frame(Frame::Ping, now);
-    assert!(matches!(end, Err(End::Nonsense(_))));
+    let (_, mut slot) = pair(now);
+    let end = slot.connection.handle_frame(Frame::Ping, now);
+    assert!(matches!(end, Err(ConnectionEnd::ProtocolViolation(_))));
 }
 
 #[test]
@@ -420,7 +426,10 @@ fn silence_is_asked_about_and_then_ends_it() {
     a.connection.handle_timeout(now, 0).unwrap();
     a.transmit(usize::MAX, &mut b.coming, now);
     now += keep_alive;
-    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
+    assert_eq!(
+        a.connection.handle_timeout(now, 0),
+        Err(ConnectionEnd::Silent)
+    );
 }
 
 #[test]
@@ -443,7 +452,10 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     now += patience / 2;
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.connection.handle_timeout(now, 0).unwrap();
-    assert_eq!(a.connection.handle_timeout(due, 0), Err(End::Silent));
+    assert_eq!(
+        a.connection.handle_timeout(due, 0),
+        Err(ConnectionEnd::Silent)
+    );
 }
 
 #[test]
@@ -461,7 +473,10 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
     }
     // What was written has time to arrive.
     now += patience + Duration::from_millis(10);
-    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
+    assert_eq!(
+        a.connection.handle_timeout(now, 0),
+        Err(ConnectionEnd::Silent)
+    );
 }
 
 #[test]
@@ -516,7 +531,10 @@ fn idleness_ends_it_but_not_while_something_is_open() {
     settle(&mut a, &mut b, now);
     assert_eq!(a.concluded.len(), 1);
     now += limits().idle_close;
-    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Idle));
+    assert_eq!(
+        a.connection.handle_timeout(now, 0),
+        Err(ConnectionEnd::Idle)
+    );
     assert_eq!(a.dispatch(1), Err(SendError::Ended));
 }
 
@@ -539,7 +557,7 @@ fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
     }
     assert!(matches!(
         a.connection.handle_timeout(now, 0),
-        Err(End::TooSlow(_))
+        Err(ConnectionEnd::TooSlow(_))
     ));
 }
 
@@ -551,7 +569,7 @@ fn a_hello_must_come_in_time() {
     assert_eq!(b.connection.poll_timeout(), Some(late));
     assert!(matches!(
         a.connection.handle_timeout(late, 0),
-        Err(End::TooSlow(_))
+        Err(ConnectionEnd::TooSlow(_))
     ));
 }
 
@@ -567,7 +585,10 @@ fn a_peer_that_says_it_is_this_service_is_refused() {
         let mut connection = Connection::new(limits(), role, sample(1), now);
         connection.connected(now);
         let other = connection.handle_frame(Frame::Hello(sample(1)), now);
-        assert!(matches!(other, Err(End::Nonsense(_))), "{other:?}");
+        assert!(
+            matches!(other, Err(ConnectionEnd::ProtocolViolation(_))),
+            "{other:?}"
+        );
         assert_eq!(connection.poll_event(), None);
     }
 }

@@ -76,7 +76,10 @@ fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting
     }
 }
 
-async fn enters(endpoint: &Endpoint, greeting: Greeting) -> Result<(Arc<Link>, Hop), End> {
+async fn enters(
+    endpoint: &Endpoint,
+    greeting: Greeting,
+) -> Result<(Arc<Link>, Hop), ConnectionEnd> {
     let (link, _) = endpoint.accepted().unwrap();
     let peer = Hello {
         identity: identity(greeting.incarnation),
@@ -124,22 +127,22 @@ async fn no_source_has_more_than_half_of_the_places() {
 async fn strangers_of_one_source_push_out_each_other() {
     let limits = Limits::default();
     let endpoint = endpoint(limits.clone());
-    let stranger = |from: &str| {
-        let place = endpoint.receive_stranger(at(from)).unwrap();
+    let slot = |from: &str| {
+        let place = endpoint.admit_unproved(at(from)).unwrap();
         let task = tokio::spawn(std::future::pending::<()>());
-        endpoint.stranger_started(place.number, task.abort_handle());
+        endpoint.unproved_started(place.number, task.abort_handle());
         (place, task)
     };
-    let slow = stranger("10.0.0.7:1");
+    let slow = slot("10.0.0.7:1");
     let crowd: Vec<_> = (0..4 * limits.max_strangers)
-        .map(|n| stranger(&format!("127.0.{}.{}:1", n / 250, n % 250 + 1)))
+        .map(|n| slot(&format!("127.0.{}.{}:1", n / 250, n % 250 + 1)))
         .collect();
     let networks: Vec<_> = (0..4 * limits.max_strangers)
-        .map(|n| stranger(&format!("[2001:db8::{n:x}]:1")))
+        .map(|n| slot(&format!("[2001:db8::{n:x}]:1")))
         .collect();
     let registry = endpoint.registry.lock();
     let has =
-        |(place, _): &(Stranger, JoinHandle<()>)| registry.strangers.contains_key(&place.number);
+        |(place, _): &(UnprovedSlot, JoinHandle<()>)| registry.unproved.contains_key(&place.number);
     assert!(has(&slow));
     let left = [&crowd, &networks].map(|crowd| crowd.iter().filter(|it| has(it)).count());
     assert_eq!(1 + left[0] + left[1], limits.max_strangers);
@@ -167,14 +170,14 @@ const Y: &str = "tcp://10.0.0.2:7788";
 /// The peer of the link that is asked. The tests have no sockets, so this stands for its task.
 async fn ends_when_asked_to(link: Arc<Link>) {
     let end = link.leaving().await;
-    assert_eq!(end, End::Superseded);
+    assert_eq!(end, ConnectionEnd::Superseded);
     link.is_over();
 }
 
 #[tokio::test]
 async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
     let endpoint = endpoint(Limits::default());
-    let refused = |why| Err(End::Impostor(why));
+    let refused = |why| Err(ConnectionEnd::IdentityConflict(why));
     enters(&endpoint, comes(certificate(1), 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
@@ -238,7 +241,7 @@ async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection
     }
     // A stranger cannot list its own address: the connected peer has to. The peer of the first
     // connection has no socket here and gives no sign of life.
-    let stranger = Greeting {
+    let slot = Greeting {
         listening: &["10.0.0.8:7788", "10.0.0.7:7788"],
         ..comes(None, 8, "10.0.0.8:1", 3, X)
     };
@@ -246,8 +249,12 @@ async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection
         .await
         .unwrap();
     tokio::spawn(ends_when_asked_to(claimed.clone()));
-    enters(&endpoint, stranger).await.unwrap();
-    assert_eq!(claimed.ending(), Some(End::Superseded), "it was asked");
+    enters(&endpoint, slot).await.unwrap();
+    assert_eq!(
+        claimed.ending(),
+        Some(ConnectionEnd::Superseded),
+        "it was asked"
+    );
     assert_eq!(first.ending(), None);
 }
 
@@ -256,13 +263,13 @@ async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certific
     let endpoint = endpoint(Limits::default());
     let limits = endpoint.limits().clone();
     let len = limits.max_incoming_per_source / 2 - 1;
-    let account = |number| Account::Certificate([number; 32]);
+    let quota_key = |number| QuotaKey::Certificate([number; 32]);
     let of_one: Vec<_> = (0..64)
-        .filter_map(|_| endpoint.window(&account(0), len))
+        .filter_map(|_| endpoint.window(&quota_key(0), len))
         .collect();
     assert_eq!(of_one.len(), 2);
     let of_all: Vec<_> = (0..64)
-        .filter_map(|number| endpoint.window(&account(number), len))
+        .filter_map(|number| endpoint.window(&quota_key(number), len))
         .collect();
     let taken = (of_one.len() + of_all.len()) * len;
     assert!(
@@ -271,7 +278,7 @@ async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certific
     );
     // A connection that ends gives its share back.
     drop(of_all);
-    assert!(endpoint.window(&account(9), len).is_some());
+    assert!(endpoint.window(&quota_key(9), len).is_some());
 }
 
 #[tokio::test]
@@ -291,13 +298,13 @@ async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_thi
         "tcp://10.0.0.1:7788#0000000000000009",
     );
     let entered = enters(&endpoint, earlier).await;
-    assert_eq!(entered.map(|_| ()), Err(End::NotSought));
+    assert_eq!(entered.map(|_| ()), Err(ConnectionEnd::NotSought));
     assert_eq!(good.ending(), None);
 }
 
 /// A link that was dialled for this location, and whose peer has introduced itself.
 async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
-    let Way::ToDial(link, _) = endpoint.way_to(to).unwrap() else {
+    let Route::New(link, _) = endpoint.route_to(to).unwrap() else {
         panic!("there is a connection already");
     };
     link.connected(Instant::now());
@@ -321,18 +328,22 @@ async fn letters_take_another_connection_when_one_is_suspect() {
     });
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let first = dials(&endpoint, &to).await;
-    let Way::There(same) = endpoint.way_to(&to).unwrap() else {
+    let Route::Open(same) = endpoint.route_to(&to).unwrap() else {
         panic!("a connection that works is kept");
     };
     assert!(Arc::ptr_eq(&first, &same));
     first.doubt();
     assert!(first.is_suspect());
     let second = dials(&endpoint, &to).await;
-    assert_eq!(first.ending(), Some(End::Silent), "the other one is open");
-    let Way::There(used) = endpoint.way_to(&to).unwrap() else {
+    assert_eq!(
+        first.ending(),
+        Some(ConnectionEnd::Silent),
+        "the other one is open"
+    );
+    let Route::Open(used) = endpoint.route_to(&to).unwrap() else {
         panic!("it is used");
     };
     assert!(Arc::ptr_eq(&second, &used));
     second.doubt();
-    assert!(matches!(endpoint.way_to(&to).unwrap(), Way::ToDial(..)));
+    assert!(matches!(endpoint.route_to(&to).unwrap(), Route::New(..)));
 }

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::reader::{APART_FROM, CHUNK, FIRST_STEP};
 use super::*;
-use crate::stream::place::{Place, Rooms};
+use crate::stream::budget::{ByteBudget, ContentBuffer};
 
 fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
     let payload = Payload {
@@ -38,7 +38,7 @@ fn read_into(
     reader: &mut FrameReader,
     mut bytes: &[u8],
     sizes: &[usize],
-    mut memory: impl FnMut(&Arriving<'_>) -> Option<Place>,
+    mut memory: impl FnMut(&Arriving<'_>) -> Option<ContentBuffer>,
 ) -> Result<Vec<Frame>, FrameError> {
     let mut frames = Vec::new();
     let mut sizes = sizes.iter().cycle();
@@ -82,9 +82,9 @@ impl LoanedContent for Memory {
     }
 }
 
-fn place(len: usize) -> Option<Place> {
-    let loan = Rooms::default().lend(len, len)?;
-    Some(Place::new(Box::new(Memory(vec![0; len])), loan))
+fn place(len: usize) -> Option<ContentBuffer> {
+    let loan = ByteBudget::default().lend(len, len)?;
+    Some(ContentBuffer::new(Box::new(Memory(vec![0; len])), loan))
 }
 
 fn content(frame: &Frame) -> &Bytes {
@@ -181,8 +181,8 @@ fn large_content_is_read_into_the_memory_that_is_offered_and_nowhere_else() {
         assert_eq!((receiver, front, tail), ("arm@crex", 8 + 8 + 300, 1));
         let memory = Memory(vec![0; len]);
         places.push(memory.0.as_ptr());
-        let loan = Rooms::default().lend(len, len)?;
-        Some(Place::new(Box::new(memory), loan))
+        let loan = ByteBudget::default().lend(len, len)?;
+        Some(ContentBuffer::new(Box::new(memory), loan))
     };
     let run = [&large[..], &large, &large].concat();
     let first = read_into(&mut reader, &run, &[usize::MAX], &mut memory).unwrap();

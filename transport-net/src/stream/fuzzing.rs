@@ -10,12 +10,12 @@ use fipa_transport::{
     Abandoned, Answer, AttemptId, Conclusion, Incarnation, LoanedContent, Parcel,
 };
 
+use super::budget::{ByteBudget, ContentBuffer};
 use super::config::Limits;
 use super::connection::{Connection, Event, Role};
 use super::frame::{self, FrameReader, Space};
-use super::place::{Place, Rooms};
 use crate::Identity;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 
 const MAX_LETTER: usize = 100_000;
@@ -29,7 +29,7 @@ pub struct Framed {
     reader: FrameReader,
     /// Whether the owner of the connection lends memory for large contents.
     lends: bool,
-    rooms: Rooms,
+    byte_budget: ByteBudget,
     /// Attempts that were taken for sending, and those the kernel has taken something of.
     dispatched: u64,
     concluded: BTreeMap<AttemptId, Conclusion>,
@@ -126,7 +126,7 @@ impl Framed {
             connection,
             reader: FrameReader::new(MAX_LETTER, BytesMut::new()),
             lends,
-            rooms: Rooms::default(),
+            byte_budget: ByteBudget::default(),
             dispatched: 0,
             concluded: BTreeMap::new(),
             abandoned: BTreeSet::new(),
@@ -169,17 +169,20 @@ impl Framed {
     }
 
     fn take_frames(&mut self, now: Instant) {
-        let (lends, rooms) = (self.lends, self.rooms.clone());
+        let (lends, byte_budget) = (self.lends, self.byte_budget.clone());
         loop {
             let memory = |arriving: &fipa_transport::Arriving<'_>| {
                 assert!(arriving.len <= MAX_LETTER * 2, "much memory is asked for");
-                let loan = rooms.lend(arriving.len, 1 << 20).filter(|_| lends)?;
-                Some(Place::new(Box::new(Memory(vec![0; arriving.len])), loan))
+                let loan = byte_budget.lend(arriving.len, 1 << 20).filter(|_| lends)?;
+                Some(ContentBuffer::new(
+                    Box::new(Memory(vec![0; arriving.len])),
+                    loan,
+                ))
             };
             let end = match self.reader.next(memory) {
                 Ok(Some(frame)) => self.connection.handle_frame(frame, now).err(),
                 Ok(None) => return,
-                Err(error) => Some(End::Nonsense(error.to_string())),
+                Err(error) => Some(ConnectionEnd::ProtocolViolation(error.to_string())),
             };
             self.take_events();
             if let Some(end) = end {
@@ -264,14 +267,14 @@ impl Framed {
 
     /// The connection ends: every attempt has its conclusion then.
     pub fn close(&mut self) {
-        self.end(&End::Closed);
+        self.end(&ConnectionEnd::Closed);
         for attempt in (0..self.dispatched).map(AttemptId) {
             let known = self.concluded.contains_key(&attempt);
             assert!(known || self.abandoned.contains(&attempt), "{attempt:?}");
         }
     }
 
-    fn end(&mut self, end: &End) {
+    fn end(&mut self, end: &ConnectionEnd) {
         self.ended = true;
         for (attempt, conclusion) in self.connection.end(end) {
             assert!(!matches!(conclusion, Conclusion::Answered(_)));

@@ -14,19 +14,20 @@ use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, sleep_until, timeout};
 
-use super::accept_queue::{self, Full, Place, TURN};
-#[cfg(feature = "secure")]
-use super::tls;
+use super::accept_queue::{self, Full, QueueTurn, TURN};
+use super::endpoint::TcpEndpoint;
 use super::unframed::{self, UnframedError};
 use crate::address::{self, AddressError};
-use crate::seldom::warn_seldom;
+use crate::log_limit::warn_limited;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
-use crate::stream::endpoint::{Endpoint, Stranger};
+use crate::stream::endpoint::UnprovedSlot;
 use crate::stream::frame::{FrameReader, MAGIC};
-use crate::stream::link::Running;
+use crate::stream::link::LinkTask;
 use crate::stream::proof::Proof;
-use crate::stream::source::{Account, Home, Source};
+use crate::stream::source::{Home, QuotaKey, Source};
+#[cfg(feature = "secure")]
+use crate::stream::tls;
 use crate::stream::wire;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
@@ -73,18 +74,18 @@ pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
 }
 
 /// Accepts connections until it is aborted.
-pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
+pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {
     let mut pace = Pace::default();
     loop {
         match listener.accept().await {
             Ok((stream, from)) => {
                 let stream = Arc::new(stream);
                 let queue = &endpoint.legacy.accept_queue;
-                let place = queue.admit(&endpoint, from.ip(), &stream);
-                if matches!(place, Err(Full::Closed)) {
+                let turn = queue.admit(&endpoint, from.ip(), &stream);
+                if matches!(turn, Err(Full::Closed)) {
                     return;
                 }
-                serve(&endpoint, place, stream, from);
+                serve(&endpoint, turn, stream, from);
                 let (waiting, left) = endpoint.legacy.accept_queue.progress();
                 if pace.pauses(waiting, left) {
                     sleep(Pace::PAUSE).await;
@@ -130,18 +131,18 @@ impl Pace {
 
 /// Starts the task of an accepted connection.
 fn serve(
-    endpoint: &Arc<Endpoint>,
-    place: Result<Place, Full>,
+    endpoint: &Arc<TcpEndpoint>,
+    turn: Result<QueueTurn, Full>,
     stream: Arc<TcpStream>,
     from: SocketAddr,
 ) {
     // The task ends itself when others push it out, so it begins when it has its own handle.
     let (handle, own) = oneshot::channel();
-    let receiving = receive(endpoint.clone(), place, stream, from, own);
+    let receiving = receive(endpoint.clone(), turn, stream, from, own);
     let _ended = handle.send(tokio::spawn(receiving).abort_handle());
 }
 
-fn reset(endpoint: &Arc<Endpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
+fn reset(endpoint: &Arc<TcpEndpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
     if let Some(stream) = Arc::into_inner(stream) {
         endpoint.legacy.reset(endpoint, stream, from, full);
     }
@@ -150,12 +151,12 @@ fn reset(endpoint: &Arc<Endpoint>, stream: Arc<TcpStream>, from: SocketAddr, ful
 /// The place of a connection whose first byte is awaited.
 enum Waiting {
     /// In the accept queue, with its turn.
-    InTurn(Place),
+    InTurn(QueueTurn),
     /// Among those that have not introduced themselves.
-    Late(Stranger),
+    Late(UnprovedSlot),
     /// The same, because the accept queue was full: letters of legacy peers do not keep out a peer
     /// that is going to introduce itself.
-    Beside(Stranger, Full),
+    Beside(UnprovedSlot, Full),
 }
 
 /// The first byte of a connection.
@@ -169,8 +170,8 @@ enum First {
 }
 
 async fn receive(
-    endpoint: Arc<Endpoint>,
-    place: Result<Place, Full>,
+    endpoint: Arc<TcpEndpoint>,
+    turn: Result<QueueTurn, Full>,
     stream: Arc<TcpStream>,
     from: SocketAddr,
     own: oneshot::Receiver<AbortHandle>,
@@ -178,11 +179,11 @@ async fn receive(
     let Ok(task) = own.await else {
         return;
     };
-    let waiting = match place {
-        Ok(place) if !place.started(task.clone()) => return,
-        Ok(place) => Waiting::InTurn(place),
-        Err(full) => match stranger(&endpoint, from, task.clone()) {
-            Some(place) => Waiting::Beside(place, full),
+    let waiting = match turn {
+        Ok(turn) if !turn.started(task.clone()) => return,
+        Ok(turn) => Waiting::InTurn(turn),
+        Err(full) => match unproved_slot(&endpoint, from, task.clone()) {
+            Some(slot) => Waiting::Beside(slot, full),
             None => return,
         },
     };
@@ -200,7 +201,7 @@ async fn receive(
     };
     let refused = match first {
         First::Byte(byte) if byte == MAGIC[0] && endpoint.config.takes_frames_of(from.ip()) => {
-            let Some(place) = waiting.introduces_itself(&endpoint, from, task) else {
+            let Some(slot) = waiting.introduces_itself(&endpoint, from, task) else {
                 return;
             };
             let (Some(stream), Some((link, sink))) = (Arc::into_inner(stream), endpoint.accepted())
@@ -208,24 +209,24 @@ async fn receive(
                 return;
             };
             let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
-            Running::new(endpoint, link, sink, None)
+            LinkTask::new(endpoint.stream.clone(), link, sink, None)
                 .serve(
                     wire::plain(stream),
                     Proof::default(),
                     reader,
                     Source::Address(from),
-                    || drop(place),
+                    || drop(slot),
                 )
                 .await;
             return;
         }
         // A bit-efficient or an XML envelope.
         First::Byte(0xfe | 0xfd | b'<') => {
-            let place = match waiting.takes_turn(&endpoint, from, &stream, task) {
-                Ok(place) => place,
+            let turn = match waiting.takes_turn(&endpoint, from, &stream, task) {
+                Ok(turn) => turn,
                 Err(full) => return reset(&endpoint, stream, from, full),
             };
-            match receive_letter(&endpoint, place, stream, from).await {
+            match receive_letter(&endpoint, turn, stream, from).await {
                 Ok(()) => return,
                 Err(refused) => refused.to_string(),
             }
@@ -240,13 +241,13 @@ async fn receive(
     };
     let counter = &endpoint.tally().refused_nonsense;
     let before = counter.fetch_add(1, Ordering::Relaxed);
-    warn_seldom(before, format_args!("{from}: connection closed: {refused}"));
+    warn_limited(before, format_args!("{from}: connection closed: {refused}"));
 }
 
 /// Waits for the first byte, which stays in the kernel's buffer. A connection without one loses its
 /// turn. Returns `None` when the endpoint has been closed.
 async fn first_byte(
-    endpoint: &Arc<Endpoint>,
+    endpoint: &Arc<TcpEndpoint>,
     mut waiting: Waiting,
     stream: &TcpStream,
     from: SocketAddr,
@@ -257,9 +258,9 @@ async fn first_byte(
     let mut byte = [0];
     let mut peeked = timeout(turn, stream.peek(&mut byte)).await;
     if peeked.is_err() && accept_queue::is_silent(stream) {
-        if let Waiting::InTurn(place) = waiting {
-            drop(place);
-            waiting = Waiting::Late(stranger(endpoint, from, task.clone())?);
+        if let Waiting::InTurn(turn) = waiting {
+            drop(turn);
+            waiting = Waiting::Late(unproved_slot(endpoint, from, task.clone())?);
         }
         peeked = timeout(patience - turn, stream.peek(&mut byte)).await;
     } else if peeked.is_err() {
@@ -274,33 +275,37 @@ async fn first_byte(
         Ok(Err(error)) => First::Broken(error),
         Err(_) => First::Silence,
     };
-    if let Waiting::InTurn(place) = &waiting {
-        place.has_bytes();
+    if let Waiting::InTurn(turn) = &waiting {
+        turn.has_bytes();
     }
     Some((waiting, first))
 }
 
 /// A place among those that have not introduced themselves.
-fn stranger(endpoint: &Arc<Endpoint>, from: SocketAddr, task: AbortHandle) -> Option<Stranger> {
-    let place = endpoint.receive_stranger(Source::Address(from))?;
-    endpoint.stranger_started(place.number, task);
-    Some(place)
+fn unproved_slot(
+    endpoint: &Arc<TcpEndpoint>,
+    from: SocketAddr,
+    task: AbortHandle,
+) -> Option<UnprovedSlot> {
+    let slot = endpoint.admit_unproved(Source::Address(from))?;
+    endpoint.unproved_started(slot.number, task);
+    Some(slot)
 }
 
 impl Waiting {
     /// Leaves the accept queue, because the peer is going to introduce itself.
     fn introduces_itself(
         self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         from: SocketAddr,
         task: AbortHandle,
-    ) -> Option<Stranger> {
+    ) -> Option<UnprovedSlot> {
         match self {
-            Self::InTurn(place) => {
-                drop(place);
-                stranger(endpoint, from, task)
+            Self::InTurn(turn) => {
+                drop(turn);
+                unproved_slot(endpoint, from, task)
             }
-            Self::Late(place) | Self::Beside(place, _) => Some(place),
+            Self::Late(slot) | Self::Beside(slot, _) => Some(slot),
         }
     }
 
@@ -308,23 +313,23 @@ impl Waiting {
     /// that found no room does not: later ones of its address may have.
     fn takes_turn(
         self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         from: SocketAddr,
         stream: &Arc<TcpStream>,
         task: AbortHandle,
-    ) -> Result<Place, Full> {
+    ) -> Result<QueueTurn, Full> {
         match self {
-            Self::InTurn(place) => Ok(place),
+            Self::InTurn(turn) => Ok(turn),
             Self::Beside(_, full) => Err(full),
-            Self::Late(stranger) => {
-                drop(stranger);
-                let place = endpoint
+            Self::Late(slot) => {
+                drop(slot);
+                let turn = endpoint
                     .legacy
                     .accept_queue
                     .admit(endpoint, from.ip(), stream)?;
-                place.has_bytes();
-                if place.started(task) {
-                    Ok(place)
+                turn.has_bytes();
+                if turn.started(task) {
+                    Ok(turn)
                 } else {
                     Err(Full::Closed)
                 }
@@ -336,21 +341,21 @@ impl Waiting {
 /// Reads a legacy peer's letter when its turn to be read has come, and hands it on when those of its
 /// address that were accepted before it have been.
 async fn receive_letter(
-    endpoint: &Arc<Endpoint>,
-    place: Place,
+    endpoint: &Arc<TcpEndpoint>,
+    turn: QueueTurn,
     stream: Arc<TcpStream>,
     from: SocketAddr,
 ) -> Result<(), UnframedError> {
-    place.may_read().await;
+    turn.may_read().await;
     let Some(mut stream) = Arc::into_inner(stream) else {
         return Ok(());
     };
-    let account = Account::of(Source::Address(from), None);
-    let read = unframed::read(endpoint, &place, &account, &mut stream).await?;
+    let quota_key = QuotaKey::of(Source::Address(from), None);
+    let read = unframed::read(endpoint, &turn, &quota_key, &mut stream).await?;
     drop(stream);
-    place.is_first().await;
-    if let Some(ration) = endpoint.ration(Home::Address(from.ip()))
-        && let Some(until) = ration.spend(1, read.letter.len(), Instant::now())
+    turn.is_first().await;
+    if let Some(rate_limit) = endpoint.rate_limit(Home::Address(from.ip()))
+        && let Some(until) = rate_limit.spend(1, read.letter.len(), Instant::now())
     {
         count(&endpoint.tally().held_back);
         sleep_until(until.into()).await;
@@ -367,7 +372,7 @@ async fn receive_letter(
 /// need not.
 #[cfg(feature = "secure")]
 async fn prove(
-    endpoint: &Arc<Endpoint>,
+    endpoint: &Arc<TcpEndpoint>,
     waiting: Waiting,
     stream: Arc<TcpStream>,
     from: SocketAddr,
@@ -380,15 +385,15 @@ async fn prove(
     let patience = endpoint.limits().handshake_timeout;
     let refused = match first {
         First::Byte(tls::FIRST_BYTE) => {
-            let place = waiting.introduces_itself(endpoint, from, task.clone())?;
+            let slot = waiting.introduces_itself(endpoint, from, task.clone())?;
             match tls::accept(security, Arc::into_inner(stream)?, patience).await {
                 Ok(secured) => {
                     let (link, sink) = endpoint.accepted()?;
                     let proof = Proof::of(security, secured.certificate);
                     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
-                    Running::new(endpoint.clone(), link, sink, None)
+                    LinkTask::new(endpoint.stream.clone(), link, sink, None)
                         .serve(secured.ends, proof, reader, Source::Address(from), || {
-                            drop(place);
+                            drop(slot);
                         })
                         .await;
                     return None;
@@ -406,7 +411,7 @@ async fn prove(
     };
     let counter = &endpoint.tally().refused_unproved;
     let before = counter.fetch_add(1, Ordering::Relaxed);
-    warn_seldom(
+    warn_limited(
         before,
         format_args!("{from}: connection refused: {refused}"),
     );

@@ -24,10 +24,10 @@ use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use crate::ration::whose;
+use super::endpoint::TcpEndpoint;
+use crate::rate_limit::quota_address;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
 
 /// A connection that has sent nothing for this long loses its turn.
 pub(crate) const TURN: Duration = Duration::from_millis(250);
@@ -91,7 +91,7 @@ pub(crate) enum Full {
 }
 
 /// Tasks to end because their connections were pushed out.
-type PushedOut = Vec<AbortHandle>;
+type Evicted = Vec<AbortHandle>;
 
 impl State {
     /// Appends a connection to the queue of its address. When there is no room, the oldest
@@ -102,7 +102,7 @@ impl State {
         home: IpAddr,
         entry: Entry,
         is_silent: impl Fn(&Entry) -> bool,
-    ) -> Result<(u64, PushedOut), Full> {
+    ) -> Result<(u64, Evicted), Full> {
         if self.closed {
             return Err(Full::Closed);
         }
@@ -114,14 +114,14 @@ impl State {
         } else {
             None
         };
-        let mut pushed_out = PushedOut::new();
+        let mut evicted = Evicted::new();
         if let Some(full) = full {
             let from = match full {
                 Full::All => self.most_waiting().unwrap_or(home),
                 _ => home,
             };
             let ticket = self.silent(from, is_silent).ok_or(full)?;
-            pushed_out.extend(self.remove(limits, from, ticket).and_then(|out| out.task));
+            evicted.extend(self.remove(limits, from, ticket).and_then(|out| out.task));
         }
         self.last_ticket += 1;
         let ticket = self.last_ticket;
@@ -129,7 +129,7 @@ impl State {
         peer.turns.insert(ticket, entry);
         self.waiting += 1;
         self.grant(limits, home);
-        Ok((ticket, pushed_out))
+        Ok((ticket, evicted))
     }
 
     /// The address of which most connections wait.
@@ -214,14 +214,14 @@ impl State {
 
     /// Takes the turn from a connection that is read and makes no progress. When all connections of
     /// the address that may be read are such and others wait, the older half is pushed out.
-    fn stall(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> PushedOut {
-        let mut pushed_out = PushedOut::new();
+    fn stall(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> Evicted {
+        let mut evicted = Evicted::new();
         let Some(peer) = self.peers.get_mut(&home) else {
-            return pushed_out;
+            return evicted;
         };
         match peer.turns.get_mut(&ticket) {
             Some(entry) if entry.phase == Phase::Reading => entry.phase = Phase::Stalled,
-            _ => return pushed_out,
+            _ => return evicted,
         }
         peer.wake_first();
         let all_stalled = peer.reading >= limits.max_reads_per_address
@@ -235,10 +235,10 @@ impl State {
             let half = peer.reading.div_ceil(2);
             let oldest: Vec<u64> = stalled.take(half).map(|(ticket, _)| *ticket).collect();
             for ticket in oldest {
-                pushed_out.extend(self.remove(limits, home, ticket).and_then(|out| out.task));
+                evicted.extend(self.remove(limits, home, ticket).and_then(|out| out.task));
             }
         }
-        pushed_out
+        evicted
     }
 
     /// Whether nothing that was accepted before this connection has a turn.
@@ -299,11 +299,11 @@ impl AcceptQueue {
     /// When there is no room.
     pub(crate) fn admit(
         &self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         from: IpAddr,
         socket: &Arc<TcpStream>,
-    ) -> Result<Place, Full> {
-        let home = whose(from);
+    ) -> Result<QueueTurn, Full> {
+        let home = quota_address(from);
         let wake = Arc::new(Notify::new());
         let entry = Entry {
             phase: Phase::Waiting,
@@ -313,10 +313,10 @@ impl AcceptQueue {
         };
         let limits = endpoint.limits();
         let mut state = self.0.lock();
-        let (ticket, pushed_out) = state.admit(limits, home, entry, Entry::is_silent)?;
+        let (ticket, evicted) = state.admit(limits, home, entry, Entry::is_silent)?;
         drop(state);
-        end(endpoint, pushed_out);
-        Ok(Place {
+        end(endpoint, evicted);
+        Ok(QueueTurn {
             endpoint: endpoint.clone(),
             home,
             ticket,
@@ -344,8 +344,8 @@ impl AcceptQueue {
     }
 }
 
-fn end(endpoint: &Endpoint, pushed_out: PushedOut) {
-    for task in pushed_out {
+fn end(endpoint: &TcpEndpoint, evicted: Evicted) {
+    for task in evicted {
         count(&endpoint.tally().refused_crowd);
         task.abort();
     }
@@ -353,14 +353,14 @@ fn end(endpoint: &Endpoint, pushed_out: PushedOut) {
 
 /// The place of one connection in the queue of its address; dropping it lets the next one through.
 #[derive(Debug)]
-pub(crate) struct Place {
-    endpoint: Arc<Endpoint>,
+pub(crate) struct QueueTurn {
+    endpoint: Arc<TcpEndpoint>,
     home: IpAddr,
     ticket: u64,
     wake: Arc<Notify>,
 }
 
-impl Place {
+impl QueueTurn {
     /// Sets the task of this connection. Returns whether it is to go on.
     pub(crate) fn started(&self, task: AbortHandle) -> bool {
         self.with_entry(|entry| entry.task = Some(task)).is_some() && !self.state().closed
@@ -374,8 +374,8 @@ impl Place {
     /// Takes the turn from this connection: no byte came for [`TURN`].
     pub(crate) fn stalled(&self) {
         let limits = self.endpoint.limits();
-        let pushed_out = self.state().stall(limits, self.home, self.ticket);
-        end(&self.endpoint, pushed_out);
+        let evicted = self.state().stall(limits, self.home, self.ticket);
+        end(&self.endpoint, evicted);
     }
 
     /// Waits for the permission to read this connection.
@@ -407,7 +407,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for QueueTurn {
     fn drop(&mut self) {
         let limits = self.endpoint.limits();
         self.state().remove(limits, self.home, self.ticket);
@@ -498,8 +498,8 @@ mod tests {
         let turns = &mut state.peers.get_mut(&HERE).unwrap().turns;
         turns.get_mut(&silent).unwrap().task = Some(task);
         let admitted = state.admit(&limits(), HERE, entry(), |entry| entry.task.is_some());
-        let (_, pushed_out) = admitted.unwrap();
-        assert_eq!(pushed_out.len(), 1);
+        let (_, evicted) = admitted.unwrap();
+        assert_eq!(evicted.len(), 1);
         assert!(!state.peers[&HERE].turns.contains_key(&silent));
     }
 

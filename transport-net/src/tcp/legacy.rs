@@ -10,16 +10,16 @@ use tokio::net::TcpStream;
 use tokio::time::sleep;
 
 use super::accept_queue::{AcceptQueue, Full};
-use super::courier::Couriers;
-use crate::seldom::PerSecond;
+use super::endpoint::TcpEndpoint;
+use super::legacy_sender::LegacySenders;
+use crate::log_limit::PerSecond;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
 
 /// Letters of legacy peers.
 #[derive(Debug, Default)]
 pub(crate) struct Legacy {
     /// Letters to them.
-    pub(super) couriers: Couriers,
+    pub(super) senders: LegacySenders,
     /// Accepted connections that may bring a letter of one.
     pub(super) accept_queue: AcceptQueue,
     /// Connections that were reset because the accept queue was full.
@@ -28,19 +28,19 @@ pub(crate) struct Legacy {
 
 impl Legacy {
     pub(crate) fn close(&self) {
-        self.couriers.close();
+        self.senders.close();
         self.accept_queue.close();
     }
 
     /// Ends the attempt to send a letter.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.couriers.abandon(attempt)
+        self.senders.abandon(attempt)
     }
 
     /// Resets a connection for which the accept queue has no room, so that its sender sees an error.
     pub(super) fn reset(
         &self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         stream: TcpStream,
         from: SocketAddr,
         full: Full,

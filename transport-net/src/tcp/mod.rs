@@ -11,12 +11,11 @@
 mod accept;
 mod accept_queue;
 mod config;
-mod courier;
-pub(crate) mod dial;
+mod dial;
 mod dialect;
+mod endpoint;
 mod legacy;
-#[cfg(feature = "secure")]
-pub(crate) mod tls;
+mod legacy_sender;
 mod unframed;
 
 use std::sync::Arc;
@@ -28,8 +27,8 @@ use fipa_transport::{
 use tokio::runtime::Handle;
 
 pub use self::config::TcpConfig;
-pub(crate) use self::legacy::Legacy;
-use crate::end::End;
+use self::endpoint::TcpEndpoint;
+use crate::end::ConnectionEnd;
 use crate::stream::config::StreamConfig;
 use crate::stream::counters::Counters;
 use crate::stream::endpoint::Endpoint;
@@ -52,7 +51,7 @@ use crate::stream::endpoint::Endpoint;
 #[derive(Debug)]
 pub struct TcpTransport {
     listen: Vec<String>,
-    endpoint: Arc<Endpoint>,
+    endpoint: Arc<TcpEndpoint>,
 }
 
 impl TcpTransport {
@@ -77,7 +76,7 @@ impl TcpTransport {
         };
         Self {
             listen,
-            endpoint: Endpoint::new(Kind::Tcp, config, runtime),
+            endpoint: TcpEndpoint::new(Endpoint::new(Kind::Tcp, config, runtime)),
         }
     }
 
@@ -90,13 +89,13 @@ impl TcpTransport {
     /// Hands a letter to who takes those for an old peer.
     fn hand(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
         let Some(sink) = self.endpoint.sink() else {
-            return Err(End::Closed.after());
+            return Err(ConnectionEnd::Closed.after());
         };
-        let couriers = &self.endpoint.legacy.couriers;
-        if couriers.take(&self.endpoint, attempt, to, parcel)? {
-            let run = courier::run(self.endpoint.clone(), sink, to.clone());
+        let senders = &self.endpoint.legacy.senders;
+        if senders.take(&self.endpoint, attempt, to, parcel)? {
+            let run = legacy_sender::run(self.endpoint.clone(), sink, to.clone());
             let task = self.endpoint.runtime.spawn(run);
-            if task.is_finished() && couriers.take_back(attempt, to) {
+            if task.is_finished() && senders.take_back(attempt, to) {
                 let detail = "the runtime of this endpoint has been shut down";
                 return Err(WayError::new(WayFault::Closed, detail));
             }

@@ -7,12 +7,12 @@ use fipa_transport::{Kind, LegacySource, Signature};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
-use super::accept_queue::{Place, TURN};
+use super::accept_queue::{QueueTurn, TURN};
+use super::endpoint::TcpEndpoint;
+use crate::stream::budget::ReservedBytes;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
-use crate::stream::place::Room;
-use crate::stream::source::Account;
+use crate::stream::source::QuotaKey;
 
 /// Bytes read at first.
 const FIRST_READ: usize = 4096;
@@ -43,19 +43,19 @@ pub(crate) enum UnframedError {
 pub(crate) struct Read {
     pub(crate) letter: Letter,
     pub(crate) signature: Signature,
-    pub(crate) _room: Option<Room>,
+    pub(crate) _room: Option<ReservedBytes>,
 }
 
 /// Reads a letter from this account to its end. Its envelope is brought into the standard dialect;
-/// the message behind it is not touched. The connection at `place` loses its turn when no byte has
+/// the message behind it is not touched. The connection loses its turn when no byte has
 /// come for [`TURN`], and needs its turn to get much memory.
 pub(crate) async fn read(
-    endpoint: &Endpoint,
-    place: &Place,
-    account: &Account,
+    endpoint: &TcpEndpoint,
+    turn: &QueueTurn,
+    quota_key: &QuotaKey,
     source: &mut (impl AsyncRead + Unpin),
 ) -> Result<Read, UnframedError> {
-    let (whole, room) = read_to_end(endpoint, place, account, source).await?;
+    let (whole, room) = read_to_end(endpoint, turn, quota_key, source).await?;
     let (envelope, length) = Envelope::decode(&whole)?;
     let length = length.min(whole.len());
     let signature = signature_of(&whole[..length]);
@@ -134,7 +134,7 @@ fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
 }
 
 /// Hands a letter that came from this source to the sink, unless the endpoint has been closed.
-pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: LegacySource) {
+pub(crate) fn hand_on(endpoint: &TcpEndpoint, letter: Letter, from: LegacySource) {
     if let Some(sink) = endpoint.sink() {
         count(&endpoint.tally().unframed_in);
         sink.arrived_unframed(letter, Kind::Tcp, from);
@@ -142,11 +142,11 @@ pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: LegacySource) {
 }
 
 async fn read_to_end(
-    endpoint: &Endpoint,
-    place: &Place,
-    account: &Account,
+    endpoint: &TcpEndpoint,
+    turn: &QueueTurn,
+    quota_key: &QuotaKey,
     source: &mut (impl AsyncRead + Unpin),
-) -> Result<(Bytes, Option<Room>), UnframedError> {
+) -> Result<(Bytes, Option<ReservedBytes>), UnframedError> {
     let limits = endpoint.limits();
     let mut bytes = BytesMut::with_capacity(FIRST_READ);
     let mut room = None;
@@ -160,24 +160,24 @@ async fn read_to_end(
             if bytes.len() >= COUNTED_FROM {
                 // A letter that has memory waits for none of a later one, so letters are not waited
                 // for in a circle.
-                place.is_first().await;
+                turn.is_first().await;
                 let patience = limits.stall_timeout.saturating_mul(2);
-                let taken = take_room(endpoint, account, &mut room, bytes.len(), more);
+                let taken = take_room(endpoint, quota_key, &mut room, bytes.len(), more);
                 let in_time = timeout_at(Instant::now() + patience, taken).await;
                 in_time.map_err(|_| UnframedError::NoRoom)?;
                 window = (Instant::now() + limits.stall_timeout, bytes.len());
             }
             bytes.reserve(more);
         }
-        let turn = Instant::now() + TURN;
-        match timeout_at(window.0.min(turn), source.read_buf(&mut bytes)).await {
+        let turn_ends = Instant::now() + TURN;
+        match timeout_at(window.0.min(turn_ends), source.read_buf(&mut bytes)).await {
             Ok(Ok(0)) => return Ok((bytes.freeze(), room)),
             Ok(Ok(_)) => {}
             Ok(Err(error)) => return Err(error.into()),
-            Err(_) if turn < window.0 => place.stalled(),
+            Err(_) if turn_ends < window.0 => turn.stalled(),
             Err(_) => {
                 let progress = (bytes.len() - window.1) as u64;
-                let least = room.as_ref().map_or(0, Room::least_progress);
+                let least = room.as_ref().map_or(0, ReservedBytes::least_progress);
                 if progress < least.max(Limits::MIN_PROGRESS) {
                     return Err(UnframedError::TooSlow);
                 }
@@ -189,15 +189,15 @@ async fn read_to_end(
 
 /// Waits until there is room for so much more of a letter of which `there` has arrived.
 async fn take_room(
-    endpoint: &Endpoint,
-    account: &Account,
-    room: &mut Option<Room>,
+    endpoint: &TcpEndpoint,
+    quota_key: &QuotaKey,
+    room: &mut Option<ReservedBytes>,
     there: usize,
     more: usize,
 ) {
-    let mut meter = endpoint.meter(account);
+    let mut meter = endpoint.meter(quota_key);
     loop {
-        let freed = endpoint.rooms.freed();
+        let freed = endpoint.byte_budget.freed();
         tokio::pin!(freed);
         freed.as_mut().enable();
         match room {

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use super::packet::{BASE, LARGEST};
 use crate::Identity;
-use crate::ration::{Rates, is_one_peer};
-use crate::stream::place::Budget;
+use crate::rate_limit::{Rates, is_one_peer};
+use crate::stream::budget::BudgetLimits;
 
 /// Configuration of a [`UdpTransport`](crate::UdpTransport).
 #[derive(Debug, Clone)]
@@ -69,7 +69,7 @@ impl UdpLimits {
 
     /// How many connections the peers at this address may open. No address, and not all of loopback
     /// together, has more than half of all places.
-    pub(super) fn places_of(&self, home: IpAddr) -> usize {
+    pub(super) fn max_connections_of(&self, home: IpAddr) -> usize {
         let half = (self.max_connections / 2).max(1);
         match is_one_peer(home) {
             true => self.max_per_address.min(half),
@@ -78,9 +78,9 @@ impl UdpLimits {
     }
 
     /// How many bytes of the peers at this address may wait for earlier ones, and of all.
-    pub(super) fn budget_of(&self, home: IpAddr) -> Budget {
+    pub(super) fn budget_of(&self, home: IpAddr) -> BudgetLimits {
         let each = self.max_incoming_per_source;
-        Budget {
+        BudgetLimits {
             total: self.max_incoming,
             each: match is_one_peer(home) {
                 true => each,

@@ -27,10 +27,10 @@ use super::packet::{self, BASE, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
 use super::received::Received;
 use super::recovery::{Kept, Recovery};
 use crate::answer;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
-use crate::ration::Ration;
-use crate::stream::place::{Meter, Room};
+use crate::rate_limit::PeerRateLimit;
+use crate::stream::budget::{Meter, ReservedBytes};
 
 /// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
 pub(crate) const MAX_ID: u64 = 1 << 40;
@@ -67,7 +67,7 @@ pub(crate) enum Event {
 #[derive(Debug)]
 struct Held {
     parcel: Option<Box<Parcel>>,
-    _room: Option<Room>,
+    _room: Option<ReservedBytes>,
 }
 
 #[derive(Debug)]
@@ -105,7 +105,7 @@ pub(crate) struct Connection {
     /// The last parcel that the sink has really been told of.
     told: u64,
     /// What the peer may still send, if that is limited; no parcels are taken before then.
-    pub(super) ration: Option<Arc<Ration>>,
+    pub(super) rate_limit: Option<Arc<PeerRateLimit>>,
     resting: Option<Instant>,
     received: Received,
     recovery: Recovery,
@@ -174,9 +174,9 @@ impl Connection {
     }
 
     /// The same, of a peer that may send so much, and whose parcels wait in memory from this meter.
-    pub(crate) fn bounded(self, ration: Option<Arc<Ration>>, meter: Meter) -> Self {
+    pub(crate) fn bounded(self, rate_limit: Option<Arc<PeerRateLimit>>, meter: Meter) -> Self {
         Self {
-            ration,
+            rate_limit,
             meter: Some(meter),
             ..self
         }
@@ -204,7 +204,7 @@ impl Connection {
             meter: None,
             arrivals: HashSet::new(),
             told: 0,
-            ration: None,
+            rate_limit: None,
             resting: None,
             received: Received::default(),
             recovery: Recovery::new(now),
@@ -331,7 +331,7 @@ impl Connection {
         peer_id: u64,
         peer: Hello,
         now: Instant,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         let Some(dialling) = self.dialling.take() else {
             return Ok(());
         };
@@ -344,10 +344,12 @@ impl Connection {
         self.busy = now;
         let (expected, found) = (self.expected, peer.identity.incarnation);
         if expected.is_known() && expected != found {
-            return Err(End::WrongIncarnation { expected, found });
+            return Err(ConnectionEnd::WrongIncarnation { expected, found });
         }
         if peer.max_in_flight == 0 {
-            return Err(End::Nonsense("the peer takes no parcels at all".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "the peer takes no parcels at all".into(),
+            ));
         }
         self.peer = Some(peer);
         Ok(())
@@ -406,9 +408,9 @@ impl Connection {
     ///
     /// # Errors
     /// When it was of a size that every path carries: nothing smaller is made of what it carried.
-    pub(crate) fn too_big(&mut self, size: usize) -> Result<(), End> {
+    pub(crate) fn too_big(&mut self, size: usize) -> Result<(), ConnectionEnd> {
         if !self.is_opening() && size <= BASE {
-            return Err(End::Broken(format!(
+            return Err(ConnectionEnd::Broken(format!(
                 "this host takes no datagrams of {size} bytes for this peer, and UDP needs {BASE}; \
                  see the MTU of the interface that leads there"
             )));
@@ -524,7 +526,7 @@ impl Connection {
     ///
     /// # Errors
     /// When the connection is over.
-    pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), End> {
+    pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), ConnectionEnd> {
         if let Some(dialling) = &mut self.dialling {
             return dialling.handle_timeout(now, self.limits.connect_timeout);
         }
@@ -532,13 +534,13 @@ impl Connection {
             && tries >= MIN_TRIES
             && now >= since + self.limits.silence
         {
-            return Err(End::Silent);
+            return Err(ConnectionEnd::Silent);
         }
         if self.doubt_due().is_some_and(|due| now >= due) {
-            return Err(End::Silent);
+            return Err(ConnectionEnd::Silent);
         }
         if self.idle_due().is_some_and(|due| now >= due) {
-            return Err(End::Idle);
+            return Err(ConnectionEnd::Idle);
         }
         if self.recovery.timeout().is_some_and(|due| now >= due) {
             let lost = self.recovery.timed_out();
@@ -557,9 +559,12 @@ impl Connection {
 
     /// Ends the connection: gives every parcel sent from here its conclusion, in the order of
     /// sending, and says goodbye where that makes sense.
-    pub(crate) fn end(mut self, end: &End) -> (Vec<(AttemptId, Conclusion)>, Option<Outbound>) {
+    pub(crate) fn end(
+        mut self,
+        end: &ConnectionEnd,
+    ) -> (Vec<(AttemptId, Conclusion)>, Option<Outbound>) {
         let taken = match end {
-            End::Goodbye { last } => *last,
+            ConnectionEnd::Goodbye { last } => *last,
             _ => u64::MAX,
         };
         let mut concluded = Vec::new();
@@ -587,7 +592,7 @@ impl Connection {
         }
         let speechless = matches!(
             end,
-            End::Goodbye { .. } | End::Broken(_) | End::NotOpened(_)
+            ConnectionEnd::Goodbye { .. } | ConnectionEnd::Broken(_) | ConnectionEnd::NotOpened(_)
         );
         let goodbye = self.path.filter(|_| !speechless).map(|path| {
             let mut out = Vec::new();

@@ -28,11 +28,11 @@ use super::cookie::Cookies;
 use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
-use crate::end::End;
-use crate::ration::{Ration, Rations, is_one_peer, whose};
-use crate::seldom::warn_seldom;
-use crate::stream::place::{Meter, Rooms};
-use crate::stream::source::{Account, Home};
+use crate::end::ConnectionEnd;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer, quota_address};
+use crate::stream::budget::{ByteBudget, Meter};
+use crate::stream::source::{Home, QuotaKey};
 
 /// Numbers of connections stay below this (see [`Core::ticket`]).
 const MAX_CONNECTIONS: u32 = 1 << 24;
@@ -93,9 +93,9 @@ pub(crate) struct Core {
     /// Connections that are no more.
     gone: Vec<u32>,
     /// What peers may still send.
-    rations: Rations,
+    rate_limits: PeerRateLimits,
     /// What is taken for parcels that wait for earlier ones.
-    rooms: Rooms,
+    byte_budget: ByteBudget,
     counters: UdpCounters,
     last_number: u32,
     last_serial: u64,
@@ -152,8 +152,8 @@ impl Core {
             eventful: VecDeque::new(),
             notes: VecDeque::new(),
             gone: Vec::new(),
-            rations: Rations::default(),
-            rooms: Rooms::default(),
+            rate_limits: PeerRateLimits::default(),
+            byte_budget: ByteBudget::default(),
             counters: UdpCounters::default(),
             last_number: 0,
             last_serial: 0,
@@ -165,15 +165,16 @@ impl Core {
     }
 
     /// What whoever is at this address may still send, if that is limited.
-    fn ration(&self, ip: IpAddr, now: Instant) -> Option<Arc<Ration>> {
-        is_one_peer(ip).then(|| self.rations.of(ip, self.limits.rates(), now))?
+    fn rate_limit(&self, ip: IpAddr, now: Instant) -> Option<Arc<PeerRateLimit>> {
+        is_one_peer(ip).then(|| self.rate_limits.of(ip, self.limits.rates(), now))?
     }
 
     /// Takes memory for parcels of the peers at this address.
     fn meter(&self, ip: IpAddr) -> Meter {
-        let home = whose(ip);
-        let account = Account::Unproved(Home::Address(home));
-        self.rooms.meter(account, self.limits.budget_of(home))
+        let home = quota_address(ip);
+        let quota_key = QuotaKey::Unproved(Home::Address(home));
+        self.byte_budget
+            .meter(quota_key, self.limits.budget_of(home))
     }
 
     /// Takes a parcel for sending. When the connection has just been made up, its number is
@@ -227,7 +228,7 @@ impl Core {
             .collect();
         for (number, ip) in numbers {
             let what = format!("this host no longer has the address {ip}");
-            self.end(number, &End::Broken(what));
+            self.end(number, &ConnectionEnd::Broken(what));
         }
     }
 
@@ -249,7 +250,7 @@ impl Core {
 
     /// A connection that was made up cannot be opened.
     pub(crate) fn cannot_begin(&mut self, number: u32, error: WayError) {
-        self.end(number, &End::NotOpened(error));
+        self.end(number, &ConnectionEnd::NotOpened(error));
     }
 
     pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
@@ -307,7 +308,7 @@ impl Core {
                 self.of_dialling(to, path, |_, _| {
                     let detail = "the peer takes no more connections (its max_connections), or is connected \
                                   with this service already";
-                    Err(End::NotOpened(WayError::new(WayFault::Refused, detail)))
+                    Err(ConnectionEnd::NotOpened(WayError::new(WayFault::Refused, detail)))
                 });
             }
             Datagram::Unknown { number } => self.is_unknown(path, number),
@@ -340,7 +341,7 @@ impl Core {
     pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
         self.with(number, |connection, _| match connection.dialling_mut() {
             Some(dialling) => dialling.failed(path, what, now),
-            None => Err(End::Broken(what.to_owned())),
+            None => Err(ConnectionEnd::Broken(what.to_owned())),
         });
     }
 
@@ -433,14 +434,14 @@ impl Core {
     pub(crate) fn close(&mut self) {
         let numbers: Vec<u32> = self.connections.keys().copied().collect();
         for number in numbers {
-            self.end(number, &End::Closed);
+            self.end(number, &ConnectionEnd::Closed);
         }
     }
 
     /// Makes up a connection for a location.
     fn make_up(&mut self, now: Instant, to: &Location) -> Result<u32, WayError> {
         if self.connections.len() >= self.limits.max_connections {
-            return Err(End::Crowd.after());
+            return Err(ConnectionEnd::TooManyConnections.after());
         }
         self.last_serial += 1;
         let mut hasher = DefaultHasher::new();
@@ -458,7 +459,7 @@ impl Core {
     fn with(
         &mut self,
         number: u32,
-        act: impl FnOnce(&mut Connection, &mut UdpCounters) -> Result<(), End>,
+        act: impl FnOnce(&mut Connection, &mut UdpCounters) -> Result<(), ConnectionEnd>,
     ) {
         let Some(entry) = self.connections.get_mut(&number) else {
             return;
@@ -499,12 +500,12 @@ impl Core {
         }
     }
 
-    fn end(&mut self, number: u32, end: &End) {
+    fn end(&mut self, number: u32, end: &ConnectionEnd) {
         let Some(entry) = self.remove(number) else {
             return;
         };
-        if end.is_misbehaviour() {
-            warn_seldom(
+        if end.is_misbehavior() {
+            warn_limited(
                 self.counters.refused_nonsense,
                 format_args!("connection closed: {}", end.after()),
             );
@@ -512,7 +513,7 @@ impl Core {
         } else {
             tracing::debug!(connection = number, "connection ended: {}", end.after());
         }
-        if let End::NotOpened(_) = end {
+        if let ConnectionEnd::NotOpened(_) = end {
             self.counters.dial_failures += 1;
         }
         let (concluded, goodbye) = entry.connection.end(end);

@@ -9,7 +9,7 @@ use fipa_transport::{WayError, WayFault};
 
 use super::connection::Path;
 use super::packet::{self, Cookie, NO_COOKIE};
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 
 /// How long after one address the next is greeted (RFC 8305 section 5).
@@ -81,7 +81,12 @@ impl Dialling {
     ///
     /// # Errors
     /// When no other is left.
-    pub(crate) fn failed(&mut self, path: Path, what: &str, now: Instant) -> Result<(), End> {
+    pub(crate) fn failed(
+        &mut self,
+        path: Path,
+        what: &str,
+        now: Instant,
+    ) -> Result<(), ConnectionEnd> {
         if let Some(candidate) = self.candidate(path) {
             candidate.next = None;
         }
@@ -92,7 +97,7 @@ impl Dialling {
             None => {
                 let detail = format!("{}: {what}", path.remote);
                 let error = WayError::new(WayFault::Unreachable, detail);
-                return Err(End::NotOpened(error));
+                return Err(ConnectionEnd::NotOpened(error));
             }
         }
         Ok(())
@@ -103,12 +108,19 @@ impl Dialling {
         hello.map_or(self.deadline, |hello| hello.min(self.deadline))
     }
 
-    pub(crate) fn handle_timeout(&mut self, now: Instant, patience: Duration) -> Result<(), End> {
+    pub(crate) fn handle_timeout(
+        &mut self,
+        now: Instant,
+        patience: Duration,
+    ) -> Result<(), ConnectionEnd> {
         if now < self.deadline {
             return Ok(());
         }
         let detail = format!("no answer within {patience:?} (connect_timeout)");
-        Err(End::NotOpened(WayError::new(WayFault::Unreachable, detail)))
+        Err(ConnectionEnd::NotOpened(WayError::new(
+            WayFault::Unreachable,
+            detail,
+        )))
     }
 
     pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<(Path, Vec<u8>)> {

@@ -26,7 +26,7 @@ use super::core::{Core, Random, Told};
 use super::counters::UdpCounters;
 use super::socket::{Buffers, Sent, Socket};
 use crate::address::{self, Listening, Target};
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::interfaces::Changes;
 
 /// Most addresses of one name that are greeted.
@@ -135,7 +135,7 @@ impl Endpoint {
                 self.runtime.spawn(watch).abort_handle()
             });
             state.watch = watch;
-            self.runtime.spawn(keep_time(Running(this)));
+            self.runtime.spawn(keep_time(LinkTask(this)));
         }
         Ok(locations)
     }
@@ -190,7 +190,7 @@ impl Endpoint {
             (Phase::New, _) => {
                 return Err(WayError::new(WayFault::Closed, "listen was not called yet"));
             }
-            _ => return Err(End::Closed.after()),
+            _ => return Err(ConnectionEnd::Closed.after()),
         };
         if let Some(fresh) = core.dispatch(now, attempt, to, parcel)? {
             self.dial(&mut state, fresh, to.address());
@@ -251,7 +251,7 @@ impl Endpoint {
                     self.runtime.spawn(look_up(this, connection, name, port));
                     return;
                 }
-                None => End::Closed.after(),
+                None => ConnectionEnd::Closed.after(),
             },
             Err(error) => WayError::new(WayFault::Unreachable, error),
         };
@@ -439,7 +439,7 @@ async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
 }
 
 /// Does what is due, until the endpoint is closed.
-async fn keep_time(running: Running) {
+async fn keep_time(running: LinkTask) {
     let endpoint = &running.0;
     loop {
         {
@@ -470,9 +470,9 @@ async fn keep_time(running: Running) {
 }
 
 /// An endpoint that works: whatever happens to the task, every attempt gets its conclusion.
-struct Running(Arc<Endpoint>);
+struct LinkTask(Arc<Endpoint>);
 
-impl Drop for Running {
+impl Drop for LinkTask {
     fn drop(&mut self) {
         self.0.close();
         self.0.deliver();

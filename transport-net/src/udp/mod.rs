@@ -35,7 +35,7 @@ pub use self::counters::UdpCounters;
 use self::endpoint::Endpoint;
 use self::packet::{BASE, LARGEST, PARCEL_OVERHEAD};
 
-/// Room for the receiver's name in the largest datagram.
+/// ReservedBytes for the receiver's name in the largest datagram.
 const NAME: usize = 255;
 
 /// Carries parcels over UDP, each in one datagram.

@@ -27,7 +27,7 @@ const REORDERING: u64 = 3;
 /// Time-out before the first round trip was measured.
 const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// Room for the coarseness of timers.
+/// ReservedBytes for the coarseness of timers.
 const GRANULARITY: Duration = Duration::from_millis(10);
 
 /// Back-off stops here, unless the round trip takes longer: a way that is silent must be found

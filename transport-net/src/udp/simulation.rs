@@ -616,13 +616,13 @@ fn an_interface_that_takes_less_than_every_path_carries_ends_the_connection() {
 }
 
 /// A peer that says to be another one.
-struct Stranger {
+struct UnprovedSlot {
     from: SocketAddr,
     hello: crate::hello::Hello,
     cookie: packet::Cookie,
 }
 
-impl Stranger {
+impl UnprovedSlot {
     /// A peer with the identity of B gets a cookie from A.
     fn as_b(world: &mut World, from: &str, dialled: &str) -> Self {
         let hello = crate::hello::Hello {
@@ -677,7 +677,7 @@ fn a_stranger_elsewhere_is_served_when_the_service_gives_no_sign_of_life() {
         let before = world.cores[A].counters();
         assert_eq!(before.connections, 1);
         world.cut = gone;
-        let stranger = Stranger::as_b(&mut world, "192.0.2.99:7788", "x");
+        let stranger = UnprovedSlot::as_b(&mut world, "192.0.2.99:7788", "x");
         stranger.greets(&mut world, Duration::from_millis(900));
         assert_eq!(
             world.cores[A].counters().accepted,
@@ -708,7 +708,7 @@ fn a_stranger_at_the_address_of_the_service_is_served_when_that_gives_no_sign_of
         world.until_concluded(B, &BTreeSet::from([1]));
         assert_eq!(world.cores[A].counters().accepted, 1);
         world.cut = gone;
-        let stranger = Stranger::as_b(&mut world, "192.0.2.2:99", &dialled);
+        let stranger = UnprovedSlot::as_b(&mut world, "192.0.2.2:99", &dialled);
         stranger.greets(&mut world, Duration::from_secs(2));
         let after = world.cores[A].counters();
         assert_eq!(
@@ -732,12 +732,12 @@ fn a_service_is_served_at_once_at_each_address_that_its_first_connection_lists()
     world.send(A, 1, 10).unwrap();
     world.until_concluded(A, &BTreeSet::from([1]));
     let begun = world.now;
-    let second = Stranger::as_b(&mut world, other, "x");
+    let second = UnprovedSlot::as_b(&mut world, other, "x");
     second.greets(&mut world, Duration::from_millis(100));
     assert_eq!(world.cores[A].counters().connections, 2);
     // When it has moved there, the first connection ends.
     world.cut = true;
-    let third = Stranger::as_b(&mut world, other, "y");
+    let third = UnprovedSlot::as_b(&mut world, other, "y");
     third.greets(&mut world, UdpLimits::default().silence);
     assert_eq!(
         world.cores[A].counters().connections,

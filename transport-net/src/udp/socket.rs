@@ -10,7 +10,7 @@ use tokio::net::UdpSocket;
 
 use super::connection::Path;
 
-/// Room for what arrives while nobody reads; the system may allow less.
+/// ReservedBytes for what arrives while nobody reads; the system may allow less.
 const BUFFER: usize = 4 << 20;
 
 /// Datagrams, or runs of them, fetched in one call.

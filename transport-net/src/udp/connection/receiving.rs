@@ -8,7 +8,7 @@ use fipa_transport::{Answer, Conclusion, Parcel};
 use super::super::counters::UdpCounters;
 use super::super::packet::{Frame, Frames, split_parcel};
 use super::{Connection, Event, Held, MAX_ID};
-use crate::end::End;
+use crate::end::ConnectionEnd;
 
 impl Connection {
     /// Takes a data packet.
@@ -21,7 +21,7 @@ impl Connection {
         frames: &[u8],
         now: Instant,
         counters: &mut UdpCounters,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         if self.dialling.is_some() {
             // The welcome is late, or lost; all this comes again.
             return Ok(());
@@ -36,13 +36,15 @@ impl Connection {
         let (mut elicits, mut at_once, mut taken) = (false, false, true);
         for frame in Frames(frames) {
             let Ok(frame) = frame else {
-                return Err(End::Nonsense("a packet that cannot be read".into()));
+                return Err(ConnectionEnd::ProtocolViolation(
+                    "a packet that cannot be read".into(),
+                ));
             };
             match frame {
                 Frame::Ack(ack) => {
                     let Some(told) = self.recovery.acknowledged(&ack, now) else {
                         let what = "an acknowledgement of what was never sent";
-                        return Err(End::Nonsense(what.into()));
+                        return Err(ConnectionEnd::ProtocolViolation(what.into()));
                     };
                     told.arrived.into_iter().for_each(|kept| self.arrived(kept));
                     told.lost.into_iter().for_each(|kept| self.lost(kept));
@@ -56,7 +58,7 @@ impl Connection {
                     elicits = true;
                     taken &= self.hold(id, None, 0)?;
                 }
-                Frame::Goodbye { last } => return Err(End::Goodbye { last }),
+                Frame::Goodbye { last } => return Err(ConnectionEnd::Goodbye { last }),
                 Frame::Parcel { id, bytes } => {
                     (elicits, at_once) = (true, true);
                     taken &= self.take_parcel(id, bytes, now, counters)?;
@@ -78,12 +80,13 @@ impl Connection {
         bytes: &[u8],
         now: Instant,
         counters: &mut UdpCounters,
-    ) -> Result<bool, End> {
+    ) -> Result<bool, ConnectionEnd> {
         if id < self.next_arrival || self.held.contains_key(&id) {
             counters.duplicates += 1;
             return Ok(true);
         }
-        let nonsense = |what: &dyn std::fmt::Display| Err(End::Nonsense(what.to_string()));
+        let nonsense =
+            |what: &dyn std::fmt::Display| Err(ConnectionEnd::ProtocolViolation(what.to_string()));
         let Some((header, body)) = split_parcel(bytes) else {
             return nonsense(&"a parcel without a header");
         };
@@ -103,8 +106,8 @@ impl Connection {
         if held {
             self.busy = now;
             counters.parcels_in += 1;
-            let ration = self.ration.as_ref();
-            self.resting = ration.and_then(|ration| ration.spend(1, bytes.len(), now));
+            let rate_limit = self.rate_limit.as_ref();
+            self.resting = rate_limit.and_then(|rate_limit| rate_limit.spend(1, bytes.len(), now));
         }
         Ok(held)
     }
@@ -116,13 +119,15 @@ impl Connection {
         id: u64,
         parcel: Option<Box<Parcel>>,
         len: usize,
-    ) -> Result<bool, End> {
+    ) -> Result<bool, ConnectionEnd> {
         if id < self.next_arrival || self.held.contains_key(&id) {
             return Ok(true);
         }
         let max = self.limits.max_in_flight.max(1);
         if id >= MAX_ID || self.arrivals.len() >= max {
-            return Err(End::Nonsense("more parcels than may be in flight".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "more parcels than may be in flight".into(),
+            ));
         }
         let crowded = self.held.len() >= max
             || self.held_bytes.saturating_add(len) > self.limits.max_queued_bytes;
@@ -157,9 +162,16 @@ impl Connection {
         Ok(true)
     }
 
-    pub(super) fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), End> {
+    pub(super) fn conclude(
+        &mut self,
+        id: u64,
+        answer: Answer,
+        now: Instant,
+    ) -> Result<(), ConnectionEnd> {
         if id > self.last_sent {
-            return Err(End::Nonsense("an answer to what was never sent".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "an answer to what was never sent".into(),
+            ));
         }
         // Otherwise it has been concluded before.
         if let Some(sent) = self.sent.remove(&id) {

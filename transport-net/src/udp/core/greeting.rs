@@ -9,10 +9,10 @@ use super::super::connection::{Connection, Path};
 use super::super::packet::{self, NO_COOKIE};
 use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
-use crate::ration::whose;
-use crate::seldom::warn_seldom;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::quota_address;
 
 /// How long a connected service has to give a sign of life when a stranger says that it is the service.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
@@ -79,7 +79,7 @@ impl Core {
             Standing::Asked => return,
             Standing::Taken => {
                 let before = self.counters.refused_unproved;
-                warn_seldom(
+                warn_limited(
                     before,
                     format_args!(
                         "{from}: connection refused: its incarnation has a connection that is alive"
@@ -90,9 +90,12 @@ impl Core {
                 return;
             }
         }
-        let home = whose(from.ip());
-        let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
-        let greedy = same_address.count() >= self.limits.places_of(home);
+        let home = quota_address(from.ip());
+        let same_address = self
+            .greeted
+            .keys()
+            .filter(|(a, _)| quota_address(a.ip()) == home);
+        let greedy = same_address.count() >= self.limits.max_connections_of(home);
         if greedy || self.connections.len() >= self.limits.max_connections {
             self.counters.refused_crowd += 1;
             self.reply(path, packet::refused(initiator));
@@ -107,7 +110,7 @@ impl Core {
         let name = peer.identity.name.as_str().into();
         let limits = self.limits.clone();
         let connection = Connection::accepted(limits, id, initiator, peer, path, now)
-            .bounded(self.ration(from.ip(), now), self.meter(from.ip()));
+            .bounded(self.rate_limit(from.ip(), now), self.meter(from.ip()));
         let number = self.insert(connection, None, Some((from, initiator)));
         self.greeted.insert((from, initiator), number);
         self.inbound.insert(inbound, (serial, number));
@@ -138,7 +141,7 @@ impl Core {
                 Some(asked) if now >= asked + SIGN_OF_LIFE => {
                     // What the peer sent on its connection before this one must not arrive after what
                     // it sends now.
-                    self.end(number, &End::Superseded);
+                    self.end(number, &ConnectionEnd::Superseded);
                     continue;
                 }
                 Some(_) => {}
@@ -182,16 +185,16 @@ impl Core {
             return;
         };
         let hop = self.hop(&peer, path.remote);
-        let ration = self.ration(path.remote.ip(), now);
+        let rate_limit = self.rate_limit(path.remote.ip(), now);
         let meter = self.meter(path.remote.ip());
         let (own, mut greeted) = (self.identity.incarnation, None);
         self.of_dialling(to, path, |number, connection| {
             if peer.identity.incarnation == own {
-                return Err(End::Nonsense(OWN_INCARNATION.into()));
+                return Err(ConnectionEnd::ProtocolViolation(OWN_INCARNATION.into()));
             }
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
-            connection.ration = ration;
+            connection.rate_limit = rate_limit;
             connection.meter = Some(meter);
             greeted = Some((number, name));
             Ok(())
@@ -217,7 +220,7 @@ impl Core {
         match meant {
             Some(number) => {
                 let what = "the peer has forgotten the connection; was it restarted?";
-                self.end(number, &End::Broken(what.into()));
+                self.end(number, &ConnectionEnd::Broken(what.into()));
             }
             None => self.counters.ignored += 1,
         }
@@ -228,7 +231,7 @@ impl Core {
         &mut self,
         to: u64,
         path: Path,
-        act: impl FnOnce(u32, &mut Connection) -> Result<(), End>,
+        act: impl FnOnce(u32, &mut Connection) -> Result<(), ConnectionEnd>,
     ) {
         let number = self.ids.get(&to).copied();
         let entry = number.and_then(|number| self.connections.get_mut(&number));

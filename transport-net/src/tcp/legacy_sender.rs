@@ -21,11 +21,12 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::accept::prepare;
-use super::dial::{self, Unreachable};
+use super::dial;
 use super::dialect::translate;
-use crate::end::End;
+use super::endpoint::TcpEndpoint;
+use crate::end::ConnectionEnd;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
+use crate::stream::dialing::Unreachable;
 
 /// How long a peer may take to hang up after it has got its letter, before the next one is begun.
 const FAREWELL: Duration = Duration::from_millis(50);
@@ -35,7 +36,7 @@ const STEP: usize = 256 << 10;
 
 /// The letters to old peers.
 #[derive(Debug)]
-pub(crate) struct Couriers {
+pub(crate) struct LegacySenders {
     queues: Mutex<HashMap<Location, Queue>>,
     closed: watch::Sender<bool>,
 }
@@ -43,7 +44,7 @@ pub(crate) struct Couriers {
 /// Letters to one location. It is there as long as its task is.
 #[derive(Debug, Default)]
 struct Queue {
-    waiting: VecDeque<Errand>,
+    waiting: VecDeque<LegacyDelivery>,
     bytes: usize,
     /// The letter whose connection is open or being opened.
     current: Option<AttemptId>,
@@ -52,13 +53,13 @@ struct Queue {
 }
 
 #[derive(Debug)]
-struct Errand {
+struct LegacyDelivery {
     attempt: AttemptId,
     receiver: Arc<str>,
     letter: Letter,
 }
 
-impl Default for Couriers {
+impl Default for LegacySenders {
     fn default() -> Self {
         Self {
             queues: Mutex::default(),
@@ -67,14 +68,14 @@ impl Default for Couriers {
     }
 }
 
-impl Couriers {
+impl LegacySenders {
     /// Takes a parcel for an old peer. Says whether a task is to be [run](run) for its location.
     ///
     /// # Errors
     /// When it does not go.
     pub(crate) fn take(
         &self,
-        endpoint: &Endpoint,
+        endpoint: &TcpEndpoint,
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
@@ -85,11 +86,11 @@ impl Couriers {
             return Err(WayError::new(WayFault::Incompatible, detail));
         };
         if *self.closed.borrow() {
-            return Err(End::Closed.after());
+            return Err(ConnectionEnd::Closed.after());
         }
         let mut queues = self.queues.lock();
         if !queues.contains_key(to) && queues.len() >= limits.max_connections {
-            return Err(End::Crowd.after());
+            return Err(ConnectionEnd::TooManyConnections.after());
         }
         let fresh = !queues.contains_key(to);
         let queue = queues.entry(to.clone()).or_default();
@@ -102,7 +103,7 @@ impl Couriers {
             return Err(WayError::new(WayFault::Congested, detail));
         }
         queue.bytes += len;
-        queue.waiting.push_back(Errand {
+        queue.waiting.push_back(LegacyDelivery {
             attempt,
             receiver: parcel.receiver,
             letter,
@@ -121,8 +122,8 @@ impl Couriers {
                 };
             }
             let place = queue.waiting.iter().position(|e| e.attempt == attempt);
-            if let Some(errand) = place.and_then(|place| queue.waiting.remove(place)) {
-                queue.bytes -= errand.letter.len();
+            if let Some(delivery) = place.and_then(|place| queue.waiting.remove(place)) {
+                queue.bytes -= delivery.letter.len();
                 return Abandoned::NotSent;
             }
         }
@@ -140,9 +141,12 @@ impl Couriers {
     /// Takes back the first letter for a location. Says whether its task had not begun.
     pub(crate) fn take_back(&self, attempt: AttemptId, to: &Location) -> bool {
         let mut queues = self.queues.lock();
-        let waits = queues
-            .get(to)
-            .is_some_and(|queue| queue.waiting.iter().any(|errand| errand.attempt == attempt));
+        let waits = queues.get(to).is_some_and(|queue| {
+            queue
+                .waiting
+                .iter()
+                .any(|delivery| delivery.attempt == attempt)
+        });
         if waits {
             queues.remove(to);
         }
@@ -154,15 +158,15 @@ impl Couriers {
     }
 
     /// The next letter for a location; without one the queue is gone.
-    fn next(&self, to: &Location) -> Option<Errand> {
+    fn next(&self, to: &Location) -> Option<LegacyDelivery> {
         let mut queues = self.queues.lock();
         let queue = queues.get_mut(to)?;
         match queue.waiting.pop_front() {
-            Some(errand) => {
-                queue.bytes -= errand.letter.len();
-                queue.current = Some(errand.attempt);
+            Some(delivery) => {
+                queue.bytes -= delivery.letter.len();
+                queue.current = Some(delivery.attempt);
                 queue.begun = false;
-                Some(errand)
+                Some(delivery)
             }
             None => {
                 queues.remove(to);
@@ -179,7 +183,7 @@ impl Couriers {
     }
 
     /// Everything that waits for a location.
-    fn drain(&self, to: &Location) -> VecDeque<Errand> {
+    fn drain(&self, to: &Location) -> VecDeque<LegacyDelivery> {
         let mut queues = self.queues.lock();
         let queue = queues.get_mut(to);
         queue.map_or_else(VecDeque::new, |queue| {
@@ -194,21 +198,21 @@ impl Couriers {
 }
 
 /// Delivers what waits for a location, letter by letter.
-pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Location) {
+pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Location) {
     let mut round = Round {
         endpoint,
         sink,
         to,
         done: false,
     };
-    let mut closed = round.endpoint.legacy.couriers.closed.subscribe();
-    while let Some(errand) = round.endpoint.legacy.couriers.next(&round.to) {
+    let mut closed = round.endpoint.legacy.senders.closed.subscribe();
+    while let Some(delivery) = round.endpoint.legacy.senders.next(&round.to) {
         let progress = Mutex::new(false);
         let conclusion = tokio::select! {
-            conclusion = deliver(&round, &errand, &progress) => conclusion,
+            conclusion = deliver(&round, &delivery, &progress) => conclusion,
             _ = closed.wait_for(|closed| *closed) => {
                 // What remains is concluded by the end of the round.
-                round.conclude(errand.attempt, broken(*progress.lock(), End::Closed.after()));
+                round.conclude(delivery.attempt, broken(*progress.lock(), ConnectionEnd::Closed.after()));
                 return;
             }
         };
@@ -218,12 +222,12 @@ pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Locati
             }
             _ => None,
         };
-        round.conclude(errand.attempt, conclusion);
+        round.conclude(delivery.attempt, conclusion);
         if let Some(error) = unreachable {
             // They need not all find out by themselves.
-            for errand in round.endpoint.legacy.couriers.drain(&round.to) {
+            for delivery in round.endpoint.legacy.senders.drain(&round.to) {
                 let conclusion = Conclusion::NotSent(error.clone());
-                round.sink.concluded(errand.attempt, conclusion);
+                round.sink.concluded(delivery.attempt, conclusion);
             }
         }
     }
@@ -232,7 +236,7 @@ pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Locati
 
 /// A task that delivers: whatever happens to it, every letter gets its conclusion.
 struct Round {
-    endpoint: Arc<Endpoint>,
+    endpoint: Arc<TcpEndpoint>,
     sink: Arc<dyn Sink>,
     to: Location,
     /// Whether the queue has been found empty, and is no more.
@@ -241,7 +245,7 @@ struct Round {
 
 impl Round {
     fn conclude(&self, attempt: AttemptId, conclusion: Conclusion) {
-        if self.endpoint.legacy.couriers.ended(&self.to) {
+        if self.endpoint.legacy.senders.ended(&self.to) {
             self.sink.concluded(attempt, conclusion);
         }
     }
@@ -252,24 +256,24 @@ impl Drop for Round {
         if self.done {
             return;
         }
-        let Some(queue) = self.endpoint.legacy.couriers.forget(&self.to) else {
+        let Some(queue) = self.endpoint.legacy.senders.forget(&self.to) else {
             return;
         };
         if let Some(attempt) = queue.current {
-            let conclusion = Conclusion::Unconfirmed(End::Closed.after());
+            let conclusion = Conclusion::Unconfirmed(ConnectionEnd::Closed.after());
             self.sink.concluded(attempt, conclusion);
         }
-        for errand in queue.waiting {
-            let conclusion = Conclusion::NotSent(End::Closed.after());
-            self.sink.concluded(errand.attempt, conclusion);
+        for delivery in queue.waiting {
+            let conclusion = Conclusion::NotSent(ConnectionEnd::Closed.after());
+            self.sink.concluded(delivery.attempt, conclusion);
         }
     }
 }
 
-async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclusion {
+async fn deliver(round: &Round, delivery: &LegacyDelivery, begun: &Mutex<bool>) -> Conclusion {
     let (endpoint, to) = (&round.endpoint, &round.to);
     let in_dialect = |here: Option<&str>| {
-        translate(&errand.letter, &errand.receiver, to.signature(), here)
+        translate(&delivery.letter, &delivery.receiver, to.signature(), here)
             .map_err(|error| Conclusion::NotSent(WayError::new(error.fault(), error)))
     };
     // Before anything is opened: a connection without a letter costs fipa_services a descriptor.
@@ -302,7 +306,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
     if let Err(error) = prepare(&stream, endpoint.limits()) {
         return Conclusion::NotSent(WayError::new(WayFault::Broken, error));
     }
-    if !endpoint.legacy.couriers.begin(to) {
+    if !endpoint.legacy.senders.begin(to) {
         let detail = "the letter was abandoned";
         return Conclusion::NotSent(WayError::new(WayFault::TimedOut, detail));
     }
