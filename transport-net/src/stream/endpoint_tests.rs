@@ -183,10 +183,11 @@ async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
         .unwrap();
     for from in ["10.0.0.7:2", "10.0.0.8:2"] {
         let entered = enters(&endpoint, comes(certificate(2), 7, from, 2, X)).await;
-        let another = "its incarnation is connected with another certificate";
+        let another =
+            "it claims the incarnation of a service that is connected with another certificate";
         assert_eq!(entered.map(|_| ()), refused(another));
         let entered = enters(&endpoint, comes(None, 7, from, 2, X)).await;
-        let proved = "its incarnation is connected with a certificate";
+        let proved = "it has no certificate and claims the incarnation of a service that is connected with one";
         assert_eq!(entered.map(|_| ()), refused(proved));
     }
     // What was only claimed gives way.

@@ -1,4 +1,4 @@
-//! The listening side: accepting connections and telling by their first byte who is there.
+//! The listening side: accepts connections and detects their protocol by their first byte.
 
 use std::io;
 use std::net::SocketAddr;
@@ -34,7 +34,7 @@ use crate::stream::wire;
 /// while this process is stopped.
 const BACKLOG: i32 = 1024;
 
-/// Opens a listening socket, and returns the address that it is bound to. To be called within a
+/// Opens a listening socket, and returns the address that it is bound to. Must be called within a
 /// runtime.
 pub(crate) fn listen(text: &str) -> Result<(TcpListener, SocketAddr), ListenError> {
     let unavailable = |error: AddressError| ListenError::Unavailable(error.to_string());
@@ -55,8 +55,8 @@ fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
         Type::STREAM.nonblocking(),
         Some(Protocol::TCP),
     )?;
-    // A restarted process gets its port back although old connections linger. Two listeners on
-    // one port stay impossible.
+    // A restarted process gets its port although connections linger. Two listeners on one port
+    // remain impossible.
     socket.set_reuse_address(true)?;
     if address.is_ipv6() {
         socket.set_only_v6(true)?;
@@ -66,10 +66,11 @@ fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     Ok(socket.into())
 }
 
-/// What every socket of ours is set to.
+/// Sets the options of a connected socket.
 pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
     stream.set_nodelay(true)?;
-    // Bytes that the peer's host does not confirm: a cable was pulled.
+    // Bounds the time without an acknowledgment of the peer's host, for example after a cable was
+    // unplugged.
     SockRef::from(stream).set_tcp_user_timeout(Some(limits.keep_alive.saturating_mul(2)))
 }
 
@@ -97,24 +98,24 @@ pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {
 }
 
 /// The pace of accepting. Accepting a connection is faster than reading a letter, and the letters
-/// that are not accepted yet are safe in the system's queue. So while many connections wait and are
-/// served, accepting pauses in between. A peer that keeps its connections from being served does not
+/// that are not accepted yet are safe in the system's queue. Therefore accepting pauses while many
+/// connections wait and are served. A peer that keeps its connections from being served does not
 /// slow down accepting for longer than [`Pace::PATIENCE`] pauses.
 #[derive(Debug, Default)]
 struct Pace {
-    /// Connections that had left the queues at the last pause.
+    /// Number of connections that had left the queues at the last pause.
     left: u64,
-    /// Pauses since one of them left.
+    /// Number of pauses since a connection left the queues.
     fruitless: u32,
 }
 
 impl Pace {
     const PAUSE: Duration = Duration::from_millis(1);
 
-    /// Number of waiting connections from which on there are pauses.
+    /// Minimum number of waiting connections for a pause.
     const BUSY: usize = 64;
 
-    /// Most pauses in a row in which no connection leaves the queues.
+    /// Maximum number of consecutive pauses in which no connection leaves the queues.
     const PATIENCE: u32 = 50;
 
     fn pauses(&mut self, waiting: usize, left: u64) -> bool {
@@ -136,7 +137,7 @@ fn serve(
     stream: Arc<TcpStream>,
     from: SocketAddr,
 ) {
-    // The task ends itself when others push it out, so it begins when it has its own handle.
+    // Other connections can evict this one, so the task starts when its own handle is known.
     let (handle, own) = oneshot::channel();
     let receiving = receive(endpoint.clone(), turn, stream, from, own);
     let _ended = handle.send(tokio::spawn(receiving).abort_handle());
@@ -148,15 +149,15 @@ fn reset(endpoint: &Arc<TcpEndpoint>, stream: Arc<TcpStream>, from: SocketAddr, 
     }
 }
 
-/// The place of a connection whose first byte is awaited.
+/// The slot of a connection whose first byte is awaited.
 enum Waiting {
     /// In the accept queue, with its turn.
     InTurn(QueueTurn),
-    /// Among those that have not introduced themselves.
+    /// Among the connections before their hello.
     Late(UnprovedSlot),
-    /// The same, because the accept queue was full: letters of legacy peers do not keep out a peer
-    /// that is going to introduce itself.
-    Beside(UnprovedSlot, Full),
+    /// Among the connections before their hello, because the accept queue was full: letters of
+    /// legacy peers must not keep out a peer that will introduce itself.
+    QueueFull(UnprovedSlot, Full),
 }
 
 /// The first byte of a connection.
@@ -183,12 +184,12 @@ async fn receive(
         Ok(turn) if !turn.started(task.clone()) => return,
         Ok(turn) => Waiting::InTurn(turn),
         Err(full) => match unproved_slot(&endpoint, from, task.clone()) {
-            Some(slot) => Waiting::Beside(slot, full),
+            Some(slot) => Waiting::QueueFull(slot, full),
             None => return,
         },
     };
     if let Err(error) = prepare(&stream, endpoint.limits()) {
-        tracing::debug!(%from, "connection broke at once: {error}");
+        tracing::debug!(%from, "connection failed before the first byte: {error}");
         return;
     }
     let Some((waiting, first)) = first_byte(&endpoint, waiting, &stream, from, &task).await else {
@@ -231,13 +232,13 @@ async fn receive(
                 Err(refused) => refused.to_string(),
             }
         }
-        First::Byte(byte) => format!("nothing begins with {byte:#04x}"),
+        First::Byte(byte) => format!("unknown protocol: the first byte is {byte:#04x}"),
         First::End => return,
         First::Broken(error) => {
-            tracing::debug!(%from, "connection broke at once: {error}");
+            tracing::debug!(%from, "connection failed before the first byte: {error}");
             return;
         }
-        First::Silence => "no byte came in time".to_owned(),
+        First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
     let counter = &endpoint.tally().refused_nonsense;
     let before = counter.fetch_add(1, Ordering::Relaxed);
@@ -281,7 +282,7 @@ async fn first_byte(
     Some((waiting, first))
 }
 
-/// A place among those that have not introduced themselves.
+/// Returns a slot among the connections before their hello.
 fn unproved_slot(
     endpoint: &Arc<TcpEndpoint>,
     from: SocketAddr,
@@ -293,7 +294,7 @@ fn unproved_slot(
 }
 
 impl Waiting {
-    /// Leaves the accept queue, because the peer is going to introduce itself.
+    /// Leaves the accept queue, because the peer will introduce itself.
     fn introduces_itself(
         self,
         endpoint: &Arc<TcpEndpoint>,
@@ -305,12 +306,12 @@ impl Waiting {
                 drop(turn);
                 unproved_slot(endpoint, from, task)
             }
-            Self::Late(slot) | Self::Beside(slot, _) => Some(slot),
+            Self::Late(slot) | Self::QueueFull(slot, _) => Some(slot),
         }
     }
 
-    /// Goes back to the accept queue, behind all others, when the turn has been lost. A connection
-    /// that found no room does not: later ones of its address may have.
+    /// Returns to the end of the accept queue after the turn was lost. A connection that found the
+    /// queue full does not return, because later ones of its address may be in the queue.
     fn takes_turn(
         self,
         endpoint: &Arc<TcpEndpoint>,
@@ -320,7 +321,7 @@ impl Waiting {
     ) -> Result<QueueTurn, Full> {
         match self {
             Self::InTurn(turn) => Ok(turn),
-            Self::Beside(_, full) => Err(full),
+            Self::QueueFull(_, full) => Err(full),
             Self::Late(slot) => {
                 drop(slot);
                 let turn = endpoint
@@ -338,8 +339,8 @@ impl Waiting {
     }
 }
 
-/// Reads a legacy peer's letter when its turn to be read has come, and hands it on when those of its
-/// address that were accepted before it have been.
+/// Reads a legacy peer's letter when its turn has come, and passes it on after the letters of its
+/// address that were accepted before.
 async fn receive_letter(
     endpoint: &Arc<TcpEndpoint>,
     turn: QueueTurn,
@@ -368,8 +369,8 @@ async fn receive_letter(
     Ok(())
 }
 
-/// Has a peer prove who it is, and serves it to its end; or gives back the connection of one that
-/// need not.
+/// Performs the TLS handshake with a peer that must prove its identity, and serves it to its end.
+/// Returns the connection of a peer that need not.
 #[cfg(feature = "secure")]
 async fn prove(
     endpoint: &Arc<TcpEndpoint>,
@@ -404,10 +405,12 @@ async fn prove(
         First::Byte(_) if !security.covers(from.ip()) || security.excepts(from.ip()) => {
             return Some((waiting, stream));
         }
-        First::Byte(_) => "it did not prove who is there".to_owned(),
+        First::Byte(_) => {
+            "the peer did not begin TLS, which it needs to prove its identity".to_owned()
+        }
         First::End => return None,
         First::Broken(error) => error.to_string(),
-        First::Silence => "no byte came in time".to_owned(),
+        First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
     let counter = &endpoint.tally().refused_unproved;
     let before = counter.fetch_add(1, Ordering::Relaxed);
@@ -423,13 +426,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn accepting_pauses_while_many_wait_and_are_served() {
+    fn accepting_pauses_while_many_connections_wait_and_are_served() {
         let mut pace = Pace::default();
         assert!(!pace.pauses(Pace::BUSY - 1, 0));
         for left in 0..1000 {
             assert!(pace.pauses(Pace::BUSY, left));
         }
-        // Nothing is served any more.
+        // No connection is served any longer.
         let pauses = (0..1000).filter(|_| pace.pauses(500, 999)).count();
         assert_eq!(pauses as u32, Pace::PATIENCE - 1);
         assert!(pace.pauses(500, 1000));

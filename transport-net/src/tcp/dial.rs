@@ -1,4 +1,4 @@
-//! The calling side: opening a connection to a location.
+//! The dialling side: opens a connection to a location.
 
 use std::io;
 use std::net::SocketAddr;
@@ -24,11 +24,12 @@ use crate::stream::source::Source;
 use crate::stream::tls;
 use crate::stream::wire::{self, Reading, Writing};
 
-/// How long an address is waited for before it is asked again, and how often it is asked.
+/// Time after which another connection to the same address is attempted, and the maximum number of
+/// attempts.
 const ASKED_AGAIN: Duration = Duration::from_millis(400);
 const MAX_ASKED: usize = 4;
 
-/// Opens the connection of a link that has been made up, and serves it.
+/// Opens the connection of a new link, and serves it.
 pub(crate) async fn dial(
     endpoint: Arc<TcpEndpoint>,
     link: Arc<Link>,
@@ -64,7 +65,7 @@ pub(crate) async fn dial(
         .await;
 }
 
-/// Has the peer prove who it is, where it has to.
+/// Performs the TLS handshake if the peer must prove its identity.
 #[cfg(feature = "secure")]
 async fn prove(
     running: &LinkTask,
@@ -82,7 +83,7 @@ async fn prove(
     }
 }
 
-/// Nobody has to prove anything.
+/// Without TLS, no peer proves its identity.
 #[cfg(not(feature = "secure"))]
 async fn prove(
     _running: &LinkTask,
@@ -92,7 +93,7 @@ async fn prove(
     Ok((wire::plain(stream), Proof::default()))
 }
 
-/// Opens a connection to whichever of these addresses answers first.
+/// Opens a connection to the first of these addresses that accepts one.
 pub(crate) async fn open(
     limits: &Limits,
     addresses: Vec<String>,
@@ -100,8 +101,8 @@ pub(crate) async fn open(
     first(limits, addresses, connect).await
 }
 
-/// Opens a connection, and another one after a while when there is no answer: the system repeats a lost
-/// SYN after one second, and then after two. The first one to be open is used.
+/// Opens a connection, and after a while another one if there is no answer: the system retransmits
+/// a lost SYN only after one second, and then after two. The first open connection is used.
 async fn insist(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
     let mut asked = JoinSet::new();
     loop {
@@ -115,7 +116,7 @@ async fn insist(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
 
 async fn connect(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
     let stream = TcpStream::connect(address).await?;
-    // Where nobody listens on a port of its own range, a host can connect to itself.
+    // Without a listener on an ephemeral port, a host can connect to itself.
     if stream.local_addr()? == stream.peer_addr()? {
         return Err(io::ErrorKind::ConnectionRefused.into());
     }

@@ -1,4 +1,4 @@
-//! What an endpoint keeps for legacy peers: their letters, in both directions.
+//! State of an endpoint for legacy peers: their letters in both directions.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -18,9 +18,9 @@ use crate::stream::counters::count;
 /// Letters of legacy peers.
 #[derive(Debug, Default)]
 pub(crate) struct Legacy {
-    /// Letters to them.
+    /// Letters to legacy peers.
     pub(super) senders: LegacySenders,
-    /// Accepted connections that may bring a letter of one.
+    /// Accepted connections that may carry a letter of a legacy peer.
     pub(super) accept_queue: AcceptQueue,
     /// Connections that were reset because the accept queue was full.
     resets: PerSecond,
@@ -52,7 +52,7 @@ impl Legacy {
             Full::Closed => return,
         };
         count(&endpoint.tally().refused_crowd);
-        // Without the time to linger, closing sends a reset.
+        // With a linger time of zero, closing sends a reset.
         if let Err(error) = SockRef::from(&stream).set_linger(Some(Duration::ZERO)) {
             tracing::debug!(%from, "cannot reset a connection: {error}");
         }

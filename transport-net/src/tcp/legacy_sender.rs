@@ -1,8 +1,8 @@
-//! Letters to old peers: one connection per letter, closed behind it, and no answer.
+//! Letters to legacy peers: one connection per letter, closed after it, without an answer.
 //!
-//! Each location has a queue of its own and at most one connection at a time, so that letters arrive
-//! in order. The end of the stream is what ends a letter there; whether the peer took it cannot be
-//! known, but a peer that hangs up without an error has read it to its end.
+//! Each location has its own queue and at most one connection at a time, so that letters arrive in
+//! order. The end of the stream ends a letter. This side cannot know whether the peer accepted it,
+//! but a peer that closes the connection without an error has read it to its end.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -28,27 +28,27 @@ use crate::end::ConnectionEnd;
 use crate::stream::counters::count;
 use crate::stream::dialing::Unreachable;
 
-/// How long a peer may take to hang up after it has got its letter, before the next one is begun.
+/// Time that a peer has to close the connection after its letter, before the next letter is sent.
 const FAREWELL: Duration = Duration::from_millis(50);
 
-/// Bytes written at a time: between two, progress is looked at.
+/// Maximum number of bytes per write; the stall timeout applies to each write.
 const STEP: usize = 256 << 10;
 
-/// The letters to old peers.
+/// The letters to legacy peers.
 #[derive(Debug)]
 pub(crate) struct LegacySenders {
     queues: Mutex<HashMap<Location, Queue>>,
     closed: watch::Sender<bool>,
 }
 
-/// Letters to one location. It is there as long as its task is.
+/// The letters to one location. The queue exists as long as its task.
 #[derive(Debug, Default)]
 struct Queue {
     waiting: VecDeque<LegacyDelivery>,
     bytes: usize,
     /// The letter whose connection is open or being opened.
     current: Option<AttemptId>,
-    /// Whether the first byte of the current letter has been written, or is about to be.
+    /// Whether the first byte of the current letter has been or is about to be written.
     begun: bool,
 }
 
@@ -69,10 +69,11 @@ impl Default for LegacySenders {
 }
 
 impl LegacySenders {
-    /// Takes a parcel for an old peer. Says whether a task is to be [run](run) for its location.
+    /// Queues a parcel for a legacy peer. Returns whether a task must be [started](run) for its
+    /// location.
     ///
     /// # Errors
-    /// When it does not go.
+    /// When the parcel cannot be queued.
     pub(crate) fn take(
         &self,
         endpoint: &TcpEndpoint,
@@ -82,7 +83,7 @@ impl LegacySenders {
     ) -> Result<bool, WayError> {
         let limits = endpoint.limits();
         let Body::Letter(letter) = parcel.body else {
-            let detail = "an old peer takes letters only";
+            let detail = "a legacy peer accepts letters only";
             return Err(WayError::new(WayFault::Incompatible, detail));
         };
         if *self.closed.borrow() {
@@ -99,7 +100,9 @@ impl LegacySenders {
         if count >= limits.max_in_flight
             || (bytes > 0 && bytes.saturating_add(len) > limits.max_queued_bytes)
         {
-            let detail = format!("{count} letters wait for this peer (max_in_flight)");
+            let detail = format!(
+                "{count} letters of {bytes} bytes wait for this legacy peer (max_in_flight, max_queued_bytes)"
+            );
             return Err(WayError::new(WayFault::Congested, detail));
         }
         queue.bytes += len;
@@ -111,7 +114,7 @@ impl LegacySenders {
         Ok(fresh)
     }
 
-    /// Ends an attempt: the letter is not sent if nothing of it has been written.
+    /// Ends an attempt. The letter is not sent if no byte of it has been written.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         for queue in self.queues.lock().values_mut() {
             if queue.current == Some(attempt) {
@@ -130,15 +133,16 @@ impl LegacySenders {
         Abandoned::Unconfirmed
     }
 
-    /// The first byte of the current letter is about to be written. Returns false when the letter
-    /// was abandoned, and must not be sent.
+    /// Notes that the first byte of the current letter is about to be written. Returns false when
+    /// the letter was abandoned and must not be sent.
     fn begin(&self, to: &Location) -> bool {
         let mut queues = self.queues.lock();
         let wanted = queues.get_mut(to).filter(|queue| queue.current.is_some());
         wanted.map(|queue| queue.begun = true).is_some()
     }
 
-    /// Takes back the first letter for a location. Says whether its task had not begun.
+    /// Removes the queue of a location whose task has not begun. Returns whether the letter was
+    /// still queued.
     pub(crate) fn take_back(&self, attempt: AttemptId, to: &Location) -> bool {
         let mut queues = self.queues.lock();
         let waits = queues.get(to).is_some_and(|queue| {
@@ -157,7 +161,7 @@ impl LegacySenders {
         self.closed.send_replace(true);
     }
 
-    /// The next letter for a location; without one the queue is gone.
+    /// Removes the next letter for a location. Removes the queue when it is empty.
     fn next(&self, to: &Location) -> Option<LegacyDelivery> {
         let mut queues = self.queues.lock();
         let queue = queues.get_mut(to)?;
@@ -175,14 +179,14 @@ impl LegacySenders {
         }
     }
 
-    /// The letter that was fetched last has come to its end. Says whether anybody wants to know.
+    /// Ends the current letter. Returns whether its attempt still needs a conclusion.
     fn ended(&self, to: &Location) -> bool {
         let mut queues = self.queues.lock();
         let current = queues.get_mut(to).and_then(|queue| queue.current.take());
         current.is_some()
     }
 
-    /// Everything that waits for a location.
+    /// Removes all waiting letters for a location.
     fn drain(&self, to: &Location) -> VecDeque<LegacyDelivery> {
         let mut queues = self.queues.lock();
         let queue = queues.get_mut(to);
@@ -197,7 +201,7 @@ impl LegacySenders {
     }
 }
 
-/// Delivers what waits for a location, letter by letter.
+/// Sends the waiting letters of a location, one by one.
 pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Location) {
     let mut round = Round {
         endpoint,
@@ -211,7 +215,7 @@ pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Loc
         let conclusion = tokio::select! {
             conclusion = deliver(&round, &delivery, &progress) => conclusion,
             _ = closed.wait_for(|closed| *closed) => {
-                // What remains is concluded by the end of the round.
+                // Dropping `round` concludes the remaining letters.
                 round.conclude(delivery.attempt, broken(*progress.lock(), ConnectionEnd::Closed.after()));
                 return;
             }
@@ -224,7 +228,7 @@ pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Loc
         };
         round.conclude(delivery.attempt, conclusion);
         if let Some(error) = unreachable {
-            // They need not all find out by themselves.
+            // The other waiting letters fail with the same error, without an attempt each.
             for delivery in round.endpoint.legacy.senders.drain(&round.to) {
                 let conclusion = Conclusion::NotSent(error.clone());
                 round.sink.concluded(delivery.attempt, conclusion);
@@ -234,12 +238,12 @@ pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Loc
     round.done = true;
 }
 
-/// A task that delivers: whatever happens to it, every letter gets its conclusion.
+/// The task of a queue. Dropping it concludes every remaining letter.
 struct Round {
     endpoint: Arc<TcpEndpoint>,
     sink: Arc<dyn Sink>,
     to: Location,
-    /// Whether the queue has been found empty, and is no more.
+    /// Whether the queue was empty and has been removed.
     done: bool,
 }
 
@@ -276,7 +280,8 @@ async fn deliver(round: &Round, delivery: &LegacyDelivery, begun: &Mutex<bool>) 
         translate(&delivery.letter, &delivery.receiver, to.signature(), here)
             .map_err(|error| Conclusion::NotSent(WayError::new(error.fault(), error)))
     };
-    // Before anything is opened: a connection without a letter costs fipa_services a descriptor.
+    // Translated before a connection is opened: a connection without a letter leaks a descriptor in
+    // fipa_services.
     let mut letter = match in_dialect(None) {
         Ok(letter) => letter,
         Err(not_sent) => return not_sent,
@@ -291,7 +296,9 @@ async fn deliver(round: &Round, delivery: &LegacyDelivery, begun: &Mutex<bool>) 
             }
         };
     if !endpoint.config.gives_old_peers_at(peer.ip()) {
-        let detail = format!("{peer} cannot prove who it is, and is no exception");
+        let detail = format!(
+            "{peer} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
+        );
         return Conclusion::NotSent(WayError::new(WayFault::Refused, detail));
     }
     if to.signature() == Signature::JadeProxy
@@ -346,7 +353,7 @@ async fn write(
             Ok(Ok(())) => {}
             Ok(Err(error)) => return Err(WayError::new(WayFault::Broken, error)),
             Err(_) => {
-                let detail = "the peer stopped reading";
+                let detail = "the peer stopped reading (stall_timeout)";
                 return Err(WayError::new(WayFault::TimedOut, detail));
             }
         }
@@ -354,7 +361,7 @@ async fn write(
     Ok(())
 }
 
-/// Ends the letter, and gives the peer a moment to hang up.
+/// Ends the letter, and waits a moment for the peer to close the connection.
 async fn farewell(stream: &mut TcpStream) -> std::io::Result<()> {
     stream.shutdown().await?;
     let mut ignored = [0; 256];
@@ -365,7 +372,8 @@ async fn farewell(stream: &mut TcpStream) -> std::io::Result<()> {
     timeout(FAREWELL, hangup).await.unwrap_or(Ok(()))
 }
 
-/// Where a socket with this address can be reached, when the endpoint listens there.
+/// Returns the listening address with the IP address `local` as a URL, if the endpoint listens
+/// there.
 fn listening_at(listening: &[String], local: SocketAddr) -> Option<String> {
     listening
         .iter()

@@ -1,12 +1,12 @@
-//! Framed, acknowledged letters over TCP.
+//! Letters over TCP: framed and acknowledged, or unframed for legacy peers.
 //!
-//! Frames, connections and what they share are in [`crate::stream`].
+//! Frames and framed connections are in [`crate::stream`].
 //!
-//! * [`dial`] and [`accept`] open connections; [`tls`] is for peers that prove who they are.
+//! * [`dial`] and [`accept`] open connections.
 //! * [`accept_queue`]: the order in which accepted connections are read.
-//! * [`unframed`]: letters of old peers, on the same port.
-//! * [`courier`]: letters to old peers, in their [`dialect`].
-//! * [`legacy`]: what an endpoint keeps for both.
+//! * [`unframed`]: letters from legacy peers, on the same port.
+//! * [`legacy_sender`]: letters to legacy peers, in their [`dialect`].
+//! * [`legacy`]: the state of both, which an [`endpoint`] holds beside its framed connections.
 
 mod accept;
 mod accept_queue;
@@ -35,19 +35,20 @@ use crate::stream::endpoint::Endpoint;
 
 /// Carries parcels over TCP.
 ///
-/// The first parcel to a location opens a connection, which then carries everything to and from
-/// that peer, whoever opened it, until it has been idle for some time. Letters are written from
-/// the memory they lie in, and read into one piece of memory each; large content into memory of
-/// [the sink's](Sink::memory_for), if it offers some.
+/// The first parcel to a location opens a connection. That connection then carries all parcels to
+/// and from the peer, whichever side opened it, until it reaches its idle timeout. Letters are
+/// written from the memory that holds them, and read into one allocation each; large content is
+/// read into memory of [the sink](Sink::memory_for), if it offers some.
 ///
-/// To a location with the [signature](Signature) of an old peer, each letter goes over a connection
-/// of its own, in that peer's dialect, and is concluded as [handed](fipa_transport::Conclusion::Handed).
+/// To a location with the [signature](Signature) of a legacy peer, each letter is sent over a
+/// connection of its own, in the dialect of that peer, and is concluded as
+/// [handed](fipa_transport::Conclusion::Handed).
 ///
 /// An address is a numeric `address:port`, with a scope where one is needed
 /// (`[fe80::1%eth0]:7788`), or `name:port`.
 ///
-/// Dropping it closes it. After [`close`](Transport::close) the attempts are concluded by the
-/// runtime's threads, so the runtime must live on for a moment.
+/// Dropping it closes it. After [`close`](Transport::close) the threads of the runtime conclude the
+/// attempts, so the runtime must run a moment longer.
 #[derive(Debug)]
 pub struct TcpTransport {
     listen: Vec<String>,
@@ -55,8 +56,8 @@ pub struct TcpTransport {
 }
 
 impl TcpTransport {
-    /// An endpoint that does its work on `runtime`, which must have input, output and time
-    /// enabled. Nothing is opened before `listen`.
+    /// Creates an endpoint that runs its tasks on `runtime`, which must have I/O and time enabled.
+    /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: TcpConfig, runtime: Handle) -> Self {
         let TcpConfig {
@@ -80,14 +81,19 @@ impl TcpTransport {
         }
     }
 
-    /// What happened so far.
+    /// Returns the counters of this endpoint.
     #[must_use]
     pub fn counters(&self) -> Counters {
         self.endpoint.tally().read()
     }
 
-    /// Hands a letter to who takes those for an old peer.
-    fn hand(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    /// Queues a letter for a legacy peer, and starts the task that sends it.
+    fn dispatch_legacy(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), WayError> {
         let Some(sink) = self.endpoint.sink() else {
             return Err(ConnectionEnd::Closed.after());
         };
@@ -128,7 +134,7 @@ impl Transport for TcpTransport {
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
         self.endpoint.check(to, &parcel)?;
         if to.signature() != Signature::Frames {
-            return self.hand(attempt, to, parcel);
+            return self.dispatch_legacy(attempt, to, parcel);
         }
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
             let dialling = dial::dial(self.endpoint.clone(), link, sink, to.clone());

@@ -1,5 +1,5 @@
-//! Letters of old peers (fipa_services, and JADE over its raw TCP extension): one per connection,
-//! without a header, until end of stream. Their envelopes are bit-efficient or XML.
+//! Letters from legacy peers (fipa_services, and JADE with its raw TCP extension): one per
+//! connection, without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};
@@ -14,41 +14,40 @@ use crate::stream::config::Limits;
 use crate::stream::counters::count;
 use crate::stream::source::QuotaKey;
 
-/// Bytes read at first.
+/// Initial buffer size in bytes.
 const FIRST_READ: usize = 4096;
 
-/// From this length on, the memory of a letter is taken from the budget of the endpoint.
+/// Minimum length of a letter whose memory is reserved in the budget of the endpoint.
 const COUNTED_FROM: usize = 64 * 1024;
 
-/// Why an old peer's letter is not taken.
+/// The reason for which a legacy peer's letter is refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum UnframedError {
-    #[error("a letter of more than {0} bytes (max_letter)")]
+    #[error("the letter exceeds {0} bytes (max_letter)")]
     TooLarge(usize),
-    #[error("a letter stopped arriving half way")]
+    #[error("the letter arrived too slowly (stall_timeout)")]
     TooSlow,
-    #[error("a letter waited too long for memory (max_incoming)")]
+    #[error("timed out waiting for memory for the letter (max_incoming)")]
     NoRoom,
-    #[error("a letter broke off: {0}")]
+    #[error("the connection broke in the middle of the letter: {0}")]
     Broken(#[from] std::io::Error),
-    #[error("its envelope cannot be read: {0}")]
+    #[error("its envelope cannot be decoded: {0}")]
     Envelope(#[from] DecodeError),
-    #[error("its envelope cannot be written in the standard dialect: {0}")]
+    #[error("its envelope cannot be encoded in the standard dialect: {0}")]
     Standard(#[from] EncodeError),
 }
 
-/// A letter that has been read, what the writer of its envelope understands, and the room that its bytes
-/// take.
+/// A letter with the dialect of its writer and the reservation of its memory.
 pub(crate) struct Read {
     pub(crate) letter: Letter,
     pub(crate) signature: Signature,
     pub(crate) _room: Option<ReservedBytes>,
 }
 
-/// Reads a letter from this account to its end. Its envelope is brought into the standard dialect;
-/// the message behind it is not touched. The connection loses its turn when no byte has
-/// come for [`TURN`], and needs its turn to get much memory.
+/// Reads a letter to its end. Converts its envelope to the standard dialect; the message is
+/// unchanged. The connection loses its turn when no byte arrives for [`TURN`], and needs its turn
+/// to reserve much memory.
 pub(crate) async fn read(
     endpoint: &TcpEndpoint,
     turn: &QueueTurn,
@@ -68,9 +67,9 @@ pub(crate) async fn read(
     })
 }
 
-/// What the writer of this envelope understands. JADE writes XML, and `Z` between date and time.
-/// The encoding of the message says nothing: fipa_services sends string messages, too, but does not
-/// read such dates.
+/// Returns the dialect of the writer of this envelope. JADE writes XML, and `Z` between date and
+/// time. The encoding of the message is no indication: fipa_services also sends string messages,
+/// but does not read such dates.
 fn signature_of(envelope: &[u8]) -> Signature {
     const BEFORE: &[u8] = b"<date>";
     const DAY: usize = "20261120".len();
@@ -85,10 +84,10 @@ fn signature_of(envelope: &[u8]) -> Signature {
     }
 }
 
-/// The same envelope with stamped extensions only, as FIPA00088 wants them: fipa_services narrows
+/// Returns the envelope with stamped extensions only, as FIPA00088 requires: fipa_services narrows
 /// a letter to one receiver with an extension that has no stamp. Such overriding parameters, and
-/// dates, for which an extension has no place, go to the next older part. What counts in effect
-/// stays the same.
+/// dates, for which extensions have no field, move to the next older part. The effective parameters
+/// stay the same.
 fn with_stamped_extensions(envelope: Envelope) -> Envelope {
     let Envelope {
         mut base,
@@ -133,7 +132,7 @@ fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     older.user_defined.extend(newer.user_defined);
 }
 
-/// Hands a letter that came from this source to the sink, unless the endpoint has been closed.
+/// Passes a letter to the sink, unless the endpoint is closed.
 pub(crate) fn hand_on(endpoint: &TcpEndpoint, letter: Letter, from: LegacySource) {
     if let Some(sink) = endpoint.sink() {
         count(&endpoint.tally().unframed_in);
@@ -158,8 +157,8 @@ async fn read_to_end(
         if bytes.len() == bytes.capacity() {
             let more = bytes.len().max(FIRST_READ);
             if bytes.len() >= COUNTED_FROM {
-                // A letter that has memory waits for none of a later one, so letters are not waited
-                // for in a circle.
+                // A letter with a reservation never waits for a later one, so letters do not wait
+                // for each other in a cycle.
                 turn.is_first().await;
                 let patience = limits.stall_timeout.saturating_mul(2);
                 let taken = take_room(endpoint, quota_key, &mut room, bytes.len(), more);
@@ -187,7 +186,7 @@ async fn read_to_end(
     }
 }
 
-/// Waits until there is room for so much more of a letter of which `there` has arrived.
+/// Waits until `more` bytes are reserved for a letter of which `there` bytes have arrived.
 async fn take_room(
     endpoint: &TcpEndpoint,
     quota_key: &QuotaKey,
@@ -223,11 +222,11 @@ mod tests {
 
     use super::*;
 
-    /// A letter as a fipa_services peer sent it.
+    /// A recorded letter of a fipa_services peer.
     const TCP_LETTER: &[u8] = include_bytes!("../../tests/data/tcp_letter.bin");
 
     #[test]
-    fn the_envelope_tells_what_its_writer_understands() {
+    fn the_envelope_identifies_the_dialect_of_its_writer() {
         let for_jade = include_bytes!("../../tests/data/tcp_letter_jade.bin");
         let of_jade = include_bytes!("../../../acl/tests/vectors/jade_tcp_reply.xml");
         let cases: [(&[u8], _); 3] = [
@@ -243,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn extensions_without_a_stamp_are_folded_and_count_as_before() {
+    fn extensions_without_a_stamp_are_folded_with_the_same_effect() {
         let (recorded, _) = Envelope::decode(TCP_LETTER).unwrap();
         let override_only = EnvelopeParams {
             intended_receivers: vec![AgentId::new("arm").unwrap()],

@@ -9,7 +9,7 @@ use fipa_transport::{Answer, AttemptId, Conclusion, Incarnation, Kind, Location,
 
 use super::config::UdpLimits;
 use super::connection::Path;
-use super::core::{Core, Told};
+use super::core::{Core, CoreEvent};
 use super::packet::{self, Datagram, NO_COOKIE};
 use crate::Identity;
 use crate::hello::Hello;
@@ -226,13 +226,13 @@ impl Datagrams {
         loop {
             while let Some(told) = self.core.poll_event() {
                 match told {
-                    Told::Arrived { ticket, .. } => self.tickets.push(ticket),
-                    Told::Concluded(attempt, conclusion) => {
+                    CoreEvent::Arrived { ticket, .. } => self.tickets.push(ticket),
+                    CoreEvent::Concluded(attempt, conclusion) => {
                         assert!(attempt.0 < self.dispatched);
                         let twice = self.concluded.insert(attempt, conclusion);
                         assert_eq!(twice, None, "{attempt:?} is concluded twice");
                     }
-                    Told::Introduced(peer) => {
+                    CoreEvent::Introduced(peer) => {
                         let service = peer.hop.location.incarnation();
                         assert_ne!(
                             service,
@@ -240,7 +240,7 @@ impl Datagrams {
                             "it is this service itself"
                         );
                     }
-                    Told::Parted(_) => {}
+                    CoreEvent::Parted(_) => {}
                 }
             }
             let Some(transmit) = self.core.poll_transmit(now) else {

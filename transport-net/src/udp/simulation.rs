@@ -14,7 +14,7 @@ use fipa_transport::{
 
 use super::config::UdpLimits;
 use super::connection::Path;
-use super::core::{Core, Told, Transmit};
+use super::core::{Core, CoreEvent, Transmit};
 use super::packet::{self, BASE, Datagram, NO_COOKIE};
 use crate::Identity;
 
@@ -129,14 +129,14 @@ impl World {
         }
     }
 
-    fn tell(&mut self, who: usize, told: Told) {
+    fn tell(&mut self, who: usize, told: CoreEvent) {
         match told {
-            Told::Concluded(attempt, conclusion) => {
+            CoreEvent::Concluded(attempt, conclusion) => {
                 let heard = self.concluded[who].entry(attempt).or_default();
                 heard.push(conclusion);
             }
-            Told::Introduced(_) | Told::Parted(_) => {}
-            Told::Arrived { parcel, ticket, .. } => {
+            CoreEvent::Introduced(_) | CoreEvent::Parted(_) => {}
+            CoreEvent::Arrived { parcel, ticket, .. } => {
                 self.arrived[who].push(*parcel);
                 if self.random.f64() < self.late {
                     let after = Duration::from_micros(self.random.u64(0..400_000));

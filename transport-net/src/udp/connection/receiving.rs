@@ -1,4 +1,5 @@
-//! What a connection receives: packets, and the parcels and answers in them, in their order.
+//! The receiving side of a connection: packets, and the parcels and answers in them, in their
+//! order.
 
 use std::time::Instant;
 
@@ -7,14 +8,14 @@ use fipa_transport::{Answer, Conclusion, Parcel};
 
 use super::super::counters::UdpCounters;
 use super::super::packet::{Frame, Frames, split_parcel};
-use super::{Connection, Event, Held, MAX_ID};
+use super::{Connection, Event, MAX_ID, OutOfOrderParcel};
 use crate::end::ConnectionEnd;
 
 impl Connection {
-    /// Takes a data packet.
+    /// Handles a data packet.
     ///
     /// # Errors
-    /// When the connection is over because of it.
+    /// When the packet ends the connection.
     pub(crate) fn handle_packet(
         &mut self,
         number: u64,
@@ -23,7 +24,7 @@ impl Connection {
         counters: &mut UdpCounters,
     ) -> Result<(), ConnectionEnd> {
         if self.dialling.is_some() {
-            // The welcome is late, or lost; all this comes again.
+            // The welcome is late or lost; the peer retransmits these frames.
             return Ok(());
         }
         self.heard = Some(now);
@@ -37,13 +38,13 @@ impl Connection {
         for frame in Frames(frames) {
             let Ok(frame) = frame else {
                 return Err(ConnectionEnd::ProtocolViolation(
-                    "a packet that cannot be read".into(),
+                    "a malformed packet".into(),
                 ));
             };
             match frame {
                 Frame::Ack(ack) => {
                     let Some(told) = self.recovery.acknowledged(&ack, now) else {
-                        let what = "an acknowledgement of what was never sent";
+                        let what = "an acknowledgment of a packet that was not sent";
                         return Err(ConnectionEnd::ProtocolViolation(what.into()));
                     };
                     told.arrived.into_iter().for_each(|kept| self.arrived(kept));
@@ -112,8 +113,8 @@ impl Connection {
         Ok(held)
     }
 
-    /// Notes what has this number (a parcel, or that there never is one), and hands on whatever
-    /// has its turn. Says whether there was room.
+    /// Stores the parcel with this number, or the notice that the number is skipped, and delivers
+    /// all parcels that are next in order. Returns whether there was room.
     pub(super) fn hold(
         &mut self,
         id: u64,
@@ -126,7 +127,7 @@ impl Connection {
         let max = self.limits.max_in_flight.max(1);
         if id >= MAX_ID || self.arrivals.len() >= max {
             return Err(ConnectionEnd::ProtocolViolation(
-                "more parcels than may be in flight".into(),
+                "more unanswered parcels than max_in_flight".into(),
             ));
         }
         let crowded = self.held.len() >= max
@@ -143,7 +144,7 @@ impl Connection {
             }
         }
         self.held_bytes += len;
-        let held = Held {
+        let held = OutOfOrderParcel {
             parcel,
             _room: room,
         };
@@ -170,10 +171,10 @@ impl Connection {
     ) -> Result<(), ConnectionEnd> {
         if id > self.last_sent {
             return Err(ConnectionEnd::ProtocolViolation(
-                "an answer to what was never sent".into(),
+                "an answer to a parcel that was not sent".into(),
             ));
         }
-        // Otherwise it has been concluded before.
+        // An absent parcel has been concluded before.
         if let Some(sent) = self.sent.remove(&id) {
             self.resend.remove(&id);
             self.busy = now;

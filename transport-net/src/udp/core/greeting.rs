@@ -1,4 +1,5 @@
-//! How connections begin: strangers are given cookies, and those who bring one back a connection.
+//! The handshake: an unproved peer gets a cookie, and a peer that returns the cookie gets a
+//! connection.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -14,25 +15,26 @@ use crate::hello::{Hello, OWN_INCARNATION};
 use crate::log_limit::warn_limited;
 use crate::rate_limit::quota_address;
 
-/// How long a connected service has to give a sign of life when a stranger says that it is the service.
+/// Time in which a connected service must respond to a ping when an unproved peer claims to be that
+/// service.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
 
-/// For how long such a question and its answer count. Longer than [`SIGN_OF_LIFE`] and the longest pause
-/// between two hellos.
+/// Time for which such a ping and its response are valid. It is longer than [`SIGN_OF_LIFE`] and
+/// the longest pause between two hellos.
 const ASKED_FOR: Duration = Duration::from_secs(3);
 
-/// Whether a new connection of a service that may be connected begins.
-enum Standing {
-    /// It begins.
+/// The result of checking a claimed incarnation.
+enum ClaimStatus {
+    /// No other connection has it.
     Free,
-    /// The connected service has been asked for a sign of life.
+    /// A ping was sent on the other connection.
     Asked,
-    /// The connected service has given one.
+    /// The other connection responded.
     Taken,
 }
 
 impl Core {
-    /// A stranger says hello.
+    /// Handles the hello of an unproved peer.
     pub(super) fn greet(
         &mut self,
         now: Instant,
@@ -56,7 +58,7 @@ impl Core {
             }
             return;
         }
-        // One that says that it is this service itself would make it write to itself.
+        // A peer that claims to be this service itself would make it send letters to itself.
         let own = self.identity.incarnation;
         let is_fit = |it: &Hello| it.max_in_flight > 0 && it.identity.incarnation != own;
         let Some(peer) = Hello::decode(hello).filter(is_fit) else {
@@ -73,16 +75,16 @@ impl Core {
             self.counters.ignored += 1;
             return;
         }
-        match self.standing(now, &inbound) {
-            Standing::Free => {}
-            // The peer sends its hello again, because it gets no answer.
-            Standing::Asked => return,
-            Standing::Taken => {
+        match self.claim_status(now, &inbound) {
+            ClaimStatus::Free => {}
+            // The peer repeats its hello because it gets no reply.
+            ClaimStatus::Asked => return,
+            ClaimStatus::Taken => {
                 let before = self.counters.refused_unproved;
                 warn_limited(
                     before,
                     format_args!(
-                        "{from}: connection refused: its incarnation has a connection that is alive"
+                        "{from}: connection refused: it claims the incarnation of a connected service whose connection is alive"
                     ),
                 );
                 self.counters.refused_unproved += 1;
@@ -121,42 +123,43 @@ impl Core {
         self.touch(number);
     }
 
-    /// Whether the service with this incarnation may be the peer of a new connection. A stranger must
-    /// not end the connections of the service that it claims to be: these are asked for a sign of life,
-    /// and end if there is none within [`SIGN_OF_LIFE`]. Nothing is remembered of the stranger.
-    fn standing(&mut self, now: Instant, inbound: &Inbound) -> Standing {
-        let mut standing = Standing::Free;
-        for number in self.rivals(inbound) {
-            let Some(rival) = self.connections.get_mut(&number) else {
+    /// Checks whether the service with this incarnation may be the peer of a new connection. An
+    /// unproved peer must not end the connections of the service that it claims to be: these get a
+    /// ping, and end if there is no response within [`SIGN_OF_LIFE`]. No state about the unproved
+    /// peer is stored.
+    fn claim_status(&mut self, now: Instant, inbound: &Inbound) -> ClaimStatus {
+        let mut status = ClaimStatus::Free;
+        for number in self.conflicting(inbound) {
+            let Some(other) = self.connections.get_mut(&number) else {
                 continue;
             };
-            let asked = rival.asked.filter(|asked| now < *asked + ASKED_FOR);
+            let asked = other.asked.filter(|asked| now < *asked + ASKED_FOR);
             match asked {
                 None => {
-                    rival.asked = Some(now);
-                    rival.connection.ask();
+                    other.asked = Some(now);
+                    other.connection.ask();
                     self.touch(number);
                 }
-                Some(asked) if rival.connection.is_heard_since(asked) => return Standing::Taken,
+                Some(asked) if other.connection.is_heard_since(asked) => return ClaimStatus::Taken,
                 Some(asked) if now >= asked + SIGN_OF_LIFE => {
-                    // What the peer sent on its connection before this one must not arrive after what
-                    // it sends now.
+                    // Letters that the peer sent on the previous connection must not arrive after
+                    // letters on this one.
                     self.end(number, &ConnectionEnd::Superseded);
                     continue;
                 }
                 Some(_) => {}
             }
-            standing = Standing::Asked;
+            status = ClaimStatus::Asked;
         }
-        standing
+        status
     }
 
-    /// The connections that end if this one begins: the earlier one for the same location, and those at
-    /// other addresses than this, unless their peers list this one as their own.
-    fn rivals(&self, inbound: &Inbound) -> Vec<u32> {
+    /// Returns the connections that end if this one is accepted: the earlier one for the same
+    /// location, and those at other addresses, unless their peers list this address as their own.
+    fn conflicting(&self, inbound: &Inbound) -> Vec<u32> {
         let same = self.inbound.get(inbound).map(|(_, number)| *number);
         let known = self.known.get(&inbound.incarnation);
-        let is_rival = |number: &u32| {
+        let conflicts = |number: &u32| {
             let Some(entry) = self.connections.get(number) else {
                 return false;
             };
@@ -168,10 +171,10 @@ impl Core {
             !peer.is_some_and(|peer| address::lists(&peer.listening, inbound.ip))
         };
         let known = known.into_iter().flatten().copied();
-        known.filter(is_rival).collect()
+        known.filter(conflicts).collect()
     }
 
-    /// A peer has answered the hello of a connection.
+    /// Handles the welcome that answers the hello of a connection.
     pub(super) fn welcome(
         &mut self,
         now: Instant,
@@ -205,7 +208,7 @@ impl Core {
         }
     }
 
-    /// Somebody knows nothing of a connection.
+    /// Handles a datagram that reports a connection as unknown.
     pub(super) fn is_unknown(&mut self, path: Path, peer_id: u64) {
         let is_meant = |connection: &Connection| {
             connection.peer().is_some()
@@ -219,14 +222,15 @@ impl Core {
             .next();
         match meant {
             Some(number) => {
-                let what = "the peer has forgotten the connection; was it restarted?";
+                let what =
+                    "the peer no longer has this connection, probably because it was restarted";
                 self.end(number, &ConnectionEnd::Broken(what.into()));
             }
             None => self.counters.ignored += 1,
         }
     }
 
-    /// Lets a connection that is being opened have what came for it.
+    /// Calls `act` with the connection that is being opened over this path.
     pub(super) fn of_dialling(
         &mut self,
         to: u64,
