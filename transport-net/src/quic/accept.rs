@@ -1,4 +1,4 @@
-//! The listening side: handshakes, and who is refused.
+//! The listening side: handshakes and refusals.
 
 use std::io;
 use std::sync::Arc;
@@ -24,11 +24,11 @@ pub(super) async fn accept(
     socket: quinn::Endpoint,
 ) {
     while let Some(incoming) = socket.accept().await {
-        // When many knock, whoever gives a false address is sent away without memory being taken
-        // (RFC 9000 section 8.1.2).
+        // With many pending handshakes, a source address is validated before memory is allocated
+        // for it (RFC 9000 section 8.1.2).
         if endpoint.is_crowded() && !incoming.remote_address_validated() {
             if let Err(error) = incoming.retry() {
-                tracing::debug!(%error, "a handshake that cannot be begun again");
+                tracing::debug!(%error, "cannot request another handshake with address validation");
             }
             continue;
         }
@@ -53,11 +53,11 @@ async fn receive(
     let shaken = match timeout(patience, shake(&sockets, incoming)).await {
         Ok(Ok((connection, send, receive))) => match sockets.certificate(&connection) {
             Some(certificate) => Ok((connection, send, receive, certificate)),
-            None => Err("the peer's certificate is not trusted any more".to_owned()),
+            None => Err("the peer's certificate is no longer trusted".to_owned()),
         },
         Ok(Err(error)) => Err(error.to_string()),
         Err(_) => Err(format!(
-            "no handshake within {patience:?} (handshake_timeout)"
+            "handshake not complete within {patience:?} (handshake_timeout)"
         )),
     };
     let (connection, send, receive, certificate) = match shaken {
@@ -82,7 +82,7 @@ async fn receive(
         .await;
 }
 
-/// The handshake, and the stream that the peer opens first.
+/// Performs the handshake, and accepts the first stream of the peer.
 async fn shake(
     sockets: &Sockets,
     incoming: Incoming,

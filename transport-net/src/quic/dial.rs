@@ -1,4 +1,4 @@
-//! The calling side: opening a connection to a location.
+//! The dialling side: opens a connection to a location.
 
 use std::io;
 use std::net::SocketAddr;
@@ -20,7 +20,7 @@ use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire::{Reading, Writing};
 
-/// Opens the connection of a link that has been made up, and serves it.
+/// Opens the connection of a new link, and serves it.
 pub(super) async fn dial(
     endpoint: Arc<Endpoint>,
     sockets: Arc<Sockets>,
@@ -38,7 +38,7 @@ pub(super) async fn dial(
         Err(end) => return running.fail(end),
     };
     let Some(certificate) = sockets.certificate(&connection) else {
-        let what = "the peer's certificate is not trusted any more";
+        let what = "the peer's certificate is no longer trusted";
         return running.fail(ConnectionEnd::unreachable(&to, &what));
     };
     link.connected(Instant::now());
@@ -61,7 +61,7 @@ async fn connect(
     Ok((connection, send, receive))
 }
 
-/// What a link reads from and writes to.
+/// Returns the wire of a connection.
 pub(super) fn ends(
     connection: &Connection,
     send: SendStream,

@@ -1,10 +1,10 @@
 //! The streams of one connection.
 //!
-//! The side that dialled opens one stream in both directions, for hello, answers, signs of life and
-//! goodbye. Every parcel goes in a stream of its own, in the order in which the streams are opened,
-//! and is read in that order: letters to one location have to arrive so. Streams that have arrived
-//! and are not read yet wait in the windows of [`super::settings`]. So an answer never waits behind
-//! a letter on the wire, and of one that is lost nothing is sent again but itself.
+//! The dialling side opens one bidirectional stream for hello, answers, pings and goodbye. Every
+//! parcel has a stream of its own. Parcels are read in the order in which their streams were
+//! opened, because letters to one location must arrive in order. Streams that have arrived and are
+//! not read yet wait in the windows of [`super::settings`]. So an answer never waits behind a
+//! letter on the wire, and a lost packet only delays its own letter.
 
 use std::future::{pending, poll_fn};
 use std::io::{self, IoSlice};
@@ -21,10 +21,10 @@ use super::sockets::why_lost;
 use crate::stream::frame::{self, FrameReader, Space};
 use crate::stream::wire::{BoxFuture, ControlStream, ParcelStreams, StreamWriter};
 
-/// Answers go before letters.
+/// Priority of the control stream: answers precede letters.
 const URGENT: i32 = 1;
 
-/// The stream of everything but letters, as it is read.
+/// The receiving side of the control stream.
 pub(super) struct Control {
     connection: Connection,
     stream: RecvStream,
@@ -70,12 +70,12 @@ impl ControlStream for Control {
 
 impl Drop for Control {
     fn drop(&mut self) {
-        // Whoever was to read what is still on its way has had the time.
+        // The peer has had time to read the bytes that are still on their way.
         self.connection.close(VarInt::from_u32(0), b"");
     }
 }
 
-/// The streams of the peer's letters.
+/// The streams of the peer's parcels.
 pub(super) struct Letters {
     connection: Connection,
     stream: Option<RecvStream>,
@@ -91,8 +91,8 @@ impl Letters {
         }
     }
 
-    /// Reads what has arrived of the letter whose turn it is. Waits for ever when the connection is
-    /// lost: why is read from the other stream, with what the peer said before.
+    /// Reads the available bytes of the current parcel. Never completes after the connection is
+    /// lost: the control stream reports the loss after the frames that precede it.
     async fn read(&mut self) -> io::Result<usize> {
         loop {
             let stream = match &mut self.stream {
@@ -105,7 +105,7 @@ impl Letters {
             match fill(stream, &mut self.reader.space()).await {
                 Ok(Some(len)) => return Ok(len),
                 Ok(None) if self.reader.is_partial() => {
-                    let what = "a stream that ended in the middle of a letter";
+                    let what = "a stream ended in the middle of a letter";
                     return Err(io::Error::new(io::ErrorKind::InvalidData, what));
                 }
                 Ok(None) => self.stream = None,
@@ -126,13 +126,13 @@ impl ParcelStreams for Letters {
     }
 }
 
-/// Puts what has arrived into the space; nothing more comes after `None`.
+/// Copies the available bytes into the space. Returns `None` at the end of the stream.
 async fn fill(stream: &mut RecvStream, space: &mut Space<'_>) -> Result<Option<usize>, ReadError> {
     let chunk = stream.read_chunk(space.room(), true).await?;
     Ok(chunk.map(|chunk| space.fill(&chunk.bytes)))
 }
 
-/// Reading or writing, whichever notices first: why says the connection.
+/// Returns the error of a lost connection.
 fn lost(error: &ConnectionError) -> io::Error {
     io::Error::other(why_lost(error))
 }
@@ -144,7 +144,7 @@ fn not_written(error: WriteError) -> io::Error {
     }
 }
 
-/// Where a link writes its frames, one after the other.
+/// The sending side of a connection, which takes frames one after the other.
 #[derive(Debug)]
 pub(super) struct Outgoing {
     connection: Connection,
@@ -154,20 +154,20 @@ pub(super) struct Outgoing {
 #[derive(Debug)]
 struct State {
     control: SendStream,
-    /// The stream of the letter that has begun, or one for the next.
+    /// The stream of the parcel that has begun, or a stream for the next one.
     letter: Option<SendStream>,
-    /// The number of the last of those.
+    /// The number of the latest of these streams.
     latest: Option<u64>,
     /// The frame that has begun.
     begun: Option<Begun>,
-    /// What the next byte waits for.
+    /// The stream that the next byte waits for.
     blocked: Lane,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Begun {
     lane: Lane,
-    /// Bytes that are missing.
+    /// Number of missing bytes.
     left: u64,
 }
 
@@ -179,7 +179,7 @@ enum Lane {
 
 impl Outgoing {
     pub(super) fn new(connection: &Connection, control: SendStream) -> Self {
-        // An error would mean that the connection is lost, which the next write finds out.
+        // An error means that the connection is lost, which the next write reports.
         let _ = control.set_priority(URGENT);
         Self {
             connection: connection.clone(),
@@ -193,12 +193,12 @@ impl Outgoing {
         }
     }
 
-    /// Takes some of these bytes, which are of one frame, and perhaps of those behind it.
+    /// Writes some of these bytes, which begin within or at the start of one frame.
     fn put(&self, state: &mut State, bytes: &[u8]) -> io::Result<usize> {
         let begun = match state.begun {
             Some(begun) => begun,
             None => {
-                // Frames of ours begin with their whole header in one piece.
+                // Frames of this side begin with their whole header in one piece.
                 let (is_parcel, left) = frame::begun(bytes).ok_or(io::ErrorKind::InvalidInput)?;
                 let lane = if is_parcel {
                     Lane::Letter
@@ -224,7 +224,7 @@ impl Outgoing {
         let wanted = bytes.get(..most).unwrap_or(bytes);
         let taken = match Pin::new(stream).poll_write(&mut context, wanted) {
             Poll::Ready(taken) => taken.map_err(not_written)?,
-            // Another frame may come before this one, if it has not begun.
+            // Another frame may precede this one, if it has not begun.
             Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
         };
         let left = begun.left.saturating_sub(taken as u64);
@@ -238,7 +238,7 @@ impl Outgoing {
         Ok(taken)
     }
 
-    /// Waits until there is room for what was not taken.
+    /// Waits until there is room for the bytes that were not taken.
     async fn writable(&self) -> io::Result<()> {
         let opens = {
             let state = self.state.lock();
@@ -248,8 +248,8 @@ impl Outgoing {
             let opened = self.connection.open_uni().await;
             let opened = opened.map_err(|error| lost(&error))?;
             let mut state = self.state.lock();
-            // Another thread may have had a later one meanwhile. Then this one ends without a byte,
-            // which its reader passes over: letters are read in the order of their streams.
+            // Another thread may have opened a later stream meanwhile. Then this one ends without a
+            // byte, and its reader skips it: parcels are read in the order of their streams.
             state.keep(opened);
             return Ok(());
         }
@@ -257,7 +257,7 @@ impl Outgoing {
             let mut state = self.state.lock();
             let lane = state.blocked;
             match state.stream(lane) {
-                // Nothing is written: what is asked is whether something could be.
+                // An empty write tests whether bytes could be written.
                 Some(stream) => match Pin::new(stream).poll_write(context, &[]) {
                     Poll::Ready(Ok(_)) => Poll::Ready(Ok(())),
                     Poll::Ready(Err(error)) => Poll::Ready(Err(not_written(error))),
@@ -271,8 +271,8 @@ impl Outgoing {
 }
 
 impl StreamWriter for Outgoing {
-    /// The address of this host that the peer dialled. A connection that this side dialled has none:
-    /// it goes on from another address (RFC 9000 section 9).
+    /// Returns the local address that the peer dialled. A connection that this side dialled has
+    /// none: it survives a change of address (RFC 9000 section 9).
     fn local_ip(&self) -> Option<IpAddr> {
         self.connection.local_ip()
     }
@@ -302,7 +302,7 @@ impl StreamWriter for Outgoing {
 }
 
 impl State {
-    /// Takes a stream for the next letter, if no later one has been taken yet.
+    /// Keeps a stream for the next parcel, if no later one has been used.
     fn keep(&mut self, opened: SendStream) {
         let number = opened.id().index();
         if self.letter.is_none() && self.latest.is_none_or(|latest| latest < number) {

@@ -1,29 +1,29 @@
-//! What to do when two hosts do not come to trust each other.
+//! Remedies when two hosts do not trust each other.
 
 use rustls::{CertificateError, Error};
 
-/// What is to be done when neither side says more.
+/// The remedy when neither side reports a cause.
 const LOOK: &str = "`fipa keys list` on both sides";
 
-/// What is to be done when a certificate begins later than now.
+/// The remedy for a certificate that is not valid yet.
 pub(crate) const NOT_YET: &str = "the clock of this host is before the making of the peer's certificate: set the clock \
                        of this host; if it is right, set that of the peer and `fipa keys renew` there";
 
-/// Alerts (RFC 8446 section 6.2) that are about certificates.
+/// Alerts about certificates (RFC 8446 section 6.2).
 const BAD_CERTIFICATE: u8 = 42;
 const CERTIFICATE_EXPIRED: u8 = 45;
 const CERTIFICATE_UNKNOWN: u8 = 46;
 const UNKNOWN_CA: u8 = 48;
 const ACCESS_DENIED: u8 = 49;
 
-/// Who has found something wrong with the other one's certificate.
+/// The side that rejected the other one's certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Finder {
     Here,
     Peer,
 }
 
-/// What to do about an alert.
+/// Returns the remedy for an alert.
 pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
     match (alert, finder) {
         (CERTIFICATE_EXPIRED, Finder::Here) => {
@@ -43,7 +43,7 @@ pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
     }
 }
 
-/// What to do about an error of TLS.
+/// Returns the remedy for an error of TLS.
 pub(crate) fn of_error(error: &Error) -> &'static str {
     match error {
         Error::AlertReceived(alert) => of_alert(u8::from(*alert), Finder::Peer),

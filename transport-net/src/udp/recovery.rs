@@ -175,7 +175,7 @@ impl Recovery {
         Some(told)
     }
 
-    /// Nothing was heard for too long: what was in the oldest packets is to be sent again.
+    /// Handles a timeout: returns the contents of the oldest packets for retransmission.
     pub(crate) fn timed_out(&mut self) -> Vec<SentContent> {
         self.backoff = self.backoff.saturating_add(1);
         let oldest: Vec<u64> = self.sent.keys().take(2).copied().collect();
@@ -185,7 +185,7 @@ impl Recovery {
             .collect()
     }
 
-    /// The packet sent last did not leave. What it carried is to be sent otherwise.
+    /// Withdraws the last packet, which could not be sent. Returns its contents.
     pub(crate) fn withdraw(&mut self) -> Vec<SentContent> {
         let last = self.next.checked_sub(1);
         let packet = last.and_then(|number| self.remove(number));
@@ -195,24 +195,23 @@ impl Recovery {
         packet.map_or_else(Vec::new, |packet| packet.kept)
     }
 
-    /// Nothing is awaited any more.
+    /// Resets the backoff when no acknowledgment is awaited.
     pub(crate) fn calm(&mut self) {
         self.backoff = 0;
         self.waiting_since = None;
     }
 
-    /// When nothing will have been heard for too long.
+    /// Returns the time of the retransmission timeout.
     pub(crate) fn timeout(&self) -> Option<Instant> {
         (!self.sent.is_empty()).then(|| self.last_sent + self.patience())
     }
 
-    /// Since when acknowledgements are awaited in vain, and how often what was sent has been sent
-    /// again.
+    /// Returns the time since which acknowledgments are missing, and the number of timeouts since.
     pub(crate) fn waiting_since(&self) -> Option<(Instant, u32)> {
         self.waiting_since.map(|since| (since, self.backoff))
     }
 
-    /// Whether packets are under way.
+    /// Whether packets are in flight.
     pub(crate) fn is_waiting(&self) -> bool {
         !self.sent.is_empty()
     }

@@ -1,4 +1,4 @@
-//! The listening side: accepting connections of this user.
+//! The listening side: accepts connections of this user.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;

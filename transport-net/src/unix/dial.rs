@@ -1,4 +1,4 @@
-//! The calling side: opening a connection to a location.
+//! The dialling side: opens a connection to a location.
 
 use std::io;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire;
 
-/// Opens the connection of a link that has been made up, and serves it.
+/// Opens the connection of a new link, and serves it.
 pub(super) async fn dial(
     endpoint: Arc<Endpoint>,
     directory: Option<Arc<Directory>>,
@@ -56,7 +56,7 @@ async fn connect(
         Ok(connected) => connected,
         Err(_) => Err(io::Error::new(
             io::ErrorKind::TimedOut,
-            format!("no connection within {patience:?} (connect_timeout)"),
+            format!("timed out connecting after {patience:?} (connect_timeout)"),
         )),
     }
 }
