@@ -3,11 +3,11 @@
 use rustls::{CertificateError, Error};
 
 /// The remedy when neither side reports a cause.
-const LOOK: &str = "`fipa keys list` on both sides";
+const LOOK: &str = "run `fipa keys list` on both hosts";
 
 /// The remedy for a certificate that is not valid yet.
-pub(crate) const NOT_YET: &str = "the clock of this host is before the making of the peer's certificate: set the clock \
-                       of this host; if it is right, set that of the peer and `fipa keys renew` there";
+pub(crate) const NOT_YET: &str = "the peer's certificate is not valid yet by the clock of this host: set the clock \
+                       of this host; if it is right, set the clock of the peer and run `fipa keys renew` there";
 
 /// Alerts about certificates (RFC 8446 section 6.2).
 const BAD_CERTIFICATE: u8 = 42;
@@ -27,17 +27,17 @@ pub(crate) enum Finder {
 pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
     match (alert, finder) {
         (CERTIFICATE_EXPIRED, Finder::Here) => {
-            "the peer's certificate does not hold now: `fipa keys renew` there; are the clocks right?"
+            "the peer's certificate is not valid now: check both clocks, or run `fipa keys renew` there"
         }
         (CERTIFICATE_EXPIRED, Finder::Peer) => {
-            "this host's certificate does not hold now by the clock of the peer: set the clocks of both \
-             hosts, or `fipa keys renew`"
+            "this host's certificate is not valid now by the clock of the peer: set the clocks of both \
+             hosts, or run `fipa keys renew`"
         }
         (UNKNOWN_CA, Finder::Here) => {
-            "the peer is not trusted here: `fipa keys trust` the own.pem of that host"
+            "this host does not trust the peer: run `fipa keys trust` with the peer's own.pem"
         }
         (BAD_CERTIFICATE | CERTIFICATE_UNKNOWN | UNKNOWN_CA | ACCESS_DENIED, Finder::Peer) => {
-            "the peer does not trust this host: `fipa keys trust` there the own.pem of this one"
+            "the peer does not trust this host: run `fipa keys trust` there with this host's own.pem"
         }
         _ => LOOK,
     }

@@ -35,13 +35,13 @@ fn limits() -> Limits {
     }
 }
 
-/// One side of a simulated connection: what it did, and what the network holds for it.
+/// One side of a simulated connection, with its results and the bytes in the network.
 struct Side {
     connection: Connection,
     reader: FrameReader,
     /// Bytes on their way to this side.
     coming: BytesMut,
-    /// Parcels that arrived, by their sequence, and those not answered yet, by number.
+    /// Arrived parcels by their sequence, and unanswered ones by number.
     arrived: Vec<u64>,
     open: Vec<u64>,
     concluded: BTreeMap<AttemptId, Vec<Conclusion>>,
@@ -79,7 +79,7 @@ impl Side {
         Ok(())
     }
 
-    /// Up to `max` bytes go into the network.
+    /// Puts up to `max` bytes into the network.
     fn transmit(&mut self, max: usize, to: &mut BytesMut, now: Instant) {
         let mut slices = [IoSlice::new(&[]); 5];
         let count = self.connection.gather(&mut slices);
@@ -89,7 +89,7 @@ impl Side {
         self.connection.written(taken, now);
     }
 
-    /// Up to `max` bytes come out of the network.
+    /// Takes up to `max` bytes out of the network.
     fn receive(&mut self, max: usize, now: Instant) {
         let step = {
             let Space::Buffer(mut space) = self.reader.space() else {
@@ -138,7 +138,7 @@ impl Side {
         }
     }
 
-    /// What must be true once this side has ended and the other took all it ever will.
+    /// Checks the conclusions after this side has ended and the other has received everything.
     fn check(&self, other: &Self) -> Result<(), TestCaseError> {
         for sequence in &self.dispatched {
             let conclusions = self.concluded.get(&AttemptId(*sequence));
@@ -212,7 +212,7 @@ fn pair(now: Instant) -> (Side, Side) {
     )
 }
 
-/// Lets both sides do all they can. Says whether they are done.
+/// Lets both sides make progress. Returns whether both are done.
 fn settle(a: &mut Side, b: &mut Side, now: Instant) {
     for _ in 0..2000 {
         for pick in 0..2 {
@@ -229,7 +229,7 @@ fn settle(a: &mut Side, b: &mut Side, now: Instant) {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
 
-    /// Whatever happens in whatever order, a connection that lives answers everything.
+    /// A connection that does not end answers every parcel, for any order of events.
     #[test]
     fn every_parcel_is_answered_once_and_in_order(
         steps in prop::collection::vec(step(), 0..200),
@@ -253,9 +253,9 @@ proptest! {
         }
     }
 
-    /// However a connection ends, nothing that was called not sent arrives.
+    /// No parcel that was concluded as not sent arrives, for any end of the connection.
     #[test]
-    fn conclusions_are_honest_when_a_connection_ends(
+    fn conclusions_are_true_when_a_connection_ends(
         steps in prop::collection::vec(step(), 0..120),
         end in prop_oneof![
             Just(ConnectionEnd::Hangup),
@@ -289,7 +289,7 @@ proptest! {
     }
 }
 
-/// Both have said hello.
+/// Two sides that have exchanged their hello.
 fn greeted(now: Instant) -> (Side, Side) {
     let (mut a, mut b) = pair(now);
     settle(&mut a, &mut b, now);
@@ -298,7 +298,7 @@ fn greeted(now: Instant) -> (Side, Side) {
 }
 
 #[test]
-fn another_incarnation_ends_it_before_anything_is_sent() {
+fn another_incarnation_ends_the_connection_before_a_parcel_is_sent() {
     let now = Instant::now();
     let expected = Incarnation::from_u64(3);
     let mut a = Side::new(Role::Dialler { expected }, 1, now);
@@ -318,7 +318,7 @@ fn another_incarnation_ends_it_before_anything_is_sent() {
 }
 
 #[test]
-fn a_letter_that_the_peer_does_not_take_is_not_sent() {
+fn a_letter_that_the_peer_does_not_accept_is_not_sent() {
     let now = Instant::now();
     let (mut a, mut b) = pair(now);
     b.connection.hello.max_letter = 100;
@@ -335,7 +335,7 @@ fn a_letter_that_the_peer_does_not_take_is_not_sent() {
 }
 
 #[test]
-fn the_window_of_the_peer_is_kept_and_congestion_told() {
+fn the_window_of_the_peer_is_respected_and_congestion_reported() {
     let now = Instant::now();
     let (mut a, mut b) = pair(now);
     b.connection.hello.max_in_flight = 2;
@@ -353,7 +353,7 @@ fn the_window_of_the_peer_is_kept_and_congestion_told() {
 }
 
 #[test]
-fn bytes_that_wait_are_bounded_and_one_letter_always_fits() {
+fn queued_bytes_are_bounded_and_one_letter_always_fits() {
     let now = Instant::now();
     let (mut a, _) = pair(now);
     a.connection.limits.max_queued_bytes = 100;
@@ -365,7 +365,7 @@ fn bytes_that_wait_are_bounded_and_one_letter_always_fits() {
 }
 
 #[test]
-fn what_a_peer_must_not_send_ends_the_connection() {
+fn a_protocol_violation_ends_the_connection() {
     let now = Instant::now();
     let nonsense = |frames: Vec<Frame>| {
         let (mut a, _) = greeted(now);
@@ -410,7 +410,7 @@ fn a_peer_that_pings_and_does_not_read_gets_few_pongs() {
 }
 
 #[test]
-fn silence_is_asked_about_and_then_ends_it() {
+fn a_silent_peer_gets_a_ping_and_is_then_given_up() {
     let mut now = Instant::now();
     let (mut a, mut b) = greeted(now);
     a.connection.limits.idle_close = Duration::from_secs(1000);
@@ -437,14 +437,17 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
     let patience = limits().keep_alive / 4;
-    assert!(!a.connection.doubt(start, patience), "heard a moment ago");
-    // A peer that answers stays.
+    assert!(
+        !a.connection.doubt(start, patience),
+        "a byte has just arrived"
+    );
+    // A peer that responds keeps its connection.
     let mut now = start + patience;
     assert!(a.connection.doubt(now, patience));
     settle(&mut a, &mut b, now);
     now += patience;
     a.connection.handle_timeout(now, 0).unwrap();
-    // One that does not is given up; doubting again grants no more time.
+    // A peer that does not respond is given up; doubting again grants no more time.
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.transmit(usize::MAX, &mut b.coming, now);
     let due = a.connection.poll_timeout().unwrap();
@@ -471,7 +474,7 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
         a.transmit(100, &mut BytesMut::new(), now);
         a.connection.handle_timeout(now, 0).unwrap();
     }
-    // What was written has time to arrive.
+    // The written bytes have time to arrive.
     now += patience + Duration::from_millis(10);
     assert_eq!(
         a.connection.handle_timeout(now, 0),
@@ -491,18 +494,18 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     };
     let now = start + Duration::from_millis(1);
     let first = dispatch(&mut a, now);
-    // Its letter had a short deadline, which says nothing about the connection.
+    // A letter with a short deadline does not make the connection suspect.
     a.connection.abandon(first, now + patience / 2);
     assert!(!a.connection.is_suspect());
     let second = dispatch(&mut a, now);
     a.connection.received(1, false, now + patience / 2);
     a.connection.abandon(second, now + patience * 2);
-    assert!(!a.connection.is_suspect(), "something came meanwhile");
+    assert!(!a.connection.is_suspect(), "a byte arrived meanwhile");
     let now = now + patience * 3;
     let third = dispatch(&mut a, now);
     a.connection.abandon(third, now + patience);
     assert!(a.connection.is_suspect());
-    // The peer is asked, and what it says counts.
+    // The peer gets a ping, and its response counts.
     let mut asked = BytesMut::new();
     a.transmit(usize::MAX, &mut asked, now + patience);
     assert!(!asked.is_empty());
@@ -512,7 +515,7 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
 }
 
 #[test]
-fn idleness_ends_it_but_not_while_something_is_open() {
+fn an_idle_connection_closes_unless_a_parcel_is_open() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
     let mut now = start;
@@ -539,7 +542,7 @@ fn idleness_ends_it_but_not_while_something_is_open() {
 }
 
 #[test]
-fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
+fn a_stalled_frame_ends_the_connection_and_a_slow_one_does_not() {
     let mut now = Instant::now();
     let (mut a, _) = greeted(now);
     a.connection.received(100, true, now);
@@ -574,7 +577,7 @@ fn a_hello_must_come_in_time() {
 }
 
 #[test]
-fn a_peer_that_says_it_is_this_service_is_refused() {
+fn a_peer_that_claims_to_be_this_service_is_refused() {
     let now = Instant::now();
     for role in [
         Role::Acceptor,

@@ -169,6 +169,7 @@ struct Peer {
     /// opened the connection.
     dialled: Option<(String, u64)>,
     /// The listening addresses in its hello.
+    #[cfg_attr(not(feature = "ip"), expect(dead_code, reason = "only IP peers move"))]
     listening: Vec<String>,
 }
 

@@ -1,4 +1,4 @@
-//! The registry of connections, without sockets: which connections get a place.
+//! The registry of connections, without sockets.
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 use std::net::SocketAddr;
@@ -29,7 +29,7 @@ fn identity(incarnation: u64) -> Identity {
     }
 }
 
-/// An endpoint that listens nowhere, to be used within a runtime.
+/// An endpoint without a listener. Must be used within a runtime.
 fn endpoint(limits: Limits) -> Arc<Endpoint> {
     let config = StreamConfig {
         identity: identity(1 << 40),
@@ -55,7 +55,7 @@ fn certificate(number: u8) -> Option<Principal> {
     Some(Principal::Certificate([number; 32]))
 }
 
-/// A connection accepted from there, whose peer says hello.
+/// An accepted connection whose peer sends a hello.
 struct Greeting {
     incarnation: u64,
     serial: u64,
@@ -94,7 +94,7 @@ async fn enters(
 }
 
 #[tokio::test]
-async fn no_source_has_more_than_half_of_the_places() {
+async fn no_source_has_more_than_half_of_the_slots() {
     let endpoint = endpoint(Limits {
         max_connections: 16,
         max_per_address: 4,
@@ -110,21 +110,21 @@ async fn no_source_has_more_than_half_of_the_places() {
         }
         entered
     };
-    // Every local user has all of 127.0.0.0/8.
+    // Every local user has all addresses of 127.0.0.0/8.
     assert_eq!(get_in(None, &|n| format!("127.0.0.{n}:1")).await, 8);
-    // Peers with keys are counted by certificate, also when they come from there.
+    // Peers with keys are counted by certificate, also on loopback.
     assert_eq!(get_in(certificate(1), &|_| "[::1]:1".into()).await, 4);
     assert_eq!(get_in(None, &|n| format!("[2001:db8::{n}]:1")).await, 4);
     assert_eq!(
         get_in(None, &|_| "10.0.0.1:1".into()).await,
         0,
-        "all are taken"
+        "all slots are taken"
     );
     assert_eq!(endpoint.tally().read().refused_crowd, 2 + 6 + 6 + 10);
 }
 
 #[tokio::test]
-async fn strangers_of_one_source_push_out_each_other() {
+async fn unproved_connections_of_one_source_evict_each_other() {
     let limits = Limits::default();
     let endpoint = endpoint(limits.clone());
     let slot = |from: &str| {
@@ -149,7 +149,7 @@ async fn strangers_of_one_source_push_out_each_other() {
     drop(registry);
 }
 
-/// A certificate or none, an incarnation, where from, the serial, and what was dialled.
+/// A certificate or none, an incarnation, an origin, the serial number, and the dialled location.
 fn comes(
     proved: Option<Principal>,
     incarnation: u64,
@@ -167,7 +167,7 @@ fn comes(
 const X: &str = "tcp://10.0.0.1:7788";
 const Y: &str = "tcp://10.0.0.2:7788";
 
-/// The peer of the link that is asked. The tests have no sockets, so this stands for its task.
+/// Stands for the task of a link, because the tests have no sockets: ends the link on request.
 async fn ends_when_asked_to(link: Arc<Link>) {
     let end = link.leaving().await;
     assert_eq!(end, ConnectionEnd::Superseded);
@@ -190,7 +190,7 @@ async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
         let proved = "it has no certificate and claims the incarnation of a service that is connected with one";
         assert_eq!(entered.map(|_| ()), refused(proved));
     }
-    // What was only claimed gives way.
+    // A connection with an unproved claim is replaced.
     let (claimed, _) = enters(&endpoint, comes(None, 9, "10.0.0.8:1", 1, X))
         .await
         .unwrap();
@@ -201,14 +201,13 @@ async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
 }
 
 #[tokio::test]
-async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its_other_connections_stay()
- {
+async fn a_moved_peer_with_keys_replaces_only_its_older_connection_for_the_same_location() {
     let endpoint = endpoint(Limits::default());
     let proved = certificate(1);
     let (first, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
-    // For another location, and one that this side has opened.
+    // One connection for another location, and one opened by this side.
     let (second, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:2", 2, Y))
         .await
         .unwrap();
@@ -227,7 +226,7 @@ async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its
 }
 
 #[tokio::test]
-async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection_lists() {
+async fn a_peer_without_keys_is_admitted_at_each_address_that_its_first_connection_lists() {
     let endpoint = endpoint(Limits::default());
     let first = Greeting {
         listening: &["0.0.0.0:7788", "10.0.0.7:7788", "10.0.1.7:7788"],
@@ -240,8 +239,8 @@ async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection
         enters(&endpoint, second).await.unwrap();
         assert_eq!(first.ending(), None, "both stay: {dialled}");
     }
-    // A stranger cannot list its own address: the connected peer has to. The peer of the first
-    // connection has no socket here and gives no sign of life.
+    // An unproved peer cannot list its own address: the connected peer must list it. The peer of
+    // the first connection has no socket here and does not respond.
     let slot = Greeting {
         listening: &["10.0.0.8:7788", "10.0.0.7:7788"],
         ..comes(None, 8, "10.0.0.8:1", 3, X)
@@ -254,13 +253,13 @@ async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection
     assert_eq!(
         claimed.ending(),
         Some(ConnectionEnd::Superseded),
-        "it was asked"
+        "it did not respond"
     );
     assert_eq!(first.ending(), None);
 }
 
 #[tokio::test]
-async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certificate() {
+async fn receive_windows_share_one_budget_with_a_share_for_each_certificate() {
     let endpoint = endpoint(Limits::default());
     let limits = endpoint.limits().clone();
     let len = limits.max_incoming_per_source / 2 - 1;
@@ -277,20 +276,21 @@ async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certific
         taken <= limits.max_incoming && taken + len > limits.max_incoming,
         "{taken}"
     );
-    // A connection that ends gives its share back.
+    // A connection that ends releases its share.
     drop(of_all);
     assert!(endpoint.window(&quota_key(9), len).is_some());
 }
 
 #[tokio::test]
-async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_this_one() {
+async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this_one() {
     let endpoint = endpoint(Limits::default());
     let proved = certificate(1);
     let (good, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
     tokio::spawn(ends_when_asked_to(good.clone()));
-    // From a new address, as after a move, the peer dials what a directory still says.
+    // From a new address, as after a move, the peer dials the location in an outdated directory
+    // entry.
     let earlier = comes(
         proved,
         7,
@@ -303,7 +303,7 @@ async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_thi
     assert_eq!(good.ending(), None);
 }
 
-/// A link that was dialled for this location, and whose peer has introduced itself.
+/// A link that was dialled for this location and whose peer has introduced itself.
 async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
     let Route::New(link, _) = endpoint.route_to(to).unwrap() else {
         panic!("there is a connection already");
@@ -330,7 +330,7 @@ async fn letters_take_another_connection_when_one_is_suspect() {
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let first = dials(&endpoint, &to).await;
     let Route::Open(same) = endpoint.route_to(&to).unwrap() else {
-        panic!("a connection that works is kept");
+        panic!("a healthy connection is kept");
     };
     assert!(Arc::ptr_eq(&first, &same));
     first.doubt();

@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_urgent_waits_for_the_frame_that_has_begun_only() {
+    fn urgent_frames_wait_only_for_the_frame_that_has_begun() {
         let mut outbox = Outbox::default();
         outbox.push_parcel(1, vec![Bytes::from_static(b"first")]);
         outbox.push_parcel(2, vec![Bytes::from_static(b"second")]);

@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_said_is_refused() {
+    fn letters_that_cannot_be_translated_are_refused() {
         let garbage = Letter::new(Bytes::from_static(b"x"), Bytes::new());
         let refused = translate(&garbage, "arm", Signature::FipaServices, None);
         assert!(matches!(refused, Err(TranslateError::Read(_))));
