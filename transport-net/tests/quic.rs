@@ -215,7 +215,7 @@ fn a_peer_without_quic_is_reported_in_time() {
     let (from, _to) = friends();
     let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
     let location = Location::new(Kind::Quic, &silent.local_addr().unwrap().to_string()).unwrap();
-    from.send(1, &location, parcel(1, "anybody?")).unwrap();
+    from.send(1, &location, parcel(1, "hello?")).unwrap();
     let Conclusion::NotSent(error) = from.conclusion(1) else {
         panic!("{:?}", from.conclusion(1));
     };

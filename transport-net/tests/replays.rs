@@ -15,7 +15,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use common::certificates::Host;
-use common::intruder::{ONLY_13, PROTOCOL, ROGUE, client, quic, said};
+use common::intruder::{ONLY_13, PROTOCOL, ROGUE, client, hello_and_letter, quic};
 use common::{NAME, Party, Recorder, accepted, config, parcel, quic_config, until};
 use fipa_transport::{Conclusion, Kind, Location};
 use fipa_transport_net::secure::Security;
@@ -249,7 +249,7 @@ fn sessions_are_not_resumed() {
         let stream = TcpStream::connect(tcp.location().address()).unwrap();
         stream.set_read_timeout(Some(WATCHDOG)).unwrap();
         let mut stream = StreamOwned::new(session, stream);
-        stream.write_all(&said()).unwrap();
+        stream.write_all(&hello_and_letter()).unwrap();
         stream.read_exact(&mut [0; 24]).unwrap();
         assert_eq!(stream.conn.handshake_kind(), Some(HandshakeKind::Full));
         assert!(!stream.conn.is_early_data_accepted());
@@ -266,7 +266,7 @@ fn sessions_are_not_resumed() {
             };
             let connection = connecting.await.unwrap();
             let (mut send, mut receive) = connection.open_bi().await.unwrap();
-            send.write_all(&said()).await.unwrap();
+            send.write_all(&hello_and_letter()).await.unwrap();
             // A session ticket would arrive before this.
             receive.read_exact(&mut [0; 24]).await.unwrap();
         }

@@ -81,9 +81,9 @@ fn a_name_resolves_to_the_address_that_answers() {
     let port = far.location.address().rsplit_once(':').unwrap().1;
     let named = Location::new(Kind::Udp, &format!("localhost:{port}")).unwrap();
     near.assert_reaches(1, &named);
-    let nobody = Location::new(Kind::Udp, "nobody.invalid:7").unwrap();
+    let unknown = Location::new(Kind::Udp, "nobody.invalid:7").unwrap();
     near.transport
-        .dispatch(AttemptId(2), &nobody, parcel(1, "x"))
+        .dispatch(AttemptId(2), &unknown, parcel(1, "x"))
         .unwrap();
     match near.conclusion(2) {
         Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),

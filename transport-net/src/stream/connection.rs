@@ -33,7 +33,7 @@ const MAX_CONTROL: usize = 4;
 /// gets more time.
 const SLOWEST_BYTES_PER_SECOND: u64 = 128 << 10;
 
-/// Which side opened the connection.
+/// The side that opened the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Role {
     /// This side opened it and expects this incarnation, which may be unknown.
@@ -433,10 +433,10 @@ impl Connection {
         Some(since + self.doubt_patience() + self.transfer_time())
     }
 
-    /// Takes a frame from the peer.
+    /// Handles a frame of the peer.
     ///
     /// # Errors
-    /// When the connection is over because of it.
+    /// When the frame ends the connection.
     pub(crate) fn handle_frame(&mut self, frame: Frame, now: Instant) -> Result<(), ConnectionEnd> {
         if self.ended {
             // Frames after a goodbye are not valid.

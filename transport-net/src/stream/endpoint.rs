@@ -422,7 +422,7 @@ impl Endpoint {
             let moved = match listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
-                    tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations after a change of the network interfaces; keeping the previous ones");
+                    tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
                     return;
                 }
             };
@@ -449,7 +449,7 @@ impl Endpoint {
         match (sink, told) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
-                tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations after a change of the network interfaces; keeping the previous ones");
+                tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
             }
             _ => {}
         }

@@ -148,7 +148,7 @@ impl Endpoint {
             let moved = match state.listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
-                    tracing::warn!(kind = %Kind::Udp, %error, "cannot refresh the locations after a change of the network interfaces; keeping the previous ones");
+                    tracing::warn!(kind = %Kind::Udp, %error, "cannot refresh the locations; keeping the previous ones");
                     return;
                 }
             };
@@ -171,7 +171,7 @@ impl Endpoint {
         match (sink, told) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
-                tracing::warn!(kind = %Kind::Udp, %error, "cannot refresh the locations after a change of the network interfaces; keeping the previous ones");
+                tracing::warn!(kind = %Kind::Udp, %error, "cannot refresh the locations; keeping the previous ones");
             }
             _ => {}
         }

@@ -235,7 +235,7 @@ impl Recovery {
         let Some(packet) = self.remove(number) else {
             return Vec::new();
         };
-        // A probe that gets lost tells of the size of the path, not of its load.
+        // The loss of a probe indicates the MTU of the path, not congestion.
         let is_probe = packet
             .kept
             .iter()

@@ -243,7 +243,7 @@ impl Simulation {
             let arrived = arrived.contains(attempt);
             match &heard[0] {
                 Conclusion::Answered(Answer::Accepted) => {
-                    assert!(arrived, "{attempt} was accepted by nobody");
+                    assert!(arrived, "{attempt} was accepted but did not arrive");
                     accepted += 1;
                 }
                 Conclusion::NotSent(error) => {
