@@ -265,7 +265,7 @@ fn usable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
 /// may have got this one since it made the list; else that of the first other address, when the
 /// peer is known under another one (address translation). A loopback address is ignored for a
 /// connection from another host.
-pub(crate) fn way_back(listening: &[String], from: SocketAddr) -> SocketAddr {
+pub(crate) fn return_address(listening: &[String], from: SocketAddr) -> SocketAddr {
     let listening: Vec<SocketAddr> = listening
         .iter()
         .filter_map(|text| numeric_ignoring_scope(text))
@@ -460,7 +460,7 @@ mod tests {
             ),
             from: SocketAddr,
         ) {
-            let back = way_back(&listening, from);
+            let back = return_address(&listening, from);
             prop_assert_eq!(back.ip(), from.ip());
         }
     }
@@ -469,7 +469,7 @@ mod tests {
     fn the_return_address_has_a_listening_port_of_the_peer() {
         let back = |listening: &[&str], from: &str| {
             let listening: Vec<String> = listening.iter().map(|text| (*text).into()).collect();
-            way_back(&listening, from.parse().unwrap()).to_string()
+            return_address(&listening, from.parse().unwrap()).to_string()
         };
         let from = "10.0.0.2:40000";
         assert_eq!(back(&["192.168.0.2:7", "10.0.0.2:8"], from), "10.0.0.2:8");

@@ -50,13 +50,13 @@ fn securities() -> (Security, Security) {
 
 /// The recorded bytes of both sides of one TCP connection: the dialling side, and the accepting
 /// side.
-type Heard = JoinHandle<[Vec<u8>; 2]>;
+type Recording = JoinHandle<[Vec<u8>; 2]>;
 
 /// Forwards one connection, and records its bytes.
-fn record(behind: SocketAddr) -> (Location, Heard) {
+fn record(behind: SocketAddr) -> (Location, Recording) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let front = listener.local_addr().unwrap().to_string();
-    let heard = std::thread::spawn(move || {
+    let recording = std::thread::spawn(move || {
         let (dialler, _) = listener.accept().unwrap();
         let other = TcpStream::connect(behind).unwrap();
         let pass = |mut from: TcpStream, mut to: TcpStream| {
@@ -77,14 +77,14 @@ fn record(behind: SocketAddr) -> (Location, Heard) {
         let back = pass(other, dialler);
         [there, back].map(|passing| passing.join().unwrap())
     });
-    (Location::new(Kind::Tcp, &front).unwrap(), heard)
+    (Location::new(Kind::Tcp, &front).unwrap(), recording)
 }
 
 #[test]
 fn a_replayed_tls_connection_delivers_nothing() {
     let (rover, crex) = securities();
     let to = tcp(crex);
-    let (front, heard) = record(to.location().address().parse().unwrap());
+    let (front, recording) = record(to.location().address().parse().unwrap());
     let from = tcp(rover.clone());
     for attempt in 1..=LETTERS {
         from.send(attempt, &front, parcel(attempt, "secret"))
@@ -92,7 +92,7 @@ fn a_replayed_tls_connection_delivers_nothing() {
         assert_eq!(from.conclusion(attempt), accepted());
     }
     fipa_transport::Transport::close(&from.transport);
-    let [said, answered] = heard.join().unwrap();
+    let [said, answered] = recording.join().unwrap();
     assert!(
         !said.windows(6).any(|part| part == b"secret"),
         "in the clear"

@@ -9,7 +9,7 @@ use quinn::{Connection, ConnectionError, Incoming, RecvStream, SendStream};
 use tokio::time::timeout;
 
 use super::dial::ends;
-use super::sockets::{Sockets, why_lost};
+use super::sockets::{Sockets, loss_reason};
 use crate::log_limit::warn_limited;
 use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
@@ -50,7 +50,7 @@ async fn receive(
 ) {
     let from = incoming.remote_address();
     let patience = endpoint.limits().handshake_timeout;
-    let shaken = match timeout(patience, shake(&sockets, incoming)).await {
+    let handshake_result = match timeout(patience, handshake(&sockets, incoming)).await {
         Ok(Ok((connection, send, receive))) => match sockets.certificate(&connection) {
             Some(certificate) => Ok((connection, send, receive, certificate)),
             None => Err("the peer's certificate is no longer trusted".to_owned()),
@@ -60,8 +60,8 @@ async fn receive(
             "handshake not complete within {patience:?} (handshake_timeout)"
         )),
     };
-    let (connection, send, receive, certificate) = match shaken {
-        Ok(shaken) => shaken,
+    let (connection, send, receive, certificate) = match handshake_result {
+        Ok(handshake_result) => handshake_result,
         Err(why) => {
             let counter = &endpoint.tally().refused_unproved;
             let before = counter.fetch_add(1, Ordering::Relaxed);
@@ -83,11 +83,11 @@ async fn receive(
 }
 
 /// Performs the handshake, and accepts the first stream of the peer.
-async fn shake(
+async fn handshake(
     sockets: &Sockets,
     incoming: Incoming,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| io::Error::other(why_lost(&error));
+    let told = |error: ConnectionError| io::Error::other(loss_reason(&error));
     let connection = sockets.accept(incoming)?.await.map_err(told)?;
     let (send, receive) = connection.accept_bi().await.map_err(told)?;
     Ok((connection, send, receive))

@@ -9,7 +9,7 @@ use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
 use quinn::{Connection, ConnectionError, RecvStream, SendStream};
 
-use super::sockets::{Sockets, why_lost};
+use super::sockets::{Sockets, loss_reason};
 use super::streams::{Control, Letters, Outgoing};
 use crate::end::ConnectionEnd;
 use crate::stream::dialing::{addresses, reach};
@@ -55,7 +55,7 @@ async fn connect(
     sockets: Arc<Sockets>,
     address: SocketAddr,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| io::Error::other(why_lost(&error));
+    let told = |error: ConnectionError| io::Error::other(loss_reason(&error));
     let connection = sockets.dial(address)?.await.map_err(told)?;
     let (send, receive) = connection.open_bi().await.map_err(told)?;
     Ok((connection, send, receive))

@@ -97,7 +97,7 @@ impl Sockets {
 }
 
 /// Returns the reason for which a connection is lost, with a remedy if it is about certificates.
-pub(super) fn why_lost(error: &ConnectionError) -> String {
+pub(super) fn loss_reason(error: &ConnectionError) -> String {
     let (code, finder) = match error {
         ConnectionError::TransportError(error) => (u64::from(error.code), Finder::Here),
         ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),

@@ -17,7 +17,7 @@ use parking_lot::Mutex;
 use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
 use super::settings;
-use super::sockets::why_lost;
+use super::sockets::loss_reason;
 use crate::stream::frame::{self, FrameReader, Space};
 use crate::stream::wire::{BoxFuture, ControlStream, ParcelStreams, StreamWriter};
 
@@ -134,7 +134,7 @@ async fn fill(stream: &mut RecvStream, space: &mut Space<'_>) -> Result<Option<u
 
 /// Returns the error of a lost connection.
 fn lost(error: &ConnectionError) -> io::Error {
-    io::Error::other(why_lost(error))
+    io::Error::other(loss_reason(error))
 }
 
 fn not_written(error: WriteError) -> io::Error {

@@ -3,7 +3,7 @@
 use rustls::{CertificateError, Error};
 
 /// The remedy when neither side reports a cause.
-const LOOK: &str = "run `fipa keys list` on both hosts";
+const DEFAULT_REMEDY: &str = "run `fipa keys list` on both hosts";
 
 /// The remedy for a certificate that is not valid yet.
 pub(crate) const NOT_YET: &str = "the peer's certificate is not valid yet by the clock of this host: set the clock \
@@ -39,7 +39,7 @@ pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
         (BAD_CERTIFICATE | CERTIFICATE_UNKNOWN | UNKNOWN_CA | ACCESS_DENIED, Finder::Peer) => {
             "the peer does not trust this host: run `fipa keys trust` there with this host's own.pem"
         }
-        _ => LOOK,
+        _ => DEFAULT_REMEDY,
     }
 }
 
@@ -54,6 +54,6 @@ pub(crate) fn of_error(error: &Error) -> &'static str {
             of_alert(CERTIFICATE_EXPIRED, Finder::Here)
         }
         Error::InvalidCertificate(CertificateError::NotValidYet) => NOT_YET,
-        _ => LOOK,
+        _ => DEFAULT_REMEDY,
     }
 }

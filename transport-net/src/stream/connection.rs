@@ -60,7 +60,7 @@ pub(crate) enum SendError {
     /// The connection has ended; another one is needed.
     Ended,
     /// The parcel cannot be sent to this peer.
-    Way(WayError),
+    Transport(WayError),
 }
 
 #[derive(Debug)]
@@ -235,17 +235,20 @@ impl Connection {
     /// # Errors
     /// When the parcel cannot be sent. The connection is unchanged then.
     pub(crate) fn send(&mut self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
-        let refuse = |fault, detail: String| Err(SendError::Way(WayError::new(fault, detail)));
+        let refuse =
+            |fault, detail: String| Err(SendError::Transport(WayError::new(fault, detail)));
         if self.ended || self.retiring {
             return Err(SendError::Ended);
         }
         let letter_len = letter_len(parcel);
         let peer_max = self.peer.as_ref().map_or(u64::MAX, |peer| peer.max_letter);
         if letter_len > peer_max {
-            return Err(SendError::Way(too_large_for_peer(letter_len, peer_max)));
+            return Err(SendError::Transport(too_large_for_peer(
+                letter_len, peer_max,
+            )));
         }
         if !self.proof.speaks_for(&parcel.receiver) {
-            return Err(SendError::Way(not_its_agent(&parcel.receiver)));
+            return Err(SendError::Transport(not_its_agent(&parcel.receiver)));
         }
         let Limits {
             max_in_flight,
@@ -413,7 +416,7 @@ impl Connection {
     }
 
     /// Whether a byte arrived after `since`, or reading is paused.
-    pub(crate) fn is_heard_since(&self, since: Instant) -> bool {
+    pub(crate) fn received_since(&self, since: Instant) -> bool {
         !self.ended && (self.paused || self.clock.received > since)
     }
 

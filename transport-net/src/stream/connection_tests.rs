@@ -186,7 +186,7 @@ fn step() -> impl Strategy<Value = (bool, Step)> {
 fn perform(step: &Step, this: &mut Side, other: &mut Side, now: Instant) {
     match step {
         Step::Dispatch(len) => match this.dispatch(*len) {
-            Err(SendError::Way(error)) => assert_eq!(error.fault, WayFault::Congested),
+            Err(SendError::Transport(error)) => assert_eq!(error.fault, WayFault::Congested),
             Err(SendError::Ended) => assert!(this.end.is_some()),
             Ok(()) => {}
         },
@@ -330,7 +330,7 @@ fn a_letter_that_the_peer_does_not_accept_is_not_sent() {
         other => panic!("{other:?}"),
     }
     assert_eq!(b.arrived, [1]);
-    assert!(matches!(a.dispatch(101), Err(SendError::Way(error))
+    assert!(matches!(a.dispatch(101), Err(SendError::Transport(error))
         if error.fault == WayFault::TooLarge));
 }
 
@@ -343,7 +343,7 @@ fn the_window_of_the_peer_is_respected_and_congestion_reported() {
     for _ in 0..limits().max_in_flight {
         a.dispatch(10).unwrap();
     }
-    assert!(matches!(a.dispatch(10), Err(SendError::Way(error))
+    assert!(matches!(a.dispatch(10), Err(SendError::Transport(error))
         if error.fault == WayFault::Congested));
     a.transmit(usize::MAX, &mut b.coming, now);
     a.transmit(usize::MAX, &mut b.coming, now);
@@ -358,7 +358,7 @@ fn queued_bytes_are_bounded_and_one_letter_always_fits() {
     let (mut a, _) = pair(now);
     a.connection.limits.max_queued_bytes = 100;
     a.dispatch(4000).unwrap();
-    assert!(matches!(a.dispatch(1), Err(SendError::Way(error))
+    assert!(matches!(a.dispatch(1), Err(SendError::Transport(error))
         if error.fault == WayFault::Congested));
     a.connection.abandon(AttemptId(0), now);
     a.dispatch(1).unwrap();

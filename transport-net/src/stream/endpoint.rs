@@ -51,7 +51,7 @@ use crate::rate_limit::PeerRateLimits;
 
 /// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Maximum number of silent connections that are pinged before an unproved peer is refused.
 const MAX_ASKED: usize = 4;
@@ -60,7 +60,7 @@ const MAX_ASKED: usize = 4;
 const MAX_DOUBLINGS: u32 = 4;
 
 /// Pause of accepting after a failure, for example when the process has no descriptors left.
-const REST: Duration = Duration::from_millis(100);
+const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(100);
 
 #[derive(Debug)]
 pub(crate) struct Endpoint {
@@ -90,7 +90,7 @@ struct Registry {
     /// Connections opened by this side, by location.
     dialled: HashMap<Location, Arc<Link>>,
     /// Locations for which connections were opened beside suspect ones.
-    beside: HashMap<Location, SuspectRetries>,
+    suspect_retries: HashMap<Location, SuspectRetries>,
     /// All connections with the service of an incarnation, in the order of introduction.
     known: HashMap<Incarnation, Vec<Arc<Link>>>,
     /// The latest connection of each peer for each location that the peer dialled, with the peer's
@@ -519,13 +519,13 @@ impl Endpoint {
                     return Err(WayError::new(WayFault::Closed, detail));
                 }
                 return sent.map_err(|error| match error {
-                    SendError::Way(error) => error,
+                    SendError::Transport(error) => error,
                     SendError::Ended => ConnectionEnd::Closed.after(),
                 });
             }
             match sent {
                 Ok(()) => return Ok(()),
-                Err(SendError::Way(error)) => return Err(error),
+                Err(SendError::Transport(error)) => return Err(error),
                 // The connection has just ended: the next iteration creates another one.
                 Err(SendError::Ended) => self.forget(&link),
             }
@@ -556,7 +556,7 @@ impl Endpoint {
         let spare = self.limits().connect_timeout;
         let is_soon = || {
             registry
-                .beside
+                .suspect_retries
                 .get(to)
                 .is_some_and(|it| it.is_soon(now, spare))
         };
@@ -698,7 +698,7 @@ impl Endpoint {
             let now = Instant::now();
             asked.iter().for_each(|other| other.ask());
             for other in asked {
-                if other.answers(now, SIGN_OF_LIFE).await {
+                if other.answers(now, RESPONSE_TIMEOUT).await {
                     return Err(self.refuse(from, "it claims the incarnation of a connected service whose connection is alive"));
                 }
                 silent.push(other.number);
@@ -721,7 +721,7 @@ impl Endpoint {
             #[cfg(feature = "ip")]
             Source::Address(from) => (
                 self.config.principal_at(from.ip(), &peer.identity),
-                address::way_back(&peer.listening, from).to_string(),
+                address::return_address(&peer.listening, from).to_string(),
             ),
         };
         let location = Location::new(self.kind, &back)
@@ -832,7 +832,7 @@ impl Endpoint {
                 "cannot accept a connection: {error}; retrying (for `too many open files`, raise `ulimit -n`)"
             ),
         );
-        sleep(REST).await;
+        sleep(ACCEPT_RETRY_DELAY).await;
     }
 
     /// Admits an accepted connection before its peer's hello. Returns `None` when the endpoint is
@@ -958,14 +958,14 @@ impl Registry {
     /// Records that a connection is opened beside suspect ones. The number of records is bounded by
     /// the connections that an endpoint may have within the longest pause.
     fn note_retry(&mut self, to: &Location, now: Instant, pause: Duration) {
-        self.beside.retain(|_, it| !it.is_over(now, pause));
-        let known = self.beside.entry(to.clone());
-        let beside = known.or_insert(SuspectRetries {
+        self.suspect_retries.retain(|_, it| !it.is_over(now, pause));
+        let known = self.suspect_retries.entry(to.clone());
+        let retries = known.or_insert(SuspectRetries {
             last: now,
             times: 0,
         });
-        beside.times += 1;
-        beside.last = now;
+        retries.times += 1;
+        retries.last = now;
     }
 
     /// Selects the connection to evict when another one comes from `coming`: the oldest of the

@@ -47,7 +47,7 @@ pub(crate) struct Link {
     /// Wakes the task to write bytes or to end the connection.
     wake: Notify,
     /// Notifies waiters that bytes have arrived.
-    heard: Notify,
+    received: Notify,
     over: watch::Sender<bool>,
     begun: AtomicBool,
     /// Whether the connection is [suspect](Connection::is_suspect); readable without the lock of
@@ -87,7 +87,7 @@ impl Link {
                 leads_to: None,
             }),
             wake: Notify::new(),
-            heard: Notify::new(),
+            received: Notify::new(),
             over: watch::Sender::new(false),
             begun: AtomicBool::new(false),
             suspect: AtomicBool::new(false),
@@ -203,14 +203,14 @@ impl Link {
     pub(crate) async fn answers(&self, asked: Instant, patience: Duration) -> bool {
         let due = tokio::time::Instant::from_std(asked + patience);
         loop {
-            let heard = self.heard.notified();
-            tokio::pin!(heard);
-            heard.as_mut().enable();
-            if self.state.lock().connection.is_heard_since(asked) {
+            let received = self.received.notified();
+            tokio::pin!(received);
+            received.as_mut().enable();
+            if self.state.lock().connection.received_since(asked) {
                 return true;
             }
             tokio::select! {
-                () = heard => {}
+                () = received => {}
                 () = self.over() => return false,
                 () = sleep_until(due) => return false,
             }
@@ -433,7 +433,7 @@ impl LinkTask {
         drop(self);
         if orderly {
             // After the timeout, the socket is closed without waiting for the peer.
-            let _ = timeout(patience, farewell(&link, read)).await;
+            let _ = timeout(patience, close_gracefully(&link, read)).await;
         }
         link.state.lock().writer = None;
     }
@@ -615,7 +615,7 @@ impl LinkTask {
         }
         drop(state);
         if arrived > 0 {
-            link.heard.notify_waiters();
+            link.received.notify_waiters();
         }
         Ok(())
     }
@@ -725,7 +725,7 @@ impl Drop for LinkTask {
 
 /// Writes the remaining bytes, closes this direction, and waits until the peer closes the other:
 /// closing a socket with unread bytes would discard the bytes that are on their way to the peer.
-async fn farewell(link: &Link, mut read: Reading) {
+async fn close_gracefully(link: &Link, mut read: Reading) {
     loop {
         let writer = {
             let mut state = link.state.lock();

@@ -44,9 +44,11 @@ pub(crate) async fn accept(
     patience: Duration,
 ) -> Result<Secured, String> {
     let acceptor = TlsAcceptor::from(security.server());
-    let shaken = timeout(patience, acceptor.accept(stream)).await;
-    let shaken = shaken.map_err(|_| too_slow(patience))?;
-    let (stream, session) = shaken.map_err(|error| told(&error))?.into_inner();
+    let handshake = timeout(patience, acceptor.accept(stream)).await;
+    let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
+    let (stream, session) = handshake
+        .map_err(|error| handshake_error(&error))?
+        .into_inner();
     secured(security, stream, session.into())
 }
 
@@ -60,17 +62,19 @@ pub(crate) async fn connect(
     let connector = TlsConnector::from(security.client());
     // The name is neither sent nor verified: the certificate identifies the peer.
     let name = ServerName::from(peer.ip());
-    let shaken = timeout(patience, connector.connect(name, stream)).await;
-    let shaken = shaken.map_err(|_| too_slow(patience))?;
-    let (stream, session) = shaken.map_err(|error| told(&error))?.into_inner();
+    let handshake = timeout(patience, connector.connect(name, stream)).await;
+    let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
+    let (stream, session) = handshake
+        .map_err(|error| handshake_error(&error))?
+        .into_inner();
     secured(security, stream, session.into())
 }
 
-fn too_slow(patience: Duration) -> String {
+fn handshake_timeout(patience: Duration) -> String {
     format!("TLS handshake not complete within {patience:?} (handshake_timeout)")
 }
 
-fn told(error: &io::Error) -> String {
+fn handshake_error(error: &io::Error) -> String {
     let inner = error.get_ref().and_then(|it| it.downcast_ref());
     match inner {
         Some(inner) => format!(

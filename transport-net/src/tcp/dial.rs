@@ -26,8 +26,8 @@ use crate::stream::wire::{self, Reading, Writing};
 
 /// Time after which another connection to the same address is attempted, and the maximum number of
 /// attempts.
-const ASKED_AGAIN: Duration = Duration::from_millis(400);
-const MAX_ASKED: usize = 4;
+const RETRY_AFTER: Duration = Duration::from_millis(400);
+const MAX_CONNECTS: usize = 4;
 
 /// Opens the connection of a new link, and serves it.
 pub(crate) async fn dial(
@@ -44,7 +44,7 @@ pub(crate) async fn dial(
         sink,
         Some(to.clone()),
     );
-    let (stream, peer) = match reach(&limits, &link, &to, addresses, insist).await {
+    let (stream, peer) = match reach(&limits, &link, &to, addresses, connect_with_retries).await {
         Ok(connected) => connected,
         Err(end) => return running.fail(end),
     };
@@ -103,13 +103,13 @@ pub(crate) async fn open(
 
 /// Opens a connection, and after a while another one if there is no answer: the system retransmits
 /// a lost SYN only after one second, and then after two. The first open connection is used.
-async fn insist(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
+async fn connect_with_retries(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
     let mut asked = JoinSet::new();
     loop {
         asked.spawn(connect(address));
         tokio::select! {
             Some(ended) = asked.join_next() => return ended.unwrap_or_else(|e| Err(io::Error::other(e))),
-            () = sleep(ASKED_AGAIN), if asked.len() < MAX_ASKED => {}
+            () = sleep(RETRY_AFTER), if asked.len() < MAX_CONNECTS => {}
         }
     }
 }

@@ -29,7 +29,7 @@ use crate::stream::counters::count;
 use crate::stream::dialing::Unreachable;
 
 /// Time that a peer has to close the connection after its letter, before the next letter is sent.
-const FAREWELL: Duration = Duration::from_millis(50);
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(50);
 
 /// Maximum number of bytes per write; the stall timeout applies to each write.
 const STEP: usize = 256 << 10;
@@ -203,20 +203,20 @@ impl LegacySenders {
 
 /// Sends the waiting letters of a location, one by one.
 pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Location) {
-    let mut round = Round {
+    let mut task = QueueTask {
         endpoint,
         sink,
         to,
         done: false,
     };
-    let mut closed = round.endpoint.legacy.senders.closed.subscribe();
-    while let Some(delivery) = round.endpoint.legacy.senders.next(&round.to) {
+    let mut closed = task.endpoint.legacy.senders.closed.subscribe();
+    while let Some(delivery) = task.endpoint.legacy.senders.next(&task.to) {
         let progress = Mutex::new(false);
         let conclusion = tokio::select! {
-            conclusion = deliver(&round, &delivery, &progress) => conclusion,
+            conclusion = deliver(&task, &delivery, &progress) => conclusion,
             _ = closed.wait_for(|closed| *closed) => {
-                // Dropping `round` concludes the remaining letters.
-                round.conclude(delivery.attempt, broken(*progress.lock(), ConnectionEnd::Closed.after()));
+                // Dropping `task` concludes the remaining letters.
+                task.conclude(delivery.attempt, broken(*progress.lock(), ConnectionEnd::Closed.after()));
                 return;
             }
         };
@@ -226,20 +226,20 @@ pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Loc
             }
             _ => None,
         };
-        round.conclude(delivery.attempt, conclusion);
+        task.conclude(delivery.attempt, conclusion);
         if let Some(error) = unreachable {
             // The other waiting letters fail with the same error, without an attempt each.
-            for delivery in round.endpoint.legacy.senders.drain(&round.to) {
+            for delivery in task.endpoint.legacy.senders.drain(&task.to) {
                 let conclusion = Conclusion::NotSent(error.clone());
-                round.sink.concluded(delivery.attempt, conclusion);
+                task.sink.concluded(delivery.attempt, conclusion);
             }
         }
     }
-    round.done = true;
+    task.done = true;
 }
 
 /// The task of a queue. Dropping it concludes every remaining letter.
-struct Round {
+struct QueueTask {
     endpoint: Arc<TcpEndpoint>,
     sink: Arc<dyn Sink>,
     to: Location,
@@ -247,7 +247,7 @@ struct Round {
     done: bool,
 }
 
-impl Round {
+impl QueueTask {
     fn conclude(&self, attempt: AttemptId, conclusion: Conclusion) {
         if self.endpoint.legacy.senders.ended(&self.to) {
             self.sink.concluded(attempt, conclusion);
@@ -255,7 +255,7 @@ impl Round {
     }
 }
 
-impl Drop for Round {
+impl Drop for QueueTask {
     fn drop(&mut self) {
         if self.done {
             return;
@@ -274,8 +274,8 @@ impl Drop for Round {
     }
 }
 
-async fn deliver(round: &Round, delivery: &LegacyDelivery, begun: &Mutex<bool>) -> Conclusion {
-    let (endpoint, to) = (&round.endpoint, &round.to);
+async fn deliver(task: &QueueTask, delivery: &LegacyDelivery, begun: &Mutex<bool>) -> Conclusion {
+    let (endpoint, to) = (&task.endpoint, &task.to);
     let in_dialect = |here: Option<&str>| {
         translate(&delivery.letter, &delivery.receiver, to.signature(), here)
             .map_err(|error| Conclusion::NotSent(WayError::new(error.fault(), error)))
@@ -323,7 +323,7 @@ async fn deliver(round: &Round, delivery: &LegacyDelivery, begun: &Mutex<bool>) 
             return broken(*begun.lock(), error);
         }
     }
-    match farewell(&mut stream).await {
+    match finish(&mut stream).await {
         Ok(()) => {
             count(&endpoint.tally().unframed_out);
             Conclusion::Handed
@@ -362,14 +362,14 @@ async fn write(
 }
 
 /// Ends the letter, and waits a moment for the peer to close the connection.
-async fn farewell(stream: &mut TcpStream) -> std::io::Result<()> {
+async fn finish(stream: &mut TcpStream) -> std::io::Result<()> {
     stream.shutdown().await?;
     let mut ignored = [0; 256];
     let hangup = async {
         while stream.read(&mut ignored).await? > 0 {}
         Ok(())
     };
-    timeout(FAREWELL, hangup).await.unwrap_or(Ok(()))
+    timeout(CLOSE_TIMEOUT, hangup).await.unwrap_or(Ok(()))
 }
 
 /// Returns the listening address with the IP address `local` as a URL, if the endpoint listens

@@ -101,7 +101,7 @@ fn with_stamped_extensions(envelope: Envelope) -> Envelope {
         if extension.received.is_some() {
             stamped.push(extension);
         } else {
-            overrule(stamped.last_mut().unwrap_or(&mut base), extension);
+            override_with(stamped.last_mut().unwrap_or(&mut base), extension);
         }
     }
     Envelope {
@@ -110,7 +110,7 @@ fn with_stamped_extensions(envelope: Envelope) -> Envelope {
     }
 }
 
-fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
+fn override_with(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     fn one<T>(older: &mut Option<T>, newer: Option<T>) {
         if newer.is_some() {
             *older = newer;

@@ -104,9 +104,9 @@ pub(crate) struct Connection {
     arrivals: HashSet<u64>,
     /// The last parcel that was polled for the sink.
     told: u64,
-    /// The rate limit of the peer, if it has one. No parcels are accepted before `resting`.
+    /// The rate limit of the peer, if it has one. No parcels are accepted before `paused_until`.
     pub(super) rate_limit: Option<Arc<PeerRateLimit>>,
-    resting: Option<Instant>,
+    paused_until: Option<Instant>,
     received: Received,
     recovery: Recovery,
     mtu: Mtu,
@@ -206,7 +206,7 @@ impl Connection {
             arrivals: HashSet::new(),
             told: 0,
             rate_limit: None,
-            resting: None,
+            paused_until: None,
             received: Received::default(),
             recovery: Recovery::new(now),
             mtu: Mtu::new(limits.max_datagram),
@@ -387,7 +387,7 @@ impl Connection {
     }
 
     /// Whether a packet arrived after this time.
-    pub(crate) fn is_heard_since(&self, since: Instant) -> bool {
+    pub(crate) fn received_since(&self, since: Instant) -> bool {
         self.heard.is_some_and(|heard| heard > since)
     }
 
@@ -454,7 +454,7 @@ impl Connection {
             return dialling.poll_transmit(now);
         }
         let path = self.path?;
-        self.sift();
+        self.drop_unsendable();
         let mtu = self.mtu.current();
         let parcel = self.next_parcel();
         let mut out = Vec::with_capacity(parcel.map_or(256, |(_, size)| size + MAX_ACK));
@@ -558,7 +558,7 @@ impl Connection {
             lost.into_iter().for_each(|kept| self.lost(kept));
             if !self.recovery.is_waiting() && self.resend.is_empty() && self.urgent.is_empty() {
                 // The lost packets had no contents that are still needed.
-                self.recovery.calm();
+                self.recovery.reset_backoff();
             }
         }
         if self.ping_due().is_some_and(|due| now >= due) {

@@ -33,7 +33,7 @@ use crate::interfaces::Changes;
 const MAX_TARGETS: usize = 8;
 
 /// Pause of reading after an error on a listening socket.
-const REST: Duration = Duration::from_millis(10);
+const READ_RETRY_DELAY: Duration = Duration::from_millis(10);
 
 pub(crate) struct Endpoint {
     pub(crate) config: UdpConfig,
@@ -408,7 +408,7 @@ async fn read(endpoint: Arc<Endpoint>, socket: Arc<Socket>) {
         endpoint.deliver();
         endpoint.flush_and_wake(&mut endpoint.state.lock());
         if received.is_err() {
-            sleep(REST).await;
+            sleep(READ_RETRY_DELAY).await;
         }
     }
 }

@@ -196,7 +196,7 @@ impl Recovery {
     }
 
     /// Resets the backoff when no acknowledgment is awaited.
-    pub(crate) fn calm(&mut self) {
+    pub(crate) fn reset_backoff(&mut self) {
         self.backoff = 0;
         self.waiting_since = None;
     }

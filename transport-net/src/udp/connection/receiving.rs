@@ -91,7 +91,7 @@ impl Connection {
         let Some((header, body)) = split_parcel(bytes) else {
             return nonsense(&"a parcel without a header");
         };
-        if self.resting.is_some_and(|until| now < until) {
+        if self.paused_until.is_some_and(|until| now < until) {
             counters.held_back += 1;
             return Ok(false);
         }
@@ -108,7 +108,8 @@ impl Connection {
             self.busy = now;
             counters.parcels_in += 1;
             let rate_limit = self.rate_limit.as_ref();
-            self.resting = rate_limit.and_then(|rate_limit| rate_limit.spend(1, bytes.len(), now));
+            self.paused_until =
+                rate_limit.and_then(|rate_limit| rate_limit.spend(1, bytes.len(), now));
         }
         Ok(held)
     }

@@ -61,7 +61,7 @@ impl Connection {
     }
 
     /// Removes parcels that are abandoned or too large for the path.
-    pub(super) fn sift(&mut self) {
+    pub(super) fn drop_unsendable(&mut self) {
         let current = self.mtu.current();
         while let Some(id) = self.resend.first().copied() {
             let Some(sent) = self.sent.get_mut(&id) else {

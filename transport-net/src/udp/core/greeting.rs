@@ -17,11 +17,11 @@ use crate::rate_limit::quota_address;
 
 /// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Time for which such a ping and its response are valid. It is longer than [`SIGN_OF_LIFE`] and
+/// Time for which such a ping and its response are valid. It is longer than [`RESPONSE_TIMEOUT`] and
 /// the longest pause between two hellos.
-const ASKED_FOR: Duration = Duration::from_secs(3);
+const PING_VALIDITY: Duration = Duration::from_secs(3);
 
 /// The result of checking a claimed incarnation.
 enum ClaimStatus {
@@ -125,7 +125,7 @@ impl Core {
 
     /// Checks whether the service with this incarnation may be the peer of a new connection. An
     /// unproved peer must not end the connections of the service that it claims to be: these get a
-    /// ping, and end if there is no response within [`SIGN_OF_LIFE`]. No state about the unproved
+    /// ping, and end if there is no response within [`RESPONSE_TIMEOUT`]. No state about the unproved
     /// peer is stored.
     fn claim_status(&mut self, now: Instant, inbound: &Inbound) -> ClaimStatus {
         let mut status = ClaimStatus::Free;
@@ -133,15 +133,15 @@ impl Core {
             let Some(other) = self.connections.get_mut(&number) else {
                 continue;
             };
-            let asked = other.asked.filter(|asked| now < *asked + ASKED_FOR);
+            let asked = other.asked.filter(|asked| now < *asked + PING_VALIDITY);
             match asked {
                 None => {
                     other.asked = Some(now);
                     other.connection.ask();
                     self.touch(number);
                 }
-                Some(asked) if other.connection.is_heard_since(asked) => return ClaimStatus::Taken,
-                Some(asked) if now >= asked + SIGN_OF_LIFE => {
+                Some(asked) if other.connection.received_since(asked) => return ClaimStatus::Taken,
+                Some(asked) if now >= asked + RESPONSE_TIMEOUT => {
                     // Letters that the peer sent on the previous connection must not arrive after
                     // letters on this one.
                     self.end(number, &ConnectionEnd::Superseded);
@@ -249,7 +249,7 @@ impl Core {
     }
 
     pub(super) fn hop(&self, peer: &Hello, from: SocketAddr) -> Option<Hop> {
-        let back = address::way_back(&peer.listening, from).to_string();
+        let back = address::return_address(&peer.listening, from).to_string();
         let location = Location::new(Kind::Udp, &back).ok()?;
         Some(Hop {
             location: location.with_incarnation(peer.identity.incarnation),
