@@ -46,7 +46,7 @@ pub struct Credentials {
     pub trusted: Vec<Certificate>,
 }
 
-/// Credentials that cannot be used.
+/// The reason for which credentials cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot use this private key with this certificate: {0}")]
 #[non_exhaustive]

@@ -271,10 +271,10 @@ impl Link {
         let _ = self.over.subscribe().wait_for(|over| *over).await;
     }
 
-    /// Whether the peer may send this.
+    /// Checks that the peer may send this parcel.
     ///
     /// # Errors
-    /// Why not.
+    /// The reason for which the parcel is refused.
     fn admits(&self, parcel: &Parcel) -> Result<(), String> {
         let Body::Letter(letter) = &parcel.body else {
             return Ok(());

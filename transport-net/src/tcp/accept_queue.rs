@@ -296,7 +296,7 @@ impl AcceptQueue {
     /// Appends a connection from this address to its queue.
     ///
     /// # Errors
-    /// When there is no room.
+    /// When the queue is full and no connection can be evicted.
     pub(crate) fn admit(
         &self,
         endpoint: &Arc<TcpEndpoint>,

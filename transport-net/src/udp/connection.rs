@@ -533,7 +533,7 @@ impl Connection {
         .min()
     }
 
-    /// Does what is due.
+    /// Handles the timers that are due.
     ///
     /// # Errors
     /// When the connection is over.
