@@ -1,5 +1,6 @@
-//! The acknowledged round trip of a letter on loopback, beside raw TCP that moves as many bytes
-//! one way and one byte back: what this transport adds, what TLS adds to it, and what QUIC takes.
+//! Acknowledged round trip of a letter on loopback, compared with raw TCP that moves the same
+//! number of bytes one way and one byte back: measures the overhead of this transport, of TLS and
+//! of QUIC.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -31,7 +32,7 @@ mod certificates;
 
 const SIZES: [usize; 4] = [100, 1 << 10, 64 << 10, 1 << 20];
 
-/// Accepts everything, and tells the bench of conclusions.
+/// Accepts every parcel, and reports conclusions to the bench.
 struct Accepting(Mutex<Sender<Conclusion>>);
 
 impl Sink for Accepting {
@@ -45,7 +46,7 @@ impl Sink for Accepting {
     }
 
     fn concluded(&self, _: AttemptId, conclusion: Conclusion) {
-        // The bench may be over.
+        // The bench may have ended.
         let _ = self.0.lock().send(conclusion);
     }
 }
@@ -81,7 +82,7 @@ fn config() -> TcpConfig {
     }
 }
 
-/// Two that know each other.
+/// Two endpoints that trust each other.
 #[cfg(feature = "secure")]
 fn secured(client: &Runtime, server: &Runtime) -> (Party, Party) {
     let host = certificates::Host::new("bench", &[]);
@@ -99,7 +100,7 @@ fn secured(client: &Runtime, server: &Runtime) -> (Party, Party) {
     (near, far)
 }
 
-/// Two that know each other, over QUIC.
+/// Two endpoints over QUIC that trust each other.
 #[cfg(feature = "quic")]
 fn quic(client: &Runtime, server: &Runtime) -> (Party, Party) {
     use fipa_transport_net::{QuicConfig, QuicTransport};
@@ -185,7 +186,7 @@ fn round_trip(criterion: &mut Criterion) {
         });
         drop(stream);
 
-        // Like the letters: the sending thread is none of the runtime's, which wakes it.
+        // As for letters: the sending thread is not a thread of the runtime, and wakes it.
         let (to_task, mut from_bench) = tokio::sync::mpsc::unbounded_channel::<Bytes>();
         let (done, is_done) = channel();
         let listener = server.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();

@@ -1,4 +1,4 @@
-//! Addresses as text: parsing with scopes, and which of this machine's addresses others can use.
+//! Addresses as text: parsing with scopes, and the addresses of this host that other hosts can use.
 
 use std::collections::HashSet;
 use std::io;
@@ -7,24 +7,24 @@ use std::net::{IpAddr, Ipv6Addr, SocketAddr, SocketAddrV6};
 use fipa_transport::{Incarnation, Kind, ListenError, Location, LocationError};
 use if_addrs::{IfOperStatus, Interface};
 
-/// Why a text is not an address.
+/// The reason for which a text is not an address.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum AddressError {
-    /// It has another form.
+    /// The text has another form.
     #[error(
         "not an address with a port (expected for example 127.0.0.1:7788 or [fe80::1%eth0]:7788): {0:?}"
     )]
     Syntax(String),
     /// The scope names no interface of this host.
-    #[error("no interface is called {0:?} (`ip link` lists them)")]
+    #[error("no network interface has the name {0:?}; run `ip link` to list them")]
     NoSuchInterface(String),
-    /// The operating system does not list the interfaces.
-    #[error("the interfaces of this machine cannot be listed: {0}")]
+    /// The network interfaces cannot be listed.
+    #[error("cannot list the network interfaces of this host: {0}")]
     Interfaces(String),
 }
 
-/// Where to connect to: an address, or a host name still to be looked up.
+/// The target of a connection: an address, or a host name to be resolved.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Target {
     Numeric(SocketAddr),
@@ -72,26 +72,26 @@ pub(crate) fn numeric(text: &str) -> Result<SocketAddr, AddressError> {
     Ok(SocketAddrV6::new(ip, port, 0, scope).into())
 }
 
-/// Where other hosts reach an endpoint at present that listens on these addresses, best first. A
-/// port 0 stays 0.
+/// Returns the addresses at which other hosts presently reach an endpoint that listens on these
+/// addresses, best first. A port 0 stays 0.
 ///
 /// # Errors
-/// When one is no address, or the interfaces cannot be listed.
+/// When a text is not an address, or the interfaces cannot be listed.
 pub fn reachable_at(listen: &[String]) -> Result<Vec<SocketAddr>, AddressError> {
     let bound = listen.iter().map(|text| numeric(text));
     let listening = Listening::new(bound.collect::<Result<_, _>>()?)?;
     Ok(listening.reachable)
 }
 
-/// Why an address cannot be listened on, with what to do.
+/// Returns the error of binding to an address, with a remedy.
 pub(crate) fn cannot_bind(text: &str, error: &io::Error) -> ListenError {
     let advice = match error.kind() {
         io::ErrorKind::AddrInUse => {
-            "; another process listens there: stop it, or choose another port \
+            "; another process listens on this port: stop it, or choose another port \
              (port 0 lets the system choose)"
         }
         io::ErrorKind::AddrNotAvailable => {
-            "; this machine has no such address (`ip address` lists those it has)"
+            "; this host does not have this address; run `ip address` to list its addresses"
         }
         io::ErrorKind::PermissionDenied => "; choose a port above 1023",
         _ => "",
@@ -114,7 +114,7 @@ fn interface_index(name: &str) -> Result<u32, AddressError> {
         .ok_or_else(|| AddressError::NoSuchInterface(name.chars().take(40).collect()))
 }
 
-/// The sockets that an endpoint listens on, and where others reach them at present.
+/// The listening sockets of an endpoint, and the addresses at which others presently reach them.
 ///
 /// A socket bound to an unspecified address is reached at the addresses of the interfaces that are
 /// up; these change while the endpoint runs ([`refresh`](Self::refresh)).
@@ -127,17 +127,17 @@ pub(crate) struct Listening {
     assigned: HashSet<IpAddr>,
 }
 
-/// What a change of the interfaces means for an endpoint.
+/// The effect of a change of the interfaces on an endpoint.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Moved {
-    /// Whether others reach the endpoint elsewhere than before.
+    /// Whether the reachable addresses have changed.
     pub(crate) relocated: bool,
-    /// Addresses that this host has had and has no more.
+    /// Addresses that this host no longer has.
     pub(crate) lost: HashSet<IpAddr>,
 }
 
 impl Listening {
-    /// Sockets that are bound to these addresses.
+    /// Creates the list for sockets that are bound to these addresses.
     ///
     /// # Errors
     /// When the interfaces are needed and cannot be listed.
@@ -163,7 +163,7 @@ impl Listening {
     /// Lists the interfaces again.
     ///
     /// # Errors
-    /// When that is impossible. Nothing has changed then.
+    /// When the interfaces cannot be listed. The list is unchanged then.
     pub(crate) fn refresh(&mut self) -> Result<Moved, AddressError> {
         Ok(self.update(&interfaces()?))
     }
@@ -181,8 +181,8 @@ impl Listening {
         Moved { relocated, lost }
     }
 
-    /// What a hello says of it: unspecified addresses, by which the peer knows that the port is
-    /// open at whichever address a connection comes from, then those of the interfaces.
+    /// Returns the addresses for a hello: first unspecified addresses, which tell the peer that the
+    /// port is open at the source address of any connection, then the addresses of the interfaces.
     pub(crate) fn texts(&self) -> Vec<String> {
         let any = self.bound.iter().filter(|it| it.ip().is_unspecified());
         any.chain(&self.reachable)
@@ -190,16 +190,17 @@ impl Listening {
             .collect()
     }
 
-    /// The addresses at which others reach the endpoint, best first.
+    /// Returns the addresses at which others reach the endpoint, best first.
     #[cfg(test)]
     pub(crate) fn reachable(&self) -> &[SocketAddr] {
         &self.reachable
     }
 
-    /// The locations of these addresses.
+    /// Returns the locations of these addresses.
     ///
     /// # Errors
-    /// When an address is none of a location, which the standard library's are not.
+    /// When an address is not valid in a location, which does not happen with addresses of the
+    /// standard library.
     pub(crate) fn locations(
         &self,
         kind: Kind,
@@ -213,10 +214,10 @@ impl Listening {
     }
 }
 
-/// The addresses under which others reach a socket bound to `bound`, best first: `bound` itself,
-/// or for an unspecified address those of the interfaces that are up.
+/// Returns the addresses at which others reach a socket bound to `bound`, best first: `bound`
+/// itself, or for an unspecified address those of the interfaces that are up.
 ///
-/// Loopback and link-local addresses (whose scope means nothing on another host) are named only
+/// Loopback and link-local addresses (whose scope is not valid on another host) are only returned
 /// when there are no others.
 fn reachable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
     match bound.ip().is_unspecified() {
@@ -255,15 +256,16 @@ fn usable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
     global
 }
 
-/// The address at which a connected peer can be reached again: the one that its connection comes
-/// from, with a port from the addresses that it says it listens on.
+/// Returns the address at which a connected peer can be reached again: the source address of its
+/// connection, with a port from its listening addresses.
 ///
-/// Nothing else of these addresses is used: a peer may list those of third parties, which are never
-/// to be dialed because of that. The port is that of the same address when it is listed; else that of
-/// an unspecified address, when the peer listens on all of its addresses and may have got this one
-/// since it made the list; else that of the first other address, when the peer is known under another
-/// one (address translation). A loopback address says nothing about a connection from elsewhere.
-pub(crate) fn way_back(listening: &[String], from: SocketAddr) -> SocketAddr {
+/// No other part of the listening addresses is used: a peer may list addresses of third parties,
+/// which must not be dialled for that reason. The port is that of the same address when it is
+/// listed; else that of an unspecified address, when the peer listens on all of its addresses and
+/// may have got this one since it made the list; else that of the first other address, when the
+/// peer is known under another one (address translation). A loopback address is ignored for a
+/// connection from another host.
+pub(crate) fn return_address(listening: &[String], from: SocketAddr) -> SocketAddr {
     let listening: Vec<SocketAddr> = listening
         .iter()
         .filter_map(|text| numeric_ignoring_scope(text))
@@ -284,8 +286,8 @@ pub(crate) fn way_back(listening: &[String], from: SocketAddr) -> SocketAddr {
     back
 }
 
-/// Whether a peer that listens there lists this address as one of its own. Addresses that mean another
-/// host on every host, or on every link, do not count.
+/// Whether a peer with these listening addresses lists `ip` as its own. Addresses that denote
+/// another host on every host or link do not count.
 pub(crate) fn lists(listening: &[String], ip: IpAddr) -> bool {
     let ip = ip.to_canonical();
     let own = listening
@@ -295,7 +297,7 @@ pub(crate) fn lists(listening: &[String], ip: IpAddr) -> bool {
     !ip.is_loopback() && !ip.is_unspecified() && !is_link_local(ip) && own.any(|own| own == ip)
 }
 
-/// The scope names an interface of another host: it must not be looked up here.
+/// Parses an address without its scope, which names an interface of another host.
 fn numeric_ignoring_scope(text: &str) -> Option<SocketAddr> {
     match text.split_once('%') {
         None => text.parse().ok(),
@@ -343,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn targets_are_numbers_or_plausible_names() {
+    fn targets_are_numeric_addresses_or_valid_host_names() {
         assert_eq!(
             target("127.0.0.1:7788"),
             Ok(Target::Numeric("127.0.0.1:7788".parse().unwrap()))
@@ -371,7 +373,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unspecified_address_becomes_those_of_the_interfaces() {
+    fn an_unspecified_address_is_replaced_by_those_of_the_interfaces() {
         for bound in ["0.0.0.0:7788", "[::]:7788"] {
             let bound: SocketAddr = bound.parse().unwrap();
             let listening = Listening::new(vec![bound]).unwrap();
@@ -403,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_reachable_follows_the_interfaces() {
+    fn reachable_addresses_follow_the_interfaces() {
         let own = |last| Ipv4Addr::new(10, 0, 0, last);
         let lo = interface("lo", 1, Ipv4Addr::LOCALHOST);
         let ethernet = |last| [lo.clone(), interface("eth0", 2, own(last))];
@@ -429,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_with_an_address_of_its_own_does_not_move() {
+    fn a_socket_bound_to_one_address_keeps_it() {
         let fixed = SocketAddr::from((Ipv4Addr::new(10, 0, 0, 1), 7788));
         let mut listening = Listening {
             bound: vec![fixed],
@@ -446,7 +448,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_way_back_leads_nowhere_but_to_the_peer(
+        fn the_return_address_belongs_to_the_peer(
             listening in prop::collection::vec(
                 prop_oneof![
                     any::<SocketAddr>().prop_map(|address| address.to_string()),
@@ -458,16 +460,16 @@ mod tests {
             ),
             from: SocketAddr,
         ) {
-            let back = way_back(&listening, from);
+            let back = return_address(&listening, from);
             prop_assert_eq!(back.ip(), from.ip());
         }
     }
 
     #[test]
-    fn the_way_back_leads_to_where_the_peer_listens() {
+    fn the_return_address_has_a_listening_port_of_the_peer() {
         let back = |listening: &[&str], from: &str| {
             let listening: Vec<String> = listening.iter().map(|text| (*text).into()).collect();
-            way_back(&listening, from.parse().unwrap()).to_string()
+            return_address(&listening, from.parse().unwrap()).to_string()
         };
         let from = "10.0.0.2:40000";
         assert_eq!(back(&["192.168.0.2:7", "10.0.0.2:8"], from), "10.0.0.2:8");
@@ -476,7 +478,7 @@ mod tests {
         assert_eq!(back(&["127.0.0.1:7"], from), from);
         assert_eq!(back(&[], from), from);
         assert_eq!(back(&["nonsense", "[::]:7", "10.0.0.2:0"], from), from);
-        // It listens on all addresses, and has got this one since it made the list.
+        // The peer listens on all addresses, and has got this one since it made the list.
         let any = ["0.0.0.0:7", "192.168.0.2:7"];
         assert_eq!(back(&any, from), "10.0.0.2:7");
         assert_eq!(

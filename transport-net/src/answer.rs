@@ -1,9 +1,9 @@
 //! The body of an answer frame.
 //!
-//! One byte says which answer: 0 accepted, 1 in custody, 2 busy, 3 out of order, 4 failed,
-//! 5 returned, 6 moved. Behind 3 stands the last position taken (8 bytes, little-endian); behind 4
-//! the code of the reason (one byte) and the detail (UTF-8 to the end); behind 5 whether the
-//! letter may have been delivered (one byte, 0 or 1).
+//! The first byte is the kind of answer: 0 accepted, 1 in custody, 2 busy, 3 out of order, 4
+//! failed, 5 returned, 6 moved. Kind 3 is followed by the last accepted position (8 bytes,
+//! little-endian); kind 4 by the code of the reason (one byte) and the detail (UTF-8 to the end);
+//! kind 5 by whether the letter may have been delivered (one byte, 0 or 1).
 
 use bytes::{BufMut, BytesMut};
 use fipa_transport::Answer;
@@ -43,8 +43,7 @@ pub(crate) fn encode(answer: &Answer, out: &mut BytesMut) {
         }
         Answer::Returned { uncertain } => out.put_slice(&[RETURNED, u8::from(*uncertain)]),
         Answer::Moved => out.put_u8(MOVED),
-        // Busy, and whatever may be added to the answers: "not now" is what an older peer does
-        // least harm with.
+        // Busy, and answers of later versions: "not now" is the safest reading for an older peer.
         _ => out.put_u8(BUSY),
     }
 }
@@ -78,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_answer_survives() {
+    fn every_answer_round_trips() {
         for answer in [
             Answer::Accepted,
             Answer::Custody,
@@ -87,7 +86,7 @@ mod tests {
             Answer::Returned { uncertain: false },
             Answer::Returned { uncertain: true },
             Answer::Moved,
-            Answer::failed(FailureReason::NoSuchAgent, "nobody is called béla"),
+            Answer::failed(FailureReason::NoSuchAgent, "no agent has the name béla"),
         ] {
             let mut body = BytesMut::new();
             encode(&answer, &mut body);
@@ -111,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn malformed_answers_are_refused() {
         for wrong in [
             &[][..],
             &[0, 0],

@@ -1,9 +1,9 @@
-//! Parts that the fuzz targets reach; `fuzz/` has the targets.
+//! Entry points of the fuzz targets in `fuzz/`.
 
 #![allow(
     clippy::expect_used,
     clippy::missing_panics_doc,
-    reason = "it panics at what must not be"
+    reason = "a violated invariant must panic"
 )]
 
 #[cfg(feature = "secure")]

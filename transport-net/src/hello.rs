@@ -1,10 +1,10 @@
-//! The body of a hello frame: how two endpoints introduce themselves.
+//! The body of a hello frame, with which two endpoints introduce themselves.
 //!
-//! A fixed part of 28 bytes, little-endian (incarnation 8, largest letter 8, most parcels in
-//! flight 4, number of this connection 8), then texts, each with its length in two bytes in
-//! front: name, domain, host, the location that was dialled (empty from the side that accepted),
-//! and then, after their number in one byte, the addresses the endpoint listens on. Bytes behind
-//! that belong to later versions and are ignored.
+//! A fixed part of 28 bytes, little-endian (incarnation 8, largest letter 8, maximum number of
+//! parcels in flight 4, serial number of this connection 8), then texts, each preceded by its
+//! length in two bytes: name, domain, host, the location that was dialled (empty from the side that
+//! accepted), and then, after their number in one byte, the addresses that the endpoint listens on.
+//! Later versions may append bytes, which are ignored.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use fipa_transport::{Incarnation, Location};
@@ -19,11 +19,11 @@ pub(crate) const MAX_HELLO: usize = 16 * 1024;
 /// Longest text of a location with kind and incarnation, in bytes.
 const MAX_DIALLED: usize = Location::MAX_ADDRESS + 32;
 
-/// At most this many addresses are told; the best stand first.
+/// Maximum number of listening addresses in a hello; the best come first.
 const MAX_LISTENING: usize = 16;
 
-/// Why a hello is refused that names the service which it is for.
-pub(crate) const OWN_INCARNATION: &str = "the peer says that it is this service itself";
+/// The error of a hello with the incarnation of the service that receives it.
+pub(crate) const OWN_INCARNATION: &str = "the peer claims the incarnation of this service itself";
 
 #[derive(FromBytes, IntoBytes, Immutable, KnownLayout, Unaligned)]
 #[repr(C)]
@@ -34,17 +34,17 @@ struct Fixed {
     serial: U64,
 }
 
-/// What one side says about itself when a connection begins.
+/// The introduction that each side sends when a connection begins.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Hello {
     pub(crate) identity: Identity,
-    /// Largest letter taken, in bytes.
+    /// Largest accepted letter, in bytes.
     pub(crate) max_letter: u64,
-    /// Most parcels taken before answers to earlier ones have been read.
+    /// Maximum number of parcels that the peer may send before it has read answers to earlier ones.
     pub(crate) max_in_flight: u32,
-    /// Rises with every connection that this endpoint opens.
+    /// Increases with every connection that this endpoint opens.
     pub(crate) serial: u64,
-    /// The location this connection was opened for, as the opener knows it.
+    /// The location that the dialling side opened this connection for.
     pub(crate) dialled: String,
     /// Addresses the endpoint listens on, best first.
     pub(crate) listening: Vec<String>,
@@ -142,7 +142,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_hello_survives_and_may_grow() {
+    fn a_hello_round_trips_and_may_grow() {
         let hello = sample(7);
         let mut body = hello.encode().to_vec();
         assert_eq!(Hello::decode(&body), Some(hello.clone()));
@@ -171,7 +171,7 @@ pub(crate) mod tests {
 
     proptest! {
         #[test]
-        fn arbitrary_bytes_do_no_harm(body in prop::collection::vec(any::<u8>(), 0..400)) {
+        fn arbitrary_bytes_decode_without_panic(body in prop::collection::vec(any::<u8>(), 0..400)) {
             if let Some(hello) = Hello::decode(&body) {
                 prop_assert_eq!(Hello::decode(&hello.encode()), Some(hello));
             }

@@ -1,27 +1,27 @@
-//! Who an endpoint says it is.
+//! The identity of an endpoint.
 
 use fipa_transport::Incarnation;
 
-/// How a message transport service introduces itself to its peers.
+/// The identity with which a message transport service introduces itself to its peers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Identity {
-    /// Name of the message transport service, for people; at most [`Identity::MAX_TEXT`] bytes.
+    /// Name of the message transport service; at most [`Identity::MAX_TEXT`] bytes.
     pub name: String,
-    /// The life of this service. Must be known: peers recognise it, and refuse to talk to
-    /// somebody else who took over its port.
+    /// The incarnation of this service. Must be known: peers identify the service by it, and refuse
+    /// another service that has taken over its port.
     pub incarnation: Incarnation,
-    /// The domain the service belongs to; at most [`Identity::MAX_TEXT`] bytes.
+    /// The domain of the service; at most [`Identity::MAX_TEXT`] bytes.
     pub domain: String,
-    /// What tells this host from others, for example its machine id; at most
-    /// [`Identity::MAX_TEXT`] bytes. Peers with the same host and domain count as local.
+    /// Identifier of this host, for example its machine id; at most [`Identity::MAX_TEXT`] bytes.
+    /// Peers with the same host and domain count as local.
     pub host: String,
 }
 
 impl Identity {
-    /// Longest text in an identity, in bytes.
+    /// Maximum length of a text in an identity, in bytes.
     pub const MAX_TEXT: usize = 255;
 
-    /// What is wrong with this identity, for people.
+    /// Returns an error text when the identity is not valid.
     pub(crate) fn fault(&self) -> Option<String> {
         if !self.incarnation.is_known() {
             return Some("the identity of a network transport needs a known incarnation".into());
@@ -39,8 +39,7 @@ impl Identity {
         })
     }
 
-    /// Whether somebody with the other identity is on another host, or in another domain, which
-    /// stands for one.
+    /// Whether the other identity is of another host, or of another domain, which counts as one.
     #[cfg(feature = "ip")]
     pub(crate) fn is_remote(&self, other: &Self) -> bool {
         self.host != other.host || self.domain != other.domain
@@ -61,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_said_in_a_hello_is_told() {
+    fn an_identity_that_does_not_fit_a_hello_is_reported() {
         assert_eq!(identity().fault(), None);
         let unknown = Identity {
             incarnation: Incarnation::UNKNOWN,

@@ -1,7 +1,7 @@
-//! Notices when the addresses of this host's interfaces change.
+//! Detects changes of the addresses of this host's interfaces.
 //!
 //! The kernel sends a message on a netlink socket for every change (rtnetlink(7)). The content of
-//! these messages is not parsed: a message is only the reason to list the interfaces again
+//! these messages is not parsed: a message only triggers listing the interfaces again
 //! ([`crate::address`]).
 
 use std::io;
@@ -22,25 +22,25 @@ const GROUPS: u32 = 0x1 | 0x10 | 0x100;
 /// change.
 const BUFFER: usize = 64 << 10;
 
-/// How long changes are gathered: a host that moves removes one address and adds another.
+/// Time in which changes are collected: a host that moves removes one address and adds another.
 const GATHERING: Duration = Duration::from_millis(50);
 
-/// How often the interfaces are listed when the kernel offers no netlink socket, for example to a
-/// service whose address families are restricted.
+/// Polling interval of the interfaces when the kernel offers no netlink socket, for example to a
+/// service with restricted address families.
 const POLL: Duration = Duration::from_secs(1);
 
 /// A subscription to the changes of this host's interfaces.
 #[derive(Debug)]
 pub(crate) struct Changes {
-    /// None when there is no netlink socket: the interfaces are polled then.
+    /// `None` when there is no netlink socket and the interfaces are polled.
     ///
     /// The runtime has no type for netlink sockets, and its general one (`AsyncFd`) needs `unsafe`.
-    /// Waiting and recv(2) are the same for every socket of datagrams.
+    /// Waiting and recv(2) are the same for every datagram socket.
     socket: Option<UnixDatagram>,
 }
 
 impl Changes {
-    /// Subscribes. Changes from now on are noticed. To be called within a runtime.
+    /// Subscribes to later changes. Must be called within a runtime.
     pub(crate) fn subscribe() -> Self {
         let socket = open().and_then(|socket| UnixDatagram::from_std(socket.into()));
         if let Err(error) = &socket {
@@ -74,7 +74,8 @@ impl Changes {
     }
 }
 
-/// Removes the messages that are there, as many as the buffer can hold. Says whether there were any.
+/// Discards the available messages, at most as many as the buffer can hold. Returns whether there
+/// were any.
 fn drain(socket: &UnixDatagram) -> io::Result<bool> {
     let mut message = [0; 4096];
     let mut any = false;
@@ -93,7 +94,7 @@ fn drain(socket: &UnixDatagram) -> io::Result<bool> {
 
 fn open() -> io::Result<OwnedFd> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    // No protocol is NETLINK_ROUTE, which is 0.
+    // Protocol `None` is NETLINK_ROUTE, which is 0.
     let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
     sockopt::set_socket_recv_buffer_size(&socket, BUFFER)?;
     bind(&socket, &SocketAddrNetlink::new(0, GROUPS))?;

@@ -3,18 +3,18 @@
 //! * [`UnixTransport`] carries parcels in frames over Unix domain sockets, between the processes of
 //!   one domain on one host.
 //! * `TcpTransport` (feature `ip`) carries them in the same frames over one persistent connection
-//!   per peer, and takes the unframed letters of old peers on the same port.
-//! * `UdpTransport` (feature `ip`) carries parcels that fit one datagram, acknowledged.
+//!   per peer, and accepts the unframed letters of legacy peers on the same port.
+//! * `UdpTransport` (feature `ip`) carries parcels over UDP, one acknowledged datagram each.
 //! * `QuicTransport` (feature `quic`) carries parcels in the same frames over QUIC, each in a
 //!   stream of its own.
 //!
-//! Each has a module tree of its own. Beside them stands what they share: frames and connections
-//! (`stream`), how endpoints introduce themselves ([`Identity`], `hello`), addresses as text
-//! (`address`), how answers are written (`answer`), how much a peer may send (`ration`), and why a
-//! connection ends (`end`).
+//! Each has a module tree of its own. They share frames and connections (`stream`), the
+//! introduction of endpoints ([`Identity`], `hello`), addresses as text (`address`), the encoding
+//! of answers (`answer`), rate limits (`rate_limit`) and the reasons for which connections end
+//! (`end`). `stream` depends on none of the transports.
 //!
-//! What must not live here: routes, retries, order across transports, directories. A transport
-//! tries once and reports.
+//! Routes, retries, order across transports and directories do not belong here: a transport tries
+//! once and reports the result.
 
 #[cfg(feature = "ip")]
 mod address;
@@ -27,20 +27,20 @@ mod hello;
 mod identity;
 #[cfg(feature = "ip")]
 mod interfaces;
+#[cfg_attr(
+    not(any(feature = "ip", test)),
+    expect(dead_code, reason = "only TCP resets connections")
+)]
+mod log_limit;
 #[cfg(feature = "quic")]
 mod quic;
 #[cfg_attr(
     not(any(feature = "ip", test)),
     expect(dead_code, reason = "the processes of this host may send any number")
 )]
-mod ration;
+mod rate_limit;
 #[cfg(feature = "secure")]
 pub mod secure;
-#[cfg_attr(
-    not(any(feature = "ip", test)),
-    expect(dead_code, reason = "only TCP resets connections")
-)]
-mod seldom;
 mod stream;
 #[cfg(feature = "ip")]
 mod tcp;

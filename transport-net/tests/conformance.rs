@@ -1,5 +1,5 @@
-//! The rules of every transport, kept by Unix domain sockets, and by TCP, UDP and QUIC on loopback,
-//! over IPv4 and IPv6.
+//! The conformance suite of transports for Unix domain sockets, and for TCP, UDP and QUIC on
+//! loopback, over IPv4 and IPv6.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -18,7 +18,7 @@ use tokio::net::TcpSocket;
 struct Tcp {
     runtime: common::Threads,
     address: &'static str,
-    /// Bound and never listening: connecting to it is refused, and nobody else gets the port.
+    /// Bound and never listening: connections to it are refused, and no other socket gets the port.
     nowhere: TcpSocket,
 }
 
@@ -56,7 +56,8 @@ impl Fixture for Tcp {
 struct Udp {
     runtime: common::Threads,
     address: &'static str,
-    /// Connected to itself: whatever others send is refused, and nobody else gets the port.
+    /// Connected to itself: datagrams of other sockets are refused, and no other socket gets the
+    /// port.
     nowhere: UdpSocket,
     decorated: bool,
 }
@@ -161,7 +162,7 @@ mod tls {
         fn endpoint(&self) -> Arc<dyn Transport> {
             let mut config = common::config(&[self.tcp.address]);
             config.security = Some(self.host.security(&[&self.host]));
-            // The gateways of several domains of a host have one certificate.
+            // The gateways of several domains of a host share one certificate.
             config.identity.domain = config.identity.incarnation.to_string();
             Arc::new(TcpTransport::new(config, self.tcp.runtime.handle().clone()))
         }
@@ -189,7 +190,8 @@ mod quic {
     pub(super) struct Quic {
         runtime: common::Threads,
         address: &'static str,
-        /// Connected to itself: whatever others send is refused, and nobody else gets the port.
+        /// Connected to itself: datagrams of other sockets are refused, and no other socket gets
+        /// the port.
         nowhere: UdpSocket,
         host: common::certificates::Host,
     }

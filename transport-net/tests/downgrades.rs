@@ -1,4 +1,4 @@
-//! Peers that would like less than what two hosts with keys speak: nothing is said to them.
+//! Peers that offer weaker security than two hosts with keys require are refused.
 #![cfg(feature = "quic")]
 #![allow(
     clippy::unwrap_used,
@@ -24,11 +24,12 @@ use rustls::version::TLS12;
 
 const ONLY_12: Versions = &[&TLS12];
 
-/// RFC 9000, and the last draft before it.
+/// The version of RFC 9000, and the last draft before it.
 const VERSION: u32 = 1;
 const DRAFT: u32 = 0xff00_0022;
 
-/// A host that trusts the rogue, so that nothing but his terms is wrong, over TCP and over QUIC.
+/// A host that trusts the rogue, so that only the rogue's settings are wrong, over TCP and over
+/// QUIC.
 struct Trusting {
     rogue: Host,
     tcp: Party<TcpTransport>,
@@ -64,7 +65,7 @@ impl Trusting {
     }
 }
 
-/// A letter to somebody who is not what is expected there fails, and why is told.
+/// Asserts that a letter to a wrong peer is not sent. Returns the error text.
 fn assert_not_sent<T: Transport>(from: &Party<T>, kind: Kind, at: &str) -> String {
     let to = Location::new(kind, at).unwrap();
     from.send(1, &to, parcel(1, "secret")).unwrap();
@@ -76,7 +77,7 @@ fn assert_not_sent<T: Transport>(from: &Party<T>, kind: Kind, at: &str) -> Strin
 }
 
 #[test]
-fn whoever_comes_with_everything_that_is_asked_is_let_in() {
+fn a_peer_that_meets_all_requirements_is_admitted() {
     let to = Trusting::new();
     let own = client(Some(&to.rogue), ONLY_13);
     let greeted = greet_tls(own.clone(), to.tcp_at()).unwrap();
@@ -87,16 +88,16 @@ fn whoever_comes_with_everything_that_is_asked_is_let_in() {
 }
 
 #[test]
-fn tls_1_2_is_not_spoken() {
+fn tls_1_2_is_refused() {
     let to = Trusting::new();
     let told = greet_tls(client(Some(&to.rogue), ONLY_12), to.tcp_at()).unwrap_err();
     assert!(told.contains("ProtocolVersion"), "{told}");
     to.assert_nothing_came();
-    // Nor does this side speak it when it dials.
+    // Nor does this side use it when it dials.
     let (at, heard) = hear_tls(server(&to.rogue, ONLY_12));
     assert_not_sent(&to.tcp, Kind::Tcp, &at.to_string());
     heard.join().unwrap().unwrap_err();
-    // It does speak with him who speaks 1.3.
+    // A peer with TLS 1.3 is admitted.
     let (at, heard) = hear_tls(server(&to.rogue, ONLY_13));
     let at = Location::new(Kind::Tcp, &at.to_string()).unwrap();
     to.tcp.send(2, &at, parcel(2, "hello")).unwrap();
@@ -104,7 +105,7 @@ fn tls_1_2_is_not_spoken() {
 }
 
 #[test]
-fn who_shows_no_certificate_or_has_not_its_key_is_not_let_in() {
+fn a_peer_without_a_certificate_or_its_key_is_refused() {
     let to = Trusting::new();
     let thief = to.rogue.thief();
     for own in [None, Some(&thief)] {
@@ -120,7 +121,7 @@ fn who_shows_no_certificate_or_has_not_its_key_is_not_let_in() {
 }
 
 #[test]
-fn another_protocol_is_not_spoken_over_quic() {
+fn another_protocol_over_quic_is_refused() {
     let to = Trusting::new();
     let own = client(Some(&to.rogue), ONLY_13);
     for protocol in [&b"h3"[..], b"fipa/0"] {
@@ -130,7 +131,7 @@ fn another_protocol_is_not_spoken_over_quic() {
         assert!(told.contains("error 120"), "{told}");
     }
     to.assert_nothing_came();
-    // Nor with somebody who listens for something else.
+    // Nor is a listener for another protocol accepted.
     let runtime = common::runtime();
     let _inside = runtime.enter();
     let other = listen_quic(server(&to.rogue, ONLY_13), b"h3");
@@ -146,13 +147,13 @@ fn another_protocol_is_not_spoken_over_quic() {
 }
 
 #[test]
-fn other_versions_of_quic_are_not_spoken() {
+fn other_versions_of_quic_are_refused() {
     let to = Trusting::new();
     let own = client(Some(&to.rogue), ONLY_13);
     let told = greet_quic(quic(own, PROTOCOL, DRAFT), to.quic_at()).unwrap_err();
     assert!(told.contains("version"), "{told}");
     to.assert_nothing_came();
-    // Of a version that is none, only which there are is told (RFC 9000 section 6.1).
+    // An unknown version only gets the list of supported versions (RFC 9000 section 6.1).
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     socket
         .set_read_timeout(Some(Duration::from_secs(30)))
@@ -168,18 +169,18 @@ fn other_versions_of_quic_are_not_spoken() {
 }
 
 #[test]
-fn a_listener_in_the_clear_hears_nothing_but_the_wish_to_encrypt() {
+fn a_listener_without_tls_gets_only_a_client_hello() {
     let to = Trusting::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap().to_string();
     let listening = std::thread::spawn(move || {
         let (mut stream, _) = listener.accept().unwrap();
-        // A peer of ours would be content with this.
+        // A fipa endpoint without keys would accept this.
         stream
             .write_all(&frame(1, 0, &hello_of(ROGUE, 77)))
             .unwrap();
         let mut heard = Vec::new();
-        // A reset is as good as an end.
+        // A reset is equivalent to an end of stream.
         let _ = stream.read_to_end(&mut heard);
         listener.set_nonblocking(true).unwrap();
         (heard, listener.accept().is_ok())
@@ -201,5 +202,5 @@ fn a_listener_in_the_clear_hears_nothing_but_the_wish_to_encrypt() {
             String::from_utf8_lossy(word)
         );
     }
-    assert!(!came_again, "it tried something else");
+    assert!(!came_again, "the dialler fell back to another protocol");
 }

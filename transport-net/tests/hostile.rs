@@ -1,4 +1,4 @@
-//! Old peers and hostile ones: raw bytes thrown at the port.
+//! Legacy peers and hostile peers: raw bytes sent to the port.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -18,10 +18,10 @@ use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, Verdict
 use fipa_transport_net::{Counters, Limits};
 use socket2::{Domain, Socket, Type};
 
-/// A letter as a fipa_services peer sent it.
+/// A recorded letter of a fipa_services peer.
 const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
 
-/// One that it wrote for a JADE location: XML envelope, string message.
+/// A recorded letter of that peer to a JADE location: XML envelope, string message.
 const TCP_LETTER_JADE: &[u8] = include_bytes!("data/tcp_letter_jade.bin");
 
 fn impatient() -> Party {
@@ -65,7 +65,7 @@ fn hello(incarnation: u64) -> Vec<u8> {
     fipa_testbed::frame(1, 1, &rogue_hello(incarnation))
 }
 
-/// A parcel, as a rogue sends it.
+/// A parcel frame of a hostile peer.
 fn frame(id: u64, parcel: &Parcel) -> Vec<u8> {
     fipa_testbed::frame(2, id, &written(parcel))
 }
@@ -106,7 +106,7 @@ fn arrives_in_the_standard_dialect(recorded: &[u8]) {
 }
 
 #[test]
-fn what_is_no_letter_is_refused() {
+fn malformed_letters_are_refused() {
     let party = impatient();
     let garbage: [&[u8]; 9] = [
         b"GET / HTTP/1.1\r\n\r\n",
@@ -121,7 +121,7 @@ fn what_is_no_letter_is_refused() {
     ];
     for bytes in garbage {
         let mut stream = connect(&party);
-        // The other side may close before everything is written.
+        // The other side may close the connection before all bytes are written.
         let _ = stream.write_all(bytes);
         let _ = stream.shutdown(Shutdown::Write);
         assert_shut_out(&mut stream);
@@ -131,7 +131,7 @@ fn what_is_no_letter_is_refused() {
 }
 
 #[test]
-fn who_is_slow_is_shut_out_and_nobody_else_notices() {
+fn slow_connections_are_closed_without_effect_on_others() {
     let party = impatient();
     let mut after_hello = hello(76);
     after_hello.extend(&frame_header(2, 1, 1000)[..10]);
@@ -148,7 +148,7 @@ fn who_is_slow_is_shut_out_and_nobody_else_notices() {
         .collect();
     Party::new().assert_reaches(1, &party);
     for (index, mut stream) in streams.into_iter().enumerate() {
-        // One byte now and then does not help those who had begun well.
+        // Single bytes do not save connections that began properly.
         let mut drip = stream.try_clone().unwrap();
         let dripping = std::thread::spawn(move || {
             while index >= 2 && drip.write_all(b"\0").is_ok() {
@@ -187,20 +187,20 @@ fn a_letter_of_an_old_peer_is_bounded() {
 }
 
 #[test]
-fn a_thousand_silent_connections_hold_few_descriptors_and_stop_nobody() {
+fn a_thousand_silent_connections_hold_few_descriptors_and_block_no_peer() {
     let party = Party::new();
     let max = Limits::default().max_strangers as u64;
     let mut streams: Vec<TcpStream> = Vec::new();
     for _ in 0..1000 {
         streams.push(connect(&party));
         if streams.len() > 200 {
-            // What has been pushed out may be forgotten here too: the test has few descriptors.
+            // Evicted connections are closed here too: the test has few descriptors.
             let mut oldest = streams.remove(0);
             assert_shut_out(&mut oldest);
         }
     }
     Party::new().assert_reaches(1, &party);
-    // The honest peer has pushed out one more, unless it came and went before the last silent ones
+    // The honest peer has evicted one more, unless it came and went before the last silent ones
     // lost their turn.
     until("those that are too many are pushed out", || {
         (party.transport.counters().refused_crowd >= 1000 - max).then_some(())
@@ -208,11 +208,11 @@ fn a_thousand_silent_connections_hold_few_descriptors_and_stop_nobody() {
 }
 
 #[test]
-fn too_many_introduced_peers_are_refused_and_told() {
+fn introduced_peers_beyond_the_limit_are_refused_with_a_reason() {
     let mut few = config(&["127.0.0.1:0"]);
     few.limits.max_connections = 4;
     let party = Party::with(few);
-    // All of loopback together has half of the places.
+    // All loopback addresses together have half of the slots.
     let peers: Vec<Party> = (0..5).map(|_| Party::new()).collect();
     peers[0].assert_reaches(1, &party);
     peers[1].assert_reaches(1, &party);
@@ -221,7 +221,7 @@ fn too_many_introduced_peers_are_refused_and_told() {
         Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Refused, "{error}"),
         other => panic!("{other:?}"),
     }
-    // The others are for connections that this side opens, and for other hosts.
+    // The other slots are for connections that this side opens, and for other hosts.
     party.assert_reaches(1, &peers[2]);
     party.assert_reaches(2, &peers[3]);
     let error = party
@@ -232,7 +232,7 @@ fn too_many_introduced_peers_are_refused_and_told() {
 }
 
 #[test]
-fn a_server_that_is_none_of_ours_is_incompatible() {
+fn a_server_of_another_protocol_is_incompatible() {
     let party = Party::new();
     for (attempt, greeting) in [&b"SSH-2.0-OpenSSH_9.6\r\n"[..], b""]
         .into_iter()
@@ -243,7 +243,7 @@ fn a_server_that_is_none_of_ours_is_incompatible() {
         let server = std::thread::spawn(move || {
             let (mut stream, _) = listener.accept().unwrap();
             stream.write_all(greeting).unwrap();
-            // Reads what came, so that closing is no reset.
+            // Reads the received bytes, so that closing sends no reset.
             let _ = stream.read(&mut [0; 1000]);
         });
         let to = Location::new(Kind::Tcp, &address).unwrap();
@@ -271,7 +271,7 @@ fn a_peer_that_stops_reading_is_given_up() {
         stream
     });
     let to = Location::new(Kind::Tcp, &address).unwrap();
-    // More than the system's buffers take.
+    // More than the buffers of the system hold.
     for attempt in 0..3 {
         party
             .send(attempt, &to, parcel(attempt, vec![0; 16 << 20]))
@@ -288,9 +288,9 @@ fn a_peer_that_stops_reading_is_given_up() {
     drop(server.join().unwrap());
 }
 
-/// Nor does it keep a thread of ours busy: the socket of a broken connection is always writable.
+/// The test also fails if a thread spins: the socket of a broken connection is always writable.
 #[test]
-fn a_peer_that_resets_while_goodbye_is_said_holds_up_nothing() {
+fn a_peer_that_resets_during_the_goodbye_blocks_nothing() {
     let party = Party::new();
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
@@ -301,7 +301,7 @@ fn a_peer_that_resets_while_goodbye_is_said_holds_up_nothing() {
         stream
     });
     let to = Location::new(Kind::Tcp, &address).unwrap();
-    // More than the system's buffers take: the goodbye waits behind it.
+    // More than the buffers of the system hold: the goodbye waits behind it.
     party.send(1, &to, parcel(1, vec![0; 16 << 20])).unwrap();
     let peer = server.join().unwrap();
     party.transport.close();
@@ -309,7 +309,7 @@ fn a_peer_that_resets_while_goodbye_is_said_holds_up_nothing() {
         Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::Closed, "{error}"),
         other => panic!("{other:?}"),
     }
-    // With bytes that nobody has read: a reset.
+    // Closing with unread bytes sends a reset.
     drop(peer);
     until("every task has ended", || {
         (party.runtime.metrics().num_alive_tasks() == 0).then_some(())
@@ -317,11 +317,11 @@ fn a_peer_that_resets_while_goodbye_is_said_holds_up_nothing() {
 }
 
 #[test]
-fn an_introduced_peer_that_floods_is_shut_out_and_nobody_else_notices() {
+fn a_flooding_peer_is_closed_without_effect_on_others() {
     let mut narrow = config(&["127.0.0.1:0"]);
     narrow.limits.max_in_flight = 64;
-    // One side answers late, and has as many to answer as may be; the other answers, and nobody
-    // reads it.
+    // One side has as many unanswered parcels as allowed; the other answers, and its answers are
+    // not read.
     let late = Party::judging(narrow.clone(), Verdict::Later);
     let busy = Party::with(narrow);
     for party in [&late, &busy] {
@@ -332,7 +332,7 @@ fn an_introduced_peer_that_floods_is_shut_out_and_nobody_else_notices() {
             sent += 1;
             stream.write_all(&frame)
         });
-        // Ends when the other side has closed.
+        // Ends when the other side has closed the connection.
         let error = flood.into_iter().find_map(Result::err).unwrap();
         let kinds = [
             std::io::ErrorKind::ConnectionReset,
@@ -343,13 +343,13 @@ fn an_introduced_peer_that_floods_is_shut_out_and_nobody_else_notices() {
         counted(party, |c| c.refused_nonsense, 1);
         counted(party, |c| c.connections, 0);
     }
-    // No more than may be in flight was taken.
+    // No more parcels than max_in_flight were accepted.
     assert_eq!(late.arrivals(), 64);
     Party::new().assert_reaches(1, &busy);
 }
 
 #[test]
-fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
+fn memory_for_announced_content_is_bounded_without_effect_on_others() {
     const EACH: usize = 8 << 20;
     let mut generous = config(&["127.0.0.1:0"]);
     generous.limits.max_arriving = 20 << 20;
@@ -358,7 +358,7 @@ fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
         .map(|n| {
             let mut stream = connect(&party);
             stream.write_all(&hello(n)).unwrap();
-            // A letter that hardly begins.
+            // A letter of which only the start is sent.
             let letter = frame(1, &parcel(1, vec![0; EACH]));
             stream.write_all(&letter[..10_000]).unwrap();
             stream
@@ -366,7 +366,7 @@ fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
         .collect();
     counted(&party, |c| c.connections, 5);
     until("two places", || (party.lent().0 == 2 * EACH).then_some(()));
-    // Whoever really sends has one, too, or is served without.
+    // A peer that really sends gets memory too, or is served without it.
     let honest = Party::new();
     for (attempt, len) in [(1, 1 << 20), (2, EACH), (3, 100)] {
         let sent = parcel(attempt, vec![attempt as u8; len]);
@@ -377,13 +377,13 @@ fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
     assert_eq!(most, 2 * EACH + (1 << 20));
     let counters = party.transport.counters();
     assert_eq!((counters.placed, counters.parcels_in), (1, 3));
-    // Who leaves gives back what it had.
+    // A connection that ends releases its memory.
     drop(rogues);
     until("no place", || (party.lent().0 == 0).then_some(()));
 }
 
-/// A peer that says hello, announces a letter of so many bytes, sends half of it, and then as much at a
-/// time as keeps other letters from being called slow. Returns whether it was shut out.
+/// A peer that sends a hello, announces a letter of `len` bytes, sends half of it, and then just
+/// enough to keep the connection. Returns whether the connection was closed.
 fn sends_half(party: &Party, incarnation: u64, len: usize, at_a_time: usize) -> JoinHandle<bool> {
     let mut stream = connect(party);
     std::thread::spawn(move || {
@@ -401,12 +401,12 @@ fn sends_half(party: &Party, incarnation: u64, len: usize, at_a_time: usize) -> 
 }
 
 #[test]
-fn half_letters_take_no_more_memory_than_the_budget_and_stop_nobody() {
+fn half_letters_stay_within_the_memory_budget_and_block_no_peer() {
     const EACH: usize = 1 << 20;
     let mut small = config(&["127.0.0.1:0"]);
     small.limits.max_arriving = usize::MAX;
     small.limits.max_incoming = 4 * EACH;
-    // Loopback has twice as much.
+    // Loopback has twice the limit.
     small.limits.max_incoming_per_source = EACH + EACH / 4;
     small.limits.stall_timeout = Duration::from_millis(150);
     // All of them together would have 32 MiB.
@@ -430,7 +430,7 @@ fn half_letters_take_no_more_memory_than_the_budget_and_stop_nobody() {
     assert!(shut_out.filter(|out| *out).count() >= 2);
 }
 
-/// Its signs of life are not read meanwhile, and it hears that this side lives.
+/// Its pings are not read meanwhile, but it gets pongs of this side.
 #[test]
 fn a_connection_that_is_not_read_for_lack_of_memory_stays_open() {
     let lively = || {
@@ -459,7 +459,7 @@ fn the_address_of_a_third_party_in_a_hello_is_never_dialed() {
     let mut stream = connect(&party);
     let listening = third.local_addr().unwrap();
     let mut body = rogue_hello(77);
-    // In place of no addresses.
+    // Replaces the empty list of addresses.
     body.pop();
     body.push(1);
     let text = listening.to_string();
@@ -500,7 +500,7 @@ fn connect_from(ip: [u8; 4], to: &Party) -> TcpStream {
 }
 
 #[test]
-fn a_stranger_that_says_it_is_a_connected_service_is_refused_while_that_lives() {
+fn an_unproved_peer_that_claims_a_connected_service_is_refused_while_that_responds() {
     let party = Party::new();
     let service = Party::new();
     service.assert_reaches(1, &party);
@@ -520,7 +520,7 @@ fn a_stranger_that_says_it_is_a_connected_service_is_refused_while_that_lives() 
 }
 
 #[test]
-fn a_service_that_moved_is_served_when_its_older_connection_gives_no_sign_of_life() {
+fn a_service_that_moved_is_admitted_when_its_older_connection_does_not_respond() {
     let party = Party::new();
     for (ip, arrivals) in [([127, 0, 0, 1], 1), ([127, 0, 0, 2], 2)] {
         let mut older = connect_from(ip, &party);

@@ -1,5 +1,5 @@
 //! Letters of legacy peers, which send as fipa_services does: one connection per letter, closed
-//! behind it. None is lost, and those of one address arrive in the order of their connections.
+//! after it. No letter is lost, and those of one address arrive in the order of their connections.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -22,12 +22,12 @@ use fipa_transport_net::{Limits, TcpTransport};
 use parking_lot::{Condvar, Mutex};
 use socket2::{Domain, Socket, Type};
 
-/// A letter as a fipa_services peer sent it, to an agent `echo`.
+/// A recorded letter of a fipa_services peer to an agent `echo`.
 const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
 
 const HERE: [u8; 4] = [127, 0, 0, 1];
 
-/// Another source: all loopback addresses are one.
+/// An address of another source: all loopback addresses are one source.
 const ELSEWHERE: [u8; 4] = [10, 99, 0, 1];
 
 /// Makes a host with both addresses.
@@ -36,8 +36,8 @@ fn at_both_addresses() {
     fipa_testbed::run("ip addr add 10.99.0.1/32 dev lo");
 }
 
-/// Records what arrives, and can be made to hold up the letters of 127.0.0.1: then those wait for
-/// the core, as on a busy machine.
+/// Records arriving letters, and can block the letters of 127.0.0.1, which then wait for the core
+/// as on a busy machine.
 #[derive(Default)]
 struct Recorder {
     arrived: Mutex<Vec<(IpAddr, u64)>>,
@@ -126,7 +126,7 @@ impl Gateway {
         stream
     }
 
-    /// Sends a letter over a connection of its own, to the end of which nobody has to listen.
+    /// Sends a letter over a connection of its own.
     fn send(&self, ip: [u8; 4], number: u64) {
         self.connect_from(ip).write_all(&letter(number, 0)).unwrap();
     }

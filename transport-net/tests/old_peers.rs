@@ -1,4 +1,4 @@
-//! Letters to old peers, which behave as fipa_services and JADE's proxy agent do: one letter per
+//! Letters to legacy peers, which behave as fipa_services and JADE's proxy agent do: one letter per
 //! connection, read until the end of the stream.
 #![allow(
     clippy::unwrap_used,
@@ -22,7 +22,7 @@ use fipa_transport::{
     AttemptId, Conclusion, Kind, Location, Parcel, Signature, Transport, WayFault,
 };
 
-/// Somebody who takes connections one after the other, and reads each to its end.
+/// A legacy peer that accepts connections one after the other, and reads each to its end.
 struct OldPeer {
     location: Location,
     letters: Receiver<Vec<u8>>,
@@ -45,7 +45,7 @@ impl OldPeer {
         Self { location, letters }
     }
 
-    /// The next letter, read as these peers do: an envelope, and the payload to the end.
+    /// Returns the next letter, read as these peers do: an envelope, and the payload to the end.
     fn letter(&self) -> (Envelope, Message, Vec<u8>) {
         let bytes = self.letters.recv_timeout(Duration::from_secs(60)).unwrap();
         let (envelope, len) = Envelope::decode(&bytes).unwrap();
@@ -117,7 +117,7 @@ fn jade_gets_xml_and_a_string_message_and_can_answer() {
     assert!(envelope.effective().payload_length.is_some());
     let here = format!("tcp://{}", party.location().address());
     assert_eq!(message.sender().unwrap().addresses(), [&*here]);
-    // The answer goes there, and arrives.
+    // The answer to that address arrives.
     let mut answer = TcpStream::connect(here.strip_prefix("tcp://").unwrap()).unwrap();
     answer.write_all(&bytes).unwrap();
     drop(answer);
@@ -127,7 +127,7 @@ fn jade_gets_xml_and_a_string_message_and_can_answer() {
 }
 
 #[test]
-fn nobody_there_is_said_to_all_who_wait() {
+fn an_unreachable_peer_is_reported_for_all_waiting_letters() {
     let party = Party::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let gone = location(&listener, Signature::FipaServices);
@@ -163,13 +163,13 @@ fn a_peer_that_does_not_read_is_given_up_and_others_are_served() {
         Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
         other => panic!("{other:?}"),
     }
-    // The system takes a small letter for a peer that does not read.
+    // The system accepts a small letter for a peer that does not read.
     assert_eq!(party.conclusion(2), Conclusion::Handed);
     drop(listener);
 }
 
 #[test]
-fn what_waits_is_bounded_and_what_is_abandoned_or_closed_is_told_once() {
+fn waiting_letters_are_bounded_and_concluded_once() {
     let mut few = config(&["127.0.0.1:0"]);
     few.limits.max_in_flight = 3;
     let party = Party::with(few);
@@ -178,7 +178,7 @@ fn what_waits_is_bounded_and_what_is_abandoned_or_closed_is_told_once() {
     let large = "x".repeat(32 << 20);
     party.send(0, &slow, parcel(0, &large)).unwrap();
     let (mut stream, _) = listener.accept().unwrap();
-    // Now it is certain that the letter has begun.
+    // The letter has begun now.
     stream.read_exact(&mut [0]).unwrap();
     for attempt in 1..=3 {
         party.send(attempt, &slow, parcel(attempt, "x")).unwrap();
@@ -198,7 +198,7 @@ fn what_waits_is_bounded_and_what_is_abandoned_or_closed_is_told_once() {
 }
 
 #[test]
-fn what_the_peer_could_not_read_is_not_sent() {
+fn a_letter_that_the_peer_cannot_read_is_not_sent() {
     let (party, peer) = (Party::new(), OldPeer::new(Signature::FipaServices));
     party
         .send(1, &peer.location, common::parcel(1, "not even an envelope"))

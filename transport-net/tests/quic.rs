@@ -1,4 +1,4 @@
-//! QUIC's own: changes of address, letters that do not wait for each other, and hostile packets.
+//! Properties of QUIC: changes of address, independent letters, and hostile packets.
 #![cfg(feature = "quic")]
 #![allow(
     clippy::unwrap_used,
@@ -29,8 +29,7 @@ fn friends() -> (Party<QuicTransport>, Party<QuicTransport>) {
     (party(of(&rover, &crex)), party(of(&crex, &rover)))
 }
 
-/// Stands between two endpoints and passes on what either says; towards the one behind it, it can
-/// change its address.
+/// A relay between two endpoints that can change the address seen by the accepting one.
 struct Relay {
     front: SocketAddr,
     /// The port that the endpoint behind it sees.
@@ -88,7 +87,7 @@ impl Relay {
         Location::new(Kind::Quic, &self.front.to_string()).unwrap()
     }
 
-    /// Changes its address, and waits until it has.
+    /// Changes its address, and waits for the change.
     fn relocate(&self) {
         let before = self.seen.load(Ordering::SeqCst);
         self.moves.store(true, Ordering::SeqCst);
@@ -114,7 +113,7 @@ fn a_connection_outlives_a_change_of_address() {
         from.send(attempt, &location, parcel(attempt, "on the way"))
             .unwrap();
         if attempt % 10 == 5 {
-            // Some are under way.
+            // Some letters are in flight.
             relay.relocate();
         }
         if attempt % 3 == 0 {
@@ -161,7 +160,7 @@ fn many_large_letters_arrive_in_order() {
 }
 
 #[test]
-fn packets_that_are_none_disturb_nobody() {
+fn malformed_packets_have_no_effect() {
     let (from, to) = friends();
     from.assert_reaches(1, &to);
     let hostile = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -170,11 +169,11 @@ fn packets_that_are_none_disturb_nobody() {
         let mut random = fastrand::Rng::with_seed(number);
         let mut packet: Vec<u8> = (0..random.usize(1..1300)).map(|_| random.u8(..)).collect();
         if number % 2 == 0 {
-            // Looks like the first packet of a connection (RFC 9000 section 17.2.2).
+            // Resembles the first packet of a connection (RFC 9000 section 17.2.2).
             packet.resize(1200, 0);
             packet[..6].copy_from_slice(&[0xc3, 0, 0, 0, 1, 8]);
         }
-        // The socket may be full; there is more where that came from.
+        // The socket may be full; further packets follow.
         let _ = hostile.send_to(&packet, at);
     }
     from.assert_reaches(2, &to);
@@ -182,14 +181,14 @@ fn packets_that_are_none_disturb_nobody() {
 }
 
 #[test]
-fn whoever_begins_a_handshake_and_does_not_go_on_is_let_go() {
+fn an_unfinished_handshake_is_dropped() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let mut config = quic_config(&["127.0.0.1:0"], crex.security(&[&rover]));
     config.limits.handshake_timeout = Duration::from_millis(300);
     config.limits.max_strangers = 4;
     let to = party(config);
     let at: SocketAddr = to.location().address().parse().unwrap();
-    // First packets of real handshakes, whose answers nobody reads.
+    // First packets of real handshakes, whose answers are not read.
     let mut silent = Vec::new();
     for _ in 0..8 {
         let trap = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -212,11 +211,11 @@ fn whoever_begins_a_handshake_and_does_not_go_on_is_let_go() {
 }
 
 #[test]
-fn who_speaks_no_quic_is_told_in_time() {
+fn a_peer_without_quic_is_reported_in_time() {
     let (from, _to) = friends();
     let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
     let location = Location::new(Kind::Quic, &silent.local_addr().unwrap().to_string()).unwrap();
-    from.send(1, &location, parcel(1, "anybody?")).unwrap();
+    from.send(1, &location, parcel(1, "hello?")).unwrap();
     let Conclusion::NotSent(error) = from.conclusion(1) else {
         panic!("{:?}", from.conclusion(1));
     };

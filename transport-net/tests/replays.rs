@@ -1,5 +1,4 @@
-//! What was said before and is said again, byte by byte, by somebody who heard it: nothing comes of
-//! it.
+//! Recorded bytes that an attacker replays have no effect.
 #![cfg(feature = "quic")]
 #![allow(
     clippy::unwrap_used,
@@ -16,7 +15,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use common::certificates::Host;
-use common::intruder::{ONLY_13, PROTOCOL, ROGUE, client, quic, said};
+use common::intruder::{ONLY_13, PROTOCOL, ROGUE, client, hello_and_letter, quic};
 use common::{NAME, Party, Recorder, accepted, config, parcel, quic_config, until};
 use fipa_transport::{Conclusion, Kind, Location};
 use fipa_transport_net::secure::Security;
@@ -25,7 +24,7 @@ use parking_lot::Mutex;
 use rustls::pki_types::ServerName;
 use rustls::{ClientConnection, HandshakeKind, StreamOwned};
 
-/// Ends what hangs.
+/// Timeout of a hung operation.
 const WATCHDOG: Duration = Duration::from_secs(30);
 
 /// Letters of the recorded conversations.
@@ -49,14 +48,15 @@ fn securities() -> (Security, Security) {
     (rover.security(&[&crex]), crex.security(&[&rover]))
 }
 
-/// What either side of one TCP connection said: the one that dialled, and the one behind.
-type Heard = JoinHandle<[Vec<u8>; 2]>;
+/// The recorded bytes of both sides of one TCP connection: the dialling side, and the accepting
+/// side.
+type Recording = JoinHandle<[Vec<u8>; 2]>;
 
-/// Passes on one connection, and keeps what is said on it.
-fn overhear(behind: SocketAddr) -> (Location, Heard) {
+/// Forwards one connection, and records its bytes.
+fn record(behind: SocketAddr) -> (Location, Recording) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let front = listener.local_addr().unwrap().to_string();
-    let heard = std::thread::spawn(move || {
+    let recording = std::thread::spawn(move || {
         let (dialler, _) = listener.accept().unwrap();
         let other = TcpStream::connect(behind).unwrap();
         let pass = |mut from: TcpStream, mut to: TcpStream| {
@@ -68,7 +68,7 @@ fn overhear(behind: SocketAddr) -> (Location, Heard) {
                         break;
                     }
                 }
-                // It may be gone already.
+                // The connection may be closed already.
                 let _ = to.shutdown(Shutdown::Write);
                 all
             })
@@ -77,14 +77,14 @@ fn overhear(behind: SocketAddr) -> (Location, Heard) {
         let back = pass(other, dialler);
         [there, back].map(|passing| passing.join().unwrap())
     });
-    (Location::new(Kind::Tcp, &front).unwrap(), heard)
+    (Location::new(Kind::Tcp, &front).unwrap(), recording)
 }
 
 #[test]
-fn a_tls_connection_that_is_played_again_delivers_nothing() {
+fn a_replayed_tls_connection_delivers_nothing() {
     let (rover, crex) = securities();
     let to = tcp(crex);
-    let (front, heard) = overhear(to.location().address().parse().unwrap());
+    let (front, recording) = record(to.location().address().parse().unwrap());
     let from = tcp(rover.clone());
     for attempt in 1..=LETTERS {
         from.send(attempt, &front, parcel(attempt, "secret"))
@@ -92,7 +92,7 @@ fn a_tls_connection_that_is_played_again_delivers_nothing() {
         assert_eq!(from.conclusion(attempt), accepted());
     }
     fipa_transport::Transport::close(&from.transport);
-    let [said, answered] = heard.join().unwrap();
+    let [said, answered] = recording.join().unwrap();
     assert!(
         !said.windows(6).any(|part| part == b"secret"),
         "in the clear"
@@ -100,7 +100,7 @@ fn a_tls_connection_that_is_played_again_delivers_nothing() {
     for _ in 0..3 {
         let mut again = TcpStream::connect(to.location().address()).unwrap();
         again.set_read_timeout(Some(WATCHDOG)).unwrap();
-        // It hangs up in the middle, perhaps.
+        // It may close the connection in the middle.
         let _ = again.write_all(&said);
         let _ = again.shutdown(Shutdown::Write);
         let _ = again.read_to_end(&mut Vec::new());
@@ -109,7 +109,7 @@ fn a_tls_connection_that_is_played_again_delivers_nothing() {
         (to.transport.counters().refused_unproved == 3).then_some(())
     });
     assert_eq!(to.arrivals() as u64, LETTERS);
-    // Nor is anybody taken for the one who answered then.
+    // Nor is a replay of the accepting side accepted.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap().to_string();
     let player = std::thread::spawn(move || {
@@ -125,12 +125,12 @@ fn a_tls_connection_that_is_played_again_delivers_nothing() {
     player.join().unwrap();
 }
 
-/// Stands between two QUIC endpoints, passes on every datagram of the one that dialled twice, and
-/// keeps them.
+/// A relay between two QUIC endpoints that forwards every datagram of the dialling one twice, and
+/// records them.
 struct Repeater {
     front: Location,
     recorded: Arc<Mutex<Vec<Vec<u8>>>>,
-    /// The socket that the endpoint behind it knows.
+    /// The socket that the accepting endpoint sees.
     back: UdpSocket,
     ended: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -173,13 +173,13 @@ impl Repeater {
         }
     }
 
-    /// Everything again, from where it came before and from elsewhere.
+    /// Replays all datagrams, from the original and from another address.
     fn repeat(&self, behind: &str) {
         let elsewhere = UdpSocket::bind("127.0.0.1:0").unwrap();
         elsewhere.connect(behind).unwrap();
         for socket in [&self.back, &elsewhere] {
             for packet in self.recorded.lock().clone() {
-                // A socket that is full loses it; there are more.
+                // A full socket drops it; further datagrams follow.
                 let _ = socket.send(&packet);
             }
         }
@@ -194,7 +194,7 @@ impl Drop for Repeater {
 }
 
 #[test]
-fn datagrams_of_quic_that_come_again_deliver_nothing() {
+fn replayed_quic_datagrams_deliver_nothing() {
     let (rover, crex) = securities();
     let to = over_quic(crex.clone());
     let behind = to.location().address().to_owned();
@@ -219,10 +219,10 @@ fn datagrams_of_quic_that_come_again_deliver_nothing() {
         (to.transport.counters().connections == 0).then_some(())
     });
     repeater.repeat(&behind);
-    // and to the same service in another life.
+    // and to the same service with another incarnation.
     let next = over_quic(crex);
     repeater.repeat(next.location().address());
-    // What is not let in is so by the time that an honest letter has come after it.
+    // The replayed datagrams have been handled when a later honest letter arrives.
     let again = over_quic(rover);
     for (attempt, party) in [(1, &to), (2, &next)] {
         again
@@ -235,11 +235,11 @@ fn datagrams_of_quic_that_come_again_deliver_nothing() {
 }
 
 #[test]
-fn nobody_begins_where_he_left_off() {
+fn sessions_are_not_resumed() {
     let (rogue, crex) = (Host::new(ROGUE, &[]), Host::new(NAME, &[]));
     let security = crex.security(&[&rogue]);
     let (tcp, over_quic) = (tcp(security.clone()), over_quic(security));
-    // He would like to, and to send his letter before the other side has said anything.
+    // The rogue tries to resume, and to send its letter as early data.
     let mut wish = client(Some(&rogue), ONLY_13);
     wish.enable_early_data = true;
     let tls = Arc::new(wish.clone());
@@ -249,7 +249,7 @@ fn nobody_begins_where_he_left_off() {
         let stream = TcpStream::connect(tcp.location().address()).unwrap();
         stream.set_read_timeout(Some(WATCHDOG)).unwrap();
         let mut stream = StreamOwned::new(session, stream);
-        stream.write_all(&said()).unwrap();
+        stream.write_all(&hello_and_letter()).unwrap();
         stream.read_exact(&mut [0; 24]).unwrap();
         assert_eq!(stream.conn.handshake_kind(), Some(HandshakeKind::Full));
         assert!(!stream.conn.is_early_data_accepted());
@@ -262,12 +262,12 @@ fn nobody_begins_where_he_left_off() {
             let at = over_quic.location().address().parse().unwrap();
             let connecting = endpoint.connect_with(config.clone(), at, "x").unwrap();
             let Err(connecting) = connecting.into_0rtt() else {
-                panic!("there was something to go on from");
+                panic!("the server offered a session to resume");
             };
             let connection = connecting.await.unwrap();
             let (mut send, mut receive) = connection.open_bi().await.unwrap();
-            send.write_all(&said()).await.unwrap();
-            // What would be needed for the next time comes before this.
+            send.write_all(&hello_and_letter()).await.unwrap();
+            // A session ticket would arrive before this.
             receive.read_exact(&mut [0; 24]).await.unwrap();
         }
     });

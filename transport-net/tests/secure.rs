@@ -1,4 +1,4 @@
-//! Who is let in when peers have to prove who they are.
+//! Admission of peers that must prove their identity.
 #![cfg(feature = "secure")]
 #![allow(
     clippy::unwrap_used,
@@ -21,7 +21,7 @@ use fipa_transport::{Answer, Conclusion, FailureReason, Mandate, Transport, WayF
 use fipa_transport_net::secure::{Rules, Security};
 use fipa_transport_net::{Counters, Limits, TcpTransport};
 
-/// A transport over which peers prove who they are.
+/// A transport over which peers prove their identity.
 trait Proving: Transport + Sized {
     fn party(security: Security) -> Party<Self> {
         Self::limited(security, |_| {})
@@ -60,7 +60,7 @@ impl Proving for fipa_transport_net::QuicTransport {
     }
 }
 
-/// Each of these is a test over TCP and over QUIC.
+/// Runs each of these tests over TCP and over QUIC.
 macro_rules! over_both {
     ($($name:ident,)*) => {
         mod tcp {
@@ -76,24 +76,24 @@ macro_rules! over_both {
 
 over_both! {
     peers_that_trust_each_other_exchange_letters_of_any_size,
-    strangers_are_refused_on_either_side,
-    certificates_that_do_not_hold_now_are_refused,
-    who_proved_one_name_cannot_take_another,
+    untrusted_peers_are_refused_on_either_side,
+    certificates_that_are_not_valid_now_are_refused,
+    a_peer_cannot_claim_another_name_than_its_certificate_has,
     a_peer_speaks_for_its_own_agents_only,
-    who_has_keys_is_not_taken_for_one_of_this_host,
+    a_peer_with_keys_does_not_count_as_of_this_host,
     withdrawn_trust_ends_the_connection,
     an_expired_certificate_ends_the_connection,
     a_new_key_takes_over_while_letters_pass,
     a_peer_that_the_service_refuses_gets_no_letter_and_sends_none,
-    who_sends_more_than_it_may_is_read_later_and_loses_nothing,
-    a_restarted_gateway_takes_the_place_of_its_older_connection_at_once,
+    a_peer_beyond_its_rate_limit_is_read_later_without_loss,
+    a_restarted_gateway_replaces_its_older_connection_at_once,
 }
 
 fn party(security: Security) -> Party {
     TcpTransport::party(security)
 }
 
-/// Both know each other.
+/// Two parties that trust each other.
 fn friends<T: Proving>(left: &Host, right: &Host) -> (Party<T>, Party<T>) {
     (
         T::party(left.security(&[right])),
@@ -101,7 +101,7 @@ fn friends<T: Proving>(left: &Host, right: &Host) -> (Party<T>, Party<T>) {
     )
 }
 
-/// No letter gets from the one to the other, and nothing has arrived.
+/// Asserts that a letter from one party to the other fails, and that none has arrived.
 fn assert_refused<T: Transport>(from: &Party<T>, to: &Party<T>) -> String {
     from.send(1, to.location(), parcel(1, "let me in")).unwrap();
     let Conclusion::NotSent(error) = from.conclusion(1) else {
@@ -115,7 +115,7 @@ fn letter_from(sender: &str) -> Letter {
     letter_signed(sender, sender)
 }
 
-/// A letter whose envelope is from one agent, and whose message says it is from another.
+/// A letter whose envelope names one sender and whose message names another.
 fn letter_signed(sender: &str, signed: &str) -> Letter {
     let base = EnvelopeParams {
         to: vec![AgentId::new("arm_1").unwrap()],
@@ -151,23 +151,23 @@ fn peers_that_trust_each_other_exchange_letters_of_any_size<T: Proving>() {
     assert_eq!(from.transport.counters().dialled, 1);
 }
 
-fn strangers_are_refused_on_either_side<T: Proving>() {
+fn untrusted_peers_are_refused_on_either_side<T: Proving>() {
     let (rover, crex, stranger) = (
         Host::new(NAME, &[]),
         Host::new(NAME, &[]),
         Host::new(NAME, &[]),
     );
-    // Nobody vouched for this certificate.
+    // This certificate is not trusted.
     let to = T::party(crex.security(&[&rover]));
     let from = T::party(stranger.security(&[&crex]));
     let told = assert_refused(&from, &to);
     assert!(told.contains("the peer does not trust this host"), "{told}");
-    // Whoever listens there is somebody else.
+    // The listener has another certificate.
     let from = T::party(rover.security(&[&stranger]));
     let told = assert_refused(&from, &to);
     assert!(told.contains("UnknownIssuer"), "{told}");
     assert!(
-        told.contains("not trusted here: `fipa keys trust`"),
+        told.contains("does not trust the peer: run `fipa keys trust`"),
         "{told}"
     );
     until("it was counted", || {
@@ -175,7 +175,7 @@ fn strangers_are_refused_on_either_side<T: Proving>() {
     });
 }
 
-fn certificates_that_do_not_hold_now_are_refused<T: Proving>() {
+fn certificates_that_are_not_valid_now_are_refused<T: Proving>() {
     let day = Duration::from_secs(86_400);
     let now = SystemTime::now();
     let rover = Host::new(NAME, &[]);
@@ -190,11 +190,11 @@ fn certificates_that_do_not_hold_now_are_refused<T: Proving>() {
             told.contains(what) && told.contains("renew` there"),
             "{told}"
         );
-        let clock = told.contains("the clock of this host is before the making");
+        let clock = told.contains("not valid yet by the clock of this host");
         assert_eq!(clock, what == "NotValidYet", "{told}");
         let told = assert_refused(&to, &from);
         assert!(
-            told.contains("this host's certificate does not hold"),
+            told.contains("this host's certificate is not valid"),
             "{told}"
         );
     }
@@ -212,11 +212,11 @@ fn a_certificate_without_its_key_is_of_no_use() {
     );
 }
 
-fn who_proved_one_name_cannot_take_another<T: Proving>() {
-    let (rover, crex) = (Host::new(NAME, &[]), Host::new("somebody-else", &[]));
+fn a_peer_cannot_claim_another_name_than_its_certificate_has<T: Proving>() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new("another-mts", &[]));
     let (from, to) = friends::<T>(&rover, &crex);
     let told = assert_refused(&from, &to);
-    assert!(told.contains("somebody-else"), "{told}");
+    assert!(told.contains("another-mts"), "{told}");
 }
 
 /// The service may be connected over another transport, with another certificate.
@@ -240,7 +240,7 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
         from.send(attempt, to.location(), letter).unwrap();
         assert_eq!(from.conclusion(attempt), accepted(), "{sender}");
     }
-    // Each side tells its directory what the other may speak for.
+    // Each side reports the agents of the other to its directory.
     for (party, agents) in [(&to, ["rover", "rover_*"]), (&from, ["crex", "arm_1"])] {
         let record = party.sink.record.lock();
         let mandates: Vec<_> = record.introduced.iter().map(|it| &it.mandate).collect();
@@ -253,22 +253,22 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
         panic!("{:?}", from.conclusion(3));
     };
     assert_eq!(reason, FailureReason::Refused);
-    // Nor in the message, behind an envelope of its own.
+    // Nor may the message name another sender than the envelope.
     let disguised = letter_parcel(5, letter_signed("rover", "crex"));
     from.send(5, to.location(), disguised).unwrap();
     let Conclusion::Answered(Answer::Failed { reason, detail }) = from.conclusion(5) else {
         panic!("{:?}", from.conclusion(5));
     };
     assert_eq!(reason, FailureReason::Refused);
-    assert!(detail.contains("its message from crex"), "{detail}");
+    assert!(detail.contains("its message names crex"), "{detail}");
     assert_eq!(to.arrivals(), 2);
     assert_eq!(to.transport.counters().refused_senders, 2);
-    // Nor does it get letters for agents of others, whatever the directory says.
+    // Nor does it get letters for agents of other peers, even if the directory says so.
     let mut stray = letter_parcel(4, letter_from("rover"));
     stray.receiver = "sherpa".into();
     let refused = from.send(4, to.location(), stray.clone()).unwrap_err();
     assert_eq!(refused.fault, WayFault::Refused);
-    // Also when the connection is only opened for it.
+    // Also when the connection is only opened for such a letter.
     let later = T::party(rover.security(&[&crex]));
     later.send(1, to.location(), stray).unwrap();
     let Conclusion::NotSent(refused) = later.conclusion(1) else {
@@ -277,11 +277,11 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
     assert_eq!(refused.fault, WayFault::Refused);
 }
 
-/// Gateways pass on what processes of their own host send.
-fn who_has_keys_is_not_taken_for_one_of_this_host<T: Proving>() {
+/// Gateways forward letters of processes of their own host.
+fn a_peer_with_keys_does_not_count_as_of_this_host<T: Proving>() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let (from, to) = friends::<T>(&rover, &crex);
-    // All endpoints of these tests say that they are on the same host, in the same domain.
+    // All endpoints of these tests claim the same host and domain.
     from.assert_reaches(1, &to);
     to.assert_reaches(2, &from);
     for party in [&from, &to] {
@@ -305,7 +305,7 @@ fn withdrawn_trust_ends_the_connection<T: Proving>() {
     });
     from.send(2, to.location(), parcel(2, "again")).unwrap();
     assert!(matches!(from.conclusion(2), Conclusion::NotSent(_)));
-    // And trust that is given again lets in again.
+    // Trust that is restored admits the peer again.
     security.replace(crex.credentials(&[&rover])).unwrap();
     from.assert_reaches(3, &to);
 }
@@ -352,27 +352,28 @@ fn a_new_key_takes_over_while_letters_pass<T: Proving>() {
 }
 
 #[test]
-fn nothing_is_said_in_the_clear_to_who_has_to_prove_who_he_is() {
+fn a_peer_that_must_prove_its_identity_gets_no_unencrypted_bytes() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let to = party(crex.security(&[&rover]));
-    // A peer of ours without keys, both ways.
+    // A fipa peer without keys, in both directions.
     let plain = Party::new();
     assert_refused(&plain, &to);
     assert_refused(&to, &plain);
-    // An old peer's letter, and frames.
+    // A legacy peer's letter, and frames.
     for first in [&b"\xfe\x10"[..], b"fipa\x02\x01\0\0", b"<?xml", b"garbage"] {
         let address = to.location().address().to_owned();
         let mut stream = TcpStream::connect(address).unwrap();
         stream.write_all(first).unwrap();
         let mut said = Vec::new();
-        // A reset is as good as an end.
+        // A reset is equivalent to an end of stream.
         let _ = stream.read_to_end(&mut said);
         assert_eq!(said, b"", "an answer to {first:?}");
     }
     assert_eq!(to.arrivals() + to.sink.record.lock().unframed.len(), 0);
 }
 
-/// What a host asks of others with which it trusts the rover, and old peers on this host.
+/// The credentials of a host that trusts the rover, and has a legacy peer on this host as an
+/// exception.
 fn with_an_exception() -> Security {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let rules = Rules {
@@ -382,7 +383,7 @@ fn with_an_exception() -> Security {
     Security::new(crex.credentials(&[&rover]), rules).unwrap()
 }
 
-/// Sends a letter as old peers do.
+/// Sends a letter as legacy peers do.
 fn throw(to: &Party) {
     let mut stream = TcpStream::connect(to.location().address()).unwrap();
     stream
@@ -402,7 +403,7 @@ fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
 }
 
 #[test]
-fn an_old_peer_that_sends_more_than_it_may_is_heard_later() {
+fn an_old_peer_beyond_its_rate_limit_is_read_later() {
     let to = TcpTransport::limited(with_an_exception(), |limits| limits.peer_letters = 2);
     let begun = Instant::now();
     for _ in 0..6 {
@@ -411,13 +412,13 @@ fn an_old_peer_that_sends_more_than_it_may_is_heard_later() {
     until("its letters", || {
         (to.sink.record.lock().unframed.len() == 6).then_some(())
     });
-    // Two at once, and two more a second; nobody is made to wait longer than that.
+    // Two at once, and two more per second; no pause is longer than a second.
     let took = begun.elapsed();
     assert!(took > Duration::from_millis(900), "{took:?}");
     assert!(to.transport.counters().held_back > 0);
 }
 
-fn who_sends_more_than_it_may_is_read_later_and_loses_nothing<T: Proving>() {
+fn a_peer_beyond_its_rate_limit_is_read_later_without_loss<T: Proving>() {
     const RATE: u64 = 4 << 20;
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let there: Party<T> = T::limited(crex.security(&[&rover]), |limits| limits.peer_bytes = RATE);
@@ -432,20 +433,20 @@ fn who_sends_more_than_it_may_is_read_later_and_loses_nothing<T: Proving>() {
         assert_eq!(here.conclusion(attempt), accepted(), "{attempt}");
     }
     assert!(there.transport.counters().held_back > 0);
-    // Twelve megabytes: four of them at once, and a second's pause at most for what comes together.
+    // Twelve megabytes: four of them at once, with pauses of at most a second.
     let took = begun.elapsed();
     assert!(took > Duration::from_millis(500), "{took:?}");
     assert_eq!(here.transport.counters().held_back, 0);
 }
 
-fn a_restarted_gateway_takes_the_place_of_its_older_connection_at_once<T: Proving>() {
+fn a_restarted_gateway_replaces_its_older_connection_at_once<T: Proving>() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let there: Party<T> = T::limited(crex.security(&[&rover]), |limits| {
         limits.max_per_address = 1
     });
     let before: Party<T> = T::party(rover.security(&[&crex]));
     before.assert_reaches(1, &there);
-    // It cannot say that it ends: its connection stays open.
+    // It cannot send a goodbye: its connection stays open.
     let after: Party<T> = T::party(rover.security(&[&crex]));
     after.assert_reaches(1, &there);
     assert_eq!(there.transport.counters().connections, 1);
@@ -455,10 +456,10 @@ fn a_restarted_gateway_takes_the_place_of_its_older_connection_at_once<T: Provin
     });
 }
 
-/// Connections of a local user that never say anything, that say half a hello, that say hello, and
-/// that begin a letter of a legacy peer: more than there is room for.
+/// Connections of a local user: silent ones, some with half a hello, some with a hello, and some
+/// that begin a letter of a legacy peer; more than there are slots.
 #[test]
-fn connections_of_a_local_user_keep_out_no_peer_with_keys() {
+fn connections_of_a_local_user_do_not_keep_out_peers_with_keys() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let rules = Rules {
         loopback: false,
@@ -480,7 +481,7 @@ fn connections_of_a_local_user_keep_out_no_peer_with_keys() {
     let address = there.location().address();
     let connect = |said: &[u8]| {
         let mut stream = TcpStream::connect(address).unwrap();
-        // It may be closed already.
+        // The connection may be closed already.
         let _ = stream.write_all(said);
         stream
     };
@@ -498,7 +499,7 @@ fn connections_of_a_local_user_keep_out_no_peer_with_keys() {
     let silent: Vec<TcpStream> = (0..2 * limits.max_strangers)
         .map(|n| connect(&b"fip"[..n % 4]))
         .collect();
-    // One that is pushed out before it has proved who it is tries again.
+    // A connection that is evicted before the handshake is opened again.
     let here = party(rover.security(&[&crex]));
     let gets_in = |attempt| {
         here.send(attempt, there.location(), parcel(1, "let me in"))

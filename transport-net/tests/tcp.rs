@@ -1,4 +1,4 @@
-//! What TCP endpoints do for each other, on loopback.
+//! TCP endpoints on loopback.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -58,7 +58,7 @@ fn big_letters_and_letters_of_many_pieces_arrive_whole_among_small_ones() {
         ];
         for (attempt, letter) in (round * 3..).zip(letters) {
             a.send(attempt, b.location(), letter.clone()).unwrap();
-            // The other direction is not held up.
+            // The other direction is not delayed.
             b.send(attempt, a.location(), parcel(attempt, "y")).unwrap();
         }
     }
@@ -80,7 +80,7 @@ fn big_letters_and_letters_of_many_pieces_arrive_whole_among_small_ones() {
 }
 
 #[test]
-fn one_connection_serves_both_directions_also_for_who_does_not_listen() {
+fn one_connection_serves_both_directions_even_without_a_listener() {
     let silent = Party::judging(config(&[]), Verdict::Now(Answer::Accepted));
     assert_eq!(silent.locations, []);
     let b = Party::new();
@@ -111,7 +111,7 @@ fn another_host_or_domain_is_remote() {
 }
 
 #[test]
-fn a_restarted_peer_is_another_one_and_can_be_reached_again() {
+fn a_restarted_peer_has_another_incarnation_and_is_reachable_again() {
     let a = Party::new();
     let b = Party::new();
     a.assert_reaches(0, &b);
@@ -142,7 +142,7 @@ fn a_restarted_peer_is_another_one_and_can_be_reached_again() {
     assert_eq!(b.arrivals(), 0);
     a.assert_reaches(1, &b);
     let anyone = Location::new(Kind::Tcp, &address).unwrap();
-    a.send(2, &anyone, parcel(2, "whoever is there")).unwrap();
+    a.send(2, &anyone, parcel(2, "any incarnation")).unwrap();
     assert_eq!(a.conclusion(2), accepted());
 }
 
@@ -171,7 +171,7 @@ fn a_connection_kept_open_by_an_unanswered_letter_is_kept_alive() {
     let b = Party::judging(config(&["127.0.0.1:0"]), Verdict::Later);
     a.send(1, b.location(), parcel(1, "x")).unwrap();
     until("the arrival", || (b.arrivals() == 1).then_some(()));
-    // Several times as long as it takes to give up a silent peer.
+    // Several times the time after which a silent peer is given up.
     std::thread::sleep(Duration::from_millis(1200));
     let ticket = b.sink.record.lock().arrivals[0].2;
     b.transport.answer(ticket, Answer::Custody);
@@ -205,7 +205,7 @@ fn both_may_connect_at_the_same_time() {
 }
 
 #[test]
-fn nobody_there_is_told_with_the_address() {
+fn an_unreachable_peer_is_reported_with_its_address() {
     let a = Party::new();
     let listener = tokio::net::TcpSocket::new_v4().unwrap();
     listener.bind("127.0.0.1:0".parse().unwrap()).unwrap();
@@ -229,7 +229,7 @@ fn nobody_there_is_told_with_the_address() {
 }
 
 #[test]
-fn a_port_in_use_is_told_with_address_and_advice() {
+fn a_port_in_use_is_reported_with_address_and_remedy() {
     let a = Party::new();
     let taken = a.location().address();
     let sink = a.sink.clone();
@@ -256,13 +256,13 @@ fn a_port_in_use_is_told_with_address_and_advice() {
 }
 
 #[test]
-fn listening_everywhere_names_addresses_that_lead_back() {
+fn listening_on_all_interfaces_reports_reachable_addresses() {
     let b = Party::with(config(&["0.0.0.0:0", "[::]:0"]));
     assert!(!b.locations.is_empty());
     for location in &b.locations {
         assert!(!location.address().contains("0.0.0.0"), "{location}");
         let anyone = Location::new(Kind::Tcp, location.address()).unwrap();
-        // One service is not taken from several addresses at a time.
+        // The connections of one service do not conflict.
         let a = Party::new();
         a.send(1, &anyone, parcel(1, "x")).unwrap();
         assert_eq!(a.conclusion(1), accepted(), "{location}");
@@ -270,7 +270,7 @@ fn listening_everywhere_names_addresses_that_lead_back() {
 }
 
 #[test]
-fn a_runtime_that_is_gone_is_told() {
+fn a_runtime_that_was_shut_down_is_reported() {
     let (a, b) = (Party::new(), Party::new());
     let orphan = {
         let runtime = common::runtime();
@@ -284,12 +284,12 @@ fn a_runtime_that_is_gone_is_told() {
     assert_eq!(error.fault, WayFault::Closed, "{error}");
 }
 
-/// An address at which the system answers no more, as long as what it returns is kept.
+/// An address at which the system ignores connections while the returned sockets are kept.
 fn silent() -> (socket2::Socket, TcpStream, String) {
     let full = socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::STREAM, None).unwrap();
     full.bind(&SocketAddr::from((Ipv4Addr::LOCALHOST, 0)).into())
         .unwrap();
-    // A queue of one, and it is taken.
+    // The accept queue has one slot, which is taken.
     full.listen(0).unwrap();
     let address = full.local_addr().unwrap().as_socket().unwrap();
     let first = TcpStream::connect(address).unwrap();
@@ -297,18 +297,18 @@ fn silent() -> (socket2::Socket, TcpStream, String) {
 }
 
 #[test]
-fn the_addresses_of_a_service_are_raced_and_its_letters_are_not() {
+fn the_addresses_of_a_service_are_raced_without_duplicating_letters() {
     let (near, far, other) = (Party::new(), Party::new(), Party::new());
     let (_full, _first, silent) = silent();
     let here = far.location();
     let to = Location::new(Kind::Tcp, &silent).unwrap();
     let to = to.with_incarnation(here.incarnation());
-    // Other services are not asked, whatever is said of them.
+    // Addresses of other services are not tried.
     *near.sink.also_at.lock() = vec![other.location().clone(), here.clone()];
     for attempt in 0..20 {
         near.send(attempt, &to, parcel(attempt + 1, "x")).unwrap();
     }
-    // Long before anybody gives the silent address up.
+    // Long before the attempt at the silent address times out.
     for attempt in 0..20 {
         assert_eq!(near.conclusion(attempt), accepted());
     }
@@ -320,7 +320,7 @@ fn the_addresses_of_a_service_are_raced_and_its_letters_are_not() {
     assert_eq!(arrived, (1..=20).collect::<Vec<_>>());
     assert_eq!(other.transport.counters().accepted, 0);
     assert_eq!(far.transport.counters().accepted, 1);
-    // The other address leads there by the same connection.
+    // The other address uses the same connection.
     near.assert_reaches(100, &far);
     assert_eq!(far.transport.counters().accepted, 1);
 }

@@ -1,4 +1,4 @@
-//! The UDP endpoint on loopback: names, and strangers who mean no good.
+//! The UDP endpoint on loopback: names, and hostile peers.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -56,7 +56,7 @@ impl Party {
     }
 }
 
-/// A stranger's socket, connected to an endpoint.
+/// The socket of an unproved peer, connected to an endpoint.
 fn stranger(to: &Party) -> UdpSocket {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     socket.connect(to.location.address()).unwrap();
@@ -76,14 +76,14 @@ fn hello(number: u64, cookie: [u8; 16]) -> Vec<u8> {
 }
 
 #[test]
-fn a_name_leads_to_whichever_of_its_addresses_answers() {
+fn a_name_resolves_to_the_address_that_answers() {
     let (near, far) = (Party::new(), Party::new());
     let port = far.location.address().rsplit_once(':').unwrap().1;
     let named = Location::new(Kind::Udp, &format!("localhost:{port}")).unwrap();
     near.assert_reaches(1, &named);
-    let nobody = Location::new(Kind::Udp, "nobody.invalid:7").unwrap();
+    let unknown = Location::new(Kind::Udp, "nobody.invalid:7").unwrap();
     near.transport
-        .dispatch(AttemptId(2), &nobody, parcel(1, "x"))
+        .dispatch(AttemptId(2), &unknown, parcel(1, "x"))
         .unwrap();
     match near.conclusion(2) {
         Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
@@ -92,7 +92,7 @@ fn a_name_leads_to_whichever_of_its_addresses_answers() {
 }
 
 #[test]
-fn a_flood_of_garbage_stops_nobody_and_leaves_nothing() {
+fn a_flood_of_garbage_blocks_no_peer_and_leaves_no_state() {
     let (near, far) = (Party::new(), Party::new());
     near.assert_reaches(0, &far.location);
     let socket = stranger(&far);
@@ -104,7 +104,7 @@ fn a_flood_of_garbage_stops_nobody_and_leaves_nothing() {
                 bytes[..5].copy_from_slice(b"fipa\x02");
                 bytes[5] %= 8;
             }
-            // What the other side's buffer has no room for is lost.
+            // Datagrams beyond the receive buffer are lost.
             let _ = socket.send(&bytes);
         }
         near.assert_reaches(round, &far.location);
@@ -133,7 +133,7 @@ fn hellos_without_a_cookie_take_no_memory_and_get_little() {
     near.assert_reaches(1, &far.location);
 }
 
-/// A connection as a rogue opens it; and the number that it has at the other side.
+/// Opens a connection as a hostile peer. Returns it with its number at the other side.
 fn introduced(to: &Party, incarnation: u64) -> (UdpSocket, u64) {
     let socket = stranger(to);
     let mut reply = [0; 2048];
@@ -164,7 +164,7 @@ fn packet(to: u64, number: u64, frames: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn nonsense_after_the_handshake_ends_the_connection_and_no_other() {
+fn a_malformed_packet_after_the_handshake_ends_only_its_connection() {
     let (near, far) = (Party::new(), Party::new());
     near.assert_reaches(0, &far.location);
     let mut acknowledgement = vec![1];
@@ -194,7 +194,7 @@ fn letters_that_wait_for_one_that_never_comes_take_bounded_memory() {
     let (near, far) = (Party::new(), Party::with(narrow));
     near.assert_reaches(0, &far.location);
     let (many, large) = (introduced(&far, 1), introduced(&far, 2));
-    // Never the first one. What the other side's buffer has no room for is lost.
+    // Never the first one. Datagrams beyond the receive buffer are lost.
     for id in 2..5_000_u64 {
         for ((socket, number), len) in [(&many, 1), (&large, 60_000)] {
             let body = written(&parcel(id, vec![0; len]));
@@ -208,10 +208,10 @@ fn letters_that_wait_for_one_that_never_comes_take_bounded_memory() {
     let counters = far.transport.counters();
     assert_eq!(counters.connections, 3);
     let waiting = counters.parcels_in - near.transport.counters().parcels_out;
-    // So many letters of the one, and what 1 MiB holds of the other's.
+    // The maximum number of letters of one peer, and 1 MiB of letters of the other.
     let most = 64 + (1 << 20) / 60_000;
     assert!((65..=most).contains(&waiting), "{waiting} of {most}");
-    // None was handed on before its turn.
+    // No letter was delivered before its turn.
     assert_eq!(far.sink.record.lock().arrivals.len(), 10);
     near.assert_reaches(1, &far.location);
 }
@@ -221,7 +221,7 @@ fn a_peer_that_stops_answering_is_given_up() {
     let mut impatient = udp_config(&["127.0.0.1:0"]);
     impatient.limits.connect_timeout = Duration::from_millis(300);
     let near = Party::with(impatient);
-    // Somebody who receives and never says a word.
+    // A peer that receives and never sends.
     let mute = UdpSocket::bind("127.0.0.1:0").unwrap();
     let to = Location::new(Kind::Udp, &mute.local_addr().unwrap().to_string()).unwrap();
     for attempt in 0..3 {
@@ -239,14 +239,14 @@ fn a_peer_that_stops_answering_is_given_up() {
 }
 
 #[test]
-fn a_peer_that_is_gone_is_noticed_when_the_system_says_so() {
+fn an_unreachable_peer_is_detected_by_an_error_of_the_system() {
     let near = Party::new();
     let far = Party::new();
     near.assert_reaches(1, &far.location);
     let gone = far.location.clone();
     drop(far);
     let port = gone.address().to_owned();
-    // Nobody is there now; nor does another socket take the port meanwhile.
+    // The peer is gone, and no other socket takes its port meanwhile.
     let same = UdpSocket::bind(&port).unwrap();
     same.connect(same.local_addr().unwrap()).unwrap();
     let sent = near
@@ -255,7 +255,7 @@ fn a_peer_that_is_gone_is_noticed_when_the_system_says_so() {
         .map(|()| near.conclusion(2));
     match sent {
         Ok(Conclusion::NotSent(error)) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
-        // Its goodbye was overtaken by the letter.
+        // The letter was sent before the goodbye arrived.
         Ok(Conclusion::Unconfirmed(error)) => assert_eq!(error.fault, WayFault::Broken, "{error}"),
         other => panic!("{other:?}"),
     }

@@ -1,4 +1,4 @@
-//! What endpoints over Unix domain sockets do for each other.
+//! Endpoints over Unix domain sockets.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -32,7 +32,7 @@ fn sockets(directory: &Path) -> Vec<PathBuf> {
     entries.map(|entry| entry.unwrap().path()).collect()
 }
 
-/// A directory whose path is longer than the address of a socket can be.
+/// A directory whose path is longer than a socket address can be.
 fn long(home: &Path) -> PathBuf {
     let path = home.join("d".repeat(200)).join("e".repeat(200));
     fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -90,7 +90,7 @@ fn a_directory_that_others_may_enter_is_not_used() {
 /// Set for the process that the test starts as another user: the socket to connect to.
 const CONNECT: &str = "FIPA_TEST_CONNECT";
 
-/// Not a test of its own: connects, and waits until the other side hangs up.
+/// Not a test of its own: connects, and waits until the other side closes the connection.
 #[test]
 fn as_another_user() {
     let Some(path) = std::env::var_os(CONNECT) else {
@@ -113,11 +113,11 @@ fn a_process_of_another_user_is_refused() {
     let directory = home.path().join("unix");
     let a = party(&directory);
     let socket = directory.join(a.location().address());
-    // As if an administrator had opened what is private.
+    // As if an administrator had made the private directory accessible.
     for (path, mode) in [(home.path(), 0o711), (&directory, 0o711), (&socket, 0o666)] {
         fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
     }
-    // Where other users can execute it.
+    // A place where other users can execute it.
     let program = home.path().join("program");
     fs::copy(std::env::current_exe().unwrap(), &program).unwrap();
     fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
@@ -125,7 +125,10 @@ fn a_process_of_another_user_is_refused() {
     let other = other.args(["--exact", "as_another_user"]);
     let other = other.env(CONNECT, &socket).current_dir("/");
     let ended = other.uid(65534).gid(65534).stdout(Stdio::null()).status();
-    assert!(ended.unwrap().success(), "the other user is not hung up on");
+    assert!(
+        ended.unwrap().success(),
+        "the connection of the other user stays open"
+    );
     assert_eq!(a.transport.counters().refused_unproved, 1);
     assert_eq!(a.transport.counters().accepted, 0);
 }
@@ -143,7 +146,7 @@ fn sockets_of_dead_processes_are_removed_and_those_of_others_are_not() {
     until("the dead socket to go", || (!dead.exists()).then_some(()));
     assert!(directory.join("notes").exists());
     drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
-    // One that starts does the same.
+    // A starting process does the same.
     let b = party(&directory);
     assert!(!dead.exists());
     a.assert_reaches(1, &b);
@@ -151,7 +154,7 @@ fn sockets_of_dead_processes_are_removed_and_those_of_others_are_not() {
 }
 
 #[test]
-fn an_endpoint_whose_socket_was_removed_makes_it_again_and_keeps_its_connections() {
+fn a_removed_socket_is_created_again_and_connections_stay() {
     let home = tempfile::tempdir().unwrap();
     let directory = home.path().join("unix");
     let (a, b) = (party(&directory), party(&directory));
@@ -194,7 +197,7 @@ fn no_path_is_an_address() {
 }
 
 #[test]
-fn the_end_of_the_other_side_is_noticed_and_an_answer_is_not_made_up() {
+fn the_end_of_the_other_side_is_reported_without_an_invented_answer() {
     let home = tempfile::tempdir().unwrap();
     let directory = home.path().join("unix");
     let a = party(&directory);

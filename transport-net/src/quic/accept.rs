@@ -1,4 +1,4 @@
-//! The listening side: handshakes, and who is refused.
+//! The listening side: handshakes and refusals.
 
 use std::io;
 use std::sync::Arc;
@@ -9,11 +9,11 @@ use quinn::{Connection, ConnectionError, Incoming, RecvStream, SendStream};
 use tokio::time::timeout;
 
 use super::dial::ends;
-use super::sockets::{Sockets, why_lost};
-use crate::seldom::warn_seldom;
-use crate::stream::endpoint::{Endpoint, Stranger};
+use super::sockets::{Sockets, loss_reason};
+use crate::log_limit::warn_limited;
+use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
-use crate::stream::link::Running;
+use crate::stream::link::LinkTask;
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 
@@ -24,49 +24,48 @@ pub(super) async fn accept(
     socket: quinn::Endpoint,
 ) {
     while let Some(incoming) = socket.accept().await {
-        // When many knock, whoever gives a false address is sent away without memory being taken
-        // (RFC 9000 section 8.1.2).
+        // With many pending handshakes, a source address is validated before memory is allocated
+        // for it (RFC 9000 section 8.1.2).
         if endpoint.is_crowded() && !incoming.remote_address_validated() {
             if let Err(error) = incoming.retry() {
-                tracing::debug!(%error, "a handshake that cannot be begun again");
+                tracing::debug!(%error, "cannot request another handshake with address validation");
             }
             continue;
         }
-        let Some(place) = endpoint.receive_stranger(Source::Address(incoming.remote_address()))
-        else {
+        let Some(slot) = endpoint.admit_unproved(Source::Address(incoming.remote_address())) else {
             return;
         };
-        let number = place.number;
-        let task = receive(endpoint.clone(), sockets.clone(), place, incoming);
+        let number = slot.number;
+        let task = receive(endpoint.clone(), sockets.clone(), slot, incoming);
         let task = tokio::spawn(task).abort_handle();
-        endpoint.stranger_started(number, task);
+        endpoint.unproved_started(number, task);
     }
 }
 
 async fn receive(
     endpoint: Arc<Endpoint>,
     sockets: Arc<Sockets>,
-    place: Stranger,
+    slot: UnprovedSlot,
     incoming: Incoming,
 ) {
     let from = incoming.remote_address();
     let patience = endpoint.limits().handshake_timeout;
-    let shaken = match timeout(patience, shake(&sockets, incoming)).await {
+    let handshake_result = match timeout(patience, handshake(&sockets, incoming)).await {
         Ok(Ok((connection, send, receive))) => match sockets.certificate(&connection) {
             Some(certificate) => Ok((connection, send, receive, certificate)),
-            None => Err("the peer's certificate is not trusted any more".to_owned()),
+            None => Err("the peer's certificate is no longer trusted".to_owned()),
         },
         Ok(Err(error)) => Err(error.to_string()),
         Err(_) => Err(format!(
-            "no handshake within {patience:?} (handshake_timeout)"
+            "handshake not complete within {patience:?} (handshake_timeout)"
         )),
     };
-    let (connection, send, receive, certificate) = match shaken {
-        Ok(shaken) => shaken,
+    let (connection, send, receive, certificate) = match handshake_result {
+        Ok(handshake_result) => handshake_result,
         Err(why) => {
             let counter = &endpoint.tally().refused_unproved;
             let before = counter.fetch_add(1, Ordering::Relaxed);
-            warn_seldom(before, format_args!("{from}: connection refused: {why}"));
+            warn_limited(before, format_args!("{from}: connection refused: {why}"));
             return;
         }
     };
@@ -78,17 +77,17 @@ async fn receive(
     let reader = FrameReader::new(max_letter, BytesMut::new());
     let ends = ends(&connection, send, receive, max_letter);
     drop(connection);
-    Running::new(endpoint, link, sink, None)
-        .serve(ends, proof, reader, Source::Address(from), || drop(place))
+    LinkTask::new(endpoint, link, sink, None)
+        .serve(ends, proof, reader, Source::Address(from), || drop(slot))
         .await;
 }
 
-/// The handshake, and the stream that the peer opens first.
-async fn shake(
+/// Performs the handshake, and accepts the first stream of the peer.
+async fn handshake(
     sockets: &Sockets,
     incoming: Incoming,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| io::Error::other(why_lost(&error));
+    let told = |error: ConnectionError| io::Error::other(loss_reason(&error));
     let connection = sockets.accept(incoming)?.await.map_err(told)?;
     let (send, receive) = connection.accept_bi().await.map_err(told)?;
     Ok((connection, send, receive))

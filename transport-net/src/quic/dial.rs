@@ -1,4 +1,4 @@
-//! The calling side: opening a connection to a location.
+//! The dialling side: opens a connection to a location.
 
 use std::io;
 use std::net::SocketAddr;
@@ -9,18 +9,18 @@ use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
 use quinn::{Connection, ConnectionError, RecvStream, SendStream};
 
-use super::sockets::{Sockets, why_lost};
+use super::sockets::{Sockets, loss_reason};
 use super::streams::{Control, Letters, Outgoing};
-use crate::end::End;
+use crate::end::ConnectionEnd;
+use crate::stream::dialing::{addresses, reach};
 use crate::stream::endpoint::Endpoint;
 use crate::stream::frame::FrameReader;
-use crate::stream::link::{Link, Running};
+use crate::stream::link::{Link, LinkTask};
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire::{Reading, Writing};
-use crate::tcp::dial::{addresses, reach};
 
-/// Opens the connection of a link that has been made up, and serves it.
+/// Opens the connection of a new link, and serves it.
 pub(super) async fn dial(
     endpoint: Arc<Endpoint>,
     sockets: Arc<Sockets>,
@@ -30,7 +30,7 @@ pub(super) async fn dial(
 ) {
     let limits = endpoint.limits().clone();
     let addresses = addresses(&*sink, &to);
-    let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
+    let running = LinkTask::new(endpoint, link.clone(), sink, Some(to.clone()));
     let by = sockets.clone();
     let connect = move |address| connect(by.clone(), address);
     let (connection, send, receive) = match reach(&limits, &link, &to, addresses, connect).await {
@@ -38,8 +38,8 @@ pub(super) async fn dial(
         Err(end) => return running.fail(end),
     };
     let Some(certificate) = sockets.certificate(&connection) else {
-        let what = "the peer's certificate is not trusted any more";
-        return running.fail(End::unreachable(&to, &what));
+        let what = "the peer's certificate is no longer trusted";
+        return running.fail(ConnectionEnd::unreachable(&to, &what));
     };
     link.connected(Instant::now());
     let from = connection.remote_address();
@@ -55,13 +55,13 @@ async fn connect(
     sockets: Arc<Sockets>,
     address: SocketAddr,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| io::Error::other(why_lost(&error));
+    let told = |error: ConnectionError| io::Error::other(loss_reason(&error));
     let connection = sockets.dial(address)?.await.map_err(told)?;
     let (send, receive) = connection.open_bi().await.map_err(told)?;
     Ok((connection, send, receive))
 }
 
-/// What a link reads from and writes to.
+/// Returns the wire of a connection.
 pub(super) fn ends(
     connection: &Connection,
     send: SendStream,
@@ -69,6 +69,10 @@ pub(super) fn ends(
     max_letter: usize,
 ) -> (Reading, Writing) {
     let letters = Box::new(Letters::new(connection, max_letter));
-    let reading = Reading::Quic(Control::new(connection, receive), Some(letters));
-    (reading, Writing::Quic(Outgoing::new(connection, send)))
+    let control = Box::new(Control::new(connection, receive));
+    let outgoing = Box::new(Outgoing::new(connection, send));
+    (
+        Reading::Streams(control, Some(letters)),
+        Writing::Streams(outgoing),
+    )
 }

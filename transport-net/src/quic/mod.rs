@@ -1,23 +1,24 @@
 //! Letters over QUIC (RFC 9000), each in a stream of its own.
 //!
-//! Frames, hello, limits and the account of parcels are those of [`crate::stream`], trust is that of
-//! TCP with TLS ([`crate::secure`]); here is what differs: sockets, how connections are made, and which streams
-//! frames go in.
+//! Frames, hello, limits and the states of parcels are those of [`crate::stream`], trust is that of
+//! TCP with TLS ([`crate::secure`]). This module contains the differences: sockets, the opening of
+//! connections, and the assignment of frames to streams.
 //!
 //! * [`streams`]: the streams of one connection.
-//! * [`sockets`]: the sockets of an endpoint, and what is agreed upon with peers.
-//! * [`dial`] and [`accept`] make connections.
+//! * [`sockets`]: the sockets of an endpoint, and the handshake.
+//! * `settings`: transport parameters.
+//! * [`dial`] and [`accept`] open connections.
 //!
-//! A connection outlives a change of address of the side that dialled: peers go by its number, and
-//! follow it once the new address has been proved to be on its way (RFC 9000 section 9). When the
-//! side that was dialled moves, it falls silent and is dialled anew. Datagrams are not used, nor is
-//! early data, which could be replayed.
+//! A connection survives a change of address of the dialling side: peers identify it by its number,
+//! and follow it once the new address has been validated (RFC 9000 section 9). When the accepting
+//! side moves, it falls silent and is dialled again. Datagrams are not used, nor is early data,
+//! which could be replayed.
 
 mod accept;
 mod dial;
 mod settings;
 mod sockets;
-pub(crate) mod streams;
+mod streams;
 
 use std::sync::Arc;
 
@@ -38,23 +39,23 @@ use crate::{Counters, Identity, Limits};
 pub struct QuicConfig {
     /// Numeric addresses to listen on, as for [`TcpConfig::listen`](crate::TcpConfig::listen).
     pub listen: Vec<String>,
-    /// How this endpoint introduces itself.
+    /// Identity of this endpoint.
     pub identity: Identity,
-    /// What it takes and how long it waits. Beside it a connection holds at most 33 MiB that have
-    /// arrived and are not read, and 8 MiB that were sent and are not acknowledged.
+    /// Limits and timeouts. In addition, a connection holds at most 33 MiB of unread and 8 MiB of
+    /// unacknowledged bytes.
     pub limits: Limits,
-    /// What this host is known by, and whom it knows. QUIC is never spoken without; its rules leave
-    /// nobody out here.
+    /// Credentials and trust. QUIC always requires them; the exceptions of its rules do not apply
+    /// here.
     pub security: Security,
 }
 
-/// Carries parcels over QUIC, between services that have proved to each other who they are.
+/// Carries parcels over QUIC, between services that have proved their identity to each other.
 ///
-/// An address is what it is for [`TcpTransport`](crate::TcpTransport); connections are kept, shared
-/// and closed as there.
+/// Addresses have the form that they have for [`TcpTransport`](crate::TcpTransport); connections
+/// are kept, shared and closed in the same way.
 ///
-/// Dropping it closes it. After [`close`](Transport::close) the attempts are concluded by the
-/// runtime's threads, so the runtime must live on for a moment.
+/// Dropping it closes it. After [`close`](Transport::close) the threads of the runtime conclude the
+/// attempts, so the runtime must run a moment longer.
 #[derive(Debug)]
 pub struct QuicTransport {
     listen: Vec<String>,
@@ -63,8 +64,8 @@ pub struct QuicTransport {
 }
 
 impl QuicTransport {
-    /// An endpoint that does its work on `runtime`, which must have input, output and time
-    /// enabled. Nothing is opened before `listen`.
+    /// Creates an endpoint that runs its tasks on `runtime`, which must have I/O and time enabled.
+    /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: QuicConfig, runtime: Handle) -> Self {
         let QuicConfig {
@@ -87,7 +88,7 @@ impl QuicTransport {
         }
     }
 
-    /// What happened so far.
+    /// Returns the counters of this endpoint.
     #[must_use]
     pub fn counters(&self) -> Counters {
         self.endpoint.tally().read()

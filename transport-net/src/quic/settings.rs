@@ -1,4 +1,4 @@
-//! What is agreed upon with peers: windows, streams, and how long silence lasts.
+//! Transport parameters: windows, streams and timeouts.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,51 +9,51 @@ use quinn::{ClientConfig, Connection, IdleTimeout, ServerConfig, TransportConfig
 use crate::Limits;
 use crate::secure::Security;
 
-/// What both sides have to speak (RFC 7301).
+/// The ALPN protocol name (RFC 7301).
 const PROTOCOL: &[u8] = b"fipa/1";
 
-/// Letters that may arrive at the same time on a connection with a whole window. They are read one after the other, so more would only
-/// wait.
+/// Maximum number of concurrent parcel streams of a connection with the usual window. Parcels are
+/// read one after the other, so more would only wait.
 const STREAMS: u32 = 64;
 
-/// Bytes of one letter that may wait to be read: what is under way at 50 MB/s in 10 ms.
+/// Maximum number of unread bytes of one parcel: the bytes in flight at 50 MB/s and 10 ms.
 const STREAM_WINDOW: u32 = 512 << 10;
 
-/// Bytes that may wait to be read in all. Each of the streams may fill its own window, and there is
-/// room for another: otherwise letters that wait for their turn could keep the one whose turn it is
-/// from arriving.
+/// Maximum number of unread bytes of a connection. Each stream may fill its own window, and there
+/// is room for another one: otherwise waiting parcels could block the one that is read next.
 const WINDOW: u32 = (STREAMS + 1) * STREAM_WINDOW;
 
-/// Letters and bytes of a connection that has no share of the budget for whole windows.
+/// Streams and bytes of a connection without a reservation for the usual window.
 const FIRST_STREAMS: u32 = 2;
 const FIRST_WINDOW: u32 = (FIRST_STREAMS + 1) * STREAM_WINDOW;
 
-/// What a connection with a whole window takes of the budget.
+/// Bytes to reserve for the usual window, beyond the minimum.
 pub(super) const WIDENING: usize = (WINDOW - FIRST_WINDOW) as usize;
 
-/// Gives a connection its whole window.
+/// Increases the receive window of a connection to its usual size.
 pub(super) fn widen(connection: &Connection) {
     connection.set_receive_window(VarInt::from_u32(WINDOW));
     connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS));
 }
 
-/// Bytes that were sent and are not acknowledged.
+/// Maximum number of sent and unacknowledged bytes.
 const SEND_WINDOW: u64 = 8 << 20;
 
-/// Round trip that is assumed before one was measured: a lost first packet is repeated after three times
-/// as long. The default of 333 ms is that of the Internet; here are networks of robots.
+/// Assumed round-trip time before the first measurement: a lost first packet is retransmitted after
+/// three times this time. quinn's default of 333 ms is meant for the Internet; this transport is
+/// used in local networks.
 const INITIAL_RTT: Duration = Duration::from_millis(100);
 
-/// Handshakes of which the first packet has come and nothing been done yet; more are refused.
+/// Maximum number of handshakes of which only the first packet has arrived; more are refused.
 const MAX_INCOMING: usize = 256;
 
-/// Bytes that are kept of each of those, and of all.
+/// Maximum number of bytes buffered for each of those handshakes, and for all of them.
 const INCOMING_BUFFER: u64 = 16 << 10;
 const INCOMING_BUFFERS: u64 = 1 << 20;
 
 pub(super) fn transport(limits: &Limits) -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
-    // Frames ask for signs of life; this is for peers that die in the middle of a handshake.
+    // Ping frames detect silent peers; this timeout detects peers that fail during the handshake.
     let silence = (limits.keep_alive * 4).max(limits.handshake_timeout);
     let silence = IdleTimeout::try_from(silence).unwrap_or_else(|_| VarInt::MAX.into());
     transport
@@ -62,7 +62,7 @@ pub(super) fn transport(limits: &Limits) -> Arc<TransportConfig> {
         .stream_receive_window(VarInt::from_u32(STREAM_WINDOW))
         .receive_window(VarInt::from_u32(FIRST_WINDOW))
         .send_window(SEND_WINDOW)
-        // The letter that is read first is sent first.
+        // The parcel that is read first is sent first.
         .send_fairness(false)
         .datagram_receive_buffer_size(None)
         .initial_rtt(INITIAL_RTT)
@@ -70,7 +70,7 @@ pub(super) fn transport(limits: &Limits) -> Arc<TransportConfig> {
     Arc::new(transport)
 }
 
-/// How this side accepts, with the keys it has now.
+/// Returns the configuration for accepting, with the present credentials.
 pub(super) fn server(
     security: &Security,
     transport: &Arc<TransportConfig>,
@@ -87,7 +87,7 @@ pub(super) fn server(
     Ok(server)
 }
 
-/// How this side dials, with the keys it has now.
+/// Returns the configuration for dialling, with the present credentials.
 pub(super) fn client(
     security: &Security,
     transport: &Arc<TransportConfig>,

@@ -1,7 +1,7 @@
-//! The sockets of an endpoint: those it listens on, and one per family from which it dials.
+//! The sockets of an endpoint: the listening ones, and one per address family for dialling.
 //!
-//! The latter are bound to no address, so that packets leave from whichever the host has: after a
-//! change of address connections go on.
+//! The latter are bound to no address, so that packets leave from any address of the host:
+//! connections survive a change of address.
 
 use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -25,7 +25,7 @@ use crate::{Limits, address};
 pub(super) struct Sockets {
     pub(super) security: Security,
     transport: Arc<TransportConfig>,
-    /// Over IPv4 and over IPv6, once they are needed.
+    /// For IPv4 and IPv6; opened on demand.
     dialling: Mutex<[Option<Endpoint>; 2]>,
 }
 
@@ -38,7 +38,7 @@ impl Sockets {
         }
     }
 
-    /// Listens on an address of the configuration. Returns the address that the socket is bound to.
+    /// Listens on a configured address. Returns the address that the socket is bound to.
     pub(super) fn listen(&self, text: &str) -> Result<(Endpoint, SocketAddr), ListenError> {
         let unavailable = |error: String| ListenError::Unavailable(error);
         let bind = address::numeric(text).map_err(|error| unavailable(error.to_string()))?;
@@ -53,7 +53,7 @@ impl Sockets {
         Ok((socket, bound))
     }
 
-    /// Goes on with the handshake of a peer.
+    /// Continues the handshake of a peer.
     pub(super) fn accept(&self, incoming: Incoming) -> io::Result<Connecting> {
         let server = settings::server(&self.security, &self.transport).map_err(io::Error::other)?;
         incoming
@@ -61,7 +61,7 @@ impl Sockets {
             .map_err(io::Error::from)
     }
 
-    /// Begins a handshake with whoever is there.
+    /// Begins a handshake with the peer at this address.
     pub(super) fn dial(&self, to: SocketAddr) -> io::Result<Connecting> {
         let client = settings::client(&self.security, &self.transport).map_err(io::Error::other)?;
         let socket = {
@@ -76,34 +76,35 @@ impl Sockets {
                 None => place.insert(endpoint(None, open(any)?)?).clone(),
             }
         };
-        // Neither told to the peer nor compared with anything: who is there says the certificate.
+        // The name is neither sent nor verified: the certificate identifies the peer.
         let name = to.ip().to_string();
         socket
             .connect_with(client, to, &name)
             .map_err(io::Error::other)
     }
 
-    /// What a peer has proved.
+    /// Returns the trusted certificate that a peer has presented.
     pub(super) fn certificate(&self, connection: &quinn::Connection) -> Option<Certificate> {
         let presented = connection.peer_identity()?;
         let presented = presented.downcast::<Vec<CertificateDer<'static>>>().ok()?;
         self.security.peer(Some(&presented))
     }
 
-    /// Lets go of the sockets; connections that are ending keep them for that long.
+    /// Releases the sockets; connections that are closing keep them until they have ended.
     pub(super) fn close(&self) {
         *self.dialling.lock() = [None, None];
     }
 }
 
-/// Why there is no connection, and what to do where that is about certificates.
-pub(super) fn why_lost(error: &ConnectionError) -> String {
+/// Returns the reason for which a connection is lost, with a remedy if it is about certificates.
+pub(super) fn loss_reason(error: &ConnectionError) -> String {
     let (code, finder) = match error {
         ConnectionError::TransportError(error) => (u64::from(error.code), Finder::Here),
         ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),
         other => return other.to_string(),
     };
-    // Of the error of TLS, quinn keeps the text and the alert, which is that of an expired one.
+    // quinn only keeps the text and the alert of a TLS error, and the alert is that of an expired
+    // certificate.
     if let ConnectionError::TransportError(failed) = error
         && failed.reason.ends_with("NotValidYet")
     {
@@ -128,7 +129,7 @@ fn open(address: SocketAddr) -> io::Result<UdpSocket> {
 
 fn endpoint(server: Option<ServerConfig>, socket: UdpSocket) -> io::Result<Endpoint> {
     let mut config = EndpointConfig::default();
-    // RFC 9000, and none of the drafts before it.
+    // Only version 1 (RFC 9000), no drafts.
     config.supported_versions(vec![1]);
     Endpoint::new(config, server, socket, Arc::new(TokioRuntime))
 }

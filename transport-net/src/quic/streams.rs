@@ -1,10 +1,10 @@
 //! The streams of one connection.
 //!
-//! The side that dialled opens one stream in both directions, for hello, answers, signs of life and
-//! goodbye. Every parcel goes in a stream of its own, in the order in which the streams are opened,
-//! and is read in that order: letters to one location have to arrive so. Streams that have arrived
-//! and are not read yet wait in the windows of [`super::settings`]. So an answer never waits behind
-//! a letter on the wire, and of one that is lost nothing is sent again but itself.
+//! The dialling side opens one bidirectional stream for hello, answers, pings and goodbye. Every
+//! parcel has a stream of its own. Parcels are read in the order in which their streams were
+//! opened, because letters to one location must arrive in order. Streams that have arrived and are
+//! not read yet wait in the windows of [`super::settings`]. So an answer never waits behind a
+//! letter on the wire, and a lost packet only delays its own letter.
 
 use std::future::{pending, poll_fn};
 use std::io::{self, IoSlice};
@@ -17,15 +17,15 @@ use parking_lot::Mutex;
 use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
 use super::settings;
-use super::sockets::why_lost;
+use super::sockets::loss_reason;
 use crate::stream::frame::{self, FrameReader, Space};
-use crate::stream::place::Room;
+use crate::stream::wire::{BoxFuture, ControlStream, ParcelStreams, StreamWriter};
 
-/// Answers go before letters.
+/// Priority of the control stream: answers precede letters.
 const URGENT: i32 = 1;
 
-/// The stream of everything but letters, as it is read.
-pub(crate) struct Control {
+/// The receiving side of the control stream.
+pub(super) struct Control {
     connection: Connection,
     stream: RecvStream,
 }
@@ -36,7 +36,7 @@ impl Control {
         Self { connection, stream }
     }
 
-    pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
+    async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match fill(&mut self.stream, space).await {
             Ok(Some(len)) => Ok(len),
             Ok(None) | Err(ReadError::ConnectionLost(ConnectionError::ApplicationClosed(_))) => {
@@ -46,29 +46,37 @@ impl Control {
             Err(error) => Err(error.into()),
         }
     }
+}
 
-    /// Gives the connection its whole window, if there is room for that many bytes.
-    pub(crate) fn widen(&self, take: impl FnOnce(usize) -> Option<Room>) -> Option<Room> {
-        let room = take(settings::WIDENING)?;
-        settings::widen(&self.connection);
-        Some(room)
+impl ControlStream for Control {
+    fn read<'a>(&'a mut self, space: &'a mut Space<'_>) -> BoxFuture<'a, io::Result<usize>> {
+        Box::pin(self.read(space))
     }
 
-    /// Waits until the peer has closed the connection.
-    pub(crate) async fn drain(&mut self) {
-        self.connection.closed().await;
+    fn extra_window(&self) -> usize {
+        settings::WIDENING
+    }
+
+    fn widen(&self) {
+        settings::widen(&self.connection);
+    }
+
+    fn drain(&mut self) -> BoxFuture<'_, ()> {
+        Box::pin(async {
+            self.connection.closed().await;
+        })
     }
 }
 
 impl Drop for Control {
     fn drop(&mut self) {
-        // Whoever was to read what is still on its way has had the time.
+        // The peer has had time to read the bytes that are still on their way.
         self.connection.close(VarInt::from_u32(0), b"");
     }
 }
 
-/// The streams of the peer's letters.
-pub(crate) struct Letters {
+/// The streams of the peer's parcels.
+pub(super) struct Letters {
     connection: Connection,
     stream: Option<RecvStream>,
     reader: FrameReader,
@@ -83,14 +91,9 @@ impl Letters {
         }
     }
 
-    /// The frames that are read.
-    pub(crate) fn reader(&mut self) -> &mut FrameReader {
-        &mut self.reader
-    }
-
-    /// Reads what has arrived of the letter whose turn it is. Waits for ever when the connection is
-    /// lost: why is read from the other stream, with what the peer said before.
-    pub(crate) async fn read(&mut self) -> io::Result<usize> {
+    /// Reads the available bytes of the current parcel. Never completes after the connection is
+    /// lost: the control stream reports the loss after the frames that precede it.
+    async fn read(&mut self) -> io::Result<usize> {
         loop {
             let stream = match &mut self.stream {
                 Some(stream) => stream,
@@ -102,7 +105,7 @@ impl Letters {
             match fill(stream, &mut self.reader.space()).await {
                 Ok(Some(len)) => return Ok(len),
                 Ok(None) if self.reader.is_partial() => {
-                    let what = "a stream that ended in the middle of a letter";
+                    let what = "a stream ended in the middle of a letter";
                     return Err(io::Error::new(io::ErrorKind::InvalidData, what));
                 }
                 Ok(None) => self.stream = None,
@@ -113,15 +116,25 @@ impl Letters {
     }
 }
 
-/// Puts what has arrived into the space; nothing more comes after `None`.
+impl ParcelStreams for Letters {
+    fn read(&mut self) -> BoxFuture<'_, io::Result<usize>> {
+        Box::pin(self.read())
+    }
+
+    fn reader(&mut self) -> &mut FrameReader {
+        &mut self.reader
+    }
+}
+
+/// Copies the available bytes into the space. Returns `None` at the end of the stream.
 async fn fill(stream: &mut RecvStream, space: &mut Space<'_>) -> Result<Option<usize>, ReadError> {
     let chunk = stream.read_chunk(space.room(), true).await?;
     Ok(chunk.map(|chunk| space.fill(&chunk.bytes)))
 }
 
-/// Reading or writing, whichever notices first: why says the connection.
+/// Returns the error of a lost connection.
 fn lost(error: &ConnectionError) -> io::Error {
-    io::Error::other(why_lost(error))
+    io::Error::other(loss_reason(error))
 }
 
 fn not_written(error: WriteError) -> io::Error {
@@ -131,9 +144,9 @@ fn not_written(error: WriteError) -> io::Error {
     }
 }
 
-/// Where a link writes its frames, one after the other.
+/// The sending side of a connection, which takes frames one after the other.
 #[derive(Debug)]
-pub(crate) struct Outgoing {
+pub(super) struct Outgoing {
     connection: Connection,
     state: Mutex<State>,
 }
@@ -141,20 +154,20 @@ pub(crate) struct Outgoing {
 #[derive(Debug)]
 struct State {
     control: SendStream,
-    /// The stream of the letter that has begun, or one for the next.
+    /// The stream of the parcel that has begun, or a stream for the next one.
     letter: Option<SendStream>,
-    /// The number of the last of those.
+    /// The number of the latest of these streams.
     latest: Option<u64>,
     /// The frame that has begun.
     begun: Option<Begun>,
-    /// What the next byte waits for.
+    /// The stream that the next byte waits for.
     blocked: Lane,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Begun {
     lane: Lane,
-    /// Bytes that are missing.
+    /// Number of missing bytes.
     left: u64,
 }
 
@@ -166,7 +179,7 @@ enum Lane {
 
 impl Outgoing {
     pub(super) fn new(connection: &Connection, control: SendStream) -> Self {
-        // An error would mean that the connection is lost, which the next write finds out.
+        // An error means that the connection is lost, which the next write reports.
         let _ = control.set_priority(URGENT);
         Self {
             connection: connection.clone(),
@@ -180,38 +193,12 @@ impl Outgoing {
         }
     }
 
-    /// The address of this host that the peer dialled. A connection that this side dialled has none:
-    /// it goes on from another address (RFC 9000 section 9).
-    pub(crate) fn local_ip(&self) -> Option<IpAddr> {
-        self.connection.local_ip()
-    }
-
-    /// Takes what there is room for.
-    pub(crate) fn write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
-        let mut state = self.state.lock();
-        let mut taken = 0;
-        for slice in slices {
-            let mut rest: &[u8] = slice;
-            while !rest.is_empty() {
-                match self.put(&mut state, rest) {
-                    Ok(len) => {
-                        taken += len;
-                        rest = rest.get(len..).unwrap_or_default();
-                    }
-                    Err(_) if taken > 0 => return Ok(taken),
-                    Err(error) => return Err(error),
-                }
-            }
-        }
-        Ok(taken)
-    }
-
-    /// Takes some of these bytes, which are of one frame, and perhaps of those behind it.
+    /// Writes some of these bytes, which begin within or at the start of one frame.
     fn put(&self, state: &mut State, bytes: &[u8]) -> io::Result<usize> {
         let begun = match state.begun {
             Some(begun) => begun,
             None => {
-                // Frames of ours begin with their whole header in one piece.
+                // Frames of this side begin with their whole header in one piece.
                 let (is_parcel, left) = frame::begun(bytes).ok_or(io::ErrorKind::InvalidInput)?;
                 let lane = if is_parcel {
                     Lane::Letter
@@ -237,7 +224,7 @@ impl Outgoing {
         let wanted = bytes.get(..most).unwrap_or(bytes);
         let taken = match Pin::new(stream).poll_write(&mut context, wanted) {
             Poll::Ready(taken) => taken.map_err(not_written)?,
-            // Another frame may come before this one, if it has not begun.
+            // Another frame may precede this one, if it has not begun.
             Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
         };
         let left = begun.left.saturating_sub(taken as u64);
@@ -251,8 +238,8 @@ impl Outgoing {
         Ok(taken)
     }
 
-    /// Waits until there is room for what was not taken.
-    pub(crate) async fn writable(&self) -> io::Result<()> {
+    /// Waits until there is room for the bytes that were not taken.
+    async fn writable(&self) -> io::Result<()> {
         let opens = {
             let state = self.state.lock();
             state.blocked == Lane::Letter && state.letter.is_none()
@@ -261,8 +248,8 @@ impl Outgoing {
             let opened = self.connection.open_uni().await;
             let opened = opened.map_err(|error| lost(&error))?;
             let mut state = self.state.lock();
-            // Another thread may have had a later one meanwhile. Then this one ends without a byte,
-            // which its reader passes over: letters are read in the order of their streams.
+            // Another thread may have opened a later stream meanwhile. Then this one ends without a
+            // byte, and its reader skips it: parcels are read in the order of their streams.
             state.keep(opened);
             return Ok(());
         }
@@ -270,7 +257,7 @@ impl Outgoing {
             let mut state = self.state.lock();
             let lane = state.blocked;
             match state.stream(lane) {
-                // Nothing is written: what is asked is whether something could be.
+                // An empty write tests whether bytes could be written.
                 Some(stream) => match Pin::new(stream).poll_write(context, &[]) {
                     Poll::Ready(Ok(_)) => Poll::Ready(Ok(())),
                     Poll::Ready(Err(error)) => Poll::Ready(Err(not_written(error))),
@@ -283,8 +270,39 @@ impl Outgoing {
     }
 }
 
+impl StreamWriter for Outgoing {
+    /// Returns the local address that the peer dialled. A connection that this side dialled has
+    /// none: it survives a change of address (RFC 9000 section 9).
+    fn local_ip(&self) -> Option<IpAddr> {
+        self.connection.local_ip()
+    }
+
+    fn write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
+        let mut state = self.state.lock();
+        let mut taken = 0;
+        for slice in slices {
+            let mut rest: &[u8] = slice;
+            while !rest.is_empty() {
+                match self.put(&mut state, rest) {
+                    Ok(len) => {
+                        taken += len;
+                        rest = rest.get(len..).unwrap_or_default();
+                    }
+                    Err(_) if taken > 0 => return Ok(taken),
+                    Err(error) => return Err(error),
+                }
+            }
+        }
+        Ok(taken)
+    }
+
+    fn writable(&self) -> BoxFuture<'_, io::Result<()>> {
+        Box::pin(self.writable())
+    }
+}
+
 impl State {
-    /// Takes a stream for the next letter, if no later one has been taken yet.
+    /// Keeps a stream for the next parcel, if no later one has been used.
     fn keep(&mut self, opened: SendStream) {
         let number = opened.id().index();
         if self.letter.is_none() && self.latest.is_none_or(|latest| latest < number) {

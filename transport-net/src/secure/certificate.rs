@@ -1,12 +1,12 @@
-//! What a certificate says: which message transport service it is of, which agents that service
-//! may speak for, and for how long.
+//! The contents of a certificate: its message transport service, the agents that this service may
+//! speak for, and its validity.
 //!
-//! Both stand among the subject's alternative names as URIs (RFC 5280 section 4.2.1.6):
-//! `urn:fipa:mts:NAME`, exactly once, and `urn:fipa:agent:NAME` for each agent; without one the
+//! Service and agents are URIs in the subject alternative names (RFC 5280 section 4.2.1.6):
+//! `urn:fipa:mts:NAME`, exactly once, and `urn:fipa:agent:NAME` for each agent; without any the
 //! service may speak for every agent. Names are percent-encoded UTF-8; an agent's name that ends
-//! with `*` stands for all names that begin so. Names are checked when they are decoded.
+//! with `*` stands for all names with that prefix. Names are checked when they are decoded.
 //!
-//! What must not live here: whether anybody is trusted.
+//! Decisions about trust do not belong here.
 
 use std::fmt;
 use std::sync::Arc;
@@ -22,20 +22,20 @@ use x509_parser::prelude::{FromDer, GeneralName, X509Certificate};
 const MTS: &str = "urn:fipa:mts:";
 const AGENT: &str = "urn:fipa:agent:";
 
-/// What stays as it is in a URI (RFC 3986 section 2.3).
+/// Characters that are not escaped in a URI (RFC 3986 section 2.3).
 const KEPT: &AsciiSet = &NON_ALPHANUMERIC
     .remove(b'-')
     .remove(b'.')
     .remove(b'_')
     .remove(b'~');
 
-/// Longest certificate that is looked at, in bytes.
+/// Maximum length of a certificate, in bytes.
 const MAX_LEN: usize = 64 * 1024;
 
-/// Longest name, in bytes.
+/// Maximum length of a name, in bytes.
 const MAX_NAME: usize = 1024;
 
-/// Most agents that a certificate may name.
+/// Maximum number of agents in a certificate.
 const MAX_AGENTS: usize = 1024;
 
 /// The SHA-256 of a certificate's DER form; shown as 64 hexadecimal digits.
@@ -66,7 +66,7 @@ impl fmt::Debug for Fingerprint {
     }
 }
 
-/// A certificate that was read.
+/// A parsed certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Certificate {
     der: CertificateDer<'static>,
@@ -77,31 +77,33 @@ pub struct Certificate {
     until: i64,
 }
 
-/// Whom a certificate is of, and for whom that service may speak.
+/// The service of a certificate, and the agents that it may speak for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Certified {
     mts: String,
-    /// Certified, always.
+    /// Always [`Mandate::Certified`].
     mandate: Mandate,
 }
 
-/// A certificate that says nothing, or nothing that can be used here.
+/// The reason for which a certificate cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum CertificateError {
-    /// It is longer than 64 KiB.
-    #[error("{0} bytes; at most {MAX_LEN} are looked at")]
+    /// The certificate is longer than 64 KiB.
+    #[error("the certificate has {0} bytes; at most {MAX_LEN} are allowed")]
     TooLong(usize),
-    /// It is no X.509 certificate.
-    #[error("no X.509 certificate: {}", escape(.0))]
+    /// The bytes are not an X.509 certificate.
+    #[error("not an X.509 certificate: {}", escape(.0))]
     Malformed(String),
-    /// It names no message transport service, or several.
-    #[error("{0} names of message transport services ({MTS}…) where one has to be")]
+    /// The certificate names no message transport service, or several.
+    #[error(
+        "the certificate names {0} message transport services ({MTS}…); exactly one is required"
+    )]
     Services(usize),
-    /// It names more agents than are looked at.
-    #[error("it names more than {MAX_AGENTS} agents")]
+    /// The certificate names more than 1,024 agents.
+    #[error("the certificate names more than {MAX_AGENTS} agents")]
     Agents,
-    /// A name is no UTF-8, empty, longer than 1,024 bytes, or has
+    /// A name is not UTF-8, empty, longer than 1,024 bytes, or has
     /// [unprintable](fipa_acl::is_unprintable) characters.
     #[error(
         "{}: not a name (1 to {MAX_NAME} bytes of UTF-8 without control and format characters)",
@@ -111,10 +113,10 @@ pub enum CertificateError {
 }
 
 impl Certificate {
-    /// Reads a certificate in DER form.
+    /// Parses a certificate in DER form.
     ///
     /// # Errors
-    /// When it is none, or names nobody.
+    /// When the bytes are not a certificate, or the certificate names no service.
     pub fn from_der(der: Vec<u8>) -> Result<Self, CertificateError> {
         if der.len() > MAX_LEN {
             return Err(CertificateError::TooLong(der.len()));
@@ -139,38 +141,39 @@ impl Certificate {
         })
     }
 
-    /// The certificate in DER form.
+    /// Returns the certificate in DER form.
     #[must_use]
     pub fn der(&self) -> &CertificateDer<'static> {
         &self.der
     }
 
-    /// What tells it from every other certificate.
+    /// Returns the fingerprint, which identifies the certificate.
     #[must_use]
     pub fn fingerprint(&self) -> Fingerprint {
         self.fingerprint
     }
 
-    /// Whom it is of.
+    /// Returns the service and agents of the certificate.
     #[must_use]
     pub fn certified(&self) -> &Arc<Certified> {
         &self.certified
     }
 
-    /// The first and the last second at which it holds, since 1970-01-01 00:00 UTC.
+    /// Returns the first and the last second at which the certificate is valid, since 1970-01-01
+    /// 00:00 UTC.
     #[must_use]
     pub fn validity(&self) -> (i64, i64) {
         (self.from, self.until)
     }
 
-    /// The time from `now` until it has expired.
+    /// Returns the time from `now` until the certificate expires.
     pub(crate) fn left(&self, now: SystemTime) -> Duration {
         let last = u64::try_from(self.until).unwrap_or(0);
         let end = Duration::from_secs(last.saturating_add(1));
         end.saturating_sub(now.duration_since(UNIX_EPOCH).unwrap_or_default())
     }
 
-    /// Whether it holds at this time.
+    /// Returns whether the certificate is valid at this time.
     pub(super) fn holds(&self, now: UnixTime) -> Holds {
         let now = i64::try_from(now.as_secs()).unwrap_or(i64::MAX);
         match now {
@@ -181,7 +184,7 @@ impl Certificate {
     }
 }
 
-/// Whether a certificate holds.
+/// The validity of a certificate at some time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Holds {
     NotYet,
@@ -215,14 +218,14 @@ impl Certified {
         }
     }
 
-    /// The name of the message transport service.
+    /// Returns the name of the message transport service.
     #[must_use]
     pub fn mts(&self) -> &str {
         &self.mts
     }
 
-    /// The agents it may speak for, a name ending with `*` standing for all that begin so; empty
-    /// when it may speak for every agent.
+    /// Returns the agents that the service may speak for; a name that ends with `*` stands for all
+    /// names with that prefix. Empty when the service may speak for every agent.
     #[must_use]
     pub fn agents(&self) -> &[String] {
         match &self.mandate {
@@ -237,16 +240,16 @@ impl Certified {
         self.mts == name || self.mandate.speaks_for(name)
     }
 
-    /// The agents that the service may speak for beside itself.
+    /// Returns the agents that the service may speak for beside itself.
     pub(crate) fn mandate(&self) -> &Mandate {
         &self.mandate
     }
 }
 
-/// What a certificate with these URIs among its alternative names says.
+/// Parses the contents of a certificate with these URIs in its alternative names.
 ///
 /// # Errors
-/// When it says nothing that can be used here.
+/// When they cannot be used.
 #[cfg(feature = "fuzzing")]
 pub fn certified(uris: &[&str]) -> Result<Certified, CertificateError> {
     let names: Vec<GeneralName<'_>> = uris.iter().map(|uri| GeneralName::URI(uri)).collect();
@@ -261,13 +264,13 @@ fn decoded(encoded: &str) -> Result<String, CertificateError> {
     }
 }
 
-/// Whether an agent or a service can have this name, or an agent one that begins so: what is shown of a
-/// certificate to the owner who is to trust it must not look like something else.
+/// Whether this is a valid name of a service or agent, or a valid prefix of an agent's name. A name
+/// that is shown to the owner for a decision about trust must not look like another one.
 fn is_name(name: &str) -> bool {
     !name.is_empty() && name.len() <= MAX_NAME && !name.contains(is_unprintable)
 }
 
-/// The alternative names with which a certificate says this.
+/// Returns the alternative names of a certificate with this service and these agents.
 #[must_use]
 pub fn alternative_names(mts: &str, agents: &[String]) -> Vec<String> {
     let encoded = |prefix: &str, name: &str| format!("{prefix}{}", utf8_percent_encode(name, KEPT));

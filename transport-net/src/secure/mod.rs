@@ -1,16 +1,15 @@
-//! Who may speak with this host: mutual TLS 1.3 (RFC 8446) between services that know each other's
-//! certificates.
+//! Mutual TLS 1.3 (RFC 8446) between services that trust each other's certificates.
 //!
-//! There is no authority that vouches for others. A peer is trusted because its owner gave its
-//! certificate to the owner of this host, who put it among those trusted; what a peer presents is
-//! compared with it. So nothing is left to be decided about chains, and withdrawing trust is
-//! taking a certificate out again, which ends the connections that were opened with it.
+//! There is no certification authority. A peer is trusted because its owner gave its certificate to
+//! the owner of this host, who added it to the trusted ones; the certificate that a peer presents
+//! is compared with them. There are no chains to verify, and withdrawing trust is removing a
+//! certificate, which ends the connections that were opened with it.
 //!
-//! * `certificate`: what a certificate says.
-//! * `advice`: what to do when a peer is not let in.
-//! * `verify`: whether whoever presents one is trusted.
+//! * `certificate`: the contents of a certificate.
+//! * `advice`: remedies when a peer is not trusted.
+//! * `verify`: the verification of a presented certificate.
 //!
-//! What must not live here: files, and what is done with letters.
+//! Files and the handling of letters do not belong here.
 
 pub(crate) mod advice;
 mod certificate;
@@ -36,7 +35,7 @@ use self::verify::Known;
 #[doc(hidden)]
 pub use self::certificate::certified;
 
-/// What a host is known by, and whom it knows.
+/// The certificate and key of a host, and the certificates that it trusts.
 #[derive(Debug)]
 pub struct Credentials {
     /// This host's own certificate.
@@ -47,14 +46,14 @@ pub struct Credentials {
     pub trusted: Vec<Certificate>,
 }
 
-/// Credentials that cannot be used.
+/// The reason for which credentials cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[error("this key and this certificate cannot be used together: {0}")]
+#[error("cannot use this private key with this certificate: {0}")]
 #[non_exhaustive]
 pub struct CredentialsError(#[from] rustls::Error);
 
-/// The credentials of an endpoint. Clones are the same; [`replace`](Self::replace) changes all of
-/// them.
+/// The credentials of an endpoint. Clones share them: [`replace`](Self::replace) changes all
+/// clones.
 #[derive(Clone)]
 pub struct Security {
     now: Arc<RwLock<Arc<Prepared>>>,
@@ -63,13 +62,13 @@ pub struct Security {
     rules: Rules,
 }
 
-/// Who has to prove who it is.
+/// The peers that must prove their identity.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Rules {
-    /// Whether peers on loopback addresses have to, where this host usually speaks with itself.
+    /// Whether peers at loopback addresses must prove their identity, too.
     pub loopback: bool,
-    /// Addresses of old peers, which cannot. Letters in their dialects are exchanged with them, and
-    /// nothing else.
+    /// Addresses of legacy peers, which cannot prove their identity. Only letters in their dialects
+    /// are exchanged with them.
     pub old_peers: Vec<IpAddr>,
 }
 
@@ -83,7 +82,7 @@ struct Prepared {
 }
 
 impl Security {
-    /// Speaks with trusted peers only, but for what the rules leave out.
+    /// Creates credentials that only admit trusted peers, with the exceptions of the rules.
     ///
     /// # Errors
     /// When the key does not belong to the certificate.
@@ -95,10 +94,10 @@ impl Security {
         })
     }
 
-    /// Uses other credentials from now on. Connections with peers that are not trusted any more end.
+    /// Replaces the credentials. Connections with peers that are no longer trusted end.
     ///
     /// # Errors
-    /// When they cannot be used; those before stay.
+    /// When the credentials cannot be used; the previous ones stay in use.
     pub fn replace(&self, credentials: Credentials) -> Result<(), CredentialsError> {
         let prepared = Arc::new(Prepared::new(credentials)?);
         *self.now.write() = prepared;
@@ -106,10 +105,10 @@ impl Security {
         Ok(())
     }
 
-    /// Trusts these peers and no others from now on, with the key and certificate there were.
+    /// Replaces the trusted peers, and keeps the key and certificate.
     ///
     /// # Errors
-    /// When they cannot be used; those before stay.
+    /// When the credentials cannot be used; the previous ones stay in use.
     pub fn trust_only(&self, trusted: Vec<Certificate>) -> Result<(), CredentialsError> {
         let (own, key) = {
             let now = self.now.read();
@@ -118,17 +117,17 @@ impl Security {
         self.replace(Credentials { own, key, trusted })
     }
 
-    /// Whether whoever is at this address has to prove who it is.
+    /// Whether a peer at this address must prove its identity.
     pub(crate) fn covers(&self, ip: IpAddr) -> bool {
         self.rules.loopback || !ip.to_canonical().is_loopback()
     }
 
-    /// Whether an old peer may be at this address.
+    /// Whether this is the address of a legacy peer.
     pub(crate) fn excepts(&self, ip: IpAddr) -> bool {
         self.rules.old_peers.contains(&ip.to_canonical())
     }
 
-    /// Counts up when trust has changed.
+    /// Returns a receiver that is notified when the credentials have been replaced.
     pub(crate) fn changes(&self) -> watch::Receiver<u64> {
         self.replaced.subscribe()
     }
@@ -147,7 +146,7 @@ impl Security {
         self.now.read().client.clone()
     }
 
-    /// What the certificate says that a peer has proved to be its own.
+    /// Returns the trusted certificate that a peer has presented.
     pub(crate) fn peer(&self, presented: Option<&[CertificateDer<'_>]>) -> Option<Certificate> {
         let presented = presented?.first()?;
         self.now.read().known.find(presented).cloned()
@@ -177,7 +176,7 @@ impl Prepared {
             .dangerous()
             .with_custom_certificate_verifier(known.clone())
             .with_client_auth_cert(chain, key.clone_key())?;
-        // A session that is resumed would not ask whether the peer is still trusted.
+        // A resumed session would skip the check whether the peer is still trusted.
         server.send_tls13_tickets = 0;
         client.resumption = Resumption::disabled();
         client.enable_sni = false;

@@ -1,4 +1,4 @@
-//! Whether whoever presents a certificate is trusted.
+//! Verification of presented certificates.
 
 use std::collections::HashMap;
 
@@ -39,8 +39,8 @@ impl Known {
         self.trusted.contains_key(&fingerprint)
     }
 
-    /// Whether a certificate is one of a trusted peer, and holds now. That the peer has its key is
-    /// asked by its signature over the handshake.
+    /// Checks that a certificate is that of a trusted peer and valid now. The signature over the
+    /// handshake proves that the peer has its key.
     fn check(&self, presented: &CertificateDer<'_>, now: UnixTime) -> Result<(), Error> {
         let certificate = self.find(presented);
         let certificate = certificate.ok_or(CertificateError::UnknownIssuer)?;
@@ -61,7 +61,7 @@ impl Known {
     }
 }
 
-/// TLS 1.2 is not offered; who gets here nevertheless has made a mistake.
+/// TLS 1.2 is not offered, so this is only reached through a protocol error.
 fn only_tls13() -> Result<HandshakeSignatureValid, Error> {
     Err(PeerIncompatible::Tls12NotOfferedOrEnabled.into())
 }
@@ -71,7 +71,7 @@ impl ServerCertVerifier for Known {
         &self,
         presented: &CertificateDer<'_>,
         _intermediates: &[CertificateDer<'_>],
-        // Addresses change; who is there is what the certificate says.
+        // The name is not compared: addresses change, and the certificate identifies the peer.
         _address: &ServerName<'_>,
         _ocsp: &[u8],
         now: UnixTime,
@@ -105,7 +105,7 @@ impl ServerCertVerifier for Known {
 
 impl ClientCertVerifier for Known {
     fn root_hint_subjects(&self) -> &[DistinguishedName] {
-        // Whom this host trusts is nobody's business.
+        // The list of trusted peers is not disclosed.
         &[]
     }
 

@@ -1,16 +1,16 @@
-//! What the owner of an endpoint chooses.
+//! Configuration of an endpoint of framed connections.
 
 #[cfg(feature = "ip")]
 use fipa_transport::Principal;
 use std::time::Duration;
 
-use super::place::Budget;
-use super::source::{Account, Home};
+use super::budget::BudgetLimits;
+use super::source::{Home, QuotaKey};
 use crate::Identity;
 #[cfg(feature = "ip")]
-use crate::ration::{Rates, is_one_peer};
+use crate::rate_limit::{Rates, is_one_peer};
 
-/// How an endpoint introduces itself, and what it takes from whom.
+/// Identity, limits and trust of an endpoint.
 #[derive(Debug, Clone)]
 pub(crate) struct StreamConfig {
     pub(crate) identity: Identity,
@@ -18,7 +18,7 @@ pub(crate) struct StreamConfig {
     /// Whether processes of this host connect over loopback.
     #[cfg(feature = "ip")]
     pub(crate) processes: bool,
-    /// What peers have to prove. Without it nobody has to prove anything.
+    /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<crate::secure::Security>,
 }
@@ -35,8 +35,8 @@ impl StreamConfig {
         true
     }
 
-    /// What a peer has proved that connects from this address, without a certificate, and says this of
-    /// itself. Strangers can say that they are of this host.
+    /// Returns the principal of a peer without a certificate that connects from this address and
+    /// sends this identity. An unproved peer can claim to be of this host.
     #[cfg(feature = "ip")]
     pub(crate) fn principal_at(&self, ip: std::net::IpAddr, peer: &Identity) -> Principal {
         let is_here = self.processes && ip.to_canonical().is_loopback();
@@ -46,8 +46,8 @@ impl StreamConfig {
         }
     }
 
-    /// Whether there are limits to what a peer there may have: if it is one peer of another host, or
-    /// has to prove who it is.
+    /// Whether a peer with this origin is subject to limits: it is one peer of another host, or
+    /// must prove its identity.
     pub(crate) fn limits_peer_at(&self, home: Home) -> bool {
         match home {
             Home::Process(_) => false,
@@ -64,13 +64,13 @@ impl StreamConfig {
         }
     }
 
-    /// How many introduced connections one account may have at a time. No account has more than half
-    /// of all places, so none stops the listener.
-    pub(crate) fn places_of(&self, account: &Account) -> usize {
+    /// Returns the maximum number of introduced connections of one quota key: at most half of all,
+    /// so that no quota key blocks the listener.
+    pub(crate) fn max_connections_of(&self, quota_key: &QuotaKey) -> usize {
         let half = (self.limits.max_connections / 2).max(1);
-        let is_one_peer = match account {
-            Account::Unproved(home) => self.limits_peer_at(*home),
-            Account::Certificate(_) => true,
+        let is_one_peer = match quota_key {
+            QuotaKey::Unproved(home) => self.limits_peer_at(*home),
+            QuotaKey::Certificate(_) => true,
         };
         match is_one_peer {
             true => self.limits.max_per_address.min(half),
@@ -78,16 +78,16 @@ impl StreamConfig {
         }
     }
 
-    /// How much memory the letters of one account may take while they arrive, and those of all.
-    pub(crate) fn budget_of(&self, account: &Account) -> Budget {
+    /// Returns the memory limits of arriving letters, for one quota key and for all.
+    pub(crate) fn budget_of(&self, quota_key: &QuotaKey) -> BudgetLimits {
         let each = self.limits.max_incoming_per_source;
-        // Loopback stands for many processes.
-        let is_many = match account {
+        // A loopback address stands for many processes.
+        let is_many = match quota_key {
             #[cfg(feature = "ip")]
-            Account::Unproved(Home::Address(ip)) => !is_one_peer(*ip),
+            QuotaKey::Unproved(Home::Address(ip)) => !is_one_peer(*ip),
             _ => false,
         };
-        Budget {
+        BudgetLimits {
             total: self.limits.max_incoming,
             each: if is_many {
                 each.saturating_mul(2)
@@ -97,7 +97,8 @@ impl StreamConfig {
         }
     }
 
-    /// Whether letters may go to an old peer at this address, which cannot prove anything.
+    /// Whether letters may be sent to a legacy peer at this address, which cannot prove its
+    /// identity.
     #[cfg(feature = "ip")]
     pub(crate) fn gives_old_peers_at(&self, ip: std::net::IpAddr) -> bool {
         #[cfg(feature = "secure")]
@@ -109,9 +110,9 @@ impl StreamConfig {
     }
 }
 
-/// Bounds of an endpoint whose letters go over streams of bytes. Memory is at most about
-/// `max_incoming` for letters that are arriving, and `max_connections` × `max_queued_bytes` for those
-/// that wait to be sent, the latter only when this side sends them.
+/// Limits of an endpoint that sends letters over byte streams. Memory is bounded by about
+/// `max_incoming` for arriving letters, and `max_connections` × `max_queued_bytes` for letters that
+/// wait to be sent, the latter only when this side sends them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Limits {
     /// Largest letter sent or taken, in bytes. Default 64 MiB.
@@ -121,32 +122,33 @@ pub struct Limits {
     /// (with IPv6, one network of 64 bits), all loopback addresses together, or one process.
     pub max_connections: usize,
     /// Maximum number of accepted connections that have not introduced themselves: those whose
-    /// handshake has begun and those that have been silent for 250 ms. One more pushes out the oldest
-    /// of the address (with IPv6, the network of 64 bits) that has the most. Default 64. As many
-    /// letters of legacy peers are read at once, and one of each address in any case.
+    /// handshake has begun and those that have been silent for 250 ms. One more evicts the oldest
+    /// of the address (with IPv6, the network of 64 bits) that has the most. Default 64. The same
+    /// number of letters of legacy peers are read at once, and always at least one of each address.
     pub max_strangers: usize,
     /// Maximum number of legacy peers' letters of one address that are read at once. Default 32.
     pub max_reads_per_address: usize,
     /// Maximum number of connections of one address that wait unread beside these, in the order of
-    /// acceptance. The next one pushes out the oldest that has sent nothing; when all have sent
-    /// something, the next one itself is reset. Default 512.
+    /// acceptance. The next one evicts the oldest that has sent no byte; when all have sent a byte,
+    /// the next one itself is reset. Default 512.
     pub max_unread_per_address: usize,
     /// The same for all addresses together. Default 1024.
     pub max_unread: usize,
-    /// Maximum number of connections that the peers with one certificate, or the peers at one address
-    /// that have proved nothing, have opened and introduced themselves on. Default 64. It does not
-    /// apply to loopback addresses, unless peers there have to prove who they are, too.
+    /// Maximum number of connections that the peers with one certificate, or the peers at one
+    /// address that have proved nothing, have opened and introduced themselves on. Default 64. It
+    /// does not apply to loopback addresses, unless peers there must also prove their identity.
     pub max_per_address: usize,
-    /// Letters a second that are taken from one address, as many of which may come at once; what is
-    /// more is read later. 0: any number. Default 20,000. This and the next are not for loopback
-    /// addresses either.
+    /// Maximum number of letters per second from one address, which is also the maximum burst;
+    /// further letters are read later. 0: unlimited. Default 20,000. This limit and the next do not
+    /// apply to loopback addresses either.
     pub peer_letters: u64,
-    /// The same of bytes. Default 256 MiB.
+    /// Maximum number of bytes per second from one address, which is also the maximum burst. 0:
+    /// unlimited. Default 256 MiB.
     pub peer_bytes: u64,
-    /// Most parcels per connection and direction that are not answered yet. Default 1024.
+    /// Maximum number of unanswered parcels per connection and direction. Default 1024.
     pub max_in_flight: usize,
-    /// Most bytes per connection that wait to be handed to the kernel; a single letter is always
-    /// let in. Default 64 MiB.
+    /// Maximum number of bytes per connection that wait to be handed to the kernel; a single letter
+    /// is always accepted. Default 64 MiB.
     pub max_queued_bytes: usize,
     /// Maximum number of bytes of letters that are arriving, on all connections together: the whole
     /// length of a letter of 32 KiB or more from its header to its end, and the memory of a legacy
@@ -159,26 +161,26 @@ pub struct Limits {
     /// address (with IPv6, one network of 64 bits) or process, and with twice as much all loopback
     /// addresses together. Default 64 MiB.
     pub max_incoming_per_source: usize,
-    /// Most bytes of [the sink's memory](fipa_transport::Sink::memory_for) that are taken for
-    /// content which has been announced and is arriving, on all connections together. What is
-    /// beyond is read into memory that grows as it arrives. Default 32 MiB.
+    /// Maximum number of bytes of [the sink's memory](fipa_transport::Sink::memory_for) for
+    /// announced content that is arriving, on all connections together. Beyond it, content is read
+    /// into memory that grows as the bytes arrive. Default 32 MiB.
     pub max_arriving: usize,
-    /// How long opening a connection may take. Default 2 s.
+    /// Timeout of opening a connection. Default 2 s.
     pub connect_timeout: Duration,
-    /// How long a new connection may take to say hello. Default 5 s.
+    /// Timeout of the peer's hello on a new connection. Default 5 s.
     pub handshake_timeout: Duration,
-    /// How long a frame, or an old peer's letter, may stand half arrived with less than
-    /// [`Limits::MIN_PROGRESS`] bytes of progress. Default 10 s.
+    /// Period in which a partly arrived frame, or letter of a legacy peer, must progress by at
+    /// least [`Limits::MIN_PROGRESS`] bytes. Default 10 s.
     pub stall_timeout: Duration,
-    /// After this long without a byte from the peer it is asked for a sign of life; after as long
-    /// again without one the connection is given up. Default 10 s.
+    /// Time without a byte from the peer after which it gets a ping; after the same time again
+    /// without a byte the connection is given up. Default 10 s.
     pub keep_alive: Duration,
-    /// After this long without a letter or an answer a connection is closed. Default 60 s.
+    /// Time without a letter or an answer after which a connection is closed. Default 60 s.
     pub idle_close: Duration,
 }
 
 impl Limits {
-    /// Bytes that must arrive within `stall_timeout` while something is half arrived.
+    /// Number of bytes that must arrive within `stall_timeout` while a frame has partly arrived.
     pub const MIN_PROGRESS: u64 = 4096;
 
     #[cfg(feature = "ip")]

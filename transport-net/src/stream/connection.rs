@@ -1,8 +1,8 @@
 //! One connection without its socket: frames and `now` in, bytes to write and events out.
 //!
-//! The connection keeps the honest account of parcels. A parcel is *waiting* until the kernel has
-//! begun to take it, and *begun* until its answer arrives; when the connection ends, the former
-//! cannot have arrived and the latter may have.
+//! The connection tracks the state of each parcel. A parcel is *waiting* until the kernel has begun
+//! to take it, and *begun* until its answer arrives. When the connection ends, a waiting parcel
+//! cannot have arrived, and a begun parcel may have.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::IoSlice;
@@ -19,47 +19,48 @@ use super::config::Limits;
 use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
 
-/// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
+/// Upper bound of parcel numbers, so that a ticket also holds the number of the connection.
 pub(crate) const MAX_ID: u64 = 1 << 40;
 
-/// Control frames that may wait to be written before pings are no longer answered: a peer that
-/// does not read needs no more signs of life.
+/// Maximum number of queued control frames. Beyond it, pings are not answered: a peer that does not
+/// read needs no more pongs.
 const MAX_CONTROL: usize = 4;
 
-/// A peer that has to read more before it can answer gets more time: it reads this fast at least.
+/// Assumed minimum speed at which a peer reads. A peer that has to read more before it can answer
+/// gets more time.
 const SLOWEST_BYTES_PER_SECOND: u64 = 128 << 10;
 
-/// Which side opened the connection.
+/// The side that opened the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Role {
-    /// This side, looking for this incarnation (which may be unknown).
+    /// This side opened it and expects this incarnation, which may be unknown.
     Dialler { expected: Incarnation },
-    /// The other side.
+    /// The other side opened it.
     Acceptor,
 }
 
-/// What happened, in order.
+/// An event of a connection. Events are delivered in order.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Event {
-    /// The peer introduced itself, and is the one that was meant. To be
-    /// [welcomed](Connection::welcome), or the connection to be ended.
+    /// The peer introduced itself with the expected incarnation. The caller
+    /// [welcomes](Connection::welcome) it or ends the connection.
     Greeted,
-    /// A parcel arrived, to be answered by its number.
+    /// A parcel arrived; it is answered by its number.
     Arrived { id: u64, parcel: Box<Parcel> },
-    /// A parcel sent from here came to its end.
+    /// An attempt of this side is concluded.
     Concluded(AttemptId, Conclusion),
 }
 
-/// Why a parcel is not taken for sending.
+/// The reason for which a parcel is not queued.
 #[derive(Debug, PartialEq)]
 pub(crate) enum SendError {
-    /// The connection has ended: another one is needed.
+    /// The connection has ended; another one is needed.
     Ended,
-    /// The parcel does not go.
-    Way(WayError),
+    /// The parcel cannot be sent to this peer.
+    Transport(WayError),
 }
 
 #[derive(Debug)]
@@ -69,23 +70,23 @@ pub(crate) struct Connection {
     hello: Hello,
     peer: Option<Hello>,
     proof: Proof,
-    /// Whether parcels may be sent: the peer is known, and knows this side.
+    /// Whether parcels may be sent: both sides have exchanged their hello.
     open: bool,
-    /// Whether nothing is read, because there is no memory for the next letter.
+    /// Whether reading is paused because there is no memory for the next letter.
     paused: bool,
     /// See [`Connection::is_suspect`].
     suspect: bool,
-    /// Whether it is about to end for idleness: what comes now needs another connection.
+    /// Whether the connection is about to close for idleness; new parcels need another connection.
     retiring: bool,
     ended: bool,
     outbox: Outbox,
-    /// Parcels sent from here, by number, until their answer arrives.
+    /// Parcels of this side, by number, until their answer arrives.
     sent: BTreeMap<u64, Sent>,
     attempts: HashMap<AttemptId, u64>,
     last_sent: u64,
-    /// How many of `sent` have begun.
+    /// Number of parcels in `sent` that have begun.
     begun: usize,
-    /// Parcels that arrived and are not answered.
+    /// Parcels that arrived and are not answered yet.
     arrivals: HashSet<u64>,
     last_arrival: u64,
     answers_waiting: usize,
@@ -97,34 +98,35 @@ pub(crate) struct Connection {
 
 #[derive(Debug)]
 struct Sent {
-    /// None when it was abandoned.
+    /// `None` when the attempt was abandoned.
     attempt: Option<AttemptId>,
     receiver: Arc<str>,
     letter_len: u64,
-    /// When the kernel began to take it, if it has.
+    /// Time at which the kernel began to take it.
     begun: Option<Instant>,
 }
 
-/// What the timers go by.
+/// The times that the timers are based on.
 #[derive(Debug)]
 struct Clock {
-    /// When the socket was connected, before the peer's hello.
+    /// Time at which the socket was connected.
     connected: Option<Instant>,
     received: Instant,
     written: Instant,
-    /// Bytes written since something last arrived.
+    /// Bytes written since the last byte arrived.
     written_since: u64,
-    /// When something last went on that makes the connection useful.
+    /// Time of the last parcel, answer or hello.
     busy: Instant,
     pinged: bool,
-    /// Since when the connection is in doubt; see [`Connection::doubt`].
+    /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
-    /// Since when a frame has been half arrived, and the bytes that came since.
+    /// Start of the present measuring period of a partly arrived frame, and the bytes that arrived
+    /// since.
     partial: Option<(Instant, u64)>,
 }
 
 impl Connection {
-    /// A connection whose socket is connected, or (for the dialler) will be.
+    /// Creates a connection whose socket is connected or, for the dialler, will be connected.
     pub(crate) fn new(limits: Limits, role: Role, hello: Hello, now: Instant) -> Self {
         let connected = (role == Role::Acceptor).then_some(now);
         Self {
@@ -162,7 +164,7 @@ impl Connection {
         }
     }
 
-    /// The dialler's socket is connected.
+    /// Notes that the dialler's socket is connected.
     pub(crate) fn connected(&mut self, now: Instant) {
         self.clock.connected = Some(now);
         self.clock.received = now;
@@ -170,40 +172,42 @@ impl Connection {
         self.say_hello();
     }
 
-    /// The peer has proved who it is, before anything else.
+    /// Sets what the peer has proved before the first frame.
     pub(crate) fn proved(&mut self, proof: Proof) {
         self.proof = proof;
     }
 
-    /// Whether the peer may send this letter: whoever has proved who it is speaks for its agents
-    /// only, in the envelope and in the message.
+    /// Checks that the peer may send this letter. A peer with a certificate may only send letters
+    /// of its own agents, according to both the envelope and the message.
     ///
     /// # Errors
-    /// Why not.
+    /// The reason for which the letter is refused.
     pub(crate) fn admits(&self, letter: &Letter) -> Result<(), String> {
         if !self.proof.restricts() {
             return Ok(());
         }
         let envelope = letter.envelope();
         let view = EnvelopeView::parse(&envelope);
-        let view = view.map_err(|error| format!("its envelope cannot be read: {error}"))?;
-        let from = view.from_name().ok_or("it names no sender")?;
+        let view = view.map_err(|error| format!("its envelope cannot be decoded: {error}"))?;
+        let from = view.from_name().ok_or("its envelope names no sender")?;
         if !self.proof.speaks_for(&from.to_string()) {
-            return Err(format!("the peer's certificate does not speak for {from}"));
+            return Err(format!(
+                "the peer's certificate does not cover the sender {from}"
+            ));
         }
-        // Agents go by whom the message calls its sender.
+        // Agents rely on the sender that the message names.
         let message = MessageView::parse_payload(letter.payload());
-        let message = message.map_err(|error| format!("its message cannot be read: {error}"))?;
+        let message = message.map_err(|error| format!("its message cannot be decoded: {error}"))?;
         match message.sender() {
             Some(sender) if sender.name().as_str() != from.as_str() => Err(format!(
-                "its envelope is from {from}, and its message from {}",
+                "its envelope names the sender {from}, but its message names {}",
                 sender.name()
             )),
             _ => Ok(()),
         }
     }
 
-    /// The peer that has introduced itself is wanted.
+    /// Accepts the peer that has introduced itself.
     pub(crate) fn welcome(&mut self) {
         if self.role == Role::Acceptor {
             self.say_hello();
@@ -211,37 +215,40 @@ impl Connection {
         self.open = true;
     }
 
-    /// The peer's hello, once it came.
+    /// Returns the peer's hello after its arrival.
     pub(crate) fn peer(&self) -> Option<&Hello> {
         self.peer.as_ref()
     }
 
-    /// The certificate that the peer has proved to have the key of, if any.
+    /// Returns the certificate whose key the peer has proved to have, if any.
     pub(crate) fn proved_principal(&self) -> Option<Principal> {
         self.proof.principal()
     }
 
-    /// The agents that the peer may speak for.
+    /// Returns the agents that the peer may speak for.
     pub(crate) fn mandate(&self) -> Mandate {
         self.proof.mandate()
     }
 
-    /// Takes a parcel for sending.
+    /// Queues a parcel for sending.
     ///
     /// # Errors
-    /// When it does not go; nothing has been changed then.
+    /// When the parcel cannot be sent. The connection is unchanged then.
     pub(crate) fn send(&mut self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
-        let refuse = |fault, detail: String| Err(SendError::Way(WayError::new(fault, detail)));
+        let refuse =
+            |fault, detail: String| Err(SendError::Transport(WayError::new(fault, detail)));
         if self.ended || self.retiring {
             return Err(SendError::Ended);
         }
         let letter_len = letter_len(parcel);
         let peer_max = self.peer.as_ref().map_or(u64::MAX, |peer| peer.max_letter);
         if letter_len > peer_max {
-            return Err(SendError::Way(too_large_for_peer(letter_len, peer_max)));
+            return Err(SendError::Transport(too_large_for_peer(
+                letter_len, peer_max,
+            )));
         }
         if !self.proof.speaks_for(&parcel.receiver) {
-            return Err(SendError::Way(not_its_agent(&parcel.receiver)));
+            return Err(SendError::Transport(not_its_agent(&parcel.receiver)));
         }
         let Limits {
             max_in_flight,
@@ -249,12 +256,17 @@ impl Connection {
             ..
         } = self.limits;
         if self.sent.len() >= max_in_flight.max(1) {
-            let detail = format!("{max_in_flight} parcels are on their way (max_in_flight)");
+            let detail = format!(
+                "{max_in_flight} parcels of this connection wait for their answer; the limit is max_in_flight"
+            );
             return refuse(WayFault::Congested, detail);
         }
         let id = self.last_sent + 1;
         if id >= MAX_ID {
-            return refuse(WayFault::Congested, "the connection is worn out".into());
+            return refuse(
+                WayFault::Congested,
+                "parcel numbers of this connection are exhausted".into(),
+            );
         }
         let pieces = match frame::parcel(id, parcel) {
             Ok(pieces) => pieces,
@@ -263,7 +275,9 @@ impl Connection {
         let queued = self.outbox.parcel_bytes();
         let len: usize = pieces.iter().map(bytes::Bytes::len).sum();
         if queued > 0 && queued.saturating_add(len) > max_queued_bytes {
-            let detail = format!("{queued} bytes wait to be sent (max_queued_bytes)");
+            let detail = format!(
+                "{queued} bytes of this connection wait to be sent; the limit is {max_queued_bytes} (max_queued_bytes)"
+            );
             return refuse(WayFault::Congested, detail);
         }
         self.last_sent = id;
@@ -281,8 +295,9 @@ impl Connection {
         Ok(())
     }
 
-    /// Ends an attempt: it is not sent if the kernel has taken nothing of it. An attempt that had time
-    /// enough, and in which nothing came from the peer, puts the connection in doubt.
+    /// Ends an attempt. The parcel is not sent if the kernel has taken no byte of it. An attempt
+    /// that had enough time and during which no byte came from the peer puts the connection in
+    /// doubt.
     pub(crate) fn abandon(&mut self, attempt: AttemptId, now: Instant) -> Abandoned {
         let Some(id) = self.attempts.remove(&attempt) else {
             return Abandoned::Unconfirmed;
@@ -303,13 +318,14 @@ impl Connection {
             self.suspect = true;
         }
         if let Some(sent) = self.sent.get_mut(&id) {
-            // The peer counts it until it has answered, so it goes on filling the window.
+            // The peer counts the parcel until it has answered, so the parcel still occupies the
+            // window.
             sent.attempt = None;
         }
         Abandoned::Unconfirmed
     }
 
-    /// Answers a parcel that arrived. Unknown ones are ignored.
+    /// Answers a parcel that arrived. An unknown number is ignored.
     pub(crate) fn answer(&mut self, id: u64, answer: &Answer, now: Instant) {
         if !self.ended && self.arrivals.remove(&id) {
             self.answers_waiting += 1;
@@ -319,7 +335,7 @@ impl Connection {
         }
     }
 
-    /// So many bytes arrived, and a frame is half arrived now, or not.
+    /// Notes that `bytes` arrived; `partial` is whether a frame has partly arrived.
     pub(crate) fn received(&mut self, bytes: usize, partial: bool, now: Instant) {
         self.clock.received = now;
         self.clock.pinged = false;
@@ -333,8 +349,8 @@ impl Connection {
         };
     }
 
-    /// Nothing is read from now on, or it is again. Meanwhile the peer is told that this side lives,
-    /// and is not given up, because its signs of life are not read either.
+    /// Pauses or resumes reading. While reading is paused, pongs show the peer that this side is
+    /// alive, and the peer is not given up, because its pongs are not read either.
     pub(crate) fn pause(&mut self, paused: bool, now: Instant) {
         if std::mem::replace(&mut self.paused, paused) != paused {
             self.clock.received = now;
@@ -344,9 +360,9 @@ impl Connection {
         }
     }
 
-    /// There is reason to believe that the peer is elsewhere by now: it is asked for a sign of life,
-    /// with less patience than usual. Does nothing when the peer has been heard within `quiet`.
-    /// Returns whether the connection is in doubt.
+    /// Puts the connection in doubt because the peer may have moved: sends a ping with a shorter
+    /// timeout than usual. Does nothing when a byte arrived within `quiet`. Returns whether the
+    /// connection is in doubt.
     pub(crate) fn doubt(&mut self, now: Instant, quiet: Duration) -> bool {
         if self.ended || self.paused || self.peer.is_none() || now < self.clock.received + quiet {
             return false;
@@ -360,56 +376,57 @@ impl Connection {
         true
     }
 
-    /// The peer has not introduced itself yet. If that takes long, what is dispatched from now on
-    /// needs another connection: the system repeats lost packets more and more rarely.
+    /// Makes the connection suspect when the peer's hello takes too long: later dispatches then
+    /// need another connection, because the system retransmits lost packets with growing pauses.
     fn suspect_slow_start(&mut self, now: Instant) {
         let since = self.clock.connected.unwrap_or(self.clock.received);
         self.suspect |= now >= since + self.answer_patience();
     }
 
-    /// Whether letters are to take another connection with the same peer, if there is one or one can
-    /// be opened: an attempt got no answer, and nothing has come since.
+    /// Whether letters should take another connection with the same peer, if there is one or one
+    /// can be opened: an attempt got no answer, and no byte has arrived since.
     pub(crate) fn is_suspect(&self) -> bool {
         self.suspect
     }
 
-    /// Another connection with the peer came from elsewhere; see [`is_suspect`](Self::is_suspect).
+    /// Makes the connection suspect because another connection with the peer came from another
+    /// address; see [`is_suspect`](Self::is_suspect).
     pub(crate) fn suspect(&mut self, now: Instant) {
         self.suspect |= self.doubt(now, Duration::ZERO);
     }
 
-    /// The time without an answer, and without any byte from the peer, after which an attempt that is
-    /// abandoned speaks against the connection.
+    /// Returns the time without any byte from the peer after which an abandoned attempt makes the
+    /// connection suspect.
     fn answer_patience(&self) -> Duration {
         self.limits.keep_alive / 20 + self.transfer_time()
     }
 
-    /// The time that the bytes may take to arrive that were written since the peer was last heard.
+    /// Returns the time that the bytes written since the last arrival may take to reach the peer.
     fn transfer_time(&self) -> Duration {
         Duration::from_millis(
             self.clock.written_since.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND,
         )
     }
 
-    /// Asks the peer for a sign of life, of which nothing follows here.
+    /// Sends a ping without changing any timer.
     pub(crate) fn ask(&mut self) {
         if !self.ended && self.control_waiting < MAX_CONTROL {
             self.push_control(frame::ping());
         }
     }
 
-    /// Whether the peer has been heard since, or would not have been because nothing is read.
-    pub(crate) fn is_heard_since(&self, since: Instant) -> bool {
+    /// Whether a byte arrived after `since`, or reading is paused.
+    pub(crate) fn received_since(&self, since: Instant) -> bool {
         !self.ended && (self.paused || self.clock.received > since)
     }
 
-    /// How long a peer in doubt has to give a sign of life.
+    /// Returns the time that a peer in doubt has to respond.
     pub(crate) fn doubt_patience(&self) -> Duration {
         self.limits.keep_alive / 4
     }
 
-    /// When a connection in doubt is given up. While something waits to be written, bytes that the
-    /// kernel still takes show that the peer reads.
+    /// Returns the time at which a connection in doubt is given up. While bytes wait to be written,
+    /// bytes that the kernel still takes show that the peer reads.
     fn doubt_due(&self) -> Option<Instant> {
         let doubted = self.clock.doubted?;
         let since = match self.is_flushed() {
@@ -419,20 +436,24 @@ impl Connection {
         Some(since + self.doubt_patience() + self.transfer_time())
     }
 
-    /// Takes a frame from the peer.
+    /// Handles a frame of the peer.
     ///
     /// # Errors
-    /// When the connection is over because of it.
-    pub(crate) fn handle_frame(&mut self, frame: Frame, now: Instant) -> Result<(), End> {
+    /// When the frame ends the connection.
+    pub(crate) fn handle_frame(&mut self, frame: Frame, now: Instant) -> Result<(), ConnectionEnd> {
         if self.ended {
-            // What arrives behind a goodbye has been disowned by it.
+            // Frames after a goodbye are not valid.
             return Ok(());
         }
         match (frame, self.peer.is_some()) {
             (Frame::Hello(hello), false) => self.greet(hello, now),
-            (Frame::Goodbye { last }, _) => Err(End::Goodbye { last }),
-            (_, false) => Err(End::Nonsense("something else before the hello".into())),
-            (Frame::Hello(_), true) => Err(End::Nonsense("a second hello".into())),
+            (Frame::Goodbye { last }, _) => Err(ConnectionEnd::Goodbye { last }),
+            (_, false) => Err(ConnectionEnd::ProtocolViolation(
+                "a frame before the hello".into(),
+            )),
+            (Frame::Hello(_), true) => {
+                Err(ConnectionEnd::ProtocolViolation("a second hello".into()))
+            }
             (Frame::Parcel { id, parcel }, true) => self.arrive(id, parcel, now),
             (Frame::Answer { id, answer }, true) => self.conclude(id, answer, now),
             (Frame::Ping, true) => {
@@ -445,22 +466,22 @@ impl Connection {
         }
     }
 
-    /// The next thing that happened.
+    /// Returns the next event.
     pub(crate) fn poll_event(&mut self) -> Option<Event> {
         self.events.pop_front()
     }
 
-    /// Fills `slices` with what is to be written next and says how many were filled.
+    /// Fills `slices` with the next bytes to write. Returns the number of filled slices.
     pub(crate) fn gather<'a>(&'a self, slices: &mut [IoSlice<'a>]) -> usize {
         self.outbox.gather(slices, self.window())
     }
 
-    /// Whether there is nothing to write now.
+    /// Whether there are no bytes to write now.
     pub(crate) fn is_flushed(&self) -> bool {
         self.outbox.is_idle(self.window())
     }
 
-    /// The kernel took so many bytes of what [`gather`](Self::gather) had shown.
+    /// Notes that the kernel took `taken` bytes of those that [`gather`](Self::gather) returned.
     pub(crate) fn written(&mut self, taken: usize, now: Instant) {
         self.clock.written = now;
         self.clock.written_since += taken as u64;
@@ -489,12 +510,13 @@ impl Connection {
         });
     }
 
-    /// Parcels handed to the kernel since this was last asked.
+    /// Returns the number of parcels handed to the kernel since the last call.
     pub(crate) fn take_parcels_written(&mut self) -> u64 {
         std::mem::take(&mut self.parcels_written)
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is to be called at the latest.
+    /// Returns the time at which [`handle_timeout`](Self::handle_timeout) must be called at the
+    /// latest.
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
         let connected = self.clock.connected?;
         let stalled = self
@@ -514,18 +536,24 @@ impl Connection {
             .min()
     }
 
-    /// Does what is due. `least_progress` is how many bytes the frame that is half arrived needs to
-    /// get in the time in which that is measured.
+    /// Handles the timers that are due. `least_progress` is the number of bytes of a partly arrived
+    /// frame that must arrive in each measuring period.
     ///
     /// # Errors
     /// When the connection is over.
-    pub(crate) fn handle_timeout(&mut self, now: Instant, least_progress: u64) -> Result<(), End> {
+    pub(crate) fn handle_timeout(
+        &mut self,
+        now: Instant,
+        least_progress: u64,
+    ) -> Result<(), ConnectionEnd> {
         let Some(connected) = self.clock.connected else {
             return Ok(());
         };
         if self.peer.is_none() {
             return if now >= connected + self.limits.handshake_timeout {
-                Err(End::TooSlow("the peer did not say hello in time"))
+                Err(ConnectionEnd::TooSlow(
+                    "the peer sent no hello in time (handshake_timeout)",
+                ))
             } else {
                 Ok(())
             };
@@ -534,16 +562,18 @@ impl Connection {
             && now >= since + self.limits.stall_timeout
         {
             if bytes < least_progress.max(Limits::MIN_PROGRESS) {
-                return Err(End::TooSlow("the peer stopped in the middle of a frame"));
+                return Err(ConnectionEnd::TooSlow(
+                    "the peer stopped sending in the middle of a frame (stall_timeout)",
+                ));
             }
             self.clock.partial = Some((now, 0));
         }
         if self.is_idle() && now >= self.clock.busy + self.limits.idle_close {
             self.retiring = true;
-            return Err(End::Idle);
+            return Err(ConnectionEnd::Idle);
         }
         if self.doubt_due().is_some_and(|due| now >= due) {
-            return Err(End::Silent);
+            return Err(ConnectionEnd::Silent);
         }
         if now >= self.sign_of_life_due() {
             if self.paused {
@@ -554,7 +584,7 @@ impl Connection {
                 return Ok(());
             }
             if self.clock.pinged {
-                return Err(End::Silent);
+                return Err(ConnectionEnd::Silent);
             }
             self.clock.pinged = true;
             self.push_control(frame::ping());
@@ -562,9 +592,9 @@ impl Connection {
         Ok(())
     }
 
-    /// Ends the connection: gives every parcel sent from here its conclusion, in the order of
-    /// sending. After an orderly end what is left to write is a goodbye.
-    pub(crate) fn end(&mut self, end: &End) -> Vec<(AttemptId, Conclusion)> {
+    /// Ends the connection. Returns the conclusion of every attempt, in the order of sending. After
+    /// an orderly end, a goodbye remains to be written.
+    pub(crate) fn end(&mut self, end: &ConnectionEnd) -> Vec<(AttemptId, Conclusion)> {
         if std::mem::replace(&mut self.ended, true) {
             return Vec::new();
         }
@@ -575,7 +605,7 @@ impl Connection {
         self.arrivals.clear();
         self.attempts.clear();
         let taken = match end {
-            End::Goodbye { last } => *last,
+            ConnectionEnd::Goodbye { last } => *last,
             _ => u64::MAX,
         };
         let greeted = self.peer.is_some();
@@ -592,7 +622,7 @@ impl Connection {
             .collect()
     }
 
-    /// How many more parcels may begin.
+    /// Returns the number of parcels that may still begin.
     fn window(&self) -> usize {
         let Some(peer) = self.peer.as_ref().filter(|_| self.open) else {
             return 0;
@@ -604,11 +634,11 @@ impl Connection {
         self.attempts.is_empty() && self.arrivals.is_empty() && self.answers_waiting == 0
     }
 
-    /// When the peer must be asked for a sign of life, or (after that) given up. Bytes that the
-    /// kernel still takes show that the peer reads: it may be busy with a large letter.
+    /// Returns the time at which a ping is due or, after a ping, the peer is given up. Bytes that
+    /// the kernel still takes show that the peer reads: it may be busy with a large letter.
     fn sign_of_life_due(&self) -> Instant {
         if self.paused {
-            // Before the peer begins to ask.
+            // Earlier than the peer's own ping.
             return self.clock.received + self.limits.keep_alive / 2;
         }
         if self.clock.pinged {
@@ -628,7 +658,8 @@ impl Connection {
         self.outbox.push_urgent(About::Control, frame);
     }
 
-    /// Why this peer cannot get what was meant for whoever is there.
+    /// Returns the error of a parcel that was queued before the hello and that this peer cannot
+    /// receive.
     fn unfit(&self, sent: &Sent, peer: &Hello) -> Option<WayError> {
         if sent.letter_len > peer.max_letter {
             return Some(too_large_for_peer(sent.letter_len, peer.max_letter));
@@ -637,27 +668,29 @@ impl Connection {
         (!is_its).then(|| not_its_agent(&sent.receiver))
     }
 
-    fn greet(&mut self, hello: Hello, now: Instant) -> Result<(), End> {
+    fn greet(&mut self, hello: Hello, now: Instant) -> Result<(), ConnectionEnd> {
         let found = hello.identity.incarnation;
         if let Role::Dialler { expected } = self.role
             && expected.is_known()
             && expected != found
         {
-            return Err(End::WrongIncarnation { expected, found });
+            return Err(ConnectionEnd::WrongIncarnation { expected, found });
         }
         if found == self.hello.identity.incarnation {
-            // This side would write to itself, and exchange its directory with itself.
-            return Err(End::Nonsense(OWN_INCARNATION.into()));
+            // This side would send letters and its directory to itself.
+            return Err(ConnectionEnd::ProtocolViolation(OWN_INCARNATION.into()));
         }
         if hello.max_in_flight == 0 {
-            return Err(End::Nonsense("the peer takes no parcels at all".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "the peer's hello allows no parcels in flight".into(),
+            ));
         }
         if let Some(what) = self.proof.contradicts(&hello.identity.name) {
-            return Err(End::Nonsense(what));
+            return Err(ConnectionEnd::ProtocolViolation(what));
         }
         self.clock.busy = now;
         self.events.push_back(Event::Greeted);
-        // These were taken before it was known who the peer is, and how much it takes.
+        // These parcels were queued before the peer's identity and limits were known.
         let unfit: Vec<(u64, WayError)> = self
             .sent
             .iter()
@@ -676,15 +709,21 @@ impl Connection {
         Ok(())
     }
 
-    fn arrive(&mut self, id: u64, parcel: Box<Parcel>, now: Instant) -> Result<(), End> {
+    fn arrive(&mut self, id: u64, parcel: Box<Parcel>, now: Instant) -> Result<(), ConnectionEnd> {
         if id <= self.last_arrival || id >= MAX_ID {
-            return Err(End::Nonsense("parcels whose numbers do not rise".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "a parcel number that is not larger than the one before".into(),
+            ));
         }
         if self.arrivals.len() + self.answers_waiting >= self.limits.max_in_flight.max(1) {
-            return Err(End::Nonsense("more parcels than may be in flight".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "more unanswered parcels than max_in_flight".into(),
+            ));
         }
         if letter_len(&parcel) > self.limits.max_letter as u64 {
-            return Err(End::Nonsense("a larger letter than may be sent".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "a letter larger than max_letter".into(),
+            ));
         }
         self.last_arrival = id;
         self.arrivals.insert(id);
@@ -693,7 +732,7 @@ impl Connection {
         Ok(())
     }
 
-    fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), End> {
+    fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), ConnectionEnd> {
         match self.sent.remove(&id) {
             Some(sent) if sent.begun.is_some() => {
                 self.begun -= 1;
@@ -706,16 +745,20 @@ impl Connection {
                 Ok(())
             }
             Some(unsent) => {
-                // Put back: it still needs its conclusion.
+                // Reinserted because it still needs a conclusion.
                 self.sent.insert(id, unsent);
-                Err(End::Nonsense("an answer to what was never sent".into()))
+                Err(ConnectionEnd::ProtocolViolation(
+                    "an answer to a parcel that was not sent".into(),
+                ))
             }
-            None => Err(End::Nonsense("an answer to what was never asked".into())),
+            None => Err(ConnectionEnd::ProtocolViolation(
+                "an answer to an unknown parcel".into(),
+            )),
         }
     }
 }
 
-/// Length of the letter in a parcel; what is no letter is small.
+/// Returns the length of the letter in a parcel; 0 for other parcels.
 pub(crate) fn letter_len(parcel: &Parcel) -> u64 {
     match &parcel.body {
         Body::Letter(letter) => letter.len() as u64,
@@ -724,14 +767,14 @@ pub(crate) fn letter_len(parcel: &Parcel) -> u64 {
 }
 
 fn not_its_agent(receiver: &str) -> WayError {
-    let detail = format!("the certificate of the peer there does not speak for {receiver}");
+    let detail = format!("the certificate of the peer does not cover the agent {receiver}");
     WayError::new(WayFault::Refused, detail)
 }
 
 fn too_large_for_peer(len: u64, max: u64) -> WayError {
     WayError::new(
         WayFault::TooLarge,
-        format_args!("{len} bytes; the peer takes letters of up to {max}"),
+        format_args!("the letter has {len} bytes; the peer accepts at most {max}"),
     )
 }
 

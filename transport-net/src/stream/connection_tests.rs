@@ -35,19 +35,19 @@ fn limits() -> Limits {
     }
 }
 
-/// One side of a simulated connection: what it did, and what the network holds for it.
+/// One side of a simulated connection, with its results and the bytes in the network.
 struct Side {
     connection: Connection,
     reader: FrameReader,
     /// Bytes on their way to this side.
     coming: BytesMut,
-    /// Parcels that arrived, by their sequence, and those not answered yet, by number.
+    /// Arrived parcels by their sequence, and unanswered ones by number.
     arrived: Vec<u64>,
     open: Vec<u64>,
     concluded: BTreeMap<AttemptId, Vec<Conclusion>>,
     dispatched: Vec<u64>,
     abandoned: Vec<u64>,
-    end: Option<End>,
+    end: Option<ConnectionEnd>,
 }
 
 impl Side {
@@ -79,7 +79,7 @@ impl Side {
         Ok(())
     }
 
-    /// Up to `max` bytes go into the network.
+    /// Puts up to `max` bytes into the network.
     fn transmit(&mut self, max: usize, to: &mut BytesMut, now: Instant) {
         let mut slices = [IoSlice::new(&[]); 5];
         let count = self.connection.gather(&mut slices);
@@ -89,7 +89,7 @@ impl Side {
         self.connection.written(taken, now);
     }
 
-    /// Up to `max` bytes come out of the network.
+    /// Takes up to `max` bytes out of the network.
     fn receive(&mut self, max: usize, now: Instant) {
         let step = {
             let Space::Buffer(mut space) = self.reader.space() else {
@@ -124,7 +124,7 @@ impl Side {
         }
     }
 
-    fn finish(&mut self, end: End) {
+    fn finish(&mut self, end: ConnectionEnd) {
         for (attempt, conclusion) in self.connection.end(&end) {
             self.concluded.entry(attempt).or_default().push(conclusion);
         }
@@ -138,7 +138,7 @@ impl Side {
         }
     }
 
-    /// What must be true once this side has ended and the other took all it ever will.
+    /// Checks the conclusions after this side has ended and the other has received everything.
     fn check(&self, other: &Self) -> Result<(), TestCaseError> {
         for sequence in &self.dispatched {
             let conclusions = self.concluded.get(&AttemptId(*sequence));
@@ -186,7 +186,7 @@ fn step() -> impl Strategy<Value = (bool, Step)> {
 fn perform(step: &Step, this: &mut Side, other: &mut Side, now: Instant) {
     match step {
         Step::Dispatch(len) => match this.dispatch(*len) {
-            Err(SendError::Way(error)) => assert_eq!(error.fault, WayFault::Congested),
+            Err(SendError::Transport(error)) => assert_eq!(error.fault, WayFault::Congested),
             Err(SendError::Ended) => assert!(this.end.is_some()),
             Ok(()) => {}
         },
@@ -212,7 +212,7 @@ fn pair(now: Instant) -> (Side, Side) {
     )
 }
 
-/// Lets both sides do all they can. Says whether they are done.
+/// Lets both sides make progress. Returns whether both are done.
 fn settle(a: &mut Side, b: &mut Side, now: Instant) {
     for _ in 0..2000 {
         for pick in 0..2 {
@@ -229,7 +229,7 @@ fn settle(a: &mut Side, b: &mut Side, now: Instant) {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
 
-    /// Whatever happens in whatever order, a connection that lives answers everything.
+    /// A connection that does not end answers every parcel, for any order of events.
     #[test]
     fn every_parcel_is_answered_once_and_in_order(
         steps in prop::collection::vec(step(), 0..200),
@@ -253,15 +253,15 @@ proptest! {
         }
     }
 
-    /// However a connection ends, nothing that was called not sent arrives.
+    /// No parcel that was concluded as not sent arrives, for any end of the connection.
     #[test]
-    fn conclusions_are_honest_when_a_connection_ends(
+    fn conclusions_are_true_when_a_connection_ends(
         steps in prop::collection::vec(step(), 0..120),
         end in prop_oneof![
-            Just(End::Hangup),
-            Just(End::Closed),
-            Just(End::Idle),
-            Just(End::Silent),
+            Just(ConnectionEnd::Hangup),
+            Just(ConnectionEnd::Closed),
+            Just(ConnectionEnd::Idle),
+            Just(ConnectionEnd::Silent),
         ],
         lost in any::<bool>(),
         first in any::<bool>(),
@@ -283,13 +283,13 @@ proptest! {
                 other.receive(1000, now);
             }
         }
-        other.finish(End::Hangup);
+        other.finish(ConnectionEnd::Hangup);
         ending.check(other)?;
         other.check(ending)?;
     }
 }
 
-/// Both have said hello.
+/// Two sides that have exchanged their hello.
 fn greeted(now: Instant) -> (Side, Side) {
     let (mut a, mut b) = pair(now);
     settle(&mut a, &mut b, now);
@@ -298,7 +298,7 @@ fn greeted(now: Instant) -> (Side, Side) {
 }
 
 #[test]
-fn another_incarnation_ends_it_before_anything_is_sent() {
+fn another_incarnation_ends_the_connection_before_a_parcel_is_sent() {
     let now = Instant::now();
     let expected = Incarnation::from_u64(3);
     let mut a = Side::new(Role::Dialler { expected }, 1, now);
@@ -306,7 +306,10 @@ fn another_incarnation_ends_it_before_anything_is_sent() {
     a.dispatch(10).unwrap();
     settle(&mut a, &mut b, now);
     let found = Incarnation::from_u64(2);
-    assert_eq!(a.end, Some(End::WrongIncarnation { expected, found }));
+    assert_eq!(
+        a.end,
+        Some(ConnectionEnd::WrongIncarnation { expected, found })
+    );
     match &a.concluded[&AttemptId(0)][..] {
         [Conclusion::NotSent(error)] => assert_eq!(error.fault, WayFault::WrongIncarnation),
         other => panic!("{other:?}"),
@@ -315,7 +318,7 @@ fn another_incarnation_ends_it_before_anything_is_sent() {
 }
 
 #[test]
-fn a_letter_that_the_peer_does_not_take_is_not_sent() {
+fn a_letter_that_the_peer_does_not_accept_is_not_sent() {
     let now = Instant::now();
     let (mut a, mut b) = pair(now);
     b.connection.hello.max_letter = 100;
@@ -327,12 +330,12 @@ fn a_letter_that_the_peer_does_not_take_is_not_sent() {
         other => panic!("{other:?}"),
     }
     assert_eq!(b.arrived, [1]);
-    assert!(matches!(a.dispatch(101), Err(SendError::Way(error))
+    assert!(matches!(a.dispatch(101), Err(SendError::Transport(error))
         if error.fault == WayFault::TooLarge));
 }
 
 #[test]
-fn the_window_of_the_peer_is_kept_and_congestion_told() {
+fn the_window_of_the_peer_is_respected_and_congestion_reported() {
     let now = Instant::now();
     let (mut a, mut b) = pair(now);
     b.connection.hello.max_in_flight = 2;
@@ -340,7 +343,7 @@ fn the_window_of_the_peer_is_kept_and_congestion_told() {
     for _ in 0..limits().max_in_flight {
         a.dispatch(10).unwrap();
     }
-    assert!(matches!(a.dispatch(10), Err(SendError::Way(error))
+    assert!(matches!(a.dispatch(10), Err(SendError::Transport(error))
         if error.fault == WayFault::Congested));
     a.transmit(usize::MAX, &mut b.coming, now);
     a.transmit(usize::MAX, &mut b.coming, now);
@@ -350,19 +353,19 @@ fn the_window_of_the_peer_is_kept_and_congestion_told() {
 }
 
 #[test]
-fn bytes_that_wait_are_bounded_and_one_letter_always_fits() {
+fn queued_bytes_are_bounded_and_one_letter_always_fits() {
     let now = Instant::now();
     let (mut a, _) = pair(now);
     a.connection.limits.max_queued_bytes = 100;
     a.dispatch(4000).unwrap();
-    assert!(matches!(a.dispatch(1), Err(SendError::Way(error))
+    assert!(matches!(a.dispatch(1), Err(SendError::Transport(error))
         if error.fault == WayFault::Congested));
     a.connection.abandon(AttemptId(0), now);
     a.dispatch(1).unwrap();
 }
 
 #[test]
-fn what_a_peer_must_not_send_ends_the_connection() {
+fn a_protocol_violation_ends_the_connection() {
     let now = Instant::now();
     let nonsense = |frames: Vec<Frame>| {
         let (mut a, _) = greeted(now);
@@ -370,7 +373,10 @@ fn what_a_peer_must_not_send_ends_the_connection() {
             .into_iter()
             .map(|frame| a.connection.handle_frame(frame, now))
             .last();
-        assert!(matches!(last, Some(Err(End::Nonsense(_)))), "{last:?}");
+        assert!(
+            matches!(last, Some(Err(ConnectionEnd::ProtocolViolation(_)))),
+            "{last:?}"
+        );
     };
     let arrive = |id, len| Frame::Parcel {
         id,
@@ -386,9 +392,9 @@ fn what_a_peer_must_not_send_ends_the_connection() {
     nonsense(vec![arrive(1, 5001)]);
     nonsense((1..=9).map(|id| arrive(id, 1)).collect());
     nonsense(vec![answer]);
-    let (_, mut stranger) = pair(now);
-    let end = stranger.connection.handle_frame(Frame::Ping, now);
-    assert!(matches!(end, Err(End::Nonsense(_))));
+    let (_, mut slot) = pair(now);
+    let end = slot.connection.handle_frame(Frame::Ping, now);
+    assert!(matches!(end, Err(ConnectionEnd::ProtocolViolation(_))));
 }
 
 #[test]
@@ -404,7 +410,7 @@ fn a_peer_that_pings_and_does_not_read_gets_few_pongs() {
 }
 
 #[test]
-fn silence_is_asked_about_and_then_ends_it() {
+fn a_silent_peer_gets_a_ping_and_is_then_given_up() {
     let mut now = Instant::now();
     let (mut a, mut b) = greeted(now);
     a.connection.limits.idle_close = Duration::from_secs(1000);
@@ -420,7 +426,10 @@ fn silence_is_asked_about_and_then_ends_it() {
     a.connection.handle_timeout(now, 0).unwrap();
     a.transmit(usize::MAX, &mut b.coming, now);
     now += keep_alive;
-    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
+    assert_eq!(
+        a.connection.handle_timeout(now, 0),
+        Err(ConnectionEnd::Silent)
+    );
 }
 
 #[test]
@@ -428,14 +437,17 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
     let patience = limits().keep_alive / 4;
-    assert!(!a.connection.doubt(start, patience), "heard a moment ago");
-    // A peer that answers stays.
+    assert!(
+        !a.connection.doubt(start, patience),
+        "a byte has just arrived"
+    );
+    // A peer that responds keeps its connection.
     let mut now = start + patience;
     assert!(a.connection.doubt(now, patience));
     settle(&mut a, &mut b, now);
     now += patience;
     a.connection.handle_timeout(now, 0).unwrap();
-    // One that does not is given up; doubting again grants no more time.
+    // A peer that does not respond is given up; doubting again grants no more time.
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.transmit(usize::MAX, &mut b.coming, now);
     let due = a.connection.poll_timeout().unwrap();
@@ -443,7 +455,10 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     now += patience / 2;
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.connection.handle_timeout(now, 0).unwrap();
-    assert_eq!(a.connection.handle_timeout(due, 0), Err(End::Silent));
+    assert_eq!(
+        a.connection.handle_timeout(due, 0),
+        Err(ConnectionEnd::Silent)
+    );
 }
 
 #[test]
@@ -459,9 +474,12 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
         a.transmit(100, &mut BytesMut::new(), now);
         a.connection.handle_timeout(now, 0).unwrap();
     }
-    // What was written has time to arrive.
+    // The written bytes have time to arrive.
     now += patience + Duration::from_millis(10);
-    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
+    assert_eq!(
+        a.connection.handle_timeout(now, 0),
+        Err(ConnectionEnd::Silent)
+    );
 }
 
 #[test]
@@ -476,18 +494,18 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     };
     let now = start + Duration::from_millis(1);
     let first = dispatch(&mut a, now);
-    // Its letter had a short deadline, which says nothing about the connection.
+    // A letter with a short deadline does not make the connection suspect.
     a.connection.abandon(first, now + patience / 2);
     assert!(!a.connection.is_suspect());
     let second = dispatch(&mut a, now);
     a.connection.received(1, false, now + patience / 2);
     a.connection.abandon(second, now + patience * 2);
-    assert!(!a.connection.is_suspect(), "something came meanwhile");
+    assert!(!a.connection.is_suspect(), "a byte arrived meanwhile");
     let now = now + patience * 3;
     let third = dispatch(&mut a, now);
     a.connection.abandon(third, now + patience);
     assert!(a.connection.is_suspect());
-    // The peer is asked, and what it says counts.
+    // The peer gets a ping, and its response counts.
     let mut asked = BytesMut::new();
     a.transmit(usize::MAX, &mut asked, now + patience);
     assert!(!asked.is_empty());
@@ -497,7 +515,7 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
 }
 
 #[test]
-fn idleness_ends_it_but_not_while_something_is_open() {
+fn an_idle_connection_closes_unless_a_parcel_is_open() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
     let mut now = start;
@@ -516,12 +534,15 @@ fn idleness_ends_it_but_not_while_something_is_open() {
     settle(&mut a, &mut b, now);
     assert_eq!(a.concluded.len(), 1);
     now += limits().idle_close;
-    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Idle));
+    assert_eq!(
+        a.connection.handle_timeout(now, 0),
+        Err(ConnectionEnd::Idle)
+    );
     assert_eq!(a.dispatch(1), Err(SendError::Ended));
 }
 
 #[test]
-fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
+fn a_stalled_frame_ends_the_connection_and_a_slow_one_does_not() {
     let mut now = Instant::now();
     let (mut a, _) = greeted(now);
     a.connection.received(100, true, now);
@@ -539,7 +560,7 @@ fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
     }
     assert!(matches!(
         a.connection.handle_timeout(now, 0),
-        Err(End::TooSlow(_))
+        Err(ConnectionEnd::TooSlow(_))
     ));
 }
 
@@ -551,12 +572,12 @@ fn a_hello_must_come_in_time() {
     assert_eq!(b.connection.poll_timeout(), Some(late));
     assert!(matches!(
         a.connection.handle_timeout(late, 0),
-        Err(End::TooSlow(_))
+        Err(ConnectionEnd::TooSlow(_))
     ));
 }
 
 #[test]
-fn a_peer_that_says_it_is_this_service_is_refused() {
+fn a_peer_that_claims_to_be_this_service_is_refused() {
     let now = Instant::now();
     for role in [
         Role::Acceptor,
@@ -567,7 +588,10 @@ fn a_peer_that_says_it_is_this_service_is_refused() {
         let mut connection = Connection::new(limits(), role, sample(1), now);
         connection.connected(now);
         let other = connection.handle_frame(Frame::Hello(sample(1)), now);
-        assert!(matches!(other, Err(End::Nonsense(_))), "{other:?}");
+        assert!(
+            matches!(other, Err(ConnectionEnd::ProtocolViolation(_))),
+            "{other:?}"
+        );
         assert_eq!(connection.poll_event(), None);
     }
 }

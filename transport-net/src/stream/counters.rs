@@ -1,4 +1,4 @@
-//! What an endpoint counts, for people who look at it.
+//! Counters of an endpoint, for diagnosis.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -6,14 +6,14 @@ use serde::Serialize;
 
 macro_rules! counters {
     ($($(#[$doc:meta])* $name:ident,)*) => {
-        /// What happened at an endpoint since it was made.
+        /// Counters of an endpoint since its creation.
         #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
         #[non_exhaustive]
         pub struct Counters {
             $($(#[$doc])* pub $name: u64,)*
         }
 
-        /// The counters while they count.
+        /// The live counters.
         #[derive(Debug, Default)]
         pub(crate) struct Tally {
             $(pub(crate) $name: AtomicU64,)*
@@ -28,9 +28,9 @@ macro_rules! counters {
 }
 
 counters! {
-    /// Connections now open with peers that introduced themselves.
+    /// Connections that are open now and whose peer has introduced itself.
     connections,
-    /// Connections opened from this side, with a hello from the other.
+    /// Connections opened by this side whose peer has introduced itself.
     dialled,
     /// Connections opened by peers that introduced themselves.
     accepted,
@@ -40,26 +40,26 @@ counters! {
     parcels_out,
     /// Parcels that arrived in frames.
     parcels_in,
-    /// Large contents that were read from the socket into the memory they are passed on from.
+    /// Large contents that were read from the socket directly into memory of the sink.
     placed,
-    /// Bytes of these that had been read together with what stands in front, and were copied.
+    /// Bytes of these contents that were read together with preceding bytes, and were copied.
     placed_moved_bytes,
-    /// Old peers' letters that arrived.
+    /// Letters of legacy peers that arrived.
     unframed_in,
-    /// Letters handed to old peers.
+    /// Letters handed to legacy peers.
     unframed_out,
-    /// Connections closed because of what the peer sent, or because it was too slow.
+    /// Connections closed because the peer violated the protocol or was too slow.
     refused_nonsense,
-    /// Letters refused because the peer's certificate does not speak for their senders.
+    /// Letters refused because the peer's certificate does not cover their senders.
     refused_senders,
-    /// Connections that had to prove who is there, and did not, or whose peer said that it is a service
-    /// that is connected.
+    /// Connections refused because the peer did not prove its identity, or claimed to be a service
+    /// that is already connected.
     refused_unproved,
-    /// Connections refused or pushed out because there were too many.
+    /// Connections refused or evicted because a limit was reached.
     refused_crowd,
-    /// How often a peer was read from later, because it had sent more than it may.
+    /// Number of times that reading from a peer paused because of its rate limit.
     held_back,
-    /// Failures of the operating system to hand out a new connection.
+    /// Failures of the operating system to accept a connection.
     accept_failures,
 }
 

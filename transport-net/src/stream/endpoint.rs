@@ -1,16 +1,15 @@
-//! What the connections of one endpoint share: who is connected, and which connection leads
-//! where.
+//! The registry of an endpoint: its connections, their peers and the locations they lead to.
 //!
-//! A location stays with one connection for as long as that lives, so that order holds. A
-//! location with a known incarnation uses whatever connection there is with that incarnation,
-//! whichever side opened it; so reports find their way back to peers that cannot be dialled. When
-//! two endpoints connect to each other at the same time both connections are kept: the one that is
-//! not used closes when it has been idle.
+//! A location keeps its connection until that connection ends, so that order is preserved. A
+//! location with a known incarnation uses any connection with that incarnation, opened by either
+//! side; this is how reports reach peers that cannot be dialled. When two endpoints connect to each
+//! other at the same time both connections are kept, and the unused one closes after the idle
+//! timeout.
 //!
-//! A connection on which an attempt had no answer, and nothing else has come either, is *suspect*: the
-//! system repeats lost packets more and more rarely, and a peer that has moved never answers. What is
-//! dispatched from then on takes another connection with the same peer, which is opened if there is
-//! none. When that is open and the suspect one is still silent, the suspect one ends.
+//! A connection is *suspect* after an attempt on it got no answer and no other byte arrived either:
+//! the system retransmits lost packets with growing pauses, and a peer that moved never answers.
+//! Later dispatches take another connection with the same peer, which is opened if there is none.
+//! When that connection is open and the suspect one is still silent, the suspect one ends.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
@@ -32,54 +31,49 @@ use tokio::runtime::Handle;
 use tokio::task::{AbortHandle, JoinHandle};
 use tokio::time::sleep;
 
+use super::budget::{ByteBudget, Meter, ReservedBytes};
 use super::config::{Limits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 use super::link::{Link, MAX_LINKS, of_ticket};
-use super::place::{Meter, Room, Rooms};
-use super::source::{Account, Home, Source};
+use super::source::{Home, QuotaKey, Source};
 use crate::Identity;
 #[cfg(feature = "ip")]
 use crate::address::{self, Listening};
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 #[cfg(feature = "ip")]
 use crate::interfaces::Changes;
-use crate::ration::Ration;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::PeerRateLimit;
 #[cfg(feature = "ip")]
-use crate::ration::Rations;
-use crate::seldom::warn_seldom;
-#[cfg(feature = "ip")]
-use crate::tcp::Legacy;
+use crate::rate_limit::PeerRateLimits;
 
-/// How long a service that is connected has to give a sign of life when a stranger says that it is the
+/// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// After so many silent connections, a stranger is refused when there are others to ask.
+/// Maximum number of silent connections that are pinged before an unproved peer is refused.
 const MAX_ASKED: usize = 4;
 
-/// The pause between connections that are opened beside suspect ones doubles this often.
-const LONGEST_BESIDE: u32 = 4;
+/// Maximum number of times that the pause between retries beside suspect connections doubles.
+const MAX_DOUBLINGS: u32 = 4;
 
-/// How long accepting rests when the system has no descriptors left.
-const REST: Duration = Duration::from_millis(100);
+/// Pause of accepting after a failure, for example when the process has no descriptors left.
+const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(100);
 
 #[derive(Debug)]
 pub(crate) struct Endpoint {
     kind: Kind,
     pub(crate) config: StreamConfig,
     pub(crate) runtime: Handle,
-    /// Letters of legacy peers, in both directions.
+    /// Memory of letters that are arriving.
+    pub(crate) byte_budget: ByteBudget,
+    /// Receive windows beyond the minimum; see [`Self::window`].
+    windows: ByteBudget,
+    /// Rate limits of the peers.
     #[cfg(feature = "ip")]
-    pub(crate) legacy: Legacy,
-    /// What is taken for letters that are arriving.
-    pub(crate) rooms: Rooms,
-    /// What is taken for bytes that peers may send ahead; see [`Self::window`].
-    windows: Rooms,
-    /// What peers may still send.
-    #[cfg(feature = "ip")]
-    rations: Rations,
+    rate_limits: PeerRateLimits,
     tally: Tally,
     registry: Mutex<Registry>,
 }
@@ -93,41 +87,42 @@ struct Registry {
     listeners: Vec<AbortHandle>,
     /// Connections that were dialled, or whose peer has said hello.
     links: HashMap<u32, Arc<Link>>,
-    /// The connection that was opened for a location.
+    /// Connections opened by this side, by location.
     dialled: HashMap<Location, Arc<Link>>,
     /// Locations for which connections were opened beside suspect ones.
-    beside: HashMap<Location, Beside>,
-    /// A connection with the service of this incarnation, and all others in the order they came.
+    suspect_retries: HashMap<Location, SuspectRetries>,
+    /// All connections with the service of an incarnation, in the order of introduction.
     known: HashMap<Incarnation, Vec<Arc<Link>>>,
-    /// The peers' last connections for each of the locations they dialled.
+    /// The latest connection of each peer for each location that the peer dialled, with the peer's
+    /// serial number.
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
-    /// The accounts of the accepted ones.
-    accounts: HashMap<u32, Account>,
-    /// The peers of the links, as they introduced themselves.
+    /// The quota keys of the accepted connections.
+    quota_keys: HashMap<u32, QuotaKey>,
+    /// The introduced peers of the links.
     peers: HashMap<u32, Peer>,
-    /// Accepted connections that have not introduced themselves, oldest first, and whose they are.
-    strangers: BTreeMap<u64, (Home, Option<AbortHandle>)>,
-    last_stranger: u64,
+    /// Accepted connections before the peer's hello, oldest first, with their origin and task.
+    unproved: BTreeMap<u64, (Home, Option<AbortHandle>)>,
+    last_unproved: u64,
     last_number: u32,
     last_serial: u64,
 }
 
-/// How often a connection was opened beside suspect ones, and when last.
+/// Number and time of the connections that were opened beside suspect ones.
 #[derive(Debug, Clone, Copy)]
-struct Beside {
+struct SuspectRetries {
     last: Instant,
     times: u32,
 }
 
-impl Beside {
-    /// Whether it is too soon for another one. The pause doubles each time.
+impl SuspectRetries {
+    /// Whether the pause since the last one has not passed. The pause doubles each time.
     fn is_soon(self, now: Instant, pause: Duration) -> bool {
-        now < self.last + pause.saturating_mul(1 << self.times.min(LONGEST_BESIDE))
+        now < self.last + pause.saturating_mul(1 << self.times.min(MAX_DOUBLINGS))
     }
 
-    /// Whether it is so long ago that it does not matter any more.
+    /// Whether the record has expired.
     fn is_over(self, now: Instant, pause: Duration) -> bool {
-        now >= self.last + pause.saturating_mul(4 << LONGEST_BESIDE)
+        now >= self.last + pause.saturating_mul(4 << MAX_DOUBLINGS)
     }
 }
 
@@ -139,19 +134,19 @@ enum Phase {
     Closed,
 }
 
-/// Where an endpoint is reached.
+/// The addresses at which an endpoint is reached.
 #[derive(Debug, Default)]
 enum Reached {
     #[default]
     Nowhere,
-    /// At the one socket with this address.
+    /// One socket with this address.
     Socket(String),
     #[cfg(feature = "ip")]
     Addresses(Listening),
 }
 
 impl Reached {
-    /// What a hello says of it.
+    /// Returns the addresses as listed in a hello.
     fn texts(&self) -> Vec<String> {
         match self {
             Self::Nowhere => Vec::new(),
@@ -162,33 +157,35 @@ impl Reached {
     }
 }
 
-/// The peer of a link, as it introduced itself.
+/// The introduced peer of a link.
 #[derive(Debug, Clone)]
 struct Peer {
     identity: Identity,
-    /// What it has proved about itself, if anything.
+    /// The principal that the peer has proved, if any.
     proved: Option<Principal>,
-    /// Where it was.
+    /// The origin of its connection.
     home: Home,
-    /// What it dialled, if it opened the connection, and the number that it gave to that.
+    /// The location that the peer dialled and the serial number of that dialling, if the peer
+    /// opened the connection.
     dialled: Option<(String, u64)>,
-    /// Where it listens, as it says.
+    /// The listening addresses in its hello.
+    #[cfg_attr(not(feature = "ip"), expect(dead_code, reason = "only IP peers move"))]
     listening: Vec<String>,
 }
 
-/// What follows for other connections from a peer's introduction.
+/// The effect of a peer's hello on other connections.
 #[derive(Default)]
-struct Rivals {
-    /// This one takes their place.
+struct SupersededConnections {
+    /// Connections that the new one replaces.
     superseded: Vec<Arc<Link>>,
-    /// This one takes their place unless their peers give a sign of life.
+    /// Connections that the new one replaces unless their peers respond to a ping.
     asked: Vec<Arc<Link>>,
-    /// Their peer may have moved here.
+    /// Connections whose peer may have moved to the origin of the new one.
     doubted: Vec<Arc<Link>>,
 }
 
-/// What tells a peer's connections for one location from others. With the address, so that a
-/// stranger elsewhere cannot push out somebody's connection by using its incarnation.
+/// The key of a peer's connections for one location. It contains the origin, so that an unproved
+/// peer elsewhere cannot replace the connection of a service by claiming its incarnation.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Inbound {
     incarnation: Incarnation,
@@ -197,7 +194,7 @@ struct Inbound {
 }
 
 impl Peer {
-    /// Whether a peer at this home may be this one at another of its addresses: it has listed that.
+    /// Whether `home` is another address in the listening addresses of this peer.
     fn is_also_at(&self, home: Home) -> bool {
         match home {
             Home::Process(_) => false,
@@ -206,9 +203,10 @@ impl Peer {
         }
     }
 
-    /// Whether this connection takes the place of that one, if both are of the same service: that
-    /// service was restarted, or it opened this one after that one, from another address or for the
-    /// same location. Connections that cross each other stay, and so do those for several locations.
+    /// Whether this connection replaces that one, if both are of the same service: the service was
+    /// restarted, or it opened this connection later from another address or for the same location.
+    /// Connections that both sides opened at the same time stay, and so do connections for several
+    /// locations.
     fn replaces(&self, before: &Self) -> bool {
         if self.identity.incarnation != before.identity.incarnation {
             let (this, that) = (&self.identity, &before.identity);
@@ -219,19 +217,19 @@ impl Peer {
             (Some((this, serial)), Some((that, earlier))) => {
                 serial >= earlier && (self.home != before.home || this == that)
             }
-            // A stranger at another address may be the service or not.
+            // An unproved peer at another address may or may not be the service.
             (Some(_), None) => self.proved.is_none() && self.home != before.home,
             (None, _) => false,
         }
     }
 }
 
-/// The connection for a location.
-enum Way {
-    /// It is there.
-    There(Arc<Link>),
-    /// It has just been made up and is still to be opened.
-    ToDial(Arc<Link>, Arc<dyn Sink>),
+/// A connection for a location.
+enum Route {
+    /// An existing connection.
+    Open(Arc<Link>),
+    /// A new link whose connection has yet to be opened.
+    New(Arc<Link>, Arc<dyn Sink>),
 }
 
 impl std::fmt::Debug for Registry {
@@ -240,24 +238,22 @@ impl std::fmt::Debug for Registry {
             .field("phase", &self.phase)
             .field("listening", &self.listening)
             .field("links", &self.links.len())
-            .field("strangers", &self.strangers.len())
+            .field("unproved", &self.unproved.len())
             .finish_non_exhaustive()
     }
 }
 
 impl Endpoint {
-    /// An endpoint of this kind of transport; what has been opened, it does not ask.
+    /// Creates an endpoint of this kind of transport.
     pub(crate) fn new(kind: Kind, config: StreamConfig, runtime: Handle) -> Arc<Self> {
         Arc::new(Self {
             kind,
             config,
             runtime,
+            byte_budget: ByteBudget::default(),
+            windows: ByteBudget::default(),
             #[cfg(feature = "ip")]
-            legacy: Legacy::default(),
-            rooms: Rooms::default(),
-            windows: Rooms::default(),
-            #[cfg(feature = "ip")]
-            rations: Rations::default(),
+            rate_limits: PeerRateLimits::default(),
             tally: Tally::default(),
             registry: Mutex::default(),
         })
@@ -267,45 +263,47 @@ impl Endpoint {
         &self.config.limits
     }
 
-    /// What the peers there may still send, if that is limited.
-    pub(crate) fn ration(&self, home: Home) -> Option<Arc<Ration>> {
+    /// Returns the rate limit of the peers at `home`, if they have one.
+    pub(crate) fn rate_limit(&self, home: Home) -> Option<Arc<PeerRateLimit>> {
         if !self.config.limits_peer_at(home) {
             return None;
         }
         match home {
             Home::Process(_) => None,
             #[cfg(feature = "ip")]
-            Home::Address(ip) => self.rations.of(ip, self.limits().rates(), Instant::now()),
+            Home::Address(ip) => self
+                .rate_limits
+                .of(ip, self.limits().rates(), Instant::now()),
         }
     }
 
-    /// Takes memory for arriving letters of this account.
-    pub(crate) fn meter(&self, account: &Account) -> Meter {
-        let budget = self.config.budget_of(account);
-        self.rooms.meter(account.clone(), budget)
+    /// Returns a meter that reserves memory for arriving letters of this quota.
+    pub(crate) fn meter(&self, quota_key: &QuotaKey) -> Meter {
+        let budget = self.config.budget_of(quota_key);
+        self.byte_budget.meter(quota_key.clone(), budget)
     }
 
-    /// Takes room for bytes that a peer of this account may send ahead. The budget is as large as that of
-    /// arriving letters.
-    pub(crate) fn window(&self, account: &Account, len: usize) -> Option<Room> {
-        let budget = self.config.budget_of(account);
-        self.windows.meter(account.clone(), budget).take_now(len)
+    /// Reserves bytes of receive window for a peer of this quota. The budget has the size of the
+    /// budget of arriving letters.
+    pub(crate) fn window(&self, quota_key: &QuotaKey, len: usize) -> Option<ReservedBytes> {
+        let budget = self.config.budget_of(quota_key);
+        self.windows.meter(quota_key.clone(), budget).take_now(len)
     }
 
     pub(crate) fn tally(&self) -> &Tally {
         &self.tally
     }
 
-    /// Who is told, while the endpoint is open.
+    /// Returns the sink while the endpoint is open.
     #[cfg(feature = "ip")]
     pub(crate) fn sink(&self) -> Option<Arc<dyn Sink>> {
         self.registry.lock().sink.clone()
     }
 
-    /// Whether the endpoint can be opened.
+    /// Checks that the endpoint can be opened.
     ///
     /// # Errors
-    /// When it was opened before, or its identity cannot be told.
+    /// When the endpoint was opened before, or its identity is invalid.
     fn may_listen(&self) -> Result<(), ListenError> {
         if self.registry.lock().phase != Phase::New {
             return Err(ListenError::OpenedBefore);
@@ -316,8 +314,8 @@ impl Endpoint {
         }
     }
 
-    /// Opens the one socket of the endpoint with `open`, which returns its address as well, and has
-    /// `accept` start the task that serves it. Returns where the endpoint is reached.
+    /// Opens the only socket of the endpoint with `open`, which also returns its address, and
+    /// starts the task that serves it with `accept`. Returns the location of the endpoint.
     ///
     /// # Errors
     /// When the endpoint was opened before, or the socket cannot be opened.
@@ -344,8 +342,8 @@ impl Endpoint {
         Ok(vec![location])
     }
 
-    /// Another socket takes the place of the one of [`listen_at`](Self::listen_at), at the same
-    /// address. Does nothing when the endpoint is not open.
+    /// Replaces the socket of [`listen_at`](Self::listen_at) by another one at the same address.
+    /// Does nothing when the endpoint is not open.
     pub(crate) fn replace_listener(&self, accept: impl FnOnce() -> JoinHandle<()>) {
         let mut registry = self.registry.lock();
         if registry.phase != Phase::Open {
@@ -358,9 +356,9 @@ impl Endpoint {
         }
     }
 
-    /// Opens a socket at each of these addresses with `open`, which returns the address that the
-    /// socket is bound to as well, and has `accept` start the task that serves it. Returns where the
-    /// endpoint is reached at present; the sink is told when that changes.
+    /// Opens a socket at each of these addresses with `open`, which also returns the address that
+    /// the socket is bound to, and starts the task that serves it with `accept`. Returns the
+    /// present locations of the endpoint; the sink is notified when they change.
     ///
     /// # Errors
     /// When the endpoint was opened before, or a socket cannot be opened.
@@ -406,15 +404,14 @@ impl Endpoint {
         Ok(locations)
     }
 
-    /// What a hello says of where this endpoint is reached.
+    /// Returns the listening addresses of this endpoint as listed in a hello.
     #[cfg(feature = "ip")]
     pub(crate) fn listening(&self) -> Vec<String> {
         self.registry.lock().listening.texts()
     }
 
-    /// The interfaces of this host have changed: tells the sink where the endpoint is reached now,
-    /// and ends the connections of addresses that this host has no more, on which nothing can
-    /// arrive.
+    /// Handles a change of the network interfaces: reports the new locations to the sink, and ends
+    /// the connections of local addresses that no longer exist, on which no byte can arrive.
     #[cfg(feature = "ip")]
     fn interfaces_changed(&self) {
         let (sink, told, lost, links) = {
@@ -425,7 +422,7 @@ impl Endpoint {
             let moved = match listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
-                    tracing::warn!(kind = %self.kind, %error, "the locations stay as they were");
+                    tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
                     return;
                 }
             };
@@ -444,31 +441,29 @@ impl Endpoint {
                 && lost.contains(&ip)
             {
                 let what = format!("this host no longer has the address {ip}");
-                link.leave(End::Broken(what));
-                // What is dispatched from now on needs another connection.
+                link.leave(ConnectionEnd::Broken(what));
+                // Later dispatches need another connection.
                 self.forget(&link);
             }
         }
         match (sink, told) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
-                tracing::warn!(kind = %self.kind, %error, "the locations stay as they were");
+                tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
             }
             _ => {}
         }
     }
 
-    /// Ends everything. The connections' tasks conclude what is outstanding.
+    /// Closes every connection. The tasks of the connections conclude outstanding attempts.
     pub(crate) fn close(&self) {
-        #[cfg(feature = "ip")]
-        self.legacy.close();
         let (links, tasks) = {
             let mut registry = self.registry.lock();
             registry.phase = Phase::Closed;
             registry.sink = None;
             let mut tasks = std::mem::take(&mut registry.listeners);
             tasks.extend(
-                std::mem::take(&mut registry.strangers)
+                std::mem::take(&mut registry.unproved)
                     .into_values()
                     .filter_map(|(_, task)| task),
             );
@@ -479,14 +474,14 @@ impl Endpoint {
             task.abort();
         }
         for link in links {
-            link.leave(End::Closed);
+            link.leave(ConnectionEnd::Closed);
         }
     }
 
-    /// Whether a parcel can be taken at all for this location.
+    /// Checks a parcel against the kind of the location, the receiver's name and `max_letter`.
     pub(crate) fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
         if to.kind() != self.kind {
-            let detail = format!("{to} is no {} location", self.kind);
+            let detail = format!("{to} is not a {} location", self.kind);
             return Err(WayError::new(WayFault::Unreachable, detail));
         }
         if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
@@ -495,14 +490,14 @@ impl Endpoint {
         }
         let (len, max) = (letter_len(parcel), self.limits().max_letter);
         if len > max as u64 {
-            let detail = format!("{len} bytes; at most {max} are taken (max_letter)");
+            let detail = format!("the letter has {len} bytes; the limit is {max} (max_letter)");
             return Err(WayError::new(WayFault::TooLarge, detail));
         }
         Ok(())
     }
 
-    /// Sends a parcel over the connection that leads to a location. When there is none, `dial` is
-    /// to start the task of one.
+    /// Sends a parcel over a connection to a location. `dial` starts the task of a new connection
+    /// when there is none.
     pub(crate) fn dispatch(
         &self,
         attempt: AttemptId,
@@ -511,9 +506,9 @@ impl Endpoint {
         dial: impl Fn(Arc<Link>, Arc<dyn Sink>) -> JoinHandle<()>,
     ) -> Result<(), WayError> {
         loop {
-            let (link, fresh) = match self.way_to(to)? {
-                Way::There(link) => (link, None),
-                Way::ToDial(link, sink) => (link, Some(sink)),
+            let (link, fresh) = match self.route_to(to)? {
+                Route::Open(link) => (link, None),
+                Route::New(link, sink) => (link, Some(sink)),
             };
             let sent = link.send(attempt, parcel);
             if let Some(sink) = fresh {
@@ -524,41 +519,44 @@ impl Endpoint {
                     return Err(WayError::new(WayFault::Closed, detail));
                 }
                 return sent.map_err(|error| match error {
-                    SendError::Way(error) => error,
-                    SendError::Ended => End::Closed.after(),
+                    SendError::Transport(error) => error,
+                    SendError::Ended => ConnectionEnd::Closed.after(),
                 });
             }
             match sent {
                 Ok(()) => return Ok(()),
-                Err(SendError::Way(error)) => return Err(error),
-                // It ended in this moment: the next turn makes up another.
+                Err(SendError::Transport(error)) => return Err(error),
+                // The connection has just ended: the next iteration creates another one.
                 Err(SendError::Ended) => self.forget(&link),
             }
         }
     }
 
-    /// The connection that leads to a location, made up when there is none.
-    fn way_to(&self, to: &Location) -> Result<Way, WayError> {
+    /// Returns a connection to a location; creates a link when there is none.
+    fn route_to(&self, to: &Location) -> Result<Route, WayError> {
         let mut registry = self.registry.lock();
         let sink = match (registry.phase, &registry.sink) {
             (Phase::Open, Some(sink)) => sink.clone(),
             (Phase::New, _) => {
-                return Err(WayError::new(WayFault::Closed, "listen was not called yet"));
+                return Err(WayError::new(
+                    WayFault::Closed,
+                    "`listen` has not been called",
+                ));
             }
-            _ => return Err(End::Closed.after()),
+            _ => return Err(ConnectionEnd::Closed.after()),
         };
         let dialled = registry.dialled.get(to);
         let known = registry.known.get(&to.incarnation());
         let open = || dialled.into_iter().chain(known.into_iter().flatten());
         let is_full = registry.links.len() >= self.limits().max_connections;
         let healthy = open().find(|link| !link.is_suspect());
-        // Another connection is opened beside suspect ones, if it gets a place, and ever more rarely:
-        // a peer that is busy is not to be given more work.
+        // Another connection is opened beside suspect ones if `max_connections` allows it, with
+        // growing pauses: a busy peer must not get more work.
         let now = Instant::now();
         let spare = self.limits().connect_timeout;
         let is_soon = || {
             registry
-                .beside
+                .suspect_retries
                 .get(to)
                 .is_some_and(|it| it.is_soon(now, spare))
         };
@@ -568,10 +566,10 @@ impl Endpoint {
                 drop(registry);
                 link.is_used_for(to);
             }
-            return Ok(Way::There(link));
+            return Ok(Route::Open(link));
         }
         if is_full {
-            return Err(End::Crowd.after());
+            return Err(ConnectionEnd::TooManyConnections.after());
         }
         let suspect: Vec<_> = open().cloned().collect();
         let serial = registry.last_serial + 1;
@@ -581,15 +579,15 @@ impl Endpoint {
         };
         let link = self.make_link(&mut registry, role, serial, to.to_string());
         if !suspect.is_empty() {
-            registry.note_beside(to, now, spare);
+            registry.note_retry(to, now, spare);
         }
         link.opened_beside(suspect);
         registry.links.insert(link.number, link.clone());
         registry.dialled.insert(to.clone(), link.clone());
-        Ok(Way::ToDial(link, sink))
+        Ok(Route::New(link, sink))
     }
 
-    /// Answers a parcel on the connection that it came by, if that is still there.
+    /// Answers a parcel on the connection that it arrived on, if that connection still exists.
     pub(crate) fn answer(&self, ticket: Ticket, answer: &Answer) {
         let (number, id) = of_ticket(ticket);
         let link = self.registry.lock().links.get(&number).cloned();
@@ -598,20 +596,17 @@ impl Endpoint {
         }
     }
 
-    /// Ends an attempt, on whichever connection it is.
+    /// Ends an attempt on any connection.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let links: Vec<_> = self.registry.lock().links.values().cloned().collect();
         let unsent = |link: &Arc<Link>| link.abandon(attempt) == Abandoned::NotSent;
         if links.iter().any(unsent) {
             return Abandoned::NotSent;
         }
-        #[cfg(feature = "ip")]
-        return self.legacy.abandon(attempt);
-        #[cfg(not(feature = "ip"))]
         Abandoned::Unconfirmed
     }
 
-    /// A link for a connection that was accepted, unless the endpoint has been closed.
+    /// Creates a link for an accepted connection. Returns `None` when the endpoint is closed.
     pub(crate) fn accepted(&self) -> Option<(Arc<Link>, Arc<dyn Sink>)> {
         let mut registry = self.registry.lock();
         let sink = registry.sink.clone()?;
@@ -644,20 +639,20 @@ impl Endpoint {
         Link::new(registry.last_number, connection)
     }
 
-    /// A peer has introduced itself on a connection. Returns where its parcels come from.
+    /// Registers a connection whose peer has introduced itself. Returns the origin of its parcels.
     ///
     /// # Errors
-    /// When the connection is not wanted.
+    /// When the connection is refused.
     pub(crate) async fn enter(
         &self,
         link: &Arc<Link>,
         peer: &Hello,
         proved: Option<Principal>,
         from: Source,
-    ) -> Result<Hop, End> {
+    ) -> Result<Hop, ConnectionEnd> {
         if !self.is_sought_by(peer) {
-            // It takes the place of none of the peer's connections with this service.
-            return Err(End::NotSought);
+            // It does not replace any connection of the peer with this service.
+            return Err(ConnectionEnd::NotSought);
         }
         let incarnation = peer.identity.incarnation;
         let inbound = Inbound {
@@ -673,64 +668,64 @@ impl Endpoint {
             listening: peer.listening.clone(),
         };
         let mut silent: Vec<u32> = Vec::new();
-        let rivals = loop {
+        let affected = loop {
             let asked = {
                 let mut registry = self.registry.lock();
                 if registry.phase != Phase::Open {
-                    return Err(End::Closed);
+                    return Err(ConnectionEnd::Closed);
                 }
-                let rivals = registry.rivals(link, &this);
-                let mut rivals = rivals.map_err(|why| self.refuse(from, why))?;
-                let (gone, asked): (Vec<_>, Vec<_>) = std::mem::take(&mut rivals.asked)
+                let affected = registry.affected(link, &this);
+                let mut affected = affected.map_err(|why| self.refuse(from, why))?;
+                let (gone, asked): (Vec<_>, Vec<_>) = std::mem::take(&mut affected.asked)
                     .into_iter()
-                    .partition(|rival| silent.contains(&rival.number));
+                    .partition(|other| silent.contains(&other.number));
                 if asked.is_empty() {
-                    rivals.superseded.extend(gone);
-                    self.admit(&mut registry, link, &this, &rivals.superseded, from)?;
+                    affected.superseded.extend(gone);
+                    self.admit(&mut registry, link, &this, &affected.superseded, from)?;
                     count(match this.dialled {
                         Some(_) => &self.tally.accepted,
                         None => &self.tally.dialled,
                     });
                     registry.note(link, this, inbound)?;
                     count(&self.tally.connections);
-                    break rivals;
+                    break affected;
                 }
                 asked
             };
             if silent.len() > MAX_ASKED {
-                return Err(End::Crowd);
+                return Err(ConnectionEnd::TooManyConnections);
             }
             let now = Instant::now();
-            asked.iter().for_each(|rival| rival.ask());
-            for rival in asked {
-                if rival.answers(now, SIGN_OF_LIFE).await {
-                    return Err(self.refuse(from, "its incarnation has a connection that is alive"));
+            asked.iter().for_each(|other| other.ask());
+            for other in asked {
+                if other.answers(now, RESPONSE_TIMEOUT).await {
+                    return Err(self.refuse(from, "it claims the incarnation of a connected service whose connection is alive"));
                 }
-                silent.push(rival.number);
+                silent.push(other.number);
             }
         };
-        for other in rivals.doubted {
+        for other in affected.doubted {
             other.doubt();
         }
-        for superseded in &rivals.superseded {
-            superseded.leave(End::Superseded);
+        for superseded in &affected.superseded {
+            superseded.leave(ConnectionEnd::Superseded);
         }
-        for superseded in rivals.superseded {
-            // What the peer sent on its connection before this one must not arrive after what it
-            // sends now.
+        for superseded in affected.superseded {
+            // Letters that the peer sent on the previous connection must not arrive after letters
+            // on this one.
             superseded.over().await;
         }
         let (principal, back) = match from {
-            // A process of this host is reached at the socket that bears its incarnation.
+            // A process of this host is reached at the socket that is named after its incarnation.
             Source::Process(_) => (Principal::Host, incarnation.to_string()),
             #[cfg(feature = "ip")]
             Source::Address(from) => (
                 self.config.principal_at(from.ip(), &peer.identity),
-                address::way_back(&peer.listening, from).to_string(),
+                address::return_address(&peer.listening, from).to_string(),
             ),
         };
         let location = Location::new(self.kind, &back)
-            .map_err(|error| End::Nonsense(error.to_string()))?
+            .map_err(|error| ConnectionEnd::ProtocolViolation(error.to_string()))?
             .with_incarnation(incarnation);
         Ok(Hop {
             location,
@@ -738,18 +733,19 @@ impl Endpoint {
         })
     }
 
-    /// Whether the peer opened the connection for this service, as far as it says. If not, it dialled
-    /// an address that another incarnation had before.
+    /// Whether the peer dialled this service, according to its hello. If not, it dialled an address
+    /// that another incarnation used before.
     fn is_sought_by(&self, peer: &Hello) -> bool {
         let sought = peer.dialled.parse::<Location>().ok();
         let sought = sought.map_or(Incarnation::UNKNOWN, |location| location.incarnation());
         !sought.is_known() || sought == self.config.identity.incarnation
     }
 
-    /// Gives a place to a connection whose peer has introduced itself, in place of others.
+    /// Admits a connection whose peer has introduced itself, within the limits and in place of
+    /// superseded connections.
     ///
     /// # Errors
-    /// When there is none.
+    /// When a limit is reached.
     fn admit(
         &self,
         registry: &mut Registry,
@@ -757,48 +753,50 @@ impl Endpoint {
         peer: &Peer,
         superseded: &[Arc<Link>],
         from: Source,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         if registry.links.contains_key(&link.number) {
             return Ok(());
         }
         let goes = |number: &u32| superseded.iter().any(|other| other.number == *number);
-        let account = Account::of(from, peer.proved.as_ref());
-        let accounts = registry.accounts.iter();
-        let of_account = accounts
-            .filter(|(number, it)| **it == account && !goes(number))
+        let quota_key = QuotaKey::of(from, peer.proved.as_ref());
+        let quota_keys = registry.quota_keys.iter();
+        let of_quota_key = quota_keys
+            .filter(|(number, it)| **it == quota_key && !goes(number))
             .count();
         let all = registry.links.len() - registry.links.keys().filter(|it| goes(it)).count();
-        if all >= self.limits().max_connections || of_account >= self.config.places_of(&account) {
+        if all >= self.limits().max_connections
+            || of_quota_key >= self.config.max_connections_of(&quota_key)
+        {
             count(&self.tally.refused_crowd);
-            return Err(End::Crowd);
+            return Err(ConnectionEnd::TooManyConnections);
         }
-        registry.accounts.insert(link.number, account);
+        registry.quota_keys.insert(link.number, quota_key);
         registry.links.insert(link.number, link.clone());
         Ok(())
     }
 
-    /// Says why a peer is not the service that it says it is.
-    fn refuse(&self, from: Source, why: &'static str) -> End {
+    /// Logs and returns the refusal of a peer that claims to be another service.
+    fn refuse(&self, from: Source, why: &'static str) -> ConnectionEnd {
         let before = self.tally.refused_unproved.fetch_add(1, Ordering::Relaxed);
-        warn_seldom(before, format_args!("{from}: connection refused: {why}"));
-        End::Impostor(why)
+        warn_limited(before, format_args!("{from}: connection refused: {why}"));
+        ConnectionEnd::IdentityConflict(why)
     }
 
-    /// A connection has ended: nothing leads there any more.
-    pub(crate) fn left(&self, link: &Arc<Link>, end: &End) {
-        if end.is_misbehaviour() {
+    /// Logs the end of a connection and removes the connection from every table.
+    pub(crate) fn left(&self, link: &Arc<Link>, end: &ConnectionEnd) {
+        if end.is_misbehavior() {
             let before = self.tally.refused_nonsense.fetch_add(1, Ordering::Relaxed);
-            warn_seldom(before, format_args!("connection closed: {}", end.after()));
+            warn_limited(before, format_args!("connection closed: {}", end.after()));
         } else {
             tracing::debug!(link = link.number, "connection ended: {}", end.after());
         }
-        if let End::NotOpened(_) = end {
+        if let ConnectionEnd::NotOpened(_) = end {
             count(&self.tally.dial_failures);
         }
         self.forget(link);
     }
 
-    /// Takes a connection out of every table.
+    /// Removes a connection from every table.
     pub(crate) fn forget(&self, link: &Arc<Link>) {
         let mut registry = self.registry.lock();
         if registry
@@ -807,7 +805,7 @@ impl Endpoint {
             .is_some_and(|there| Arc::ptr_eq(there, link))
         {
             registry.links.remove(&link.number);
-            registry.accounts.remove(&link.number);
+            registry.quota_keys.remove(&link.number);
             registry.peers.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
@@ -825,111 +823,129 @@ impl Endpoint {
         }
     }
 
-    /// Accepting a connection has failed: tells that, and rests.
+    /// Logs a failure to accept a connection, and pauses.
     pub(crate) async fn accept_failed(&self, error: &io::Error) {
         let before = self.tally.accept_failures.fetch_add(1, Ordering::Relaxed);
-        warn_seldom(
+        warn_limited(
             before,
-            format_args!("cannot accept a connection: {error} (`ulimit -n`?)"),
+            format_args!(
+                "cannot accept a connection: {error}; retrying (for `too many open files`, raise `ulimit -n`)"
+            ),
         );
-        sleep(REST).await;
+        sleep(ACCEPT_RETRY_DELAY).await;
     }
 
-    /// Gives a place to a connection accepted from this home that has not introduced itself, unless
-    /// the endpoint has been closed. One too many pushes out another; so does one more of an address
-    /// that has half of all places.
-    pub(crate) fn receive_stranger(self: &Arc<Self>, from: Source) -> Option<Stranger> {
+    /// Admits an accepted connection before its peer's hello. Returns `None` when the endpoint is
+    /// closed. When the limit is reached, another connection is evicted; likewise when the
+    /// connections of one address take half of the limit.
+    pub(crate) fn admit_unproved(self: &Arc<Self>, from: Source) -> Option<UnprovedSlot> {
         let home = from.home().whole();
-        let (number, pushed_out) = {
+        let (number, evicted) = {
             let mut registry = self.registry.lock();
             if registry.phase != Phase::Open {
                 return None;
             }
-            registry.last_stranger += 1;
+            registry.last_unproved += 1;
             let most = self.limits().max_strangers.max(1);
-            let of_home = registry.strangers.values().filter(|(it, _)| *it == home);
+            let of_home = registry.unproved.values().filter(|(it, _)| *it == home);
             let greedy = self.config.limits_peer_at(home) && of_home.count() >= most.div_ceil(2);
-            let too_many = greedy || registry.strangers.len() >= most;
-            let pushed_out = too_many.then(|| registry.one_too_many(home)).flatten();
-            let pushed_out = pushed_out.and_then(|number| registry.strangers.remove(&number));
-            let number = registry.last_stranger;
-            registry.strangers.insert(number, (home, None));
-            (number, pushed_out)
+            let too_many = greedy || registry.unproved.len() >= most;
+            let evicted = too_many
+                .then(|| registry.eviction_candidate(home))
+                .flatten();
+            let evicted = evicted.and_then(|number| registry.unproved.remove(&number));
+            let number = registry.last_unproved;
+            registry.unproved.insert(number, (home, None));
+            (number, evicted)
         };
-        if let Some(task) = pushed_out.and_then(|(_, task)| task) {
+        if let Some(task) = evicted.and_then(|(_, task)| task) {
             count(&self.tally.refused_crowd);
             task.abort();
         }
-        Some(Stranger {
+        Some(UnprovedSlot {
             endpoint: self.clone(),
             number,
         })
     }
 
-    /// Whether so many have not introduced themselves yet that one should be slow to take more.
+    /// Whether the connections before their hello take at least half of their limit.
     #[cfg(feature = "quic")]
     pub(crate) fn is_crowded(&self) -> bool {
-        self.registry.lock().strangers.len() * 2 >= self.limits().max_strangers
+        self.registry.lock().unproved.len() * 2 >= self.limits().max_strangers
     }
 
-    /// The stranger with this number is served by this task.
-    pub(crate) fn stranger_started(&self, number: u64, task: AbortHandle) {
-        // Otherwise it is no stranger any more, or gone.
-        if let Some((_, place)) = self.registry.lock().strangers.get_mut(&number) {
-            *place = Some(task);
+    /// Sets the task that serves the connection with this number before its hello.
+    pub(crate) fn unproved_started(&self, number: u64, task: AbortHandle) {
+        // If it is absent, the peer has introduced itself or the connection has ended.
+        if let Some((_, slot)) = self.registry.lock().unproved.get_mut(&number) {
+            *slot = Some(task);
         }
     }
 }
 
 impl Registry {
-    /// What follows for others when this peer introduces itself on this link.
+    /// Returns the effect on other connections when this peer introduces itself on this link.
     ///
     /// # Errors
     /// When its incarnation is connected with another principal that has proved more.
-    fn rivals(&self, link: &Arc<Link>, this: &Peer) -> Result<Rivals, &'static str> {
-        let mut rivals = Rivals::default();
+    fn affected(
+        &self,
+        link: &Arc<Link>,
+        this: &Peer,
+    ) -> Result<SupersededConnections, &'static str> {
+        let mut affected = SupersededConnections::default();
         let incarnation = this.identity.incarnation;
         let others = self.links.values().filter(|it| it.number != link.number);
         for (other, peer) in others.filter_map(|it| Some((it, self.peers.get(&it.number)?))) {
             let is_same = peer.identity.incarnation == incarnation;
             let list = match (this.proved, peer.proved) {
                 (Some(proved), Some(other)) if proved != other && is_same => {
-                    return Err("its incarnation is connected with another certificate");
+                    return Err(
+                        "it claims the incarnation of a service that is connected with another certificate",
+                    );
                 }
                 (None, Some(_)) if is_same => {
-                    return Err("its incarnation is connected with a certificate");
+                    return Err(
+                        "it has no certificate and claims the incarnation of a service that is connected with one",
+                    );
                 }
-                // It was only claimed.
-                (Some(_), None) if is_same => &mut rivals.superseded,
+                // The other peer only claimed the incarnation.
+                (Some(_), None) if is_same => &mut affected.superseded,
                 (Some(proved), Some(before)) if proved == before && this.replaces(peer) => {
-                    &mut rivals.superseded
+                    &mut affected.superseded
                 }
-                // The connected peer itself has said that it has this address. Both connections stay,
-                // unless it has moved there.
-                (None, None) if is_same && peer.is_also_at(this.home) => &mut rivals.doubted,
+                // The connected peer has listed this address itself. Both connections stay, unless
+                // the peer has moved there.
+                (None, None) if is_same && peer.is_also_at(this.home) => &mut affected.doubted,
                 (None, None) if is_same && this.replaces(peer) => match this.home {
                     // The kernel proves the process.
-                    Home::Process(_) => &mut rivals.superseded,
-                    // A stranger must not end the connections of the service that it claims to be.
+                    Home::Process(_) => &mut affected.superseded,
+                    // An unproved peer must not end the connections of the service that it claims
+                    // to be.
                     #[cfg(feature = "ip")]
-                    Home::Address(_) => &mut rivals.asked,
+                    Home::Address(_) => &mut affected.asked,
                 },
-                _ if is_same && peer.home != this.home => &mut rivals.doubted,
+                _ if is_same && peer.home != this.home => &mut affected.doubted,
                 _ => continue,
             };
             list.push(other.clone());
         }
-        Ok(rivals)
+        Ok(affected)
     }
 
-    /// Enters a connection that has a place into the other tables.
+    /// Adds an admitted connection to the other tables.
     ///
     /// # Errors
     /// When the peer has opened a later one.
-    fn note(&mut self, link: &Arc<Link>, peer: Peer, inbound: Inbound) -> Result<(), End> {
+    fn note(
+        &mut self,
+        link: &Arc<Link>,
+        peer: Peer,
+        inbound: Inbound,
+    ) -> Result<(), ConnectionEnd> {
         if let Some((_, serial)) = &peer.dialled {
             match self.inbound.get(&inbound) {
-                Some((later, _)) if later > serial => return Err(End::Superseded),
+                Some((later, _)) if later > serial => return Err(ConnectionEnd::Superseded),
                 _ => self.inbound.insert(inbound, (*serial, link.clone())),
             };
         }
@@ -939,25 +955,25 @@ impl Registry {
         Ok(())
     }
 
-    /// A connection is opened beside suspect ones now. What is remembered is bounded by the connections
-    /// that an endpoint may have within the longest pause.
-    fn note_beside(&mut self, to: &Location, now: Instant, pause: Duration) {
-        self.beside.retain(|_, it| !it.is_over(now, pause));
-        let known = self.beside.entry(to.clone());
-        let beside = known.or_insert(Beside {
+    /// Records that a connection is opened beside suspect ones. The number of records is bounded by
+    /// the connections that an endpoint may have within the longest pause.
+    fn note_retry(&mut self, to: &Location, now: Instant, pause: Duration) {
+        self.suspect_retries.retain(|_, it| !it.is_over(now, pause));
+        let known = self.suspect_retries.entry(to.clone());
+        let retries = known.or_insert(SuspectRetries {
             last: now,
             times: 0,
         });
-        beside.times += 1;
-        beside.last = now;
+        retries.times += 1;
+        retries.last = now;
     }
 
-    /// Which stranger goes when another one comes from this home: the oldest of those from the home
-    /// that has the most places then. So those who knock often push out each other, and somebody with
-    /// a slow link gets in beside them.
-    fn one_too_many(&self, coming: Home) -> Option<u64> {
+    /// Selects the connection to evict when another one comes from `coming`: the oldest of the
+    /// origin that has the most connections then. Frequent connections of one origin evict each
+    /// other, so a peer with a slow link is still admitted.
+    fn eviction_candidate(&self, coming: Home) -> Option<u64> {
         let mut homes: HashMap<Home, (usize, Reverse<u64>)> = HashMap::new();
-        for (number, (home, task)) in &self.strangers {
+        for (number, (home, task)) in &self.unproved {
             if task.is_some() {
                 let fresh = || (usize::from(*home == coming), Reverse(*number));
                 homes.entry(*home).or_insert_with(fresh).0 += 1;
@@ -968,7 +984,7 @@ impl Registry {
     }
 }
 
-/// Tells an endpoint of changes of the interfaces, until it is gone or the task is aborted.
+/// Reports interface changes to an endpoint until the endpoint is dropped or the task is aborted.
 #[cfg(feature = "ip")]
 async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
     loop {
@@ -980,16 +996,16 @@ async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
     }
 }
 
-/// The place of one stranger; dropping it gives the place free.
+/// The slot of one accepted connection before its peer's hello. Dropping it frees the slot.
 #[derive(Debug)]
-pub(crate) struct Stranger {
+pub(crate) struct UnprovedSlot {
     endpoint: Arc<Endpoint>,
     pub(crate) number: u64,
 }
 
-impl Drop for Stranger {
+impl Drop for UnprovedSlot {
     fn drop(&mut self) {
-        self.endpoint.registry.lock().strangers.remove(&self.number);
+        self.endpoint.registry.lock().unproved.remove(&self.number);
     }
 }
 

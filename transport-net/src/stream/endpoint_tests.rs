@@ -1,4 +1,4 @@
-//! The registry of connections, without sockets: which connections get a place.
+//! The registry of connections, without sockets.
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 use std::net::SocketAddr;
@@ -29,7 +29,7 @@ fn identity(incarnation: u64) -> Identity {
     }
 }
 
-/// An endpoint that listens nowhere, to be used within a runtime.
+/// An endpoint without a listener. Must be used within a runtime.
 fn endpoint(limits: Limits) -> Arc<Endpoint> {
     let config = StreamConfig {
         identity: identity(1 << 40),
@@ -55,7 +55,7 @@ fn certificate(number: u8) -> Option<Principal> {
     Some(Principal::Certificate([number; 32]))
 }
 
-/// A connection accepted from there, whose peer says hello.
+/// An accepted connection whose peer sends a hello.
 struct Greeting {
     incarnation: u64,
     serial: u64,
@@ -76,7 +76,10 @@ fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting
     }
 }
 
-async fn enters(endpoint: &Endpoint, greeting: Greeting) -> Result<(Arc<Link>, Hop), End> {
+async fn enters(
+    endpoint: &Endpoint,
+    greeting: Greeting,
+) -> Result<(Arc<Link>, Hop), ConnectionEnd> {
     let (link, _) = endpoint.accepted().unwrap();
     let peer = Hello {
         identity: identity(greeting.incarnation),
@@ -91,7 +94,7 @@ async fn enters(endpoint: &Endpoint, greeting: Greeting) -> Result<(Arc<Link>, H
 }
 
 #[tokio::test]
-async fn no_source_has_more_than_half_of_the_places() {
+async fn no_source_has_more_than_half_of_the_slots() {
     let endpoint = endpoint(Limits {
         max_connections: 16,
         max_per_address: 4,
@@ -107,46 +110,46 @@ async fn no_source_has_more_than_half_of_the_places() {
         }
         entered
     };
-    // Every local user has all of 127.0.0.0/8.
+    // Every local user has all addresses of 127.0.0.0/8.
     assert_eq!(get_in(None, &|n| format!("127.0.0.{n}:1")).await, 8);
-    // Peers with keys are counted by certificate, also when they come from there.
+    // Peers with keys are counted by certificate, also on loopback.
     assert_eq!(get_in(certificate(1), &|_| "[::1]:1".into()).await, 4);
     assert_eq!(get_in(None, &|n| format!("[2001:db8::{n}]:1")).await, 4);
     assert_eq!(
         get_in(None, &|_| "10.0.0.1:1".into()).await,
         0,
-        "all are taken"
+        "all slots are taken"
     );
     assert_eq!(endpoint.tally().read().refused_crowd, 2 + 6 + 6 + 10);
 }
 
 #[tokio::test]
-async fn strangers_of_one_source_push_out_each_other() {
+async fn unproved_connections_of_one_source_evict_each_other() {
     let limits = Limits::default();
     let endpoint = endpoint(limits.clone());
-    let stranger = |from: &str| {
-        let place = endpoint.receive_stranger(at(from)).unwrap();
+    let slot = |from: &str| {
+        let place = endpoint.admit_unproved(at(from)).unwrap();
         let task = tokio::spawn(std::future::pending::<()>());
-        endpoint.stranger_started(place.number, task.abort_handle());
+        endpoint.unproved_started(place.number, task.abort_handle());
         (place, task)
     };
-    let slow = stranger("10.0.0.7:1");
+    let slow = slot("10.0.0.7:1");
     let crowd: Vec<_> = (0..4 * limits.max_strangers)
-        .map(|n| stranger(&format!("127.0.{}.{}:1", n / 250, n % 250 + 1)))
+        .map(|n| slot(&format!("127.0.{}.{}:1", n / 250, n % 250 + 1)))
         .collect();
     let networks: Vec<_> = (0..4 * limits.max_strangers)
-        .map(|n| stranger(&format!("[2001:db8::{n:x}]:1")))
+        .map(|n| slot(&format!("[2001:db8::{n:x}]:1")))
         .collect();
     let registry = endpoint.registry.lock();
     let has =
-        |(place, _): &(Stranger, JoinHandle<()>)| registry.strangers.contains_key(&place.number);
+        |(place, _): &(UnprovedSlot, JoinHandle<()>)| registry.unproved.contains_key(&place.number);
     assert!(has(&slow));
     let left = [&crowd, &networks].map(|crowd| crowd.iter().filter(|it| has(it)).count());
     assert_eq!(1 + left[0] + left[1], limits.max_strangers);
     drop(registry);
 }
 
-/// A certificate or none, an incarnation, where from, the serial, and what was dialled.
+/// A certificate or none, an incarnation, an origin, the serial number, and the dialled location.
 fn comes(
     proved: Option<Principal>,
     incarnation: u64,
@@ -164,29 +167,30 @@ fn comes(
 const X: &str = "tcp://10.0.0.1:7788";
 const Y: &str = "tcp://10.0.0.2:7788";
 
-/// The peer of the link that is asked. The tests have no sockets, so this stands for its task.
+/// Stands for the task of a link, because the tests have no sockets: ends the link on request.
 async fn ends_when_asked_to(link: Arc<Link>) {
     let end = link.leaving().await;
-    assert_eq!(end, End::Superseded);
+    assert_eq!(end, ConnectionEnd::Superseded);
     link.is_over();
 }
 
 #[tokio::test]
 async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
     let endpoint = endpoint(Limits::default());
-    let refused = |why| Err(End::Impostor(why));
+    let refused = |why| Err(ConnectionEnd::IdentityConflict(why));
     enters(&endpoint, comes(certificate(1), 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
     for from in ["10.0.0.7:2", "10.0.0.8:2"] {
         let entered = enters(&endpoint, comes(certificate(2), 7, from, 2, X)).await;
-        let another = "its incarnation is connected with another certificate";
+        let another =
+            "it claims the incarnation of a service that is connected with another certificate";
         assert_eq!(entered.map(|_| ()), refused(another));
         let entered = enters(&endpoint, comes(None, 7, from, 2, X)).await;
-        let proved = "its incarnation is connected with a certificate";
+        let proved = "it has no certificate and claims the incarnation of a service that is connected with one";
         assert_eq!(entered.map(|_| ()), refused(proved));
     }
-    // What was only claimed gives way.
+    // A connection with an unproved claim is replaced.
     let (claimed, _) = enters(&endpoint, comes(None, 9, "10.0.0.8:1", 1, X))
         .await
         .unwrap();
@@ -197,14 +201,13 @@ async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
 }
 
 #[tokio::test]
-async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its_other_connections_stay()
- {
+async fn a_moved_peer_with_keys_replaces_only_its_older_connection_for_the_same_location() {
     let endpoint = endpoint(Limits::default());
     let proved = certificate(1);
     let (first, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
-    // For another location, and one that this side has opened.
+    // One connection for another location, and one opened by this side.
     let (second, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:2", 2, Y))
         .await
         .unwrap();
@@ -223,7 +226,7 @@ async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its
 }
 
 #[tokio::test]
-async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection_lists() {
+async fn a_peer_without_keys_is_admitted_at_each_address_that_its_first_connection_lists() {
     let endpoint = endpoint(Limits::default());
     let first = Greeting {
         listening: &["0.0.0.0:7788", "10.0.0.7:7788", "10.0.1.7:7788"],
@@ -236,9 +239,9 @@ async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection
         enters(&endpoint, second).await.unwrap();
         assert_eq!(first.ending(), None, "both stay: {dialled}");
     }
-    // A stranger cannot list its own address: the connected peer has to. The peer of the first
-    // connection has no socket here and gives no sign of life.
-    let stranger = Greeting {
+    // An unproved peer cannot list its own address: the connected peer must list it. The peer of
+    // the first connection has no socket here and does not respond.
+    let slot = Greeting {
         listening: &["10.0.0.8:7788", "10.0.0.7:7788"],
         ..comes(None, 8, "10.0.0.8:1", 3, X)
     };
@@ -246,43 +249,48 @@ async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection
         .await
         .unwrap();
     tokio::spawn(ends_when_asked_to(claimed.clone()));
-    enters(&endpoint, stranger).await.unwrap();
-    assert_eq!(claimed.ending(), Some(End::Superseded), "it was asked");
+    enters(&endpoint, slot).await.unwrap();
+    assert_eq!(
+        claimed.ending(),
+        Some(ConnectionEnd::Superseded),
+        "it did not respond"
+    );
     assert_eq!(first.ending(), None);
 }
 
 #[tokio::test]
-async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certificate() {
+async fn receive_windows_share_one_budget_with_a_share_for_each_certificate() {
     let endpoint = endpoint(Limits::default());
     let limits = endpoint.limits().clone();
     let len = limits.max_incoming_per_source / 2 - 1;
-    let account = |number| Account::Certificate([number; 32]);
+    let quota_key = |number| QuotaKey::Certificate([number; 32]);
     let of_one: Vec<_> = (0..64)
-        .filter_map(|_| endpoint.window(&account(0), len))
+        .filter_map(|_| endpoint.window(&quota_key(0), len))
         .collect();
     assert_eq!(of_one.len(), 2);
     let of_all: Vec<_> = (0..64)
-        .filter_map(|number| endpoint.window(&account(number), len))
+        .filter_map(|number| endpoint.window(&quota_key(number), len))
         .collect();
     let taken = (of_one.len() + of_all.len()) * len;
     assert!(
         taken <= limits.max_incoming && taken + len > limits.max_incoming,
         "{taken}"
     );
-    // A connection that ends gives its share back.
+    // A connection that ends releases its share.
     drop(of_all);
-    assert!(endpoint.window(&account(9), len).is_some());
+    assert!(endpoint.window(&quota_key(9), len).is_some());
 }
 
 #[tokio::test]
-async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_this_one() {
+async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this_one() {
     let endpoint = endpoint(Limits::default());
     let proved = certificate(1);
     let (good, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
     tokio::spawn(ends_when_asked_to(good.clone()));
-    // From a new address, as after a move, the peer dials what a directory still says.
+    // From a new address, as after a move, the peer dials the location in an outdated directory
+    // entry.
     let earlier = comes(
         proved,
         7,
@@ -291,13 +299,13 @@ async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_thi
         "tcp://10.0.0.1:7788#0000000000000009",
     );
     let entered = enters(&endpoint, earlier).await;
-    assert_eq!(entered.map(|_| ()), Err(End::NotSought));
+    assert_eq!(entered.map(|_| ()), Err(ConnectionEnd::NotSought));
     assert_eq!(good.ending(), None);
 }
 
-/// A link that was dialled for this location, and whose peer has introduced itself.
+/// A link that was dialled for this location and whose peer has introduced itself.
 async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
-    let Way::ToDial(link, _) = endpoint.way_to(to).unwrap() else {
+    let Route::New(link, _) = endpoint.route_to(to).unwrap() else {
         panic!("there is a connection already");
     };
     link.connected(Instant::now());
@@ -321,18 +329,22 @@ async fn letters_take_another_connection_when_one_is_suspect() {
     });
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let first = dials(&endpoint, &to).await;
-    let Way::There(same) = endpoint.way_to(&to).unwrap() else {
-        panic!("a connection that works is kept");
+    let Route::Open(same) = endpoint.route_to(&to).unwrap() else {
+        panic!("a healthy connection is kept");
     };
     assert!(Arc::ptr_eq(&first, &same));
     first.doubt();
     assert!(first.is_suspect());
     let second = dials(&endpoint, &to).await;
-    assert_eq!(first.ending(), Some(End::Silent), "the other one is open");
-    let Way::There(used) = endpoint.way_to(&to).unwrap() else {
+    assert_eq!(
+        first.ending(),
+        Some(ConnectionEnd::Silent),
+        "the other one is open"
+    );
+    let Route::Open(used) = endpoint.route_to(&to).unwrap() else {
         panic!("it is used");
     };
     assert!(Arc::ptr_eq(&second, &used));
     second.doubt();
-    assert!(matches!(endpoint.way_to(&to).unwrap(), Way::ToDial(..)));
+    assert!(matches!(endpoint.route_to(&to).unwrap(), Route::New(..)));
 }

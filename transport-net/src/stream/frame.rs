@@ -1,16 +1,16 @@
-//! Frames: what stands on a connection between two endpoints.
+//! Frames: the encoding of a connection between two endpoints.
 //!
 //! A frame is a [`FrameHeader`] of 24 bytes, little-endian, and a body:
 //!
 //! | kind | id | body |
 //! |---|---|---|
 //! | 1 hello | 0 | see [`crate::hello`] |
-//! | 2 parcel | the sender's number of the parcel, rising | [`ParcelHeader`], then its body |
+//! | 2 parcel | the sender's number of the parcel, increasing | [`ParcelHeader`], then its body |
 //! | 3 answer | the parcel it answers | see [`crate::answer`] |
 //! | 4 ping, 5 pong | 0 | none |
-//! | 6 goodbye | the last parcel that was taken; later ones have not been and never will be | none |
+//! | 6 goodbye | the last accepted parcel; later ones are never accepted | none |
 //!
-//! The first byte tells a frame (`f`) from the letter of an old peer (`FE`, `FD`, `<`).
+//! The first byte distinguishes a frame (`f`) from the letter of a legacy peer (`FE`, `FD`, `<`).
 //!
 //! [`FrameReader`] turns bytes in pieces of any size into frames.
 
@@ -27,7 +27,8 @@ use crate::hello::{Hello, MAX_HELLO};
 
 pub(crate) use self::reader::{FrameReader, Placed, Space};
 
-/// What every frame begins with. A later version of the protocol keeps these eight bytes' layout.
+/// The header of every frame. A later version of the protocol keeps the layout of the first eight
+/// bytes.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout, Unaligned,
 )]
@@ -36,7 +37,7 @@ struct FrameHeader {
     magic: [u8; 4],
     version: u8,
     kind: u8,
-    /// Written as zero, not looked at: for what may be left out by who does not know it.
+    /// Written as zero and ignored on receipt; reserved for optional extensions.
     flags: U16,
     id: U64,
     body_len: U64,
@@ -53,10 +54,10 @@ const PING: u8 = 4;
 const PONG: u8 = 5;
 const GOODBYE: u8 = 6;
 
-/// Room in a parcel's body beside the letter: receiver name, or a whole report.
+/// Maximum length of a parcel's body beyond the letter: the receiver's name, or a whole report.
 const PARCEL_ALLOWANCE: u64 = 128 * 1024;
 
-/// A frame as it arrived.
+/// A decoded frame.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Frame {
     Hello(Hello),
@@ -67,17 +68,17 @@ pub(crate) enum Frame {
     Goodbye { last: u64 },
 }
 
-/// Bytes that are not frames.
+/// An error in the bytes of a frame.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum FrameError {
-    #[error("no frame begins with {0:02x?}")]
+    #[error("unknown start of a frame: {0:02x?}")]
     Magic([u8; 4]),
-    #[error("version {0} of the protocol; this side speaks {VERSION}")]
+    #[error("unsupported protocol version {0}; this side supports {VERSION}")]
     Version(u8),
-    #[error("unknown kind of frame: {0}")]
+    #[error("unknown frame kind {0}")]
     Kind(u8),
-    #[error("a frame of kind {kind} with {announced} bytes; {min} to {max} are allowed")]
+    #[error("frame of kind {kind} announces {announced} bytes; allowed are {min} to {max}")]
     Length {
         kind: u8,
         announced: u64,
@@ -92,8 +93,8 @@ pub(crate) enum FrameError {
     Parcel(#[from] WireError),
 }
 
-/// Whether a frame of ours whose first bytes are these is a parcel, and how long it is with its
-/// header.
+/// Decodes the header of a frame of this side. Returns whether the frame is a parcel, and its
+/// length with the header.
 #[cfg(feature = "quic")]
 pub(crate) fn begun(bytes: &[u8]) -> Option<(bool, u64)> {
     let (header, _) = FrameHeader::read_from_prefix(bytes).ok()?;
@@ -101,7 +102,7 @@ pub(crate) fn begun(bytes: &[u8]) -> Option<(bool, u64)> {
     Some((header.kind == PARCEL, len))
 }
 
-/// A hello, ready to be written.
+/// Encodes a hello.
 pub(crate) fn hello(hello: &Hello) -> Bytes {
     let body = hello.encode();
     let mut frame = BytesMut::with_capacity(HEADER_LEN + body.len());
@@ -110,7 +111,7 @@ pub(crate) fn hello(hello: &Hello) -> Bytes {
     frame.freeze()
 }
 
-/// A parcel, ready to be written: pieces in order, none of them empty. The letter is not copied.
+/// Encodes a parcel as ordered, nonempty pieces. The letter is not copied.
 pub(crate) fn parcel(id: u64, parcel: &Parcel) -> Result<Vec<Bytes>, WireError> {
     let (header, mut pieces) = ParcelHeader::of(parcel)?;
     let name = pieces.first().map_or(&[][..], |piece| piece);
@@ -126,7 +127,7 @@ pub(crate) fn parcel(id: u64, parcel: &Parcel) -> Result<Vec<Bytes>, WireError> 
     Ok(pieces)
 }
 
-/// An answer, ready to be written.
+/// Encodes an answer.
 pub(crate) fn answer(id: u64, answer: &Answer) -> Bytes {
     let mut frame = BytesMut::with_capacity(HEADER_LEN + MAX_ANSWER);
     put_header(&mut frame, ANSWER, id, answer::len(answer) as u64);
@@ -210,7 +211,7 @@ fn finish(header: FrameHeader, mut body: Bytes) -> Result<Frame, FrameError> {
     })
 }
 
-/// A parcel whose content lies in memory of its own.
+/// Decodes a parcel whose content is in separate memory.
 fn finish_apart(
     header: FrameHeader,
     mut front: Bytes,
@@ -225,7 +226,7 @@ fn finish_apart(
     })
 }
 
-/// Takes the parcel's header from the front of a body.
+/// Removes the parcel header from the front of a body.
 fn parcel_header(body: &mut Bytes) -> Result<ParcelHeader, WireError> {
     let Ok((header, _)) = ParcelHeader::read_from_prefix(body) else {
         let found = body.len() as u64;

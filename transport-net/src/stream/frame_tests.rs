@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::reader::{APART_FROM, CHUNK, FIRST_STEP};
 use super::*;
-use crate::stream::place::{Place, Rooms};
+use crate::stream::budget::{ByteBudget, ContentBuffer};
 
 fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
     let payload = Payload {
@@ -33,12 +33,12 @@ fn read(reader: &mut FrameReader, bytes: &[u8], sizes: &[usize]) -> Result<Vec<F
     read_into(reader, bytes, sizes, |_| None)
 }
 
-/// The same with memory for contents.
+/// Like [`read`], with memory for contents.
 fn read_into(
     reader: &mut FrameReader,
     mut bytes: &[u8],
     sizes: &[usize],
-    mut memory: impl FnMut(&Arriving<'_>) -> Option<Place>,
+    mut memory: impl FnMut(&Arriving<'_>) -> Option<ContentBuffer>,
 ) -> Result<Vec<Frame>, FrameError> {
     let mut frames = Vec::new();
     let mut sizes = sizes.iter().cycle();
@@ -56,7 +56,7 @@ fn read_into(
         while let Some(frame) = reader.next(&mut memory)? {
             frames.push(frame);
         }
-        // What waits until more comes is where it belongs, or the beginning of a header.
+        // Bytes that wait for more are in their final memory, or the start of a header.
         assert!(reader.chunk.len() < HEADER_LEN, "{reader:?}");
     }
     Ok(frames)
@@ -69,7 +69,7 @@ fn room(space: &Space<'_>) -> usize {
     }
 }
 
-/// Memory of the sink's.
+/// Memory of the sink.
 struct Memory(Vec<u8>);
 
 impl LoanedContent for Memory {
@@ -82,9 +82,9 @@ impl LoanedContent for Memory {
     }
 }
 
-fn place(len: usize) -> Option<Place> {
-    let loan = Rooms::default().lend(len, len)?;
-    Some(Place::new(Box::new(Memory(vec![0; len])), loan))
+fn place(len: usize) -> Option<ContentBuffer> {
+    let loan = ByteBudget::default().lend(len, len)?;
+    Some(ContentBuffer::new(Box::new(Memory(vec![0; len])), loan))
 }
 
 fn content(frame: &Frame) -> &Bytes {
@@ -145,7 +145,7 @@ fn a_written_letter_is_not_copied_and_a_read_one_lies_in_one_piece() {
 }
 
 #[test]
-fn announcing_much_takes_no_memory() {
+fn an_announced_length_allocates_no_memory() {
     let mut reader = reader(4 << 30);
     let announced = 4 << 30;
     assert_eq!(
@@ -164,7 +164,7 @@ fn announcing_much_takes_no_memory() {
 }
 
 #[test]
-fn large_content_is_read_into_the_memory_that_is_offered_and_nowhere_else() {
+fn large_content_is_read_only_into_the_offered_memory() {
     let large = parcel(9, &letter_parcel(vec![1; 300], vec![2; 100_000])).unwrap();
     let small = parcel(9, &letter_parcel(vec![1; 300], vec![2; 1000])).unwrap();
     let (large, small) = (large.concat(), small.concat());
@@ -181,16 +181,16 @@ fn large_content_is_read_into_the_memory_that_is_offered_and_nowhere_else() {
         assert_eq!((receiver, front, tail), ("arm@crex", 8 + 8 + 300, 1));
         let memory = Memory(vec![0; len]);
         places.push(memory.0.as_ptr());
-        let loan = Rooms::default().lend(len, len)?;
-        Some(Place::new(Box::new(memory), loan))
+        let loan = ByteBudget::default().lend(len, len)?;
+        Some(ContentBuffer::new(Box::new(memory), loan))
     };
     let run = [&large[..], &large, &large].concat();
     let first = read_into(&mut reader, &run, &[usize::MAX], &mut memory).unwrap();
     let Placed { contents, moved } = reader.take_placed();
     assert_eq!(contents, 3);
-    // Of the first letter only, what came with its front.
+    // Only bytes of the first letter that came with its front are moved.
     assert!(moved > 0 && moved < CHUNK as u64, "{moved}");
-    // Answers, as they come between letters, and letters that come one by one.
+    // Answers between letters, and letters one by one.
     let run = [&answer(1, &Answer::Busy)[..], &large, &ping(), &large].concat();
     let second = read_into(&mut reader, &run, &[7, usize::MAX], &mut memory).unwrap();
     let placed = reader.take_placed();
@@ -210,34 +210,34 @@ fn large_content_is_read_into_the_memory_that_is_offered_and_nowhere_else() {
 }
 
 #[test]
-fn lengths_that_do_not_add_up_get_no_memory() {
+fn inconsistent_lengths_get_no_memory() {
     let whole = parcel(9, &letter_parcel(vec![1; 10], vec![2; 100_000])).unwrap();
     let mut bytes = whole.concat();
-    // The body is said to be a byte longer than its parts are.
+    // The announced body is one byte longer than its parts.
     let len = u64::from_le_bytes(bytes[16..24].try_into().unwrap()) + 1;
     bytes[16..24].copy_from_slice(&len.to_le_bytes());
     bytes.push(0);
     let refused = read_into(&mut reader(1 << 20), &bytes, &[usize::MAX], |_| {
-        panic!("memory for nonsense")
+        panic!("memory for a malformed parcel")
     });
     assert!(matches!(
         refused,
         Err(FrameError::Parcel(WireError::BodyLength { .. }))
     ));
-    // Nor does what is too short to be worth it.
+    // Nor does content below the minimum length.
     let short = parcel(
         9,
         &letter_parcel(vec![1; APART_FROM as usize], vec![2; 100]),
     )
     .unwrap();
     let read = read_into(&mut reader(1 << 20), &short.concat(), &[usize::MAX], |_| {
-        panic!("memory for little")
+        panic!("memory for small content")
     });
     assert_eq!(read.unwrap().len(), 1);
 }
 
 #[test]
-fn what_is_no_frame_is_refused_at_once() {
+fn bytes_that_are_not_a_frame_are_refused_at_once() {
     let refused = |bytes: &[u8]| read(&mut reader(1 << 20), bytes, &[1]).unwrap_err();
     assert_eq!(refused(b"GET / HTTP/1.1"), FrameError::Magic(*b"G\0\0\0"));
     assert_eq!(refused(b"fipx"), FrameError::Magic(*b"fipx"));
@@ -280,7 +280,7 @@ fn any_frame() -> impl Strategy<Value = Vec<u8>> {
 }
 
 proptest! {
-    /// However a stream is cut into pieces, the same frames come out, each as it would alone.
+    /// The same frames are read for any division of a stream into pieces, as from separate streams.
     #[test]
     fn chunking_does_not_matter(
         written in prop::collection::vec(any_frame(), 1..12),
@@ -302,9 +302,9 @@ proptest! {
         }
     }
 
-    /// No bytes make the reader panic or hold more than it was given.
+    /// For no bytes the reader panics or holds more than it was given.
     #[test]
-    fn arbitrary_bytes_do_no_harm(
+    fn arbitrary_bytes_decode_without_panic(
         mut bytes in prop::collection::vec(any::<u8>(), 0..4000),
         version in prop_oneof![9 => Just(VERSION), 1 => any::<u8>()],
         kind in 0_u8..8,

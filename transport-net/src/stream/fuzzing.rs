@@ -1,5 +1,5 @@
-//! One end of a framed stream for fuzz targets: bytes of a peer in, and what must hold of the reader and
-//! the connection, whatever they are.
+//! One end of a framed stream for fuzz targets: takes any bytes of a peer, and checks the
+//! invariants of the reader and the connection.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::IoSlice;
@@ -10,31 +10,31 @@ use fipa_transport::{
     Abandoned, Answer, AttemptId, Conclusion, Incarnation, LoanedContent, Parcel,
 };
 
+use super::budget::{ByteBudget, ContentBuffer};
 use super::config::Limits;
 use super::connection::{Connection, Event, Role};
 use super::frame::{self, FrameReader, Space};
-use super::place::{Place, Rooms};
 use crate::Identity;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 
 const MAX_LETTER: usize = 100_000;
 const MAX_IN_FLIGHT: usize = 8;
 
-/// One end of a framed stream: TCP, TLS, the Unix socket and QUIC put a reader and a connection
-/// together in this way.
+/// One end of a framed stream, with a reader and a connection combined as for TCP, TLS, the Unix
+/// socket and QUIC.
 #[derive(Debug)]
 pub struct Framed {
     connection: Connection,
     reader: FrameReader,
     /// Whether the owner of the connection lends memory for large contents.
     lends: bool,
-    rooms: Rooms,
-    /// Attempts that were taken for sending, and those the kernel has taken something of.
+    byte_budget: ByteBudget,
+    /// Queued attempts, and those of which the kernel has taken bytes.
     dispatched: u64,
     concluded: BTreeMap<AttemptId, Conclusion>,
     abandoned: BTreeSet<AttemptId>,
-    /// Parcels that arrived and are not answered.
+    /// Parcels that arrived and are not answered yet.
     open: Vec<u64>,
     ended: bool,
 }
@@ -67,7 +67,7 @@ fn hello(incarnation: u64) -> Hello {
     }
 }
 
-/// A frame with this kind, number and body, as a peer writes it.
+/// Encodes a frame with this kind, number and body.
 #[must_use]
 pub fn frame(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
     let mut frame = frame::ping().to_vec();
@@ -78,7 +78,7 @@ pub fn frame(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
     frame
 }
 
-/// The body of a peer's hello.
+/// Encodes the body of a hello.
 #[must_use]
 pub fn hello_body(incarnation: u64, max_in_flight: u32) -> Vec<u8> {
     let hello = Hello {
@@ -88,13 +88,13 @@ pub fn hello_body(incarnation: u64, max_in_flight: u32) -> Vec<u8> {
     hello.encode().to_vec()
 }
 
-/// The body of an answer.
+/// Encodes the body of an answer.
 #[must_use]
 pub fn answer_body(answer: &Answer) -> Vec<u8> {
     frame::answer(0, answer)[frame::HEADER_LEN..].to_vec()
 }
 
-/// The body of a frame with this parcel; none when it cannot be written.
+/// Encodes the body of a frame with this parcel; empty when it cannot be encoded.
 #[must_use]
 pub fn parcel_body(parcel: &Parcel) -> Vec<u8> {
     match frame::parcel(0, parcel) {
@@ -104,7 +104,7 @@ pub fn parcel_body(parcel: &Parcel) -> Vec<u8> {
 }
 
 impl Framed {
-    /// The end that opened the connection, for the service 7, or the other one.
+    /// Creates the end that opened the connection, expecting incarnation 7, or the other one.
     #[must_use]
     pub fn new(opened: bool, lends: bool, now: Instant) -> Self {
         let limits = Limits {
@@ -126,7 +126,7 @@ impl Framed {
             connection,
             reader: FrameReader::new(MAX_LETTER, BytesMut::new()),
             lends,
-            rooms: Rooms::default(),
+            byte_budget: ByteBudget::default(),
             dispatched: 0,
             concluded: BTreeMap::new(),
             abandoned: BTreeSet::new(),
@@ -141,7 +141,7 @@ impl Framed {
         self.ended
     }
 
-    /// Bytes of the peer arrive, at most `step` at a time.
+    /// Handles bytes of the peer, at most `step` at a time.
     pub fn arrive(&mut self, mut bytes: &[u8], step: usize, now: Instant) {
         while !bytes.is_empty() && !self.ended {
             let mut space = self.reader.space();
@@ -169,17 +169,20 @@ impl Framed {
     }
 
     fn take_frames(&mut self, now: Instant) {
-        let (lends, rooms) = (self.lends, self.rooms.clone());
+        let (lends, byte_budget) = (self.lends, self.byte_budget.clone());
         loop {
             let memory = |arriving: &fipa_transport::Arriving<'_>| {
                 assert!(arriving.len <= MAX_LETTER * 2, "much memory is asked for");
-                let loan = rooms.lend(arriving.len, 1 << 20).filter(|_| lends)?;
-                Some(Place::new(Box::new(Memory(vec![0; arriving.len])), loan))
+                let loan = byte_budget.lend(arriving.len, 1 << 20).filter(|_| lends)?;
+                Some(ContentBuffer::new(
+                    Box::new(Memory(vec![0; arriving.len])),
+                    loan,
+                ))
             };
             let end = match self.reader.next(memory) {
                 Ok(Some(frame)) => self.connection.handle_frame(frame, now).err(),
                 Ok(None) => return,
-                Err(error) => Some(End::Nonsense(error.to_string())),
+                Err(error) => Some(ConnectionEnd::ProtocolViolation(error.to_string())),
             };
             self.take_events();
             if let Some(end) = end {
@@ -217,7 +220,7 @@ impl Framed {
         assert_eq!(twice, None, "{attempt:?} is concluded twice");
     }
 
-    /// This side sends a parcel.
+    /// Sends a parcel.
     pub fn send(&mut self, parcel: &Parcel) {
         let attempt = AttemptId(self.dispatched);
         if self.connection.send(attempt, parcel).is_ok() {
@@ -225,7 +228,7 @@ impl Framed {
         }
     }
 
-    /// This side gives up one of its attempts.
+    /// Abandons one of the attempts.
     pub fn abandon(&mut self, pick: u64, now: Instant) {
         let attempt = AttemptId(pick % self.dispatched.max(1));
         let is_open = attempt.0 < self.dispatched
@@ -235,7 +238,7 @@ impl Framed {
         assert!(is_open || told == Abandoned::Unconfirmed);
     }
 
-    /// This side answers one of the parcels that arrived.
+    /// Answers one of the parcels that arrived.
     pub fn answer(&mut self, pick: usize, answer: &Answer, now: Instant) {
         if !self.open.is_empty() {
             let id = self.open.swap_remove(pick % self.open.len());
@@ -243,7 +246,7 @@ impl Framed {
         }
     }
 
-    /// The kernel takes up to `max` bytes.
+    /// Writes up to `max` bytes.
     pub fn transmit(&mut self, max: usize, now: Instant) {
         let mut slices = [IoSlice::new(&[]); 16];
         let count = self.connection.gather(&mut slices);
@@ -251,7 +254,7 @@ impl Framed {
         self.connection.written(shown.min(max), now);
     }
 
-    /// Time has passed.
+    /// Handles the timers that are due.
     pub fn timeout(&mut self, now: Instant) {
         if self.ended || self.connection.poll_timeout().is_none_or(|due| now < due) {
             return;
@@ -262,16 +265,16 @@ impl Framed {
         }
     }
 
-    /// The connection ends: every attempt has its conclusion then.
+    /// Ends the connection and checks that every attempt has a conclusion.
     pub fn close(&mut self) {
-        self.end(&End::Closed);
+        self.end(&ConnectionEnd::Closed);
         for attempt in (0..self.dispatched).map(AttemptId) {
             let known = self.concluded.contains_key(&attempt);
             assert!(known || self.abandoned.contains(&attempt), "{attempt:?}");
         }
     }
 
-    fn end(&mut self, end: &End) {
+    fn end(&mut self, end: &ConnectionEnd) {
         self.ended = true;
         for (attempt, conclusion) in self.connection.end(end) {
             assert!(!matches!(conclusion, Conclusion::Answered(_)));

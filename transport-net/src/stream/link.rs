@@ -1,8 +1,7 @@
 //! A connection with its socket: the thin shell around [`Connection`].
 //!
-//! Whoever has something to send writes it to the socket at once, on its own thread, as far as the
-//! kernel takes it; the connection's task writes the rest. Only that task reads, and only it calls
-//! the sink.
+//! A sending thread writes to the socket itself, as far as the kernel takes the bytes; the task of
+//! the link writes the rest. Only that task reads, and only it calls the sink.
 
 use std::io::{self, IoSlice};
 #[cfg(feature = "ip")]
@@ -19,25 +18,25 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 use tokio::time::{sleep_until, timeout};
 
+use super::budget::ContentBuffer;
 use super::connection::{Connection, Event, MAX_ID, SendError};
 use super::counters::count;
 use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
-use super::place::Place;
 use super::proof::Proof;
-use super::source::{Account, Source};
-use super::wire::{Beside, Reading, Writing};
-use crate::end::End;
-use crate::ration::Ration;
-use crate::seldom::warn_seldom;
+use super::source::{QuotaKey, Source};
+use super::wire::{ExtraStreams, Reading, Writing};
+use crate::end::ConnectionEnd;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::PeerRateLimit;
 
-/// Pieces handed to the kernel in one call.
+/// Maximum number of buffers handed to the kernel in one call.
 const MAX_SLICES: usize = 64;
 
-/// Bytes written in one go before others get their turn.
+/// Maximum number of bytes written before the task yields.
 const MAX_BURST: usize = 1 << 20;
 
-/// Numbers of links stay below this (see [`Link::ticket`]).
+/// Upper bound of link numbers (see [`Link::ticket`]).
 pub(crate) const MAX_LINKS: u32 = 1 << 24;
 
 #[derive(Debug)]
@@ -45,15 +44,16 @@ pub(crate) struct Link {
     /// Unique among the links of an endpoint.
     pub(crate) number: u32,
     state: Mutex<State>,
-    /// Wakes the task: there is something to write, or an end.
+    /// Wakes the task to write bytes or to end the connection.
     wake: Notify,
-    /// Tells that something has arrived.
-    heard: Notify,
+    /// Notifies waiters that bytes have arrived.
+    received: Notify,
     over: watch::Sender<bool>,
     begun: AtomicBool,
-    /// Whether the connection is [suspect](Connection::is_suspect); to be read without its lock.
+    /// Whether the connection is [suspect](Connection::is_suspect); readable without the lock of
+    /// `state`.
     suspect: AtomicBool,
-    /// Suspect connections with the same peer, which this one was opened beside.
+    /// Suspect connections with the same peer, beside which this one was opened.
     beside: Mutex<Vec<Arc<Link>>>,
 }
 
@@ -61,18 +61,18 @@ pub(crate) struct Link {
 struct State {
     connection: Connection,
     writer: Option<Arc<Writing>>,
-    /// Why the task is to end the connection.
-    ending: Option<End>,
-    /// Where the peer has been found to be, of what it was last looked for.
+    /// The reason for which the task is to end the connection.
+    ending: Option<ConnectionEnd>,
+    /// The last location for which the connection was used and confirmed or put in doubt.
     leads_to: Option<Location>,
 }
 
-/// How far writing got.
+/// The result of a flush.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Flushed {
     All,
     Rest,
-    /// Writing failed: nothing more goes out, ever.
+    /// Writing failed; no more bytes can be written.
     Broken,
 }
 
@@ -87,7 +87,7 @@ impl Link {
                 leads_to: None,
             }),
             wake: Notify::new(),
-            heard: Notify::new(),
+            received: Notify::new(),
             over: watch::Sender::new(false),
             begun: AtomicBool::new(false),
             suspect: AtomicBool::new(false),
@@ -95,32 +95,33 @@ impl Link {
         })
     }
 
-    /// Whether the task has begun, and will see to it that every parcel gets its conclusion.
+    /// Whether the task has begun, which guarantees a conclusion for every parcel.
     pub(crate) fn has_begun(&self) -> bool {
         self.begun.load(Ordering::Acquire)
     }
 
-    /// The socket is connected.
+    /// Notes that the socket is connected.
     pub(crate) fn connected(&self, now: Instant) {
         self.state.lock().connection.connected(now);
     }
 
-    /// The peer has introduced itself. The suspect connections that this one was opened beside, and on
-    /// which still nothing has come, end: what waits in their sockets would arrive late or not at all.
+    /// Ends the suspect connections beside which this one was opened and on which still no byte has
+    /// arrived: bytes in their sockets would arrive late or not at all. Called when the peer has
+    /// introduced itself.
     pub(crate) fn replace_suspects(&self) {
         for other in std::mem::take(&mut *self.beside.lock()) {
             if other.is_suspect() {
-                other.leave(End::Silent);
+                other.leave(ConnectionEnd::Silent);
             }
         }
     }
 
-    /// This connection is to be opened beside suspect ones with the same peer.
+    /// Sets the suspect connections with the same peer beside which this one is opened.
     pub(crate) fn opened_beside(&self, others: Vec<Arc<Self>>) {
         *self.beside.lock() = others;
     }
 
-    /// Whether letters are to take another connection, if they can.
+    /// Whether letters should take another connection if there is one.
     pub(crate) fn is_suspect(&self) -> bool {
         self.suspect.load(Ordering::Acquire)
     }
@@ -130,12 +131,12 @@ impl Link {
             .store(state.connection.is_suspect(), Ordering::Release);
     }
 
-    /// The peer has proved this, before its hello.
+    /// Sets what the peer has proved before its hello.
     fn proved(&self, proof: &Proof) {
         self.state.lock().connection.proved(proof.clone());
     }
 
-    /// Takes a parcel for sending, and writes what the kernel takes at once.
+    /// Queues a parcel for sending, and writes as many bytes as the kernel takes.
     pub(crate) fn send(&self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
         let mut state = self.state.lock();
         state.connection.send(attempt, parcel)?;
@@ -143,7 +144,7 @@ impl Link {
         Ok(())
     }
 
-    /// Ends an attempt. A peer that has not answered in time is asked for a sign of life.
+    /// Ends an attempt. A peer that has not answered in time gets a ping.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let mut state = self.state.lock();
         let end = state.connection.abandon(attempt, Instant::now());
@@ -162,7 +163,7 @@ impl Link {
         self.flush(&mut state);
     }
 
-    /// The peer is looked for at a location that this connection was not opened for. When the peer
+    /// Notes that the connection is used for a location for which it was not opened. When the peer
     /// did not list that address it may have moved there, so the connection is in doubt.
     pub(crate) fn is_used_for(&self, to: &Location) {
         let mut state = self.state.lock();
@@ -181,7 +182,8 @@ impl Link {
         }
     }
 
-    /// Another connection with the same service comes from another address.
+    /// Puts the connection in doubt because another connection with the same service came from
+    /// another address.
     pub(crate) fn doubt(&self) {
         let mut state = self.state.lock();
         state.connection.suspect(Instant::now());
@@ -190,45 +192,45 @@ impl Link {
         self.wake.notify_one();
     }
 
-    /// Asks the peer for a sign of life.
+    /// Sends a ping to the peer.
     pub(crate) fn ask(&self) {
         let mut state = self.state.lock();
         state.connection.ask();
         self.flush(&mut state);
     }
 
-    /// Returns whether the peer that was asked at this time gives a sign of life within `patience`.
+    /// Returns whether a byte of the peer arrives within `patience` after the ping at `asked`.
     pub(crate) async fn answers(&self, asked: Instant, patience: Duration) -> bool {
         let due = tokio::time::Instant::from_std(asked + patience);
         loop {
-            let heard = self.heard.notified();
-            tokio::pin!(heard);
-            heard.as_mut().enable();
-            if self.state.lock().connection.is_heard_since(asked) {
+            let received = self.received.notified();
+            tokio::pin!(received);
+            received.as_mut().enable();
+            if self.state.lock().connection.received_since(asked) {
                 return true;
             }
             tokio::select! {
-                () = heard => {}
+                () = received => {}
                 () = self.over() => return false,
                 () = sleep_until(due) => return false,
             }
         }
     }
 
-    /// Asks the task to end the connection.
-    pub(crate) fn leave(&self, end: End) {
+    /// Requests that the task ends the connection.
+    pub(crate) fn leave(&self, end: ConnectionEnd) {
         self.state.lock().ending.get_or_insert(end);
         self.wake.notify_one();
     }
 
-    /// The address of this host that the connection stays with; see [`Writing::local_ip`].
+    /// Returns the local address of the connection; see [`Writing::local_ip`].
     #[cfg(feature = "ip")]
     pub(crate) fn local_ip(&self) -> Option<IpAddr> {
         self.state.lock().writer.as_ref()?.local_ip()
     }
 
-    /// Waits until somebody asks for the end.
-    pub(crate) async fn leaving(&self) -> End {
+    /// Waits until the end is requested.
+    pub(crate) async fn leaving(&self) -> ConnectionEnd {
         loop {
             if let Some(end) = self.state.lock().ending.clone() {
                 return end;
@@ -237,13 +239,13 @@ impl Link {
         }
     }
 
-    /// Why the task is to end the connection, if it is.
+    /// Returns the requested end, if any.
     #[cfg(all(test, feature = "ip"))]
-    pub(crate) fn ending(&self) -> Option<End> {
+    pub(crate) fn ending(&self) -> Option<ConnectionEnd> {
         self.state.lock().ending.clone()
     }
 
-    /// The peer says hello.
+    /// Handles a hello of the peer.
     #[cfg(all(test, feature = "ip"))]
     pub(crate) fn greeted_by(&self, hello: crate::hello::Hello) {
         use super::frame::Frame;
@@ -257,7 +259,7 @@ impl Link {
         self.replace_suspects();
     }
 
-    /// The task has ended.
+    /// Marks the task as ended.
     #[cfg(all(test, feature = "ip"))]
     pub(crate) fn is_over(&self) {
         self.over.send_replace(true);
@@ -265,14 +267,14 @@ impl Link {
 
     /// Waits until the last parcel of this connection has been handed to the sink.
     pub(crate) async fn over(&self) {
-        // The sender lives in self: an error is impossible, and would mean the same.
+        // `self` owns the sender, so an error is impossible.
         let _ = self.over.subscribe().wait_for(|over| *over).await;
     }
 
-    /// Whether the peer may send this.
+    /// Checks that the peer may send this parcel.
     ///
     /// # Errors
-    /// Why not.
+    /// The reason for which the parcel is refused.
     fn admits(&self, parcel: &Parcel) -> Result<(), String> {
         let Body::Letter(letter) = &parcel.body else {
             return Ok(());
@@ -280,12 +282,12 @@ impl Link {
         self.state.lock().connection.admits(letter)
     }
 
-    /// The endpoint's number for an arrival on this link.
+    /// Returns the ticket of a parcel that arrived on this link.
     fn ticket(&self, id: u64) -> Ticket {
         Ticket(u64::from(self.number) * MAX_ID + id)
     }
 
-    /// Writes what the kernel takes, and sees to it that the task writes the rest.
+    /// Writes as many bytes as the kernel takes, and wakes the task for the rest.
     fn flush(&self, state: &mut State) {
         if state.flush() != Flushed::All {
             self.wake.notify_one();
@@ -293,7 +295,7 @@ impl Link {
     }
 }
 
-/// The link's number and the parcel's number in a ticket.
+/// Splits a ticket into the number of the link and the number of the parcel.
 pub(crate) fn of_ticket(ticket: Ticket) -> (u32, u64) {
     let number = u32::try_from(ticket.0 / MAX_ID).unwrap_or(u32::MAX);
     (number, ticket.0 % MAX_ID)
@@ -313,7 +315,7 @@ impl State {
             let count = self.connection.gather(&mut slices);
             match writer.try_write(&slices[..count]) {
                 Ok(0) => {
-                    return self.broken("the system takes no more bytes");
+                    return self.broken("the kernel accepted no bytes");
                 }
                 Ok(taken) => {
                     burst += taken;
@@ -333,30 +335,30 @@ impl State {
 
     fn broken(&mut self, why: impl ToString) -> Flushed {
         let why = why.to_string();
-        self.ending.get_or_insert(End::Broken(why));
+        self.ending.get_or_insert(ConnectionEnd::Broken(why));
         Flushed::Broken
     }
 }
 
-/// What the task of a link needs beside the link.
-pub(crate) struct Running {
+/// The task of a link: serves the connection and concludes its attempts when dropped.
+pub(crate) struct LinkTask {
     endpoint: Arc<Endpoint>,
     link: Arc<Link>,
     sink: Arc<dyn Sink>,
-    /// What this side opened the connection for, if it did.
+    /// The location that this side dialled, if it opened the connection.
     dialled: Option<Location>,
-    /// Who is there, once the peer has said hello.
+    /// The introduction of the peer, after its hello.
     peer: Option<Introduction>,
-    /// What the peer may still send, if that is limited.
-    ration: Option<Arc<Ration>>,
-    /// Until when nothing is read, because it has sent more.
+    /// The rate limit of the peer, if it has one.
+    rate_limit: Option<Arc<PeerRateLimit>>,
+    /// Time until which no bytes are read because the peer exceeded its rate limit.
     paused: Option<Instant>,
-    end: End,
+    end: ConnectionEnd,
 }
 
-impl Running {
-    /// To be made by the task itself: from now on the link gets its end, whatever happens to the
-    /// task.
+impl LinkTask {
+    /// Must be called by the task itself: dropping the result ends the link, even if the task is
+    /// aborted.
     pub(crate) fn new(
         endpoint: Arc<Endpoint>,
         link: Arc<Link>,
@@ -370,21 +372,21 @@ impl Running {
             sink,
             dialled,
             peer: None,
-            ration: None,
+            rate_limit: None,
             paused: None,
-            // What is said when the runtime drops the task.
-            end: End::Closed,
+            // The end that is reported when the runtime drops the task.
+            end: ConnectionEnd::Closed,
         }
     }
 
-    /// Where it belongs.
+    /// Returns the endpoint of the link.
     #[cfg(feature = "secure")]
     pub(crate) fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
 
     /// Ends a link whose socket could not be connected.
-    pub(crate) fn fail(mut self, end: End) {
+    pub(crate) fn fail(mut self, end: ConnectionEnd) {
         self.end = end;
     }
 
@@ -398,20 +400,20 @@ impl Running {
         greeted: impl FnOnce() + Send,
     ) {
         let mut read = read;
-        let mut beside = read.take_beside();
+        let mut extra = read.take_extra_streams();
         let writer = Arc::new(writer);
         self.link.proved(&proof);
-        self.ration = self.endpoint.ration(from.home());
-        let account = Account::of(from, proof.principal().as_ref());
-        let _window = read.widen(|len| self.endpoint.window(&account, len));
-        reader.count_with(self.endpoint.meter(&account));
-        if let Some(letters) = beside.reader() {
-            letters.count_with(self.endpoint.meter(&account));
+        self.rate_limit = self.endpoint.rate_limit(from.home());
+        let quota_key = QuotaKey::of(from, proof.principal().as_ref());
+        let _window = read.widen(|len| self.endpoint.window(&quota_key, len));
+        reader.count_with(self.endpoint.meter(&quota_key));
+        if let Some(letters) = extra.reader() {
+            letters.count_with(self.endpoint.meter(&quota_key));
         }
         self.link.state.lock().writer = Some(writer.clone());
         let mut greeted = Some(greeted);
         let exchange = self.exchange(
-            (&mut read, &mut beside),
+            (&mut read, &mut extra),
             &writer,
             &mut reader,
             from,
@@ -422,46 +424,46 @@ impl Running {
             end = proof.withdrawn() => end,
         };
         self.end = end;
-        if self.end == End::Silent {
+        if self.end == ConnectionEnd::Silent {
             writer.discard();
         }
-        drop((writer, beside, reader));
+        drop((writer, extra, reader));
         let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
         drop(self);
         if orderly {
-            // A peer that does not hang up in time is left alone.
-            let _ = timeout(patience, farewell(&link, read)).await;
+            // After the timeout, the socket is closed without waiting for the peer.
+            let _ = timeout(patience, close_gracefully(&link, read)).await;
         }
         link.state.lock().writer = None;
     }
 
     async fn exchange(
         &mut self,
-        (read, beside): (&mut Reading, &mut Beside),
+        (read, extra): (&mut Reading, &mut ExtraStreams),
         writer: &Writing,
         reader: &mut FrameReader,
         from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
-    ) -> End {
+    ) -> ConnectionEnd {
         let timer = sleep_until(Instant::now().into());
         tokio::pin!(timer);
-        let (link, rooms) = (self.link.clone(), self.endpoint.rooms.clone());
+        let (link, byte_budget) = (self.link.clone(), self.endpoint.byte_budget.clone());
         if let Err(end) = self.take_frames(reader, 0, false, from, greeted).await {
             return end;
         }
         loop {
-            let freed = rooms.freed();
+            let freed = byte_budget.freed();
             tokio::pin!(freed);
-            let mut blocked = (reader.is_blocked(), beside.is_blocked());
+            let mut blocked = (reader.is_blocked(), extra.is_blocked());
             if blocked != (false, false) {
-                // Before the next look at whether there is room, so that none is missed.
+                // Enabled before memory is requested again, so that no notification is missed.
                 freed.as_mut().enable();
-                let retried = self.retry((reader, beside), blocked, from, greeted).await;
+                let retried = self.retry((reader, extra), blocked, from, greeted).await;
                 if let Err(end) = retried {
                     return end;
                 }
-                blocked = (reader.is_blocked(), beside.is_blocked());
+                blocked = (reader.is_blocked(), extra.is_blocked());
             }
             let (flushed, due) = {
                 let mut state = link.state.lock();
@@ -480,7 +482,7 @@ impl Running {
             self.paused = self.paused.filter(|until| *until > Instant::now());
             let reads = self.paused.is_none();
             let due = [due, self.paused].into_iter().flatten().min();
-            // Most of the time what is due moves away: then the timer is left to go off early.
+            // The deadline usually moves later. The timer is not reset then and fires early.
             let armed = timer.deadline().into_std();
             if let Some(due) = due
                 && (timer.is_elapsed() || due < armed)
@@ -491,23 +493,23 @@ impl Running {
             tokio::select! {
                 arrived = read.read(&mut space), if reads && !blocked.0 => {
                     let arrived = match arrived {
-                        Ok(0) => return End::Hangup,
+                        Ok(0) => return ConnectionEnd::Hangup,
                         Ok(bytes) => bytes,
-                        Err(error) => return End::Broken(error.to_string()),
+                        Err(error) => return ConnectionEnd::Broken(error.to_string()),
                     };
-                    let other = beside.is_partial();
+                    let other = extra.is_partial();
                     if let Err(end) = self.take_frames(reader, arrived, other, from, greeted).await {
                         return end;
                     }
                 }
-                // What the peer sends after its hello may overtake it.
-                arrived = beside.read(), if reads && !blocked.1 && self.peer.is_some() => {
+                // A parcel of the peer may overtake its hello.
+                arrived = extra.read(), if reads && !blocked.1 && self.peer.is_some() => {
                     let arrived = match arrived {
                         Ok(bytes) => bytes,
-                        Err(error) => return End::Nonsense(error.to_string()),
+                        Err(error) => return ConnectionEnd::ProtocolViolation(error.to_string()),
                     };
                     let other = reader.is_partial();
-                    if let Some(letters) = beside.reader()
+                    if let Some(letters) = extra.reader()
                         && let Err(end) = self.take_frames(letters, arrived, other, from, greeted).await
                     {
                         return end;
@@ -515,14 +517,14 @@ impl Running {
                 }
                 ready = writer.writable(), if flushed == Flushed::Rest => {
                     if let Err(error) = ready {
-                        return End::Broken(error.to_string());
+                        return ConnectionEnd::Broken(error.to_string());
                     }
                 }
                 () = link.wake.notified() => {}
                 () = &mut freed, if blocked != (false, false) => {}
                 () = &mut timer => {
                     let least = reader.least_progress();
-                    let least = least.max(beside.reader().map_or(0, |it| it.least_progress()));
+                    let least = least.max(extra.reader().map_or(0, |it| it.least_progress()));
                     let mut state = link.state.lock();
                     if let Err(end) = state.connection.handle_timeout(Instant::now(), least) {
                         return end;
@@ -532,27 +534,27 @@ impl Running {
         }
     }
 
-    /// Tries again to get memory for the letters that wait for it.
+    /// Requests memory again for the letters that wait for it.
     async fn retry(
         &mut self,
-        (reader, beside): (&mut FrameReader, &mut Beside),
+        (reader, extra): (&mut FrameReader, &mut ExtraStreams),
         blocked: (bool, bool),
         from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         if blocked.0 {
-            let other = beside.is_partial();
+            let other = extra.is_partial();
             self.take_frames(reader, 0, other, from, greeted).await?;
         }
         let other = reader.is_partial();
-        match beside.reader() {
+        match extra.reader() {
             Some(letters) if blocked.1 => self.take_frames(letters, 0, other, from, greeted).await,
             _ => Ok(()),
         }
     }
 
-    /// Hands on what has arrived in whole frames, and answers. `other_partial` is whether a frame is
-    /// half arrived elsewhere on this link.
+    /// Processes the complete frames that have arrived. `other_partial` is whether a frame has
+    /// partly arrived on another stream of this link.
     async fn take_frames(
         &mut self,
         reader: &mut FrameReader,
@@ -560,14 +562,14 @@ impl Running {
         other_partial: bool,
         from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         let now = Instant::now();
         let link = self.link.clone();
         reader.put(arrived);
         let mut letters = 0;
         loop {
-            let frame = reader.next(|arriving| self.place_for(arriving));
-            let frame = frame.map_err(|e| End::Nonsense(e.to_string()))?;
+            let frame = reader.next(|arriving| self.buffer_for(arriving));
+            let frame = frame.map_err(|e| ConnectionEnd::ProtocolViolation(e.to_string()))?;
             let Some(frame) = frame else { break };
             let events: [Option<Event>; 2];
             {
@@ -583,7 +585,7 @@ impl Running {
                 self.handle_event(event, from, greeted).await?;
             }
             loop {
-                // Rare: a hello that makes many waiting letters too large.
+                // Rare: a hello with which many waiting letters turn out too large.
                 let Some(event) = link.state.lock().connection.poll_event() else {
                     break;
                 };
@@ -597,8 +599,8 @@ impl Running {
             add(&tally.placed, placed.contents);
             add(&tally.placed_moved_bytes, placed.moved);
         }
-        if let Some(ration) = &self.ration {
-            let until = ration.spend(letters, arrived, now);
+        if let Some(rate_limit) = &self.rate_limit {
+            let until = rate_limit.spend(letters, arrived, now);
             if self.paused.is_none() && until.is_some() {
                 count(&self.endpoint.tally().held_back);
             }
@@ -606,25 +608,25 @@ impl Running {
         }
         let mut state = link.state.lock();
         let partial = reader.is_partial() || other_partial;
-        // A letter that waits for memory is no sign of life.
+        // A letter that waits for memory does not count as received.
         if arrived > 0 || !reader.is_blocked() {
             state.connection.received(arrived, partial, now);
             link.note_suspicion(&state);
         }
         drop(state);
         if arrived > 0 {
-            link.heard.notify_waiters();
+            link.received.notify_waiters();
         }
         Ok(())
     }
 
-    /// Where the content goes that a peer has announced who has introduced himself.
-    fn place_for(&self, arriving: &Arriving<'_>) -> Option<Place> {
+    /// Returns memory of the sink for announced content of an introduced peer.
+    fn buffer_for(&self, arriving: &Arriving<'_>) -> Option<ContentBuffer> {
         self.peer.as_ref()?;
         let most = self.endpoint.limits().max_arriving;
-        let loan = self.endpoint.rooms.lend(arriving.len, most)?;
+        let loan = self.endpoint.byte_budget.lend(arriving.len, most)?;
         let memory = self.sink.memory_for(arriving)?;
-        Some(Place::new(memory, loan))
+        Some(ContentBuffer::new(memory, loan))
     }
 
     async fn handle_event(
@@ -632,7 +634,7 @@ impl Running {
         event: Event,
         from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         match event {
             Event::Greeted => {
                 let (peer, proved, mandate) = {
@@ -642,8 +644,8 @@ impl Running {
                 };
                 if let Some(peer) = peer {
                     let entered = self.endpoint.enter(&self.link, &peer, proved, from).await;
-                    if let Err(End::NotSought) = entered {
-                        // The hello tells the peer which service is here.
+                    if let Err(ConnectionEnd::NotSought) = entered {
+                        // This side's hello tells the peer which service it has reached.
                         self.link.state.lock().connection.welcome();
                     }
                     let hop = entered?;
@@ -670,12 +672,14 @@ impl Running {
             Event::Arrived { id, parcel } => {
                 count(&self.endpoint.tally().parcels_in);
                 let Some(peer) = &self.peer else {
-                    return Err(End::Nonsense("a parcel from nobody".into()));
+                    return Err(ConnectionEnd::ProtocolViolation(
+                        "a parcel before the hello".into(),
+                    ));
                 };
                 if let Err(refused) = self.link.admits(&parcel) {
                     let before = &self.endpoint.tally().refused_senders;
                     let before = before.fetch_add(1, Ordering::Relaxed);
-                    warn_seldom(before, format_args!("{from}: letter refused: {refused}"));
+                    warn_limited(before, format_args!("{from}: letter refused: {refused}"));
                     self.link
                         .answer(id, &Answer::failed(FailureReason::Refused, &refused));
                     return Ok(());
@@ -698,7 +702,7 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for LinkTask {
     fn drop(&mut self) {
         let concluded = {
             let mut state = self.link.state.lock();
@@ -723,16 +727,16 @@ impl Drop for Running {
     }
 }
 
-/// Writes what is left, closes this direction, and waits for the peer to close the other: closing
-/// while bytes of the peer are unread would destroy what is on its way to it.
-async fn farewell(link: &Link, mut read: Reading) {
+/// Writes the remaining bytes, closes this direction, and waits until the peer closes the other:
+/// closing a socket with unread bytes would discard the bytes that are on their way to the peer.
+async fn close_gracefully(link: &Link, mut read: Reading) {
     loop {
         let writer = {
             let mut state = link.state.lock();
             let flushed = state.flush();
             match (flushed, &state.writer) {
                 (Flushed::Rest, Some(writer)) => writer.clone(),
-                // The socket of one that is broken counts as writable: waiting would be no waiting.
+                // A broken socket is always writable, so waiting for it would spin.
                 (Flushed::Broken, _) => return,
                 _ => break,
             }

@@ -1,25 +1,30 @@
-//! Framed, acknowledged letters over a stream of bytes: what TCP, QUIC and Unix domain sockets
+//! Framed, acknowledged letters over a byte stream: the part that TCP, QUIC and Unix domain sockets
 //! share.
 //!
-//! * [`frame`]: the bytes; [`place`]: memory for what arrives, from where it is passed on.
-//! * [`connection`] with its [`outbox`]: the protocol of one connection, without socket or clock.
-//! * [`link`]: a connection with its socket, which is a [`wire`]; [`source`] is where its peer is
-//!   and [`proof`] what that peer has proved.
-//! * [`endpoint`]: what the connections share; [`config`] and [`counters`].
+//! * [`frame`]: the encoding; [`budget`]: memory for arriving letters.
+//! * [`connection`] with its [`outbox`]: the protocol of one connection, without sockets and clock.
+//! * [`link`]: a connection with its socket, which is a [`wire`]; [`source`] is the origin of the
+//!   connection and [`proof`] is the proved identity of its peer.
+//! * [`endpoint`]: the registry of connections; [`config`] and [`counters`].
+//! * `dialing`: the addresses of a location; `tls`: TLS over a socket.
 //!
-//! What must not live here: how a connection is opened or accepted. That is what the transports
-//! differ in.
+//! This module does not open or accept connections: the transports differ in that, and this module
+//! does not depend on them.
 
+pub(crate) mod budget;
 pub(crate) mod config;
 mod connection;
 pub(crate) mod counters;
+#[cfg(feature = "ip")]
+pub(crate) mod dialing;
 pub(crate) mod endpoint;
 pub(crate) mod frame;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
 pub(crate) mod link;
 mod outbox;
-pub(crate) mod place;
 pub(crate) mod proof;
 pub(crate) mod source;
+#[cfg(feature = "secure")]
+pub(crate) mod tls;
 pub(crate) mod wire;

@@ -1,11 +1,11 @@
-//! What waits to be written: frames in order, and which of them the kernel has begun to take.
+//! The queue of frames to write, with the frame that the kernel has begun to take.
 
 use std::collections::VecDeque;
 use std::io::IoSlice;
 
 use bytes::{Buf, Bytes};
 
-/// What a waiting frame is about.
+/// The content of a queued frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum About {
     /// The parcel with this number.
@@ -18,8 +18,8 @@ pub(crate) enum About {
 
 /// Frames that wait to be written.
 ///
-/// Answers and control frames go before parcels that have not begun, so that a large letter on
-/// its way out does not hold up more answers than it must.
+/// Answers and control frames go before parcels that have not begun, so that a large letter delays
+/// as few answers as possible.
 #[derive(Debug, Default)]
 pub(crate) struct Outbox {
     /// The frame that has begun, if its first byte has been taken.
@@ -36,7 +36,7 @@ struct Waiting {
     len: usize,
 }
 
-/// What a write did to a frame.
+/// The effect of a write on a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Progress {
     /// Its first byte has been taken.
@@ -53,7 +53,7 @@ impl Outbox {
         self.urgent.push_back(Waiting { about, pieces, len });
     }
 
-    /// Appends a parcel, in pieces none of which is empty.
+    /// Appends a parcel as a list of nonempty pieces.
     pub(crate) fn push_parcel(&mut self, id: u64, pieces: Vec<Bytes>) {
         let len = pieces.iter().map(Bytes::len).sum();
         self.parcel_bytes += len;
@@ -64,12 +64,12 @@ impl Outbox {
         });
     }
 
-    /// Bytes of parcels that the kernel has not begun to take.
+    /// Returns the number of bytes of parcels that the kernel has not begun to take.
     pub(crate) fn parcel_bytes(&self) -> usize {
         self.parcel_bytes
     }
 
-    /// Removes a parcel that the kernel has not begun to take. Says whether there was one.
+    /// Removes a parcel that the kernel has not begun to take. Returns whether there was one.
     pub(crate) fn remove_parcel(&mut self, id: u64) -> bool {
         // Numbers rise from front to back.
         let place = self
@@ -89,8 +89,8 @@ impl Outbox {
         self.parcel_bytes = 0;
     }
 
-    /// Fills `slices` with what comes next and says how many were filled. `parcels` is how many
-    /// parcels may begin now.
+    /// Fills `slices` with the next bytes to write. Returns the number of filled slices. `parcels`
+    /// is the number of parcels that may begin now.
     pub(crate) fn gather<'a>(&'a self, slices: &mut [IoSlice<'a>], parcels: usize) -> usize {
         let frames = self
             .begun
@@ -105,7 +105,8 @@ impl Outbox {
             .count()
     }
 
-    /// The kernel took the next `taken` bytes of what [`gather`](Self::gather) had shown.
+    /// Notes that the kernel took the next `taken` bytes of those that [`gather`](Self::gather)
+    /// returned.
     pub(crate) fn written(&mut self, mut taken: usize, mut tell: impl FnMut(Progress)) {
         while taken > 0 {
             if self.begun.is_none() {
@@ -127,14 +128,14 @@ impl Outbox {
         }
     }
 
-    /// Whether nothing waits, parcels aside that may not begin now (see [`gather`](Self::gather)).
+    /// Whether no frame waits except parcels that may not begin now (see [`gather`](Self::gather)).
     pub(crate) fn is_idle(&self, parcels: usize) -> bool {
         self.begun.is_none() && self.urgent.is_empty() && (parcels == 0 || self.parcels.is_empty())
     }
 }
 
 impl Waiting {
-    /// Drops what was taken; says how much of it was beyond this frame.
+    /// Drops the bytes that were taken. Returns the number of bytes beyond this frame.
     fn advance(&mut self, mut taken: usize) -> usize {
         while taken > 0
             && let Some(piece) = self.pieces.front_mut()
@@ -168,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_urgent_waits_for_the_frame_that_has_begun_only() {
+    fn urgent_frames_wait_only_for_the_frame_that_has_begun() {
         let mut outbox = Outbox::default();
         outbox.push_parcel(1, vec![Bytes::from_static(b"first")]);
         outbox.push_parcel(2, vec![Bytes::from_static(b"second")]);

@@ -1,6 +1,6 @@
-//! What the peer of a connection has proved about itself, and what follows for its letters.
+//! The proved identity of the peer of a connection, and its consequences for letters.
 //!
-//! Without TLS nothing is proved, and nothing follows.
+//! Without TLS, peers prove nothing, and letters are not restricted.
 
 use fipa_transport::{Mandate, Principal};
 
@@ -10,11 +10,11 @@ use std::time::{Duration, SystemTime};
 #[cfg(feature = "secure")]
 use tokio::time::{Instant, sleep_until};
 
-use crate::end::End;
+use crate::end::ConnectionEnd;
 #[cfg(feature = "secure")]
 use crate::secure::{Certificate, Security};
 
-/// What a peer has proved about itself.
+/// The proved identity of a peer.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Proof {
     #[cfg(feature = "secure")]
@@ -22,7 +22,7 @@ pub(crate) struct Proof {
 }
 
 impl Proof {
-    /// The peer has this certificate and its key.
+    /// Creates the proof of a peer that has this certificate and its key.
     #[cfg(feature = "secure")]
     pub(crate) fn of(security: &Security, certificate: Certificate) -> Self {
         Self {
@@ -30,20 +30,20 @@ impl Proof {
         }
     }
 
-    /// What is wrong with a peer that introduces itself by this name.
+    /// Returns an error text when the certificate names another service than `name`.
     pub(crate) fn contradicts(&self, name: &str) -> Option<String> {
         #[cfg(feature = "secure")]
         if let Some((_, certificate)) = &self.certificate {
             let proved = certificate.certified().mts();
             return (proved != name).then(|| {
-                format!("it calls itself {name:?}, and its certificate is of {proved:?}")
+                format!("the peer calls itself {name:?}, but its certificate names {proved:?}")
             });
         }
         let _unproved = name;
         None
     }
 
-    /// Whether the peer may speak for the agent with this name, and take letters for it.
+    /// Whether the peer may send and receive letters for the agent with this name.
     pub(crate) fn speaks_for(&self, agent: &str) -> bool {
         #[cfg(feature = "secure")]
         if let Some((_, certificate)) = &self.certificate {
@@ -53,7 +53,7 @@ impl Proof {
         true
     }
 
-    /// The agents that the peer may speak for beside itself.
+    /// Returns the agents that the peer may speak for.
     pub(crate) fn mandate(&self) -> Mandate {
         #[cfg(feature = "secure")]
         if let Some((_, certificate)) = &self.certificate {
@@ -71,7 +71,7 @@ impl Proof {
         false
     }
 
-    /// The certificate whose key the peer has, if it has proved one.
+    /// Returns the certificate whose key the peer has proved to have, if any.
     pub(crate) fn principal(&self) -> Option<Principal> {
         #[cfg(feature = "secure")]
         if let Some((_, certificate)) = &self.certificate {
@@ -81,11 +81,12 @@ impl Proof {
         None
     }
 
-    /// Waits until the peer is not trusted any more, or its certificate expires.
+    /// Waits until the peer is no longer trusted or its certificate expires.
     ///
-    /// The time until then is taken from the calendar once and counts on the clock that never jumps: a
-    /// calendar that is set ahead ends no connection. The calendar is asked again when the time is up.
-    pub(crate) async fn withdrawn(&self) -> End {
+    /// The remaining time is computed from the calendar once and measured on the monotonic clock:
+    /// setting the calendar ahead ends no connection. The calendar is read again when the time is
+    /// up.
+    pub(crate) async fn withdrawn(&self) -> ConnectionEnd {
         #[cfg(feature = "secure")]
         if let Some((security, certificate)) = &self.certificate {
             let mut changes = security.changes();
@@ -100,22 +101,22 @@ impl Proof {
                 if ends <= Instant::now() {
                     let left = certificate.left(SystemTime::now());
                     if left.is_zero() {
-                        return End::Expired;
+                        return ConnectionEnd::Expired;
                     }
                     ends = after(left);
                 }
             }
-            return End::Distrusted;
+            return ConnectionEnd::Distrusted;
         }
         std::future::pending().await
     }
 }
 
-/// The longest time for which a timer is set.
+/// Maximum duration of a timer.
 #[cfg(feature = "secure")]
 const LONGEST_SLEEP: Duration = Duration::from_secs(86_400);
 
-/// So much later; what no clock reaches is cut to a century.
+/// Returns the instant after `time`, which is cut to a century to avoid overflow.
 #[cfg(feature = "secure")]
 fn after(time: Duration) -> Instant {
     const CENTURY: Duration = Duration::from_secs(100 * 365 * 86_400);

@@ -1,4 +1,4 @@
-//! Where the other end of a connection is, as far as the operating system vouches for it.
+//! The origin of a connection, as far as the operating system vouches for it.
 
 use std::fmt;
 #[cfg(feature = "ip")]
@@ -7,19 +7,20 @@ use std::net::{IpAddr, SocketAddr};
 use fipa_transport::Principal;
 
 #[cfg(feature = "ip")]
-use crate::ration::whose;
+use crate::rate_limit::quota_address;
 
-/// The party that the places and the memory of an accepted connection are counted for.
+/// The party to which connection slots and memory of an accepted connection are charged.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(crate) enum Account {
-    /// The peers at one [whole](Home::whole) home, which have proved nothing.
+pub(crate) enum QuotaKey {
+    /// The peers at one [whole](Home::whole) origin that have proved nothing.
     Unproved(Home),
-    /// The peers with the key of the certificate with this fingerprint, wherever they are.
+    /// The peers with the key of the certificate with this fingerprint, at any address.
     Certificate([u8; 32]),
 }
 
-impl Account {
-    /// The account of a connection from there whose peer has proved this, if anything.
+impl QuotaKey {
+    /// Returns the quota key of a connection with this origin whose peer has proved `proved`, if
+    /// anything.
     pub(crate) fn of(from: Source, proved: Option<&Principal>) -> Self {
         match proved {
             Some(Principal::Certificate(fingerprint)) => Self::Certificate(*fingerprint),
@@ -38,7 +39,7 @@ pub(crate) enum Source {
     Address(SocketAddr),
 }
 
-/// What the connections of one peer have in common.
+/// The part of an origin that all connections of one peer share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) enum Home {
     /// The process of this host.
@@ -59,12 +60,12 @@ impl Source {
 }
 
 impl Home {
-    /// The home that all addresses of one peer share; see [`whose`].
+    /// Returns the origin that all addresses of one peer share; see [`quota_address`].
     pub(crate) fn whole(self) -> Self {
         match self {
             Self::Process(_) => self,
             #[cfg(feature = "ip")]
-            Self::Address(ip) => Self::Address(whose(ip)),
+            Self::Address(ip) => Self::Address(quota_address(ip)),
         }
     }
 }

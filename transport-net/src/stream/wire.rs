@@ -1,11 +1,13 @@
-//! What a link reads from and writes to: a socket, TLS over one, or the streams of QUIC.
+//! The wires of a link: a socket, TLS over a socket, or the streams of a multiplexed connection.
 //!
-//! Frames know nothing of it. What has been handed to TLS counts as begun, as what has been handed
-//! to the kernel does: it may arrive.
+//! Frames do not depend on the wire. Bytes handed to TLS count as begun, like bytes handed to the
+//! kernel: they may arrive.
 
 use std::io::{self, IoSlice};
 #[cfg(feature = "ip")]
 use std::net::IpAddr;
+#[cfg(feature = "quic")]
+use std::pin::Pin;
 #[cfg(feature = "secure")]
 use std::sync::Arc;
 
@@ -16,26 +18,24 @@ use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{UnixStream, unix};
 
+use super::budget::ReservedBytes;
 use super::frame::{FrameReader, Space};
-use super::place::Room;
-#[cfg(feature = "quic")]
-use crate::quic::streams as quic;
 #[cfg(feature = "secure")]
-use crate::tcp::tls::{Incoming, Session};
+use super::tls::{Incoming, Session};
 
-/// The end that is read.
+/// The reading half of a wire.
 pub(crate) enum Reading {
     Unix(unix::OwnedReadHalf),
     #[cfg(feature = "ip")]
     Plain(OwnedReadHalf),
     #[cfg(feature = "secure")]
     Tls(OwnedReadHalf, Incoming),
-    /// The stream of everything but letters; those have streams of their own.
+    /// The stream of all frames except parcels, which have streams of their own.
     #[cfg(feature = "quic")]
-    Quic(quic::Control, Option<Box<quic::Letters>>),
+    Streams(Box<dyn ControlStream>, Option<Box<dyn ParcelStreams>>),
 }
 
-/// The end that is written.
+/// The writing half of a wire.
 #[derive(Debug)]
 pub(crate) enum Writing {
     Unix(unix::OwnedWriteHalf),
@@ -44,32 +44,76 @@ pub(crate) enum Writing {
     #[cfg(feature = "secure")]
     Tls(OwnedWriteHalf, Arc<Session>),
     #[cfg(feature = "quic")]
-    Quic(quic::Outgoing),
+    Streams(Box<dyn StreamWriter>),
 }
 
-/// Both ends of a Unix domain socket.
+/// A future of a wire whose type is not known here.
+#[cfg(feature = "quic")]
+pub(crate) type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
+
+/// The reading half of a wire that carries each parcel on a stream of its own: the stream of all
+/// other frames. A future that is dropped loses no bytes.
+#[cfg(feature = "quic")]
+pub(crate) trait ControlStream: Send {
+    /// Reads the available bytes into `space`; 0 at the end of the stream.
+    fn read<'a>(&'a mut self, space: &'a mut Space<'_>) -> BoxFuture<'a, io::Result<usize>>;
+
+    /// Number of bytes by which [`widen`](Self::widen) increases the receive window.
+    fn extra_window(&self) -> usize;
+
+    /// Increases the receive window from its minimum to its usual size.
+    fn widen(&self);
+
+    /// Waits until the peer has closed the connection.
+    fn drain(&mut self) -> BoxFuture<'_, ()>;
+}
+
+/// The streams that carry one parcel each. A future that is dropped loses no bytes.
+#[cfg(feature = "quic")]
+pub(crate) trait ParcelStreams: Send {
+    /// Reads the available bytes of the current stream.
+    fn read(&mut self) -> BoxFuture<'_, io::Result<usize>>;
+
+    /// The reader that receives these bytes.
+    fn reader(&mut self) -> &mut FrameReader;
+}
+
+/// The writing half of such a wire.
+#[cfg(feature = "quic")]
+pub(crate) trait StreamWriter: std::fmt::Debug + Send + Sync {
+    /// The local address that the connection is bound to, if it is bound to one.
+    fn local_ip(&self) -> Option<IpAddr>;
+
+    /// Writes as many bytes as there is room for.
+    fn write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize>;
+
+    /// Waits until there is room again.
+    fn writable(&self) -> BoxFuture<'_, io::Result<()>>;
+}
+
+/// Splits a Unix domain socket into its halves.
 pub(crate) fn unix(stream: UnixStream) -> (Reading, Writing) {
     let (read, write) = stream.into_split();
     (Reading::Unix(read), Writing::Unix(write))
 }
 
-/// Both ends of a TCP socket, as it is.
+/// Splits a TCP socket without TLS into its halves.
 #[cfg(feature = "ip")]
 pub(crate) fn plain(stream: TcpStream) -> (Reading, Writing) {
     let (read, write) = stream.into_split();
     (Reading::Plain(read), Writing::Plain(write))
 }
 
-/// What arrives beside the one stream of a link: letters, where each has a stream of its own.
+/// The streams of parcels of a link whose wire has them; otherwise empty.
 #[derive(Default)]
-pub(crate) struct Beside {
+pub(crate) struct ExtraStreams {
     #[cfg(feature = "quic")]
-    letters: Option<Box<quic::Letters>>,
+    letters: Option<Box<dyn ParcelStreams>>,
 }
 
-impl Beside {
-    /// Reads what has arrived; for ever, when there are no such streams. Nothing is lost when this
-    /// is dropped.
+impl ExtraStreams {
+    /// Reads the available bytes. Never completes without such streams. A future that is dropped
+    /// loses no bytes.
     pub(crate) async fn read(&mut self) -> io::Result<usize> {
         #[cfg(feature = "quic")]
         if let Some(letters) = &mut self.letters {
@@ -78,7 +122,7 @@ impl Beside {
         std::future::pending().await
     }
 
-    /// What was read, as frames.
+    /// Returns the reader that received the bytes.
     pub(crate) fn reader(&mut self) -> Option<&mut FrameReader> {
         #[cfg(feature = "quic")]
         if let Some(letters) = &mut self.letters {
@@ -87,7 +131,7 @@ impl Beside {
         None
     }
 
-    /// Whether the letter whose turn it is waits for memory.
+    /// Whether the current letter waits for memory.
     pub(crate) fn is_blocked(&mut self) -> bool {
         self.reader().is_some_and(|reader| reader.is_blocked())
     }
@@ -99,23 +143,31 @@ impl Beside {
 }
 
 impl Reading {
-    /// Takes out what is to be read beside the one stream.
-    pub(crate) fn take_beside(&mut self) -> Beside {
+    /// Takes the streams of parcels out of the wire.
+    pub(crate) fn take_extra_streams(&mut self) -> ExtraStreams {
         match self {
             #[cfg(feature = "quic")]
-            Self::Quic(_, letters) => Beside {
+            Self::Streams(_, letters) => ExtraStreams {
                 letters: letters.take(),
             },
-            _ => Beside::default(),
+            _ => ExtraStreams::default(),
         }
     }
 
-    /// Lets the peer send ahead as much as is usual, if there is room for what it may send beyond the
-    /// minimum. The room is to be kept as long as the connection. Only QUIC buffers that much.
-    pub(crate) fn widen(&self, take: impl FnOnce(usize) -> Option<Room>) -> Option<Room> {
+    /// Increases the receive window from its minimum to its usual size if `take` reserves the
+    /// additional bytes. The caller keeps the reservation as long as the connection. Only wires
+    /// with streams of their own for parcels buffer that much.
+    pub(crate) fn widen(
+        &self,
+        take: impl FnOnce(usize) -> Option<ReservedBytes>,
+    ) -> Option<ReservedBytes> {
         match self {
             #[cfg(feature = "quic")]
-            Self::Quic(control, _) => control.widen(take),
+            Self::Streams(control, _) => {
+                let room = take(control.extra_window())?;
+                control.widen();
+                Some(room)
+            }
             _ => {
                 let _unbuffered = take;
                 None
@@ -123,7 +175,7 @@ impl Reading {
         }
     }
 
-    /// Reads what is there, as far as there is space. Nothing is lost when this is dropped.
+    /// Reads the available bytes into `space`. A future that is dropped loses no bytes.
     pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match self {
             Self::Unix(socket) => read(socket, space).await,
@@ -132,11 +184,12 @@ impl Reading {
             #[cfg(feature = "secure")]
             Self::Tls(socket, incoming) => incoming.read(socket, space).await,
             #[cfg(feature = "quic")]
-            Self::Quic(control, _) => control.read(space).await,
+            Self::Streams(control, _) => control.read(space).await,
         }
     }
 
-    /// Waits until the peer has closed its direction, whatever comes before.
+    /// Waits until the peer has closed its direction, and discards the bytes that arrive until
+    /// then.
     pub(crate) async fn drain(&mut self) {
         match self {
             Self::Unix(socket) => drain(socket).await,
@@ -145,7 +198,7 @@ impl Reading {
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => drain(socket).await,
             #[cfg(feature = "quic")]
-            Self::Quic(control, _) => control.drain().await,
+            Self::Streams(control, _) => control.drain().await,
         }
     }
 }
@@ -163,8 +216,8 @@ async fn drain(socket: &mut (impl AsyncRead + Unpin)) {
 }
 
 impl Writing {
-    /// The address of this host that the connection stays with. None when the connection can go on
-    /// from another one, or has no address.
+    /// Returns the local address that the connection is bound to. `None` when the connection has no
+    /// address or survives a change of address.
     #[cfg(feature = "ip")]
     pub(crate) fn local_ip(&self) -> Option<IpAddr> {
         match self {
@@ -173,12 +226,12 @@ impl Writing {
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => Some(socket.local_addr().ok()?.ip()),
             #[cfg(feature = "quic")]
-            Self::Quic(outgoing) => outgoing.local_ip(),
+            Self::Streams(outgoing) => outgoing.local_ip(),
         }
     }
 
-    /// Has the kernel forget, when the socket is closed, what the peer has not acknowledged, and tell
-    /// the peer that the connection is over.
+    /// Makes closing the socket reset the connection: the kernel discards unacknowledged bytes and
+    /// notifies the peer.
     pub(crate) fn discard(&self) {
         #[cfg(feature = "ip")]
         let socket = match self {
@@ -187,12 +240,12 @@ impl Writing {
             Self::Tls(socket, _) => socket,
             _ => return,
         };
-        // Without it, the peer notices later.
+        // On failure, the peer only notices later.
         #[cfg(feature = "ip")]
         let _ = socket2::SockRef::from(socket.as_ref()).set_linger(Some(std::time::Duration::ZERO));
     }
 
-    /// Hands over what is taken at once.
+    /// Writes as many bytes as the wire takes without waiting.
     pub(crate) fn try_write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
         match self {
             Self::Unix(socket) => socket.try_write_vectored(slices),
@@ -201,12 +254,12 @@ impl Writing {
             #[cfg(feature = "secure")]
             Self::Tls(socket, session) => session.write(socket, slices),
             #[cfg(feature = "quic")]
-            Self::Quic(outgoing) => outgoing.write(slices),
+            Self::Streams(outgoing) => outgoing.write(slices),
         }
     }
 
-    /// Sees to it that the kernel has all that was taken; an error of the kind `WouldBlock` when it
-    /// does not take it now.
+    /// Hands all accepted bytes to the kernel. Fails with `WouldBlock` if the kernel does not take
+    /// them now.
     pub(crate) fn try_finish(&self) -> io::Result<()> {
         match self {
             Self::Unix(_) => Ok(()),
@@ -215,11 +268,11 @@ impl Writing {
             #[cfg(feature = "secure")]
             Self::Tls(socket, session) => session.push(socket),
             #[cfg(feature = "quic")]
-            Self::Quic(_) => Ok(()),
+            Self::Streams(_) => Ok(()),
         }
     }
 
-    /// Waits until the kernel takes more.
+    /// Waits until the wire takes more bytes.
     pub(crate) async fn writable(&self) -> io::Result<()> {
         match self {
             Self::Unix(socket) => socket.writable().await,
@@ -228,7 +281,7 @@ impl Writing {
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => socket.writable().await,
             #[cfg(feature = "quic")]
-            Self::Quic(outgoing) => outgoing.writable().await,
+            Self::Streams(outgoing) => outgoing.writable().await,
         }
     }
 }

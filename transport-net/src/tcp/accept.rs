@@ -1,4 +1,4 @@
-//! The listening side: accepting connections and telling by their first byte who is there.
+//! The listening side: accepts connections and detects their protocol by their first byte.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,26 +14,27 @@ use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, sleep_until, timeout};
 
-use super::accept_queue::{self, Full, Place, TURN};
-#[cfg(feature = "secure")]
-use super::tls;
+use super::accept_queue::{self, Full, QueueTurn, TURN};
+use super::endpoint::TcpEndpoint;
 use super::unframed::{self, UnframedError};
 use crate::address::{self, AddressError};
-use crate::seldom::warn_seldom;
+use crate::log_limit::warn_limited;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
-use crate::stream::endpoint::{Endpoint, Stranger};
+use crate::stream::endpoint::UnprovedSlot;
 use crate::stream::frame::{FrameReader, MAGIC};
-use crate::stream::link::Running;
+use crate::stream::link::LinkTask;
 use crate::stream::proof::Proof;
-use crate::stream::source::{Account, Home, Source};
+use crate::stream::source::{Home, QuotaKey, Source};
+#[cfg(feature = "secure")]
+use crate::stream::tls;
 use crate::stream::wire;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
 /// while this process is stopped.
 const BACKLOG: i32 = 1024;
 
-/// Opens a listening socket, and returns the address that it is bound to. To be called within a
+/// Opens a listening socket, and returns the address that it is bound to. Must be called within a
 /// runtime.
 pub(crate) fn listen(text: &str) -> Result<(TcpListener, SocketAddr), ListenError> {
     let unavailable = |error: AddressError| ListenError::Unavailable(error.to_string());
@@ -54,8 +55,8 @@ fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
         Type::STREAM.nonblocking(),
         Some(Protocol::TCP),
     )?;
-    // A restarted process gets its port back although old connections linger. Two listeners on
-    // one port stay impossible.
+    // A restarted process gets its port although connections linger. Two listeners on one port
+    // remain impossible.
     socket.set_reuse_address(true)?;
     if address.is_ipv6() {
         socket.set_only_v6(true)?;
@@ -65,26 +66,27 @@ fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     Ok(socket.into())
 }
 
-/// What every socket of ours is set to.
+/// Sets the options of a connected socket.
 pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
     stream.set_nodelay(true)?;
-    // Bytes that the peer's host does not confirm: a cable was pulled.
+    // Bounds the time without an acknowledgment of the peer's host, for example after a cable was
+    // unplugged.
     SockRef::from(stream).set_tcp_user_timeout(Some(limits.keep_alive.saturating_mul(2)))
 }
 
 /// Accepts connections until it is aborted.
-pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
+pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {
     let mut pace = Pace::default();
     loop {
         match listener.accept().await {
             Ok((stream, from)) => {
                 let stream = Arc::new(stream);
                 let queue = &endpoint.legacy.accept_queue;
-                let place = queue.admit(&endpoint, from.ip(), &stream);
-                if matches!(place, Err(Full::Closed)) {
+                let turn = queue.admit(&endpoint, from.ip(), &stream);
+                if matches!(turn, Err(Full::Closed)) {
                     return;
                 }
-                serve(&endpoint, place, stream, from);
+                serve(&endpoint, turn, stream, from);
                 let (waiting, left) = endpoint.legacy.accept_queue.progress();
                 if pace.pauses(waiting, left) {
                     sleep(Pace::PAUSE).await;
@@ -96,24 +98,24 @@ pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
 }
 
 /// The pace of accepting. Accepting a connection is faster than reading a letter, and the letters
-/// that are not accepted yet are safe in the system's queue. So while many connections wait and are
-/// served, accepting pauses in between. A peer that keeps its connections from being served does not
+/// that are not accepted yet are safe in the system's queue. Therefore accepting pauses while many
+/// connections wait and are served. A peer that keeps its connections from being served does not
 /// slow down accepting for longer than [`Pace::PATIENCE`] pauses.
 #[derive(Debug, Default)]
 struct Pace {
-    /// Connections that had left the queues at the last pause.
+    /// Number of connections that had left the queues at the last pause.
     left: u64,
-    /// Pauses since one of them left.
+    /// Number of pauses since a connection left the queues.
     fruitless: u32,
 }
 
 impl Pace {
     const PAUSE: Duration = Duration::from_millis(1);
 
-    /// Number of waiting connections from which on there are pauses.
+    /// Minimum number of waiting connections for a pause.
     const BUSY: usize = 64;
 
-    /// Most pauses in a row in which no connection leaves the queues.
+    /// Maximum number of consecutive pauses in which no connection leaves the queues.
     const PATIENCE: u32 = 50;
 
     fn pauses(&mut self, waiting: usize, left: u64) -> bool {
@@ -130,32 +132,32 @@ impl Pace {
 
 /// Starts the task of an accepted connection.
 fn serve(
-    endpoint: &Arc<Endpoint>,
-    place: Result<Place, Full>,
+    endpoint: &Arc<TcpEndpoint>,
+    turn: Result<QueueTurn, Full>,
     stream: Arc<TcpStream>,
     from: SocketAddr,
 ) {
-    // The task ends itself when others push it out, so it begins when it has its own handle.
+    // Other connections can evict this one, so the task starts when its own handle is known.
     let (handle, own) = oneshot::channel();
-    let receiving = receive(endpoint.clone(), place, stream, from, own);
+    let receiving = receive(endpoint.clone(), turn, stream, from, own);
     let _ended = handle.send(tokio::spawn(receiving).abort_handle());
 }
 
-fn reset(endpoint: &Arc<Endpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
+fn reset(endpoint: &Arc<TcpEndpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
     if let Some(stream) = Arc::into_inner(stream) {
         endpoint.legacy.reset(endpoint, stream, from, full);
     }
 }
 
-/// The place of a connection whose first byte is awaited.
+/// The slot of a connection whose first byte is awaited.
 enum Waiting {
     /// In the accept queue, with its turn.
-    InTurn(Place),
-    /// Among those that have not introduced themselves.
-    Late(Stranger),
-    /// The same, because the accept queue was full: letters of legacy peers do not keep out a peer
-    /// that is going to introduce itself.
-    Beside(Stranger, Full),
+    InTurn(QueueTurn),
+    /// Among the connections before their hello.
+    Late(UnprovedSlot),
+    /// Among the connections before their hello, because the accept queue was full: letters of
+    /// legacy peers must not keep out a peer that will introduce itself.
+    QueueFull(UnprovedSlot, Full),
 }
 
 /// The first byte of a connection.
@@ -169,8 +171,8 @@ enum First {
 }
 
 async fn receive(
-    endpoint: Arc<Endpoint>,
-    place: Result<Place, Full>,
+    endpoint: Arc<TcpEndpoint>,
+    turn: Result<QueueTurn, Full>,
     stream: Arc<TcpStream>,
     from: SocketAddr,
     own: oneshot::Receiver<AbortHandle>,
@@ -178,16 +180,16 @@ async fn receive(
     let Ok(task) = own.await else {
         return;
     };
-    let waiting = match place {
-        Ok(place) if !place.started(task.clone()) => return,
-        Ok(place) => Waiting::InTurn(place),
-        Err(full) => match stranger(&endpoint, from, task.clone()) {
-            Some(place) => Waiting::Beside(place, full),
+    let waiting = match turn {
+        Ok(turn) if !turn.started(task.clone()) => return,
+        Ok(turn) => Waiting::InTurn(turn),
+        Err(full) => match unproved_slot(&endpoint, from, task.clone()) {
+            Some(slot) => Waiting::QueueFull(slot, full),
             None => return,
         },
     };
     if let Err(error) = prepare(&stream, endpoint.limits()) {
-        tracing::debug!(%from, "connection broke at once: {error}");
+        tracing::debug!(%from, "connection failed before the first byte: {error}");
         return;
     }
     let Some((waiting, first)) = first_byte(&endpoint, waiting, &stream, from, &task).await else {
@@ -200,7 +202,7 @@ async fn receive(
     };
     let refused = match first {
         First::Byte(byte) if byte == MAGIC[0] && endpoint.config.takes_frames_of(from.ip()) => {
-            let Some(place) = waiting.introduces_itself(&endpoint, from, task) else {
+            let Some(slot) = waiting.introduces_itself(&endpoint, from, task) else {
                 return;
             };
             let (Some(stream), Some((link, sink))) = (Arc::into_inner(stream), endpoint.accepted())
@@ -208,45 +210,45 @@ async fn receive(
                 return;
             };
             let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
-            Running::new(endpoint, link, sink, None)
+            LinkTask::new(endpoint.stream.clone(), link, sink, None)
                 .serve(
                     wire::plain(stream),
                     Proof::default(),
                     reader,
                     Source::Address(from),
-                    || drop(place),
+                    || drop(slot),
                 )
                 .await;
             return;
         }
         // A bit-efficient or an XML envelope.
         First::Byte(0xfe | 0xfd | b'<') => {
-            let place = match waiting.takes_turn(&endpoint, from, &stream, task) {
-                Ok(place) => place,
+            let turn = match waiting.takes_turn(&endpoint, from, &stream, task) {
+                Ok(turn) => turn,
                 Err(full) => return reset(&endpoint, stream, from, full),
             };
-            match receive_letter(&endpoint, place, stream, from).await {
+            match receive_letter(&endpoint, turn, stream, from).await {
                 Ok(()) => return,
                 Err(refused) => refused.to_string(),
             }
         }
-        First::Byte(byte) => format!("nothing begins with {byte:#04x}"),
+        First::Byte(byte) => format!("unknown protocol: the first byte is {byte:#04x}"),
         First::End => return,
         First::Broken(error) => {
-            tracing::debug!(%from, "connection broke at once: {error}");
+            tracing::debug!(%from, "connection failed before the first byte: {error}");
             return;
         }
-        First::Silence => "no byte came in time".to_owned(),
+        First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
     let counter = &endpoint.tally().refused_nonsense;
     let before = counter.fetch_add(1, Ordering::Relaxed);
-    warn_seldom(before, format_args!("{from}: connection closed: {refused}"));
+    warn_limited(before, format_args!("{from}: connection closed: {refused}"));
 }
 
 /// Waits for the first byte, which stays in the kernel's buffer. A connection without one loses its
 /// turn. Returns `None` when the endpoint has been closed.
 async fn first_byte(
-    endpoint: &Arc<Endpoint>,
+    endpoint: &Arc<TcpEndpoint>,
     mut waiting: Waiting,
     stream: &TcpStream,
     from: SocketAddr,
@@ -257,9 +259,9 @@ async fn first_byte(
     let mut byte = [0];
     let mut peeked = timeout(turn, stream.peek(&mut byte)).await;
     if peeked.is_err() && accept_queue::is_silent(stream) {
-        if let Waiting::InTurn(place) = waiting {
-            drop(place);
-            waiting = Waiting::Late(stranger(endpoint, from, task.clone())?);
+        if let Waiting::InTurn(turn) = waiting {
+            drop(turn);
+            waiting = Waiting::Late(unproved_slot(endpoint, from, task.clone())?);
         }
         peeked = timeout(patience - turn, stream.peek(&mut byte)).await;
     } else if peeked.is_err() {
@@ -274,57 +276,61 @@ async fn first_byte(
         Ok(Err(error)) => First::Broken(error),
         Err(_) => First::Silence,
     };
-    if let Waiting::InTurn(place) = &waiting {
-        place.has_bytes();
+    if let Waiting::InTurn(turn) = &waiting {
+        turn.has_bytes();
     }
     Some((waiting, first))
 }
 
-/// A place among those that have not introduced themselves.
-fn stranger(endpoint: &Arc<Endpoint>, from: SocketAddr, task: AbortHandle) -> Option<Stranger> {
-    let place = endpoint.receive_stranger(Source::Address(from))?;
-    endpoint.stranger_started(place.number, task);
-    Some(place)
+/// Returns a slot among the connections before their hello.
+fn unproved_slot(
+    endpoint: &Arc<TcpEndpoint>,
+    from: SocketAddr,
+    task: AbortHandle,
+) -> Option<UnprovedSlot> {
+    let slot = endpoint.admit_unproved(Source::Address(from))?;
+    endpoint.unproved_started(slot.number, task);
+    Some(slot)
 }
 
 impl Waiting {
-    /// Leaves the accept queue, because the peer is going to introduce itself.
+    /// Leaves the accept queue, because the peer will introduce itself.
     fn introduces_itself(
         self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         from: SocketAddr,
         task: AbortHandle,
-    ) -> Option<Stranger> {
+    ) -> Option<UnprovedSlot> {
         match self {
-            Self::InTurn(place) => {
-                drop(place);
-                stranger(endpoint, from, task)
+            Self::InTurn(turn) => {
+                drop(turn);
+                unproved_slot(endpoint, from, task)
             }
-            Self::Late(place) | Self::Beside(place, _) => Some(place),
+            Self::Late(slot) | Self::QueueFull(slot, _) => Some(slot),
         }
     }
 
-    /// Goes back to the accept queue, behind all others, when the turn has been lost. A connection
-    /// that found no room does not: later ones of its address may have.
+    /// Returns to the end of the accept queue after the turn was lost. A connection that found the
+    /// queue full does not return, because later ones of its address may be in the queue.
     fn takes_turn(
         self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         from: SocketAddr,
         stream: &Arc<TcpStream>,
         task: AbortHandle,
-    ) -> Result<Place, Full> {
+    ) -> Result<QueueTurn, Full> {
         match self {
-            Self::InTurn(place) => Ok(place),
-            Self::Beside(_, full) => Err(full),
-            Self::Late(stranger) => {
-                drop(stranger);
-                let place = endpoint
+            Self::InTurn(turn) => Ok(turn),
+            Self::QueueFull(_, full) => Err(full),
+            Self::Late(slot) => {
+                drop(slot);
+                let turn = endpoint
                     .legacy
                     .accept_queue
                     .admit(endpoint, from.ip(), stream)?;
-                place.has_bytes();
-                if place.started(task) {
-                    Ok(place)
+                turn.has_bytes();
+                if turn.started(task) {
+                    Ok(turn)
                 } else {
                     Err(Full::Closed)
                 }
@@ -333,24 +339,24 @@ impl Waiting {
     }
 }
 
-/// Reads a legacy peer's letter when its turn to be read has come, and hands it on when those of its
-/// address that were accepted before it have been.
+/// Reads a legacy peer's letter when its turn has come, and passes it on after the letters of its
+/// address that were accepted before.
 async fn receive_letter(
-    endpoint: &Arc<Endpoint>,
-    place: Place,
+    endpoint: &Arc<TcpEndpoint>,
+    turn: QueueTurn,
     stream: Arc<TcpStream>,
     from: SocketAddr,
 ) -> Result<(), UnframedError> {
-    place.may_read().await;
+    turn.may_read().await;
     let Some(mut stream) = Arc::into_inner(stream) else {
         return Ok(());
     };
-    let account = Account::of(Source::Address(from), None);
-    let read = unframed::read(endpoint, &place, &account, &mut stream).await?;
+    let quota_key = QuotaKey::of(Source::Address(from), None);
+    let read = unframed::read(endpoint, &turn, &quota_key, &mut stream).await?;
     drop(stream);
-    place.is_first().await;
-    if let Some(ration) = endpoint.ration(Home::Address(from.ip()))
-        && let Some(until) = ration.spend(1, read.letter.len(), Instant::now())
+    turn.is_first().await;
+    if let Some(rate_limit) = endpoint.rate_limit(Home::Address(from.ip()))
+        && let Some(until) = rate_limit.spend(1, read.letter.len(), Instant::now())
     {
         count(&endpoint.tally().held_back);
         sleep_until(until.into()).await;
@@ -363,11 +369,11 @@ async fn receive_letter(
     Ok(())
 }
 
-/// Has a peer prove who it is, and serves it to its end; or gives back the connection of one that
-/// need not.
+/// Performs the TLS handshake with a peer that must prove its identity, and serves it to its end.
+/// Returns the connection of a peer that need not.
 #[cfg(feature = "secure")]
 async fn prove(
-    endpoint: &Arc<Endpoint>,
+    endpoint: &Arc<TcpEndpoint>,
     waiting: Waiting,
     stream: Arc<TcpStream>,
     from: SocketAddr,
@@ -380,15 +386,15 @@ async fn prove(
     let patience = endpoint.limits().handshake_timeout;
     let refused = match first {
         First::Byte(tls::FIRST_BYTE) => {
-            let place = waiting.introduces_itself(endpoint, from, task.clone())?;
+            let slot = waiting.introduces_itself(endpoint, from, task.clone())?;
             match tls::accept(security, Arc::into_inner(stream)?, patience).await {
                 Ok(secured) => {
                     let (link, sink) = endpoint.accepted()?;
                     let proof = Proof::of(security, secured.certificate);
                     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
-                    Running::new(endpoint.clone(), link, sink, None)
+                    LinkTask::new(endpoint.stream.clone(), link, sink, None)
                         .serve(secured.ends, proof, reader, Source::Address(from), || {
-                            drop(place);
+                            drop(slot);
                         })
                         .await;
                     return None;
@@ -399,14 +405,16 @@ async fn prove(
         First::Byte(_) if !security.covers(from.ip()) || security.excepts(from.ip()) => {
             return Some((waiting, stream));
         }
-        First::Byte(_) => "it did not prove who is there".to_owned(),
+        First::Byte(_) => {
+            "the peer did not begin TLS, which it needs to prove its identity".to_owned()
+        }
         First::End => return None,
         First::Broken(error) => error.to_string(),
-        First::Silence => "no byte came in time".to_owned(),
+        First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
     let counter = &endpoint.tally().refused_unproved;
     let before = counter.fetch_add(1, Ordering::Relaxed);
-    warn_seldom(
+    warn_limited(
         before,
         format_args!("{from}: connection refused: {refused}"),
     );
@@ -418,13 +426,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn accepting_pauses_while_many_wait_and_are_served() {
+    fn accepting_pauses_while_many_connections_wait_and_are_served() {
         let mut pace = Pace::default();
         assert!(!pace.pauses(Pace::BUSY - 1, 0));
         for left in 0..1000 {
             assert!(pace.pauses(Pace::BUSY, left));
         }
-        // Nothing is served any more.
+        // No connection is served any longer.
         let pauses = (0..1000).filter(|_| pace.pauses(500, 999)).count();
         assert_eq!(pauses as u32, Pace::PATIENCE - 1);
         assert!(pace.pauses(500, 1000));

@@ -1,16 +1,16 @@
-//! Connections that were accepted and whose letter has not been handed on yet.
+//! Accepted connections whose letter has not been passed on yet.
 //!
-//! A legacy peer opens one connection per letter and closes it behind the letter, so the letters of
-//! one address have to be handed on in the order in which their connections were accepted. The queue
-//! of an address gives out two permissions in that order: to read (at most
+//! A legacy peer opens one connection per letter and closes it after the letter, so the letters of
+//! one address must be passed on in the order in which their connections were accepted. The queue
+//! of an address grants two permissions in that order: to read (at most
 //! [`Limits::max_reads_per_address`] connections at once; the others wait in the kernel's buffers),
-//! and to hand on a letter that has been read.
+//! and to pass on a letter that has been read.
 //!
 //! A connection without progress for [`TURN`] loses its turn: the letters behind it no longer wait
-//! for it. The first byte tells legacy letters from frames and TLS; those leave the queue at once.
+//! for it. The first byte distinguishes legacy letters from frames and TLS; connections with those
+//! leave the queue at once.
 //!
-//! The queue contains no sockets of its own and reads no clock. The tasks in [`accept`](super::accept)
-//! do the I/O.
+//! The queue owns no sockets and reads no clock. The tasks in [`accept`](super::accept) do the I/O.
 
 use std::collections::{BTreeMap, HashMap};
 use std::mem::MaybeUninit;
@@ -24,12 +24,12 @@ use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use crate::ration::whose;
+use super::endpoint::TcpEndpoint;
+use crate::rate_limit::quota_address;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
 
-/// A connection that has sent nothing for this long loses its turn.
+/// Time without a byte after which a connection loses its turn.
 pub(crate) const TURN: Duration = Duration::from_millis(250);
 
 /// The queues of all addresses.
@@ -41,11 +41,11 @@ struct State {
     closed: bool,
     last_ticket: u64,
     peers: HashMap<IpAddr, Peer>,
-    /// Connections that may be read.
+    /// Number of connections that may be read.
     reading: usize,
-    /// Connections that may not be read yet.
+    /// Number of connections that may not be read yet.
     waiting: usize,
-    /// Connections that have left the queues so far.
+    /// Number of connections that have left the queues so far.
     left: u64,
 }
 
@@ -54,7 +54,7 @@ struct State {
 struct Peer {
     /// In the order of acceptance.
     turns: BTreeMap<u64, Entry>,
-    /// Connections that may be read, with or without a turn.
+    /// Number of connections that may be read, with or without a turn.
     reading: usize,
 }
 
@@ -79,7 +79,7 @@ enum Phase {
     Stalled,
 }
 
-/// Why a connection does not find room.
+/// The reason for which a connection is not admitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Full {
     /// Too many connections of its address wait.
@@ -90,19 +90,19 @@ pub(crate) enum Full {
     Closed,
 }
 
-/// Tasks to end because their connections were pushed out.
-type PushedOut = Vec<AbortHandle>;
+/// Tasks to end because their connections were evicted.
+type Evicted = Vec<AbortHandle>;
 
 impl State {
-    /// Appends a connection to the queue of its address. When there is no room, the oldest
-    /// connection without a byte makes room, because no letter is lost with it.
+    /// Appends a connection to the queue of its address. When the queue is full, the oldest
+    /// connection without a byte is evicted, because no letter is lost with it.
     fn admit(
         &mut self,
         limits: &Limits,
         home: IpAddr,
         entry: Entry,
         is_silent: impl Fn(&Entry) -> bool,
-    ) -> Result<(u64, PushedOut), Full> {
+    ) -> Result<(u64, Evicted), Full> {
         if self.closed {
             return Err(Full::Closed);
         }
@@ -114,14 +114,14 @@ impl State {
         } else {
             None
         };
-        let mut pushed_out = PushedOut::new();
+        let mut evicted = Evicted::new();
         if let Some(full) = full {
             let from = match full {
                 Full::All => self.most_waiting().unwrap_or(home),
                 _ => home,
             };
             let ticket = self.silent(from, is_silent).ok_or(full)?;
-            pushed_out.extend(self.remove(limits, from, ticket).and_then(|out| out.task));
+            evicted.extend(self.remove(limits, from, ticket).and_then(|out| out.task));
         }
         self.last_ticket += 1;
         let ticket = self.last_ticket;
@@ -129,24 +129,24 @@ impl State {
         peer.turns.insert(ticket, entry);
         self.waiting += 1;
         self.grant(limits, home);
-        Ok((ticket, pushed_out))
+        Ok((ticket, evicted))
     }
 
-    /// The address of which most connections wait.
+    /// Returns the address with the most waiting connections.
     fn most_waiting(&self) -> Option<IpAddr> {
         let peers = self.peers.iter();
         let most = peers.max_by_key(|(_, peer)| peer.waiting());
         most.map(|(home, _)| *home)
     }
 
-    /// The oldest connection of an address that has not sent a byte.
+    /// Returns the oldest connection of an address that has not sent a byte.
     fn silent(&self, home: IpAddr, is_silent: impl Fn(&Entry) -> bool) -> Option<u64> {
         let mut turns = self.peers.get(&home)?.turns.iter();
         let oldest = turns.find(|(_, entry)| entry.task.is_some() && is_silent(entry));
         oldest.map(|(ticket, _)| *ticket)
     }
 
-    /// Takes a connection out; what it held is granted to others.
+    /// Removes a connection, and grants its permissions to others.
     fn remove(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> Option<Entry> {
         let peer = self.peers.get_mut(&home)?;
         let entry = peer.turns.remove(&ticket)?;
@@ -178,7 +178,7 @@ impl State {
         let Some(peer) = self.peers.get_mut(&home) else {
             return false;
         };
-        // One connection of each address may always be read, so that no other address stops it.
+        // One connection of each address may always be read, so that no address blocks another.
         let has_room =
             peer.reading < limits.max_reads_per_address && self.reading < limits.max_strangers;
         let has_room = has_room || peer.reading == 0;
@@ -197,7 +197,7 @@ impl State {
         }
     }
 
-    /// Lets connections of all addresses be read, first of those that have the fewest.
+    /// Lets connections of all addresses be read, first those of the address with the fewest.
     fn grant_others(&mut self, limits: &Limits) {
         while self.reading < limits.max_strangers {
             let peers = self.peers.iter();
@@ -212,16 +212,16 @@ impl State {
         }
     }
 
-    /// Takes the turn from a connection that is read and makes no progress. When all connections of
-    /// the address that may be read are such and others wait, the older half is pushed out.
-    fn stall(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> PushedOut {
-        let mut pushed_out = PushedOut::new();
+    /// Takes the turn from a connection that is read and makes no progress. When all readable
+    /// connections of the address are stalled and others wait, the older half is evicted.
+    fn stall(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> Evicted {
+        let mut evicted = Evicted::new();
         let Some(peer) = self.peers.get_mut(&home) else {
-            return pushed_out;
+            return evicted;
         };
         match peer.turns.get_mut(&ticket) {
             Some(entry) if entry.phase == Phase::Reading => entry.phase = Phase::Stalled,
-            _ => return pushed_out,
+            _ => return evicted,
         }
         peer.wake_first();
         let all_stalled = peer.reading >= limits.max_reads_per_address
@@ -235,13 +235,13 @@ impl State {
             let half = peer.reading.div_ceil(2);
             let oldest: Vec<u64> = stalled.take(half).map(|(ticket, _)| *ticket).collect();
             for ticket in oldest {
-                pushed_out.extend(self.remove(limits, home, ticket).and_then(|out| out.task));
+                evicted.extend(self.remove(limits, home, ticket).and_then(|out| out.task));
             }
         }
-        pushed_out
+        evicted
     }
 
-    /// Whether nothing that was accepted before this connection has a turn.
+    /// Whether no connection that was accepted before this one has a turn.
     fn is_first(&self, home: IpAddr, ticket: u64) -> bool {
         let Some(peer) = self.peers.get(&home) else {
             return true;
@@ -258,7 +258,7 @@ impl Peer {
         self.turns.len() - self.reading
     }
 
-    /// The connection whose turn it is.
+    /// Returns the connection that has the turn.
     fn first(&self) -> Option<u64> {
         let mut turns = self.turns.iter();
         let first = turns.find(|(_, entry)| entry.phase != Phase::Stalled);
@@ -282,8 +282,8 @@ impl Entry {
     }
 }
 
-/// Whether the kernel has neither a byte nor the end of this connection. The socket itself is asked,
-/// because the runtime learns of bytes later.
+/// Whether the kernel has neither a byte nor the end of this connection. The socket itself is
+/// queried, because the runtime learns of bytes later.
 pub(crate) fn is_silent(socket: &TcpStream) -> bool {
     let mut byte = [MaybeUninit::uninit()];
     match SockRef::from(socket).peek(&mut byte) {
@@ -296,14 +296,14 @@ impl AcceptQueue {
     /// Appends a connection from this address to its queue.
     ///
     /// # Errors
-    /// When there is no room.
+    /// When the queue is full and no connection can be evicted.
     pub(crate) fn admit(
         &self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         from: IpAddr,
         socket: &Arc<TcpStream>,
-    ) -> Result<Place, Full> {
-        let home = whose(from);
+    ) -> Result<QueueTurn, Full> {
+        let home = quota_address(from);
         let wake = Arc::new(Notify::new());
         let entry = Entry {
             phase: Phase::Waiting,
@@ -313,10 +313,10 @@ impl AcceptQueue {
         };
         let limits = endpoint.limits();
         let mut state = self.0.lock();
-        let (ticket, pushed_out) = state.admit(limits, home, entry, Entry::is_silent)?;
+        let (ticket, evicted) = state.admit(limits, home, entry, Entry::is_silent)?;
         drop(state);
-        end(endpoint, pushed_out);
-        Ok(Place {
+        end(endpoint, evicted);
+        Ok(QueueTurn {
             endpoint: endpoint.clone(),
             home,
             ticket,
@@ -344,24 +344,25 @@ impl AcceptQueue {
     }
 }
 
-fn end(endpoint: &Endpoint, pushed_out: PushedOut) {
-    for task in pushed_out {
+fn end(endpoint: &TcpEndpoint, evicted: Evicted) {
+    for task in evicted {
         count(&endpoint.tally().refused_crowd);
         task.abort();
     }
 }
 
-/// The place of one connection in the queue of its address; dropping it lets the next one through.
+/// The position of one connection in the queue of its address. Dropping it lets the next one
+/// proceed.
 #[derive(Debug)]
-pub(crate) struct Place {
-    endpoint: Arc<Endpoint>,
+pub(crate) struct QueueTurn {
+    endpoint: Arc<TcpEndpoint>,
     home: IpAddr,
     ticket: u64,
     wake: Arc<Notify>,
 }
 
-impl Place {
-    /// Sets the task of this connection. Returns whether it is to go on.
+impl QueueTurn {
+    /// Sets the task of this connection. Returns whether the task may continue.
     pub(crate) fn started(&self, task: AbortHandle) -> bool {
         self.with_entry(|entry| entry.task = Some(task)).is_some() && !self.state().closed
     }
@@ -374,8 +375,8 @@ impl Place {
     /// Takes the turn from this connection: no byte came for [`TURN`].
     pub(crate) fn stalled(&self) {
         let limits = self.endpoint.limits();
-        let pushed_out = self.state().stall(limits, self.home, self.ticket);
-        end(&self.endpoint, pushed_out);
+        let evicted = self.state().stall(limits, self.home, self.ticket);
+        end(&self.endpoint, evicted);
     }
 
     /// Waits for the permission to read this connection.
@@ -385,7 +386,7 @@ impl Place {
         }
     }
 
-    /// Waits until the letters of all connections before this one have been handed on.
+    /// Waits until the letters of all connections before this one have been passed on.
     pub(crate) async fn is_first(&self) {
         loop {
             let is_first = self.state().is_first(self.home, self.ticket);
@@ -407,7 +408,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for QueueTurn {
     fn drop(&mut self) {
         let limits = self.endpoint.limits();
         self.state().remove(limits, self.home, self.ticket);
@@ -459,7 +460,7 @@ mod tests {
         let mut state = State::default();
         let tickets: Vec<u64> = (0..5).map(|_| admit(&mut state, HERE).unwrap()).collect();
         assert_eq!(may_read(&state, HERE), tickets[..2]);
-        // The second has been read first, and waits for the first.
+        // The second letter is complete first, and waits for the first.
         assert!(!state.is_first(HERE, tickets[1]));
         assert!(state.is_first(HERE, tickets[0]));
         state.remove(&limits(), HERE, tickets[0]);
@@ -473,7 +474,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_connection_beyond_the_bounds_finds_no_room() {
+    fn a_connection_beyond_the_limits_is_not_admitted() {
         let mut state = State::default();
         for _ in 0..7 {
             admit(&mut state, HERE).unwrap();
@@ -487,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn a_connection_without_a_byte_makes_room() {
+    fn a_full_queue_evicts_a_connection_without_a_byte() {
         let mut state = State::default();
         let silent = admit(&mut state, HERE).unwrap();
         for _ in 0..6 {
@@ -498,8 +499,8 @@ mod tests {
         let turns = &mut state.peers.get_mut(&HERE).unwrap().turns;
         turns.get_mut(&silent).unwrap().task = Some(task);
         let admitted = state.admit(&limits(), HERE, entry(), |entry| entry.task.is_some());
-        let (_, pushed_out) = admitted.unwrap();
-        assert_eq!(pushed_out.len(), 1);
+        let (_, evicted) = admitted.unwrap();
+        assert_eq!(evicted.len(), 1);
         assert!(!state.peers[&HERE].turns.contains_key(&silent));
     }
 
@@ -511,9 +512,9 @@ mod tests {
         assert!(!state.is_first(HERE, next));
         assert!(state.stall(&limits(), HERE, stalled).is_empty());
         assert!(state.is_first(HERE, next));
-        // It is handed on when it is complete after all.
+        // A stalled letter is passed on when it completes.
         assert!(state.is_first(HERE, stalled));
-        // It still counts among those that are read.
+        // A stalled connection still counts as read.
         let third = admit(&mut state, HERE).unwrap();
         assert_eq!(may_read(&state, HERE), [stalled, next]);
         state.remove(&limits(), HERE, next);
@@ -521,25 +522,25 @@ mod tests {
     }
 
     #[test]
-    fn stalled_connections_do_not_stop_their_address() {
+    fn stalled_connections_do_not_block_their_address() {
         let mut state = State::default();
         let tickets: Vec<u64> = (0..3).map(|_| admit(&mut state, HERE).unwrap()).collect();
         state.stall(&limits(), HERE, tickets[0]);
         assert_eq!(may_read(&state, HERE), tickets[..2]);
-        // Without a task there is nothing to end; the entry is removed all the same.
+        // Without a task there is no task to abort; the entry is removed all the same.
         state.stall(&limits(), HERE, tickets[1]);
         assert_eq!(may_read(&state, HERE), tickets[1..]);
     }
 
     #[test]
-    fn no_address_stops_another() {
+    fn no_address_blocks_another() {
         let mut state = State::default();
         for last in 1..=2 {
             for _ in 0..3 {
                 admit(&mut state, address(last)).unwrap();
             }
         }
-        // All four places are taken; a third address is read all the same, one at a time.
+        // All four slots are taken; one connection of a third address is still read at a time.
         let third = admit(&mut state, address(3)).unwrap();
         let waits = admit(&mut state, address(3)).unwrap();
         assert_eq!(may_read(&state, address(3)), [third]);
@@ -547,14 +548,14 @@ mod tests {
         state.remove(&limits(), address(3), third);
         assert_eq!(may_read(&state, address(3)), [waits]);
         state.remove(&limits(), address(3), waits);
-        // A place that is given back goes to those that wait.
+        // A released slot goes to a waiting connection.
         let first = may_read(&state, address(1))[0];
         state.remove(&limits(), address(1), first);
         assert_eq!(may_read(&state, address(1)).len(), 2);
     }
 
     #[test]
-    fn nothing_is_admitted_after_the_end() {
+    fn a_closed_queue_admits_no_connection() {
         let mut state = State {
             closed: true,
             ..State::default()

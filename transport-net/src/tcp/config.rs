@@ -1,4 +1,4 @@
-//! What the owner of an endpoint chooses.
+//! Configuration of a TCP endpoint.
 
 use crate::Identity;
 use crate::stream::config::Limits;
@@ -8,18 +8,18 @@ use crate::stream::config::Limits;
 pub struct TcpConfig {
     /// Numeric addresses to listen on, for example `127.0.0.1:0`, `[::1]:7788`, `0.0.0.0:7788` or
     /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. `[::]` is IPv6 only: list `0.0.0.0`
-    /// beside it for both. May be empty: then letters can be sent, and peers can answer over the
-    /// connections made for that.
+    /// beside it for both. May be empty: letters can still be sent, and peers can answer over the
+    /// connections that this side opens.
     pub listen: Vec<String>,
-    /// How this endpoint introduces itself.
+    /// Identity of this endpoint.
     pub identity: Identity,
-    /// What it takes and how long it waits.
+    /// Limits and timeouts.
     pub limits: Limits,
-    /// Whether processes of this host connect over loopback. Without it a peer that connects from a
-    /// loopback address is a stranger, whatever host and domain it says to be of, and with `security`
-    /// it has to prove itself, too.
+    /// Whether processes of this host connect over loopback. If not, a peer at a loopback address
+    /// is unproved, even if it claims this host and domain, and must also prove its identity when
+    /// `security` is set.
     pub processes: bool,
-    /// What peers have to prove. Without it nobody has to prove anything.
+    /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]
     pub security: Option<crate::secure::Security>,
 }

@@ -1,4 +1,4 @@
-//! The calling side: opening a connection to a location.
+//! The dialling side: opens a connection to a location.
 
 use std::io;
 use std::net::SocketAddr;
@@ -7,54 +7,54 @@ use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
-use tokio::net::{TcpStream, lookup_host};
+use tokio::net::TcpStream;
 use tokio::task::JoinSet;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
 use super::accept::prepare;
-#[cfg(feature = "secure")]
-use super::tls;
-use crate::address::{self, Target};
-use crate::end::End;
+use super::endpoint::TcpEndpoint;
+use crate::end::ConnectionEnd;
 use crate::stream::config::Limits;
-use crate::stream::endpoint::Endpoint;
+use crate::stream::dialing::{Unreachable, addresses, first, reach};
 use crate::stream::frame::FrameReader;
-use crate::stream::link::{Link, Running};
+use crate::stream::link::{Link, LinkTask};
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
+#[cfg(feature = "secure")]
+use crate::stream::tls;
 use crate::stream::wire::{self, Reading, Writing};
 
-/// How long one address is waited for before the next is tried as well.
-const STAGGER: Duration = Duration::from_millis(250);
+/// Time after which another connection to the same address is attempted, and the maximum number of
+/// attempts.
+const RETRY_AFTER: Duration = Duration::from_millis(400);
+const MAX_CONNECTS: usize = 4;
 
-/// How long an address is waited for before it is asked again, and how often it is asked.
-const ASKED_AGAIN: Duration = Duration::from_millis(400);
-const MAX_ASKED: usize = 4;
-
-/// Most addresses of one name, or of one service, that are tried.
-const MAX_ADDRESSES: usize = 8;
-
-/// Opens the connection of a link that has been made up, and serves it.
+/// Opens the connection of a new link, and serves it.
 pub(crate) async fn dial(
-    endpoint: Arc<Endpoint>,
+    endpoint: Arc<TcpEndpoint>,
     link: Arc<Link>,
     sink: Arc<dyn Sink>,
     to: Location,
 ) {
     let limits = endpoint.limits().clone();
     let addresses = addresses(&*sink, &to);
-    let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
-    let (stream, peer) = match reach(&limits, &link, &to, addresses, insist).await {
+    let running = LinkTask::new(
+        endpoint.stream.clone(),
+        link.clone(),
+        sink,
+        Some(to.clone()),
+    );
+    let (stream, peer) = match reach(&limits, &link, &to, addresses, connect_with_retries).await {
         Ok(connected) => connected,
         Err(end) => return running.fail(end),
     };
     if let Err(error) = prepare(&stream, &limits) {
-        return running.fail(End::unreachable(&to, &error));
+        return running.fail(ConnectionEnd::unreachable(&to, &error));
     }
     let (ends, proof) = tokio::select! {
         proved = prove(&running, stream, peer) => match proved {
             Ok(proved) => proved,
-            Err(why) => return running.fail(End::unreachable(&to, &why)),
+            Err(why) => return running.fail(ConnectionEnd::unreachable(&to, &why)),
         },
         end = link.leaving() => return running.fail(end),
     };
@@ -65,47 +65,10 @@ pub(crate) async fn dial(
         .await;
 }
 
-/// The address of a location, and those at which the same service is as well. Only where the peer
-/// says that it is this service: at another's address there may be somebody else by now.
-pub(crate) fn addresses(sink: &dyn Sink, to: &Location) -> Vec<String> {
-    let mut addresses = vec![to.address().to_owned()];
-    if to.incarnation().is_known() {
-        let same = |other: &Location| {
-            other.kind() == to.kind()
-                && other.signature() == to.signature()
-                && other.incarnation() == to.incarnation()
-        };
-        let others = sink.also_at(to).into_iter().filter(same);
-        addresses.extend(others.map(|other| other.address().to_owned()));
-        addresses.truncate(MAX_ADDRESSES);
-    }
-    addresses
-}
-
-/// Has `connect` try these addresses of a location, until one answers or the link is left.
-pub(crate) async fn reach<T, F>(
-    limits: &Limits,
-    link: &Link,
-    to: &Location,
-    addresses: Vec<String>,
-    connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,
-) -> Result<T, End>
-where
-    T: Send + 'static,
-    F: Future<Output = io::Result<T>> + Send + 'static,
-{
-    tokio::select! {
-        connected = first(limits, addresses, connect) => {
-            connected.map_err(|Unreachable(what)| End::unreachable(to, &what))
-        }
-        end = link.leaving() => Err(end),
-    }
-}
-
-/// Has the peer prove who it is, where it has to.
+/// Performs the TLS handshake if the peer must prove its identity.
 #[cfg(feature = "secure")]
 async fn prove(
-    running: &Running,
+    running: &LinkTask,
     stream: TcpStream,
     peer: SocketAddr,
 ) -> Result<((Reading, Writing), Proof), String> {
@@ -120,20 +83,17 @@ async fn prove(
     }
 }
 
-/// Nobody has to prove anything.
+/// Without TLS, no peer proves its identity.
 #[cfg(not(feature = "secure"))]
 async fn prove(
-    _running: &Running,
+    _running: &LinkTask,
     stream: TcpStream,
     _peer: SocketAddr,
 ) -> Result<((Reading, Writing), Proof), String> {
     Ok((wire::plain(stream), Proof::default()))
 }
 
-/// Why no connection could be opened.
-pub(crate) struct Unreachable(pub(crate) String);
-
-/// Opens a connection to whichever of these addresses answers first.
+/// Opens a connection to the first of these addresses that accepts one.
 pub(crate) async fn open(
     limits: &Limits,
     addresses: Vec<String>,
@@ -141,158 +101,24 @@ pub(crate) async fn open(
     first(limits, addresses, connect).await
 }
 
-/// Has `connect` try these addresses, until one answers.
-async fn first<T, F>(
-    limits: &Limits,
-    addresses: Vec<String>,
-    connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,
-) -> Result<T, Unreachable>
-where
-    T: Send + 'static,
-    F: Future<Output = io::Result<T>> + Send + 'static,
-{
-    let several = addresses.len() > 1;
-    let attempts = addresses.into_iter().map(|address| {
-        let connect = connect.clone();
-        async move {
-            let connected = target(&address, connect).await;
-            connected.map_err(|error| match several {
-                true => io::Error::new(error.kind(), format!("{address}: {error}")),
-                false => error,
-            })
-        }
-    });
-    let patience = limits.connect_timeout;
-    match timeout(patience, race(attempts)).await {
-        Ok(connected) => connected.map_err(|error| Unreachable(error.to_string())),
-        Err(_) => Err(Unreachable(format!(
-            "no connection within {patience:?} (connect_timeout)"
-        ))),
-    }
-}
-
-/// Has `connect` try what an address means.
-async fn target<T, F>(address: &str, connect: impl Fn(SocketAddr) -> F) -> io::Result<T>
-where
-    T: Send + 'static,
-    F: Future<Output = io::Result<T>> + Send + 'static,
-{
-    let target = address::target(address);
-    match target.map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error))? {
-        Target::Numeric(address) => connect(address).await,
-        Target::Named(name, port) => {
-            let found = lookup_host((name.as_str(), port)).await?;
-            let addresses = alternating(found.take(MAX_ADDRESSES).collect());
-            race(addresses.into_iter().map(connect)).await
-        }
-    }
-}
-
-/// What the first of these attempts to succeed yields. The next is begun when the one before has
-/// failed or has not answered for a while (RFC 8305 section 5).
-async fn race<T, F>(attempts: impl IntoIterator<Item = F>) -> io::Result<T>
-where
-    T: Send + 'static,
-    F: Future<Output = io::Result<T>> + Send + 'static,
-{
-    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
-    let mut waiting = attempts.into_iter().peekable();
-    let mut racing = JoinSet::new();
-    loop {
-        if let Some(attempt) = waiting.next() {
-            racing.spawn(attempt);
-        } else if racing.is_empty() {
-            return Err(last);
-        }
-        let is_last = waiting.peek().is_none();
-        tokio::select! {
-            Some(ended) = racing.join_next() => match ended {
-                Ok(Ok(connected)) => return Ok(connected),
-                Ok(Err(error)) => last = error,
-                Err(error) => last = io::Error::other(error),
-            },
-            () = sleep(STAGGER), if !is_last => {}
-        }
-    }
-}
-
-/// Opens a connection, and another one after a while when there is no answer: the system repeats a lost
-/// SYN after one second, and then after two. The first one to be open is used.
-async fn insist(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
+/// Opens a connection, and after a while another one if there is no answer: the system retransmits
+/// a lost SYN only after one second, and then after two. The first open connection is used.
+async fn connect_with_retries(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
     let mut asked = JoinSet::new();
     loop {
         asked.spawn(connect(address));
         tokio::select! {
             Some(ended) = asked.join_next() => return ended.unwrap_or_else(|e| Err(io::Error::other(e))),
-            () = sleep(ASKED_AGAIN), if asked.len() < MAX_ASKED => {}
+            () = sleep(RETRY_AFTER), if asked.len() < MAX_CONNECTS => {}
         }
     }
 }
 
 async fn connect(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
     let stream = TcpStream::connect(address).await?;
-    // Where nobody listens on a port of its own range, a host can connect to itself.
+    // Without a listener on an ephemeral port, a host can connect to itself.
     if stream.local_addr()? == stream.peer_addr()? {
         return Err(io::ErrorKind::ConnectionRefused.into());
     }
     Ok((stream, address))
-}
-
-/// The families take turns, beginning with that of the first address (RFC 8305 section 4).
-fn alternating(addresses: Vec<SocketAddr>) -> Vec<SocketAddr> {
-    let Some(first) = addresses.first().copied() else {
-        return addresses;
-    };
-    let (same, other): (Vec<_>, Vec<_>) = addresses
-        .into_iter()
-        .partition(|address| address.is_ipv4() == first.is_ipv4());
-    let (mut same, mut other) = (same.into_iter(), other.into_iter());
-    let mut all = Vec::new();
-    loop {
-        let turn = [same.next(), other.next()];
-        if turn == [None, None] {
-            return all;
-        }
-        all.extend(turn.into_iter().flatten());
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::net::Ipv4Addr;
-
-    use super::*;
-
-    #[test]
-    fn families_take_turns() {
-        let parse = |texts: &[&str]| -> Vec<SocketAddr> {
-            texts.iter().map(|text| text.parse().unwrap()).collect()
-        };
-        let mixed = parse(&["[::1]:1", "[::2]:1", "[::3]:1", "127.0.0.1:1"]);
-        let turns = parse(&["[::1]:1", "127.0.0.1:1", "[::2]:1", "[::3]:1"]);
-        assert_eq!(alternating(mixed), turns);
-        assert_eq!(alternating(Vec::new()), Vec::new());
-    }
-
-    #[tokio::test]
-    async fn an_address_that_is_silent_or_refuses_holds_up_nobody() {
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let there = listener.local_addr().unwrap();
-        // A queue of one, and it is taken: the system answers no more.
-        let full =
-            socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::STREAM, None).unwrap();
-        full.bind(&SocketAddr::from((Ipv4Addr::LOCALHOST, 0)).into())
-            .unwrap();
-        full.listen(0).unwrap();
-        let silent = full.local_addr().unwrap().as_socket().unwrap();
-        let _first = TcpStream::connect(silent).await.unwrap();
-        let refusing = tokio::net::TcpSocket::new_v4().unwrap();
-        refusing.bind("127.0.0.1:0".parse().unwrap()).unwrap();
-        let refusing_at = refusing.local_addr().unwrap();
-        let all = [silent, refusing_at, there].map(connect);
-        let (_, reached) = race(all).await.unwrap();
-        assert_eq!(reached, there);
-        assert!(race([connect(refusing_at)]).await.is_err());
-        assert!(race(Vec::new().into_iter().map(connect)).await.is_err());
-    }
 }

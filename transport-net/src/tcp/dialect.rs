@@ -1,8 +1,8 @@
-//! Letters in the hands of old peers: the edge at which our letters are translated.
+//! Translation of letters for legacy peers.
 //!
-//! fipa_services gets a bit-efficient envelope and message in its dialect; JADE's proxy agent an
-//! XML envelope with the length of the payload, and a string message. Both get the letter with the
-//! one receiver it is delivered to.
+//! fipa_services gets a bit-efficient envelope and message in its dialect. JADE's proxy agent gets
+//! an XML envelope with the length of the payload, and a string message. Both get the letter with
+//! only the receiver it is delivered to.
 
 use bytes::Bytes;
 use fipa_acl::{
@@ -11,22 +11,22 @@ use fipa_acl::{
 };
 use fipa_transport::{Signature, WayFault};
 
-/// Why a letter cannot be said to an old peer.
+/// The reason for which a letter cannot be translated for a legacy peer.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum TranslateError {
-    #[error("the letter cannot be read: {0}")]
+    #[error("the letter cannot be decoded: {0}")]
     Read(#[from] DecodeError),
     #[error("{0}")]
     Write(#[from] EncodeError),
-    #[error("the receiver's name cannot be written: {0:?}")]
+    #[error("the receiver's name is not valid: {0:?}")]
     Receiver(String),
-    #[error("{0} is not the dialect of an old peer")]
+    #[error("{0} is not the signature of a legacy peer")]
     NoDialect(Signature),
 }
 
 impl TranslateError {
-    /// The fault of an attempt that ends with this error.
+    /// Returns the fault of an attempt that ends with this error.
     pub(crate) fn fault(&self) -> WayFault {
         match self {
             Self::Read(_) | Self::Write(_) | Self::Receiver(_) => WayFault::Inexpressible,
@@ -35,9 +35,9 @@ impl TranslateError {
     }
 }
 
-/// The letter for one receiver as a peer with that signature reads it: envelope and message.
-/// `here` is where answers can be sent, as a URL: JADE answers to the addresses of the sender, so
-/// it is put there when there are none.
+/// Translates a letter for one receiver into envelope and message in the dialect of `signature`.
+/// `here` is the URL at which answers are received: JADE answers to the addresses of the sender, so
+/// it is added when the sender has none.
 pub(crate) fn translate(
     letter: &Letter,
     receiver: &str,
@@ -58,7 +58,7 @@ pub(crate) fn translate(
         Signature::JadeProxy => {
             let message = with_address(message, here);
             let message = message.encode(Representation::String, Dialect::Jade)?;
-            // JADE counts characters, in US-ASCII unless it is told otherwise.
+            // JADE counts characters, in US-ASCII unless the envelope names another encoding.
             let text = std::str::from_utf8(&message).ok();
             let length = text.map_or(message.len(), |text| text.chars().count()) as u64;
             let mut envelope = addressed(envelope, to, AclRepresentation::String, length);
@@ -73,7 +73,7 @@ pub(crate) fn translate(
     }
 }
 
-/// The receiver, with what the envelope says about it beside the name.
+/// Returns the receiver with the parameters that the envelope gives for it.
 fn receiver_of(envelope: &Envelope, name: &str) -> Result<AgentId, TranslateError> {
     let EnvelopeParams {
         to,
@@ -87,7 +87,7 @@ fn receiver_of(envelope: &Envelope, name: &str) -> Result<AgentId, TranslateErro
     }
 }
 
-/// The same envelope for this receiver alone, with what is true of the translated message.
+/// Returns the envelope for this receiver alone, with the parameters of the translated message.
 fn addressed(
     mut envelope: Envelope,
     to: AgentId,
@@ -117,7 +117,7 @@ fn add_address(agent: &mut AgentId, here: &str) {
     }
 }
 
-/// The message, whose sender has an address.
+/// Returns the message with an address of its sender.
 fn with_address(message: Message, here: Option<&str>) -> Message {
     let (Some(sender), Some(here)) = (message.sender(), here) else {
         return message;
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_said_is_refused() {
+    fn letters_that_cannot_be_translated_are_refused() {
         let garbage = Letter::new(Bytes::from_static(b"x"), Bytes::new());
         let refused = translate(&garbage, "arm", Signature::FipaServices, None);
         assert!(matches!(refused, Err(TranslateError::Read(_))));

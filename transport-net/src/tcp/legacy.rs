@@ -1,4 +1,4 @@
-//! What an endpoint keeps for legacy peers: their letters, in both directions.
+//! State of an endpoint for legacy peers: their letters in both directions.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -10,17 +10,17 @@ use tokio::net::TcpStream;
 use tokio::time::sleep;
 
 use super::accept_queue::{AcceptQueue, Full};
-use super::courier::Couriers;
-use crate::seldom::PerSecond;
+use super::endpoint::TcpEndpoint;
+use super::legacy_sender::LegacySenders;
+use crate::log_limit::PerSecond;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
 
 /// Letters of legacy peers.
 #[derive(Debug, Default)]
 pub(crate) struct Legacy {
-    /// Letters to them.
-    pub(super) couriers: Couriers,
-    /// Accepted connections that may bring a letter of one.
+    /// Letters to legacy peers.
+    pub(super) senders: LegacySenders,
+    /// Accepted connections that may carry a letter of a legacy peer.
     pub(super) accept_queue: AcceptQueue,
     /// Connections that were reset because the accept queue was full.
     resets: PerSecond,
@@ -28,19 +28,19 @@ pub(crate) struct Legacy {
 
 impl Legacy {
     pub(crate) fn close(&self) {
-        self.couriers.close();
+        self.senders.close();
         self.accept_queue.close();
     }
 
     /// Ends the attempt to send a letter.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.couriers.abandon(attempt)
+        self.senders.abandon(attempt)
     }
 
     /// Resets a connection for which the accept queue has no room, so that its sender sees an error.
     pub(super) fn reset(
         &self,
-        endpoint: &Arc<Endpoint>,
+        endpoint: &Arc<TcpEndpoint>,
         stream: TcpStream,
         from: SocketAddr,
         full: Full,
@@ -52,7 +52,7 @@ impl Legacy {
             Full::Closed => return,
         };
         count(&endpoint.tally().refused_crowd);
-        // Without the time to linger, closing sends a reset.
+        // With a linger time of zero, closing sends a reset.
         if let Err(error) = SockRef::from(&stream).set_linger(Some(Duration::ZERO)) {
             tracing::debug!(%from, "cannot reset a connection: {error}");
         }

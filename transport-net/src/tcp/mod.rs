@@ -1,22 +1,21 @@
-//! Framed, acknowledged letters over TCP.
+//! Letters over TCP: framed and acknowledged, or unframed for legacy peers.
 //!
-//! Frames, connections and what they share are in [`crate::stream`].
+//! Frames and framed connections are in [`crate::stream`].
 //!
-//! * [`dial`] and [`accept`] open connections; [`tls`] is for peers that prove who they are.
+//! * [`dial`] and [`accept`] open connections.
 //! * [`accept_queue`]: the order in which accepted connections are read.
-//! * [`unframed`]: letters of old peers, on the same port.
-//! * [`courier`]: letters to old peers, in their [`dialect`].
-//! * [`legacy`]: what an endpoint keeps for both.
+//! * [`unframed`]: letters from legacy peers, on the same port.
+//! * [`legacy_sender`]: letters to legacy peers, in their [`dialect`].
+//! * [`legacy`]: the state of both, which an [`endpoint`] holds beside its framed connections.
 
 mod accept;
 mod accept_queue;
 mod config;
-mod courier;
-pub(crate) mod dial;
+mod dial;
 mod dialect;
+mod endpoint;
 mod legacy;
-#[cfg(feature = "secure")]
-pub(crate) mod tls;
+mod legacy_sender;
 mod unframed;
 
 use std::sync::Arc;
@@ -28,36 +27,37 @@ use fipa_transport::{
 use tokio::runtime::Handle;
 
 pub use self::config::TcpConfig;
-pub(crate) use self::legacy::Legacy;
-use crate::end::End;
+use self::endpoint::TcpEndpoint;
+use crate::end::ConnectionEnd;
 use crate::stream::config::StreamConfig;
 use crate::stream::counters::Counters;
 use crate::stream::endpoint::Endpoint;
 
 /// Carries parcels over TCP.
 ///
-/// The first parcel to a location opens a connection, which then carries everything to and from
-/// that peer, whoever opened it, until it has been idle for some time. Letters are written from
-/// the memory they lie in, and read into one piece of memory each; large content into memory of
-/// [the sink's](Sink::memory_for), if it offers some.
+/// The first parcel to a location opens a connection. That connection then carries all parcels to
+/// and from the peer, whichever side opened it, until it reaches its idle timeout. Letters are
+/// written from the memory that holds them, and read into one allocation each; large content is
+/// read into memory of [the sink](Sink::memory_for), if it offers some.
 ///
-/// To a location with the [signature](Signature) of an old peer, each letter goes over a connection
-/// of its own, in that peer's dialect, and is concluded as [handed](fipa_transport::Conclusion::Handed).
+/// To a location with the [signature](Signature) of a legacy peer, each letter is sent over a
+/// connection of its own, in the dialect of that peer, and is concluded as
+/// [handed](fipa_transport::Conclusion::Handed).
 ///
 /// An address is a numeric `address:port`, with a scope where one is needed
 /// (`[fe80::1%eth0]:7788`), or `name:port`.
 ///
-/// Dropping it closes it. After [`close`](Transport::close) the attempts are concluded by the
-/// runtime's threads, so the runtime must live on for a moment.
+/// Dropping it closes it. After [`close`](Transport::close) the threads of the runtime conclude the
+/// attempts, so the runtime must run a moment longer.
 #[derive(Debug)]
 pub struct TcpTransport {
     listen: Vec<String>,
-    endpoint: Arc<Endpoint>,
+    endpoint: Arc<TcpEndpoint>,
 }
 
 impl TcpTransport {
-    /// An endpoint that does its work on `runtime`, which must have input, output and time
-    /// enabled. Nothing is opened before `listen`.
+    /// Creates an endpoint that runs its tasks on `runtime`, which must have I/O and time enabled.
+    /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: TcpConfig, runtime: Handle) -> Self {
         let TcpConfig {
@@ -77,26 +77,31 @@ impl TcpTransport {
         };
         Self {
             listen,
-            endpoint: Endpoint::new(Kind::Tcp, config, runtime),
+            endpoint: TcpEndpoint::new(Endpoint::new(Kind::Tcp, config, runtime)),
         }
     }
 
-    /// What happened so far.
+    /// Returns the counters of this endpoint.
     #[must_use]
     pub fn counters(&self) -> Counters {
         self.endpoint.tally().read()
     }
 
-    /// Hands a letter to who takes those for an old peer.
-    fn hand(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    /// Queues a letter for a legacy peer, and starts the task that sends it.
+    fn dispatch_legacy(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), WayError> {
         let Some(sink) = self.endpoint.sink() else {
-            return Err(End::Closed.after());
+            return Err(ConnectionEnd::Closed.after());
         };
-        let couriers = &self.endpoint.legacy.couriers;
-        if couriers.take(&self.endpoint, attempt, to, parcel)? {
-            let run = courier::run(self.endpoint.clone(), sink, to.clone());
+        let senders = &self.endpoint.legacy.senders;
+        if senders.take(&self.endpoint, attempt, to, parcel)? {
+            let run = legacy_sender::run(self.endpoint.clone(), sink, to.clone());
             let task = self.endpoint.runtime.spawn(run);
-            if task.is_finished() && couriers.take_back(attempt, to) {
+            if task.is_finished() && senders.take_back(attempt, to) {
                 let detail = "the runtime of this endpoint has been shut down";
                 return Err(WayError::new(WayFault::Closed, detail));
             }
@@ -129,7 +134,7 @@ impl Transport for TcpTransport {
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
         self.endpoint.check(to, &parcel)?;
         if to.signature() != Signature::Frames {
-            return self.hand(attempt, to, parcel);
+            return self.dispatch_legacy(attempt, to, parcel);
         }
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
             let dialling = dial::dial(self.endpoint.clone(), link, sink, to.clone());

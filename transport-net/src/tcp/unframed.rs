@@ -1,5 +1,5 @@
-//! Letters of old peers (fipa_services, and JADE over its raw TCP extension): one per connection,
-//! without a header, until end of stream. Their envelopes are bit-efficient or XML.
+//! Letters from legacy peers (fipa_services, and JADE with its raw TCP extension): one per
+//! connection, without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};
@@ -7,55 +7,54 @@ use fipa_transport::{Kind, LegacySource, Signature};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
-use super::accept_queue::{Place, TURN};
+use super::accept_queue::{QueueTurn, TURN};
+use super::endpoint::TcpEndpoint;
+use crate::stream::budget::ReservedBytes;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
-use crate::stream::place::Room;
-use crate::stream::source::Account;
+use crate::stream::source::QuotaKey;
 
-/// Bytes read at first.
+/// Initial buffer size in bytes.
 const FIRST_READ: usize = 4096;
 
-/// From this length on, the memory of a letter is taken from the budget of the endpoint.
+/// Minimum length of a letter whose memory is reserved in the budget of the endpoint.
 const COUNTED_FROM: usize = 64 * 1024;
 
-/// Why an old peer's letter is not taken.
+/// The reason for which a legacy peer's letter is refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum UnframedError {
-    #[error("a letter of more than {0} bytes (max_letter)")]
+    #[error("the letter exceeds {0} bytes (max_letter)")]
     TooLarge(usize),
-    #[error("a letter stopped arriving half way")]
+    #[error("the letter arrived too slowly (stall_timeout)")]
     TooSlow,
-    #[error("a letter waited too long for memory (max_incoming)")]
+    #[error("timed out waiting for memory for the letter (max_incoming)")]
     NoRoom,
-    #[error("a letter broke off: {0}")]
+    #[error("the connection broke in the middle of the letter: {0}")]
     Broken(#[from] std::io::Error),
-    #[error("its envelope cannot be read: {0}")]
+    #[error("its envelope cannot be decoded: {0}")]
     Envelope(#[from] DecodeError),
-    #[error("its envelope cannot be written in the standard dialect: {0}")]
+    #[error("its envelope cannot be encoded in the standard dialect: {0}")]
     Standard(#[from] EncodeError),
 }
 
-/// A letter that has been read, what the writer of its envelope understands, and the room that its bytes
-/// take.
+/// A letter with the dialect of its writer and the reservation of its memory.
 pub(crate) struct Read {
     pub(crate) letter: Letter,
     pub(crate) signature: Signature,
-    pub(crate) _room: Option<Room>,
+    pub(crate) _room: Option<ReservedBytes>,
 }
 
-/// Reads a letter from this account to its end. Its envelope is brought into the standard dialect;
-/// the message behind it is not touched. The connection at `place` loses its turn when no byte has
-/// come for [`TURN`], and needs its turn to get much memory.
+/// Reads a letter to its end. Converts its envelope to the standard dialect; the message is
+/// unchanged. The connection loses its turn when no byte arrives for [`TURN`], and needs its turn
+/// to reserve much memory.
 pub(crate) async fn read(
-    endpoint: &Endpoint,
-    place: &Place,
-    account: &Account,
+    endpoint: &TcpEndpoint,
+    turn: &QueueTurn,
+    quota_key: &QuotaKey,
     source: &mut (impl AsyncRead + Unpin),
 ) -> Result<Read, UnframedError> {
-    let (whole, room) = read_to_end(endpoint, place, account, source).await?;
+    let (whole, room) = read_to_end(endpoint, turn, quota_key, source).await?;
     let (envelope, length) = Envelope::decode(&whole)?;
     let length = length.min(whole.len());
     let signature = signature_of(&whole[..length]);
@@ -68,9 +67,9 @@ pub(crate) async fn read(
     })
 }
 
-/// What the writer of this envelope understands. JADE writes XML, and `Z` between date and time.
-/// The encoding of the message says nothing: fipa_services sends string messages, too, but does not
-/// read such dates.
+/// Returns the dialect of the writer of this envelope. JADE writes XML, and `Z` between date and
+/// time. The encoding of the message is no indication: fipa_services also sends string messages,
+/// but does not read such dates.
 fn signature_of(envelope: &[u8]) -> Signature {
     const BEFORE: &[u8] = b"<date>";
     const DAY: usize = "20261120".len();
@@ -85,10 +84,10 @@ fn signature_of(envelope: &[u8]) -> Signature {
     }
 }
 
-/// The same envelope with stamped extensions only, as FIPA00088 wants them: fipa_services narrows
+/// Returns the envelope with stamped extensions only, as FIPA00088 requires: fipa_services narrows
 /// a letter to one receiver with an extension that has no stamp. Such overriding parameters, and
-/// dates, for which an extension has no place, go to the next older part. What counts in effect
-/// stays the same.
+/// dates, for which extensions have no field, move to the next older part. The effective parameters
+/// stay the same.
 fn with_stamped_extensions(envelope: Envelope) -> Envelope {
     let Envelope {
         mut base,
@@ -102,7 +101,7 @@ fn with_stamped_extensions(envelope: Envelope) -> Envelope {
         if extension.received.is_some() {
             stamped.push(extension);
         } else {
-            overrule(stamped.last_mut().unwrap_or(&mut base), extension);
+            override_with(stamped.last_mut().unwrap_or(&mut base), extension);
         }
     }
     Envelope {
@@ -111,7 +110,7 @@ fn with_stamped_extensions(envelope: Envelope) -> Envelope {
     }
 }
 
-fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
+fn override_with(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     fn one<T>(older: &mut Option<T>, newer: Option<T>) {
         if newer.is_some() {
             *older = newer;
@@ -133,8 +132,8 @@ fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     older.user_defined.extend(newer.user_defined);
 }
 
-/// Hands a letter that came from this source to the sink, unless the endpoint has been closed.
-pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: LegacySource) {
+/// Passes a letter to the sink, unless the endpoint is closed.
+pub(crate) fn hand_on(endpoint: &TcpEndpoint, letter: Letter, from: LegacySource) {
     if let Some(sink) = endpoint.sink() {
         count(&endpoint.tally().unframed_in);
         sink.arrived_unframed(letter, Kind::Tcp, from);
@@ -142,11 +141,11 @@ pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: LegacySource) {
 }
 
 async fn read_to_end(
-    endpoint: &Endpoint,
-    place: &Place,
-    account: &Account,
+    endpoint: &TcpEndpoint,
+    turn: &QueueTurn,
+    quota_key: &QuotaKey,
     source: &mut (impl AsyncRead + Unpin),
-) -> Result<(Bytes, Option<Room>), UnframedError> {
+) -> Result<(Bytes, Option<ReservedBytes>), UnframedError> {
     let limits = endpoint.limits();
     let mut bytes = BytesMut::with_capacity(FIRST_READ);
     let mut room = None;
@@ -158,26 +157,26 @@ async fn read_to_end(
         if bytes.len() == bytes.capacity() {
             let more = bytes.len().max(FIRST_READ);
             if bytes.len() >= COUNTED_FROM {
-                // A letter that has memory waits for none of a later one, so letters are not waited
-                // for in a circle.
-                place.is_first().await;
+                // A letter with a reservation never waits for a later one, so letters do not wait
+                // for each other in a cycle.
+                turn.is_first().await;
                 let patience = limits.stall_timeout.saturating_mul(2);
-                let taken = take_room(endpoint, account, &mut room, bytes.len(), more);
+                let taken = take_room(endpoint, quota_key, &mut room, bytes.len(), more);
                 let in_time = timeout_at(Instant::now() + patience, taken).await;
                 in_time.map_err(|_| UnframedError::NoRoom)?;
                 window = (Instant::now() + limits.stall_timeout, bytes.len());
             }
             bytes.reserve(more);
         }
-        let turn = Instant::now() + TURN;
-        match timeout_at(window.0.min(turn), source.read_buf(&mut bytes)).await {
+        let turn_ends = Instant::now() + TURN;
+        match timeout_at(window.0.min(turn_ends), source.read_buf(&mut bytes)).await {
             Ok(Ok(0)) => return Ok((bytes.freeze(), room)),
             Ok(Ok(_)) => {}
             Ok(Err(error)) => return Err(error.into()),
-            Err(_) if turn < window.0 => place.stalled(),
+            Err(_) if turn_ends < window.0 => turn.stalled(),
             Err(_) => {
                 let progress = (bytes.len() - window.1) as u64;
-                let least = room.as_ref().map_or(0, Room::least_progress);
+                let least = room.as_ref().map_or(0, ReservedBytes::least_progress);
                 if progress < least.max(Limits::MIN_PROGRESS) {
                     return Err(UnframedError::TooSlow);
                 }
@@ -187,17 +186,17 @@ async fn read_to_end(
     }
 }
 
-/// Waits until there is room for so much more of a letter of which `there` has arrived.
+/// Waits until `more` bytes are reserved for a letter of which `there` bytes have arrived.
 async fn take_room(
-    endpoint: &Endpoint,
-    account: &Account,
-    room: &mut Option<Room>,
+    endpoint: &TcpEndpoint,
+    quota_key: &QuotaKey,
+    room: &mut Option<ReservedBytes>,
     there: usize,
     more: usize,
 ) {
-    let mut meter = endpoint.meter(account);
+    let mut meter = endpoint.meter(quota_key);
     loop {
-        let freed = endpoint.rooms.freed();
+        let freed = endpoint.byte_budget.freed();
         tokio::pin!(freed);
         freed.as_mut().enable();
         match room {
@@ -223,11 +222,11 @@ mod tests {
 
     use super::*;
 
-    /// A letter as a fipa_services peer sent it.
+    /// A recorded letter of a fipa_services peer.
     const TCP_LETTER: &[u8] = include_bytes!("../../tests/data/tcp_letter.bin");
 
     #[test]
-    fn the_envelope_tells_what_its_writer_understands() {
+    fn the_envelope_identifies_the_dialect_of_its_writer() {
         let for_jade = include_bytes!("../../tests/data/tcp_letter_jade.bin");
         let of_jade = include_bytes!("../../../acl/tests/vectors/jade_tcp_reply.xml");
         let cases: [(&[u8], _); 3] = [
@@ -243,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn extensions_without_a_stamp_are_folded_and_count_as_before() {
+    fn extensions_without_a_stamp_are_folded_with_the_same_effect() {
         let (recorded, _) = Envelope::decode(TCP_LETTER).unwrap();
         let override_only = EnvelopeParams {
             intended_receivers: vec![AgentId::new("arm").unwrap()],

@@ -1,9 +1,9 @@
 //! One connection without its socket: datagrams and `now` in, datagrams and events out.
 //!
-//! Parcels are numbered without holes when they first leave, and handed on in that order at the
-//! other side; what arrives early is held back. A packet is acknowledged as soon as what it
-//! carries is in safe hands; the answer to a parcel is a frame of its own that may come later, and
-//! is repeated until it is acknowledged, too.
+//! Parcels get consecutive numbers when they are first sent, and the other side delivers them in
+//! that order; a parcel that arrives early is held back. A packet is acknowledged as soon as its
+//! contents are stored. The answer to a parcel is a separate frame that may be sent later, and is
+//! also repeated until it is acknowledged.
 
 mod receiving;
 mod sending;
@@ -25,96 +25,96 @@ use super::dialling::Dialling;
 use super::mtu::Mtu;
 use super::packet::{self, BASE, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
 use super::received::Received;
-use super::recovery::{Kept, Recovery};
+use super::recovery::{Recovery, SentContent};
 use crate::answer;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
-use crate::ration::Ration;
-use crate::stream::place::{Meter, Room};
+use crate::rate_limit::PeerRateLimit;
+use crate::stream::budget::{Meter, ReservedBytes};
 
-/// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
+/// Upper bound of parcel numbers, so that a ticket also holds the number of the connection.
 pub(crate) const MAX_ID: u64 = 1 << 40;
 
-/// How often a large packet gets lost before the path is taken to have become smaller.
+/// Number of losses of a large packet after which the path is assumed to have a smaller MTU.
 const LOSSES_OF_LARGE: u8 = 6;
 
-/// How often what was sent is sent again, at least, before a peer counts as silent.
+/// Minimum number of retransmissions before a peer counts as silent.
 const MIN_TRIES: u32 = 3;
 
-/// Where datagrams of a connection come from and go to.
+/// The socket and addresses of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Path {
     /// The number of the socket.
     pub(crate) socket: u32,
     pub(crate) remote: SocketAddr,
-    /// The own address that the peer writes to, where the socket has several.
+    /// The local address that the peer sends to, if the socket has several.
     pub(crate) local: Option<IpAddr>,
 }
 
-/// A datagram, and where it goes.
+/// A datagram with its destination.
 pub(crate) type Outbound = (Path, Vec<u8>);
 
-/// What happened, in order.
+/// An event of a connection. Events are delivered in order.
 #[derive(Debug)]
 pub(crate) enum Event {
-    /// A parcel arrived, to be answered by its number.
+    /// A parcel arrived; it is answered by its number.
     Arrived { id: u64, parcel: Box<Parcel> },
-    /// A parcel sent from here came to its end.
+    /// An attempt of this side is concluded.
     Concluded(AttemptId, Conclusion),
 }
 
-/// What has arrived before its turn: a parcel, or that there never is one.
+/// A parcel, or the notice that a number is skipped, that arrived before an earlier parcel.
 #[derive(Debug)]
-struct Held {
+struct OutOfOrderParcel {
     parcel: Option<Box<Parcel>>,
-    _room: Option<Room>,
+    _room: Option<ReservedBytes>,
 }
 
 #[derive(Debug)]
 pub(crate) struct Connection {
     limits: UdpLimits,
-    /// What the peer writes on its datagrams.
+    /// The identifier on datagrams of the peer.
     id: u64,
-    /// What stands on those to the peer, once it is known.
+    /// The identifier on datagrams to the peer, once it is known.
     peer_id: u64,
     expected: Incarnation,
     peer: Option<Hello>,
-    /// Until the peer has answered.
+    /// The handshake, until the peer has answered.
     dialling: Option<Dialling>,
     path: Option<Path>,
     waiting: VecDeque<Outgoing>,
     waiting_bytes: usize,
-    /// Parcels that left, until their answer arrives.
+    /// Sent parcels, until their answer arrives.
     sent: BTreeMap<u64, Sent>,
     attempts: HashMap<AttemptId, u64>,
     last_sent: u64,
-    /// Parcels to be sent again.
+    /// Parcels to retransmit.
     resend: BTreeSet<u64>,
-    /// Small frames to be sent.
-    urgent: VecDeque<Kept>,
-    /// Answers that are not acknowledged.
+    /// Small frames to send.
+    urgent: VecDeque<SentContent>,
+    /// Answers that are not acknowledged yet.
     answers: HashMap<u64, Bytes>,
-    /// The parcel to be handed on next, and what arrived before its turn.
+    /// The number of the parcel to deliver next, and the parcels that arrived out of order.
     next_arrival: u64,
-    held: BTreeMap<u64, Held>,
+    held: BTreeMap<u64, OutOfOrderParcel>,
     held_bytes: usize,
-    /// Takes the memory for those, once the peer is known.
+    /// Reserves memory for them, once the peer is known.
     pub(super) meter: Option<Meter>,
-    /// Parcels handed on and not answered.
+    /// Delivered parcels that are not answered yet.
     arrivals: HashSet<u64>,
-    /// The last parcel that the sink has really been told of.
+    /// The last parcel that was polled for the sink.
     told: u64,
-    /// What the peer may still send, if that is limited; no parcels are taken before then.
-    pub(super) ration: Option<Arc<Ration>>,
-    resting: Option<Instant>,
+    /// The rate limit of the peer, if it has one. No parcels are accepted before `paused_until`.
+    pub(super) rate_limit: Option<Arc<PeerRateLimit>>,
+    paused_until: Option<Instant>,
     received: Received,
     recovery: Recovery,
     mtu: Mtu,
     events: VecDeque<Event>,
     heard: Option<Instant>,
-    /// Since when the connection is in doubt; see [`Connection::doubt`].
+    /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
-    /// Where the peer has been found to be, of what it was last looked for.
+    /// The last location for which the connection was used and confirmed or put in doubt.
     leads_to: Option<Location>,
     spoken: Instant,
     busy: Instant,
@@ -132,15 +132,16 @@ struct Outgoing {
 
 #[derive(Debug)]
 struct Sent {
-    /// None when it was abandoned, or its conclusion has been told.
+    /// `None` when the attempt was abandoned or concluded.
     attempt: Option<AttemptId>,
-    /// None when it was acknowledged, or is not to be sent again.
+    /// `None` when the parcel was acknowledged or is not retransmitted.
     outgoing: Option<Outgoing>,
     losses: u8,
 }
 
 impl Connection {
-    /// A connection that this side opens, looking for an incarnation (which may be unknown).
+    /// Creates a connection that this side opens, with the expected incarnation, which may be
+    /// unknown.
     pub(crate) fn dialling(
         limits: UdpLimits,
         id: u64,
@@ -156,7 +157,7 @@ impl Connection {
         }
     }
 
-    /// A connection that a peer has opened, which has shown that it receives what is sent there.
+    /// Creates a connection that a peer has opened, after the peer has returned its cookie.
     pub(crate) fn accepted(
         limits: UdpLimits,
         id: u64,
@@ -173,10 +174,10 @@ impl Connection {
         }
     }
 
-    /// The same, of a peer that may send so much, and whose parcels wait in memory from this meter.
-    pub(crate) fn bounded(self, ration: Option<Arc<Ration>>, meter: Meter) -> Self {
+    /// Sets the rate limit and the meter of the peer.
+    pub(crate) fn bounded(self, rate_limit: Option<Arc<PeerRateLimit>>, meter: Meter) -> Self {
         Self {
-            ration,
+            rate_limit,
             meter: Some(meter),
             ..self
         }
@@ -204,8 +205,8 @@ impl Connection {
             meter: None,
             arrivals: HashSet::new(),
             told: 0,
-            ration: None,
-            resting: None,
+            rate_limit: None,
+            paused_until: None,
             received: Received::default(),
             recovery: Recovery::new(now),
             mtu: Mtu::new(limits.max_datagram),
@@ -235,20 +236,20 @@ impl Connection {
         self.peer.as_ref()
     }
 
-    /// Whether the peer has not answered yet.
+    /// Whether the peer has not answered the hello yet.
     pub(crate) fn is_opening(&self) -> bool {
         self.dialling.is_some()
     }
 
-    /// The opening of this connection, while it goes on.
+    /// Returns the handshake while it is not complete.
     pub(crate) fn dialling_mut(&mut self) -> Option<&mut Dialling> {
         self.dialling.as_mut()
     }
 
-    /// Takes a parcel for sending.
+    /// Queues a parcel for sending.
     ///
     /// # Errors
-    /// When it does not go; nothing has been changed then.
+    /// When the parcel cannot be sent. The connection is unchanged then.
     pub(crate) fn send(&mut self, attempt: AttemptId, parcel: &Parcel) -> Result<(), WayError> {
         let Ok((header, pieces)) = ParcelHeader::of(parcel) else {
             let detail = "the receiver's name is empty or too long";
@@ -270,16 +271,20 @@ impl Connection {
             ..
         } = self.limits;
         if self.sent.len() + self.waiting.len() >= max_in_flight.max(1) {
-            let detail = format!("{max_in_flight} parcels are on their way (max_in_flight)");
+            let detail = format!(
+                "{max_in_flight} parcels of this connection wait for their answer; the limit is max_in_flight"
+            );
             return Err(WayError::new(WayFault::Congested, detail));
         }
         let queued = self.waiting_bytes;
         if queued > 0 && queued.saturating_add(size) > max_queued_bytes {
-            let detail = format!("{queued} bytes wait to be sent (max_queued_bytes)");
+            let detail = format!(
+                "{queued} bytes of this connection wait to be sent; the limit is {max_queued_bytes} (max_queued_bytes)"
+            );
             return Err(WayError::new(WayFault::Congested, detail));
         }
         if self.last_sent.saturating_add(self.waiting.len() as u64) + 1 >= MAX_ID {
-            let detail = "the connection is worn out";
+            let detail = "parcel numbers of this connection are exhausted";
             return Err(WayError::new(WayFault::Congested, detail));
         }
         self.waiting_bytes += size;
@@ -292,7 +297,7 @@ impl Connection {
         Ok(())
     }
 
-    /// Ends an attempt: it is not sent if no datagram of it has left.
+    /// Ends an attempt. The parcel is not sent if no datagram with it was sent.
     pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
         let mut end = Abandoned::Unconfirmed;
         if let Some(id) = self.attempts.remove(&attempt) {
@@ -310,28 +315,28 @@ impl Connection {
         end
     }
 
-    /// Answers a parcel that arrived. Unknown ones are ignored.
+    /// Answers a parcel that arrived. An unknown number is ignored.
     pub(crate) fn answer(&mut self, id: u64, answer: &Answer, now: Instant) {
         if self.arrivals.remove(&id) {
             let mut body = BytesMut::with_capacity(answer::len(answer));
             answer::encode(answer, &mut body);
             self.answers.insert(id, body.freeze());
-            self.urgent.push_back(Kept::Answer(id));
+            self.urgent.push_back(SentContent::Answer(id));
             self.busy = now;
         }
     }
 
-    /// The peer has answered: the connection is open.
+    /// Opens the connection after the peer's welcome.
     ///
     /// # Errors
-    /// When it is not the peer that was meant.
+    /// When the peer has another incarnation than expected, or accepts no parcels.
     pub(crate) fn welcomed(
         &mut self,
         path: Path,
         peer_id: u64,
         peer: Hello,
         now: Instant,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         let Some(dialling) = self.dialling.take() else {
             return Ok(());
         };
@@ -344,18 +349,20 @@ impl Connection {
         self.busy = now;
         let (expected, found) = (self.expected, peer.identity.incarnation);
         if expected.is_known() && expected != found {
-            return Err(End::WrongIncarnation { expected, found });
+            return Err(ConnectionEnd::WrongIncarnation { expected, found });
         }
         if peer.max_in_flight == 0 {
-            return Err(End::Nonsense("the peer takes no parcels at all".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "the peer's hello allows no parcels in flight".into(),
+            ));
         }
         self.peer = Some(peer);
         Ok(())
     }
 
-    /// There is reason to believe that the peer is elsewhere by now: it is asked for a sign of life,
-    /// with less patience than usual. Does nothing when the peer has been heard within `quiet`.
-    /// Returns whether the connection is in doubt.
+    /// Puts the connection in doubt because the peer may have moved: sends a ping with a shorter
+    /// timeout than usual. Does nothing when a packet arrived within `quiet`. Returns whether the
+    /// connection is in doubt.
     pub(crate) fn doubt(&mut self, now: Instant, quiet: Duration) -> bool {
         let heard = self.heard.is_some_and(|heard| now < heard + quiet);
         if self.peer.is_none() || heard {
@@ -363,24 +370,28 @@ impl Connection {
         }
         if self.doubted.is_none() {
             self.doubted = Some(now);
-            self.urgent.push_back(Kept::Ping);
+            self.urgent.push_back(SentContent::Ping);
         }
         true
     }
 
-    /// Asks the peer for a sign of life.
+    /// Sends a ping to the peer.
     pub(crate) fn ask(&mut self) {
-        if !self.urgent.iter().any(|kept| matches!(kept, Kept::Ping)) {
-            self.urgent.push_back(Kept::Ping);
+        if !self
+            .urgent
+            .iter()
+            .any(|kept| matches!(kept, SentContent::Ping))
+        {
+            self.urgent.push_back(SentContent::Ping);
         }
     }
 
-    /// Whether the peer was heard after this time.
-    pub(crate) fn is_heard_since(&self, since: Instant) -> bool {
+    /// Whether a packet arrived after this time.
+    pub(crate) fn received_since(&self, since: Instant) -> bool {
         self.heard.is_some_and(|heard| heard > since)
     }
 
-    /// The peer is looked for at a location that this connection was not opened for. When the peer
+    /// Notes that the connection is used for a location for which it was not opened. When the peer
     /// did not list that address it may have moved there, so the connection is in doubt.
     pub(crate) fn is_used_for(&mut self, now: Instant, to: &Location) {
         if self.leads_to.as_ref() == Some(to) {
@@ -393,7 +404,7 @@ impl Connection {
         }
     }
 
-    /// How long a peer in doubt has to give a sign of life.
+    /// Returns the time that a peer in doubt has to respond.
     fn doubt_patience(&self) -> Duration {
         self.limits.silence / 4
     }
@@ -402,15 +413,16 @@ impl Connection {
         Some(self.doubted? + self.doubt_patience())
     }
 
-    /// The datagram that was taken last is larger than what can be sent from here.
+    /// Handles the failure to send the last datagram because of its size.
     ///
     /// # Errors
-    /// When it was of a size that every path carries: nothing smaller is made of what it carried.
-    pub(crate) fn too_big(&mut self, size: usize) -> Result<(), End> {
+    /// When its size is one that every path must carry, so that its contents cannot be sent in
+    /// smaller datagrams.
+    pub(crate) fn too_big(&mut self, size: usize) -> Result<(), ConnectionEnd> {
         if !self.is_opening() && size <= BASE {
-            return Err(End::Broken(format!(
-                "this host takes no datagrams of {size} bytes for this peer, and UDP needs {BASE}; \
-                 see the MTU of the interface that leads there"
+            return Err(ConnectionEnd::Broken(format!(
+                "this host cannot send datagrams of {size} bytes to this peer, and UDP needs {BASE}; \
+                 check the MTU of the network interface"
             )));
         }
         self.mtu.too_big(size);
@@ -423,7 +435,7 @@ impl Connection {
         !self.events.is_empty()
     }
 
-    /// The next thing that happened.
+    /// Returns the next event.
     pub(crate) fn poll_event(&mut self) -> Option<Event> {
         let event = self.events.pop_front()?;
         if let Event::Arrived { id, .. } = event {
@@ -432,7 +444,7 @@ impl Connection {
         Some(event)
     }
 
-    /// The next datagram to be sent, and where to.
+    /// Returns the next datagram to send, with its destination.
     pub(crate) fn poll_transmit(
         &mut self,
         now: Instant,
@@ -442,11 +454,11 @@ impl Connection {
             return dialling.poll_transmit(now);
         }
         let path = self.path?;
-        self.sift();
+        self.drop_unsendable();
         let mtu = self.mtu.current();
         let parcel = self.next_parcel();
         let mut out = Vec::with_capacity(parcel.map_or(256, |(_, size)| size + MAX_ACK));
-        // The number follows once it is certain that there is a packet.
+        // The packet number is set below, once there is a packet to send.
         packet::put_data(&mut out, self.peer_id, 0);
         if let Some(due) = self.received.due() {
             let alone = due <= now;
@@ -481,7 +493,7 @@ impl Connection {
         {
             packet::put_ping(&mut out);
             out.resize(size, 0);
-            kept.push(Kept::Probe(size));
+            kept.push(SentContent::Probe(size));
         }
         if kept.is_empty() && empty {
             return None;
@@ -497,7 +509,8 @@ impl Connection {
         Some((path, out))
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is to be called at the latest.
+    /// Returns the time at which [`handle_timeout`](Self::handle_timeout) must be called at the
+    /// latest.
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
         if let Some(dialling) = &self.dialling {
             return Some(dialling.due());
@@ -520,11 +533,11 @@ impl Connection {
         .min()
     }
 
-    /// Does what is due.
+    /// Handles the timers that are due.
     ///
     /// # Errors
     /// When the connection is over.
-    pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), End> {
+    pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), ConnectionEnd> {
         if let Some(dialling) = &mut self.dialling {
             return dialling.handle_timeout(now, self.limits.connect_timeout);
         }
@@ -532,38 +545,41 @@ impl Connection {
             && tries >= MIN_TRIES
             && now >= since + self.limits.silence
         {
-            return Err(End::Silent);
+            return Err(ConnectionEnd::Silent);
         }
         if self.doubt_due().is_some_and(|due| now >= due) {
-            return Err(End::Silent);
+            return Err(ConnectionEnd::Silent);
         }
         if self.idle_due().is_some_and(|due| now >= due) {
-            return Err(End::Idle);
+            return Err(ConnectionEnd::Idle);
         }
         if self.recovery.timeout().is_some_and(|due| now >= due) {
             let lost = self.recovery.timed_out();
             lost.into_iter().for_each(|kept| self.lost(kept));
             if !self.recovery.is_waiting() && self.resend.is_empty() && self.urgent.is_empty() {
-                // It was about what nobody waits for any more.
-                self.recovery.calm();
+                // The lost packets had no contents that are still needed.
+                self.recovery.reset_backoff();
             }
         }
         if self.ping_due().is_some_and(|due| now >= due) {
-            self.urgent.push_back(Kept::Ping);
+            self.urgent.push_back(SentContent::Ping);
             self.spoken = now;
         }
         Ok(())
     }
 
-    /// Ends the connection: gives every parcel sent from here its conclusion, in the order of
-    /// sending, and says goodbye where that makes sense.
-    pub(crate) fn end(mut self, end: &End) -> (Vec<(AttemptId, Conclusion)>, Option<Outbound>) {
+    /// Ends the connection. Returns the conclusion of every attempt, in the order of sending, and a
+    /// goodbye if the peer can receive one.
+    pub(crate) fn end(
+        mut self,
+        end: &ConnectionEnd,
+    ) -> (Vec<(AttemptId, Conclusion)>, Option<Outbound>) {
         let taken = match end {
-            End::Goodbye { last } => *last,
+            ConnectionEnd::Goodbye { last } => *last,
             _ => u64::MAX,
         };
         let mut concluded = Vec::new();
-        // What has been concluded already, and not been told yet.
+        // Conclusions that have not been polled yet.
         while let Some(event) = self.events.pop_front() {
             if let Event::Concluded(attempt, conclusion) = event {
                 concluded.push((attempt, conclusion));
@@ -587,7 +603,7 @@ impl Connection {
         }
         let speechless = matches!(
             end,
-            End::Goodbye { .. } | End::Broken(_) | End::NotOpened(_)
+            ConnectionEnd::Goodbye { .. } | ConnectionEnd::Broken(_) | ConnectionEnd::NotOpened(_)
         );
         let goodbye = self.path.filter(|_| !speechless).map(|path| {
             let mut out = Vec::new();
@@ -598,7 +614,7 @@ impl Connection {
         (concluded, goodbye)
     }
 
-    /// When a peer that owes answers is asked for a sign of life.
+    /// Returns the time at which a peer that owes answers gets a ping.
     fn ping_due(&self) -> Option<Instant> {
         let owed = !self.sent.is_empty() && !self.recovery.is_waiting() && self.urgent.is_empty();
         let heard = self.heard.unwrap_or(self.spoken);
@@ -612,7 +628,7 @@ impl Connection {
             && self.answers.is_empty();
         let patience = match self.heard {
             Some(_) => self.limits.idle_close,
-            // It was opened, and then not used.
+            // The connection was opened but never used.
             None => self.limits.connect_timeout.min(self.limits.idle_close),
         };
         idle.then(|| self.busy + patience)
@@ -620,6 +636,7 @@ impl Connection {
 }
 
 fn too_large(size: usize, carried: usize) -> WayError {
-    let detail = format!("it needs a datagram of {size} bytes, and the path carries {carried}");
+    let detail =
+        format!("the parcel needs a datagram of {size} bytes; the path carries at most {carried}");
     WayError::new(WayFault::TooLarge, detail)
 }

@@ -1,7 +1,7 @@
-//! Cookies: what a stranger must bring back before anything is remembered of it.
+//! Cookies: a peer must return its cookie before any state about it is stored.
 //!
-//! A cookie is a keyed hash of the stranger's address, its number and the time, so that checking it
-//! needs no memory of having given it out. It is good for 15 to 30 seconds.
+//! A cookie is a keyed hash of the peer's address, its number and the time, so that checking it
+//! needs no memory of having issued it. It is valid for 15 to 30 seconds.
 
 use std::hash::{Hash, Hasher};
 use std::net::SocketAddr;
@@ -48,7 +48,7 @@ impl Cookies {
     fn of_slot(&self, slot: u64, from: SocketAddr, initiator: u64) -> Cookie {
         let mut hasher = SipHasher24::new_with_keys(self.key.0, self.key.1);
         (from.ip(), from.port(), initiator, slot).hash(&mut hasher);
-        // Only ever compared with what this process has computed.
+        // The hash is only compared with hashes of this process.
         hasher.write_u8(1);
         hasher.finish128().as_bytes()
     }

@@ -1,13 +1,13 @@
-//! What the connections of one endpoint share, without sockets or clock: who is there, which
-//! connection a datagram belongs to, and what strangers are told.
+//! The protocol of one endpoint without sockets and clock: its connections, the assignment of
+//! datagrams to them, and the replies to unproved peers.
 //!
-//! A location stays with one connection for as long as that lives, so that order holds. A location
-//! with a known incarnation uses whatever connection there is with that incarnation, whichever side
-//! opened it; so reports find their way back to peers that cannot be reached otherwise.
+//! A location keeps its connection until that connection ends, so that order is preserved. A
+//! location with a known incarnation uses any connection with that incarnation, opened by either
+//! side; this is how reports reach peers that cannot be reached otherwise.
 //!
-//! Of a stranger nothing is remembered before it has brought back a cookie, and what it is told is
-//! shorter than what it wrote. A datagram for a connection counts only with the right number of
-//! 64 random bits, from the address that the connection was opened from.
+//! The endpoint stores no state about a peer that has not returned a cookie, and its replies to
+//! such a peer are shorter than the peer's datagram. A datagram for a connection only counts with
+//! the right number of 64 random bits, from the address that the connection was opened from.
 
 mod greeting;
 
@@ -28,33 +28,33 @@ use super::cookie::Cookies;
 use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
-use crate::end::End;
-use crate::ration::{Ration, Rations, is_one_peer, whose};
-use crate::seldom::warn_seldom;
-use crate::stream::place::{Meter, Rooms};
-use crate::stream::source::{Account, Home};
+use crate::end::ConnectionEnd;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer, quota_address};
+use crate::stream::budget::{ByteBudget, Meter};
+use crate::stream::source::{Home, QuotaKey};
 
-/// Numbers of connections stay below this (see [`Core::ticket`]).
+/// Upper bound of connection numbers (see [`Ticket`]).
 const MAX_CONNECTIONS: u32 = 1 << 24;
 
-/// Datagrams to strangers that may wait to be sent; more are forgotten.
+/// Maximum number of queued datagrams to unproved peers; further ones are dropped.
 const MAX_OUTBOX: usize = 64;
 
-/// Draws unpredictable numbers.
+/// A source of unpredictable numbers.
 pub(crate) type Random = Box<dyn FnMut() -> u64 + Send>;
 
-/// What happened, for the sink.
+/// An event for the sink.
 #[derive(Debug)]
-pub(crate) enum Told {
+pub(crate) enum CoreEvent {
     Arrived {
         parcel: Box<Parcel>,
         from: Hop,
         ticket: Ticket,
     },
     Concluded(AttemptId, Conclusion),
-    /// Somebody has introduced itself.
+    /// A peer has introduced itself.
     Introduced(Introduction),
-    /// The connection on which somebody had introduced itself is no more.
+    /// The connection of an introduced peer has ended.
     Parted(Introduction),
 }
 
@@ -74,28 +74,29 @@ pub(crate) struct Core {
     cookies: Cookies,
     random: Random,
     connections: HashMap<u32, Entry>,
-    /// By the number that the peers write.
+    /// Connections by the identifier that peers put on their datagrams.
     ids: HashMap<u64, u32>,
-    /// The connection that was opened for a location.
+    /// Connections opened by this side, by location.
     dialled: HashMap<Location, u32>,
-    /// The connections with the service of this incarnation, in the order they came.
+    /// The connections with the service of an incarnation, in the order of introduction.
     known: HashMap<Incarnation, Vec<u32>>,
-    /// The peers' last connections for each of the locations they dialled.
+    /// The latest connection of each peer for each location that the peer dialled, with the peer's
+    /// serial number.
     inbound: HashMap<Inbound, (u64, u32)>,
-    /// By where a hello came from, and its number.
+    /// Accepted connections by the source address and the initiator number of their hello.
     greeted: HashMap<(SocketAddr, u64), u32>,
     ready: VecDeque<u32>,
     timers: BTreeSet<(Instant, u32)>,
     outbox: VecDeque<Outbound>,
     eventful: VecDeque<u32>,
-    /// What is to be told before what the connections have to tell.
-    notes: VecDeque<Told>,
-    /// Connections that are no more.
+    /// Events of the endpoint, delivered before the events of connections.
+    notes: VecDeque<CoreEvent>,
+    /// Removed connections.
     gone: Vec<u32>,
-    /// What peers may still send.
-    rations: Rations,
-    /// What is taken for parcels that wait for earlier ones.
-    rooms: Rooms,
+    /// Rate limits of the peers.
+    rate_limits: PeerRateLimits,
+    /// Memory of parcels that wait for earlier ones.
+    byte_budget: ByteBudget,
     counters: UdpCounters,
     last_number: u32,
     last_serial: u64,
@@ -103,21 +104,21 @@ pub(crate) struct Core {
 
 struct Entry {
     connection: Connection,
-    /// The location it was opened for, if from this side.
+    /// The location that this side dialled, if it opened the connection.
     dialled: Option<Location>,
-    /// Who is there, once that is known.
+    /// The introduction of the peer, after its hello.
     peer: Option<Introduction>,
-    /// Where the hello came from, and its number, if the peer opened it.
+    /// The source address and initiator number of the hello, if the peer opened the connection.
     greeted: Option<(SocketAddr, u64)>,
-    /// When it was asked for a sign of life because another peer says to be the same service.
+    /// Time of the ping that was sent because another peer claims to be the same service.
     asked: Option<Instant>,
     timer: Option<Instant>,
     is_ready: bool,
     is_eventful: bool,
 }
 
-/// What tells a peer's connections for one location from others. With the address, so that a
-/// stranger elsewhere cannot push out somebody's connection by using its incarnation.
+/// The key of a peer's connections for one location. It contains the address, so that an unproved
+/// peer elsewhere cannot replace the connection of a service by claiming its incarnation.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Inbound {
     incarnation: Incarnation,
@@ -152,8 +153,8 @@ impl Core {
             eventful: VecDeque::new(),
             notes: VecDeque::new(),
             gone: Vec::new(),
-            rations: Rations::default(),
-            rooms: Rooms::default(),
+            rate_limits: PeerRateLimits::default(),
+            byte_budget: ByteBudget::default(),
             counters: UdpCounters::default(),
             last_number: 0,
             last_serial: 0,
@@ -164,20 +165,21 @@ impl Core {
         self.counters
     }
 
-    /// What whoever is at this address may still send, if that is limited.
-    fn ration(&self, ip: IpAddr, now: Instant) -> Option<Arc<Ration>> {
-        is_one_peer(ip).then(|| self.rations.of(ip, self.limits.rates(), now))?
+    /// Returns the rate limit of the peer at this address, if it has one.
+    fn rate_limit(&self, ip: IpAddr, now: Instant) -> Option<Arc<PeerRateLimit>> {
+        is_one_peer(ip).then(|| self.rate_limits.of(ip, self.limits.rates(), now))?
     }
 
-    /// Takes memory for parcels of the peers at this address.
+    /// Returns a meter that reserves memory for parcels of the peers at this address.
     fn meter(&self, ip: IpAddr) -> Meter {
-        let home = whose(ip);
-        let account = Account::Unproved(Home::Address(home));
-        self.rooms.meter(account, self.limits.budget_of(home))
+        let home = quota_address(ip);
+        let quota_key = QuotaKey::Unproved(Home::Address(home));
+        self.byte_budget
+            .meter(quota_key, self.limits.budget_of(home))
     }
 
-    /// Takes a parcel for sending. When the connection has just been made up, its number is
-    /// returned: it is to [begin](Self::begin), or [not](Self::cannot_begin).
+    /// Queues a parcel for sending. Returns the number of the connection if it is new; the caller
+    /// then calls [`begin`](Self::begin) or [`cannot_begin`](Self::cannot_begin).
     pub(crate) fn dispatch(
         &mut self,
         now: Instant,
@@ -190,10 +192,10 @@ impl Core {
         let there = dialled.or_else(|| known.and_then(|numbers| numbers.first().copied()));
         let (number, fresh) = match there {
             Some(number) => (number, false),
-            None => (self.make_up(now, to)?, true),
+            None => (self.create(now, to)?, true),
         };
         let Some(entry) = self.connections.get_mut(&number) else {
-            return Err(WayError::new(WayFault::Broken, "the connection is gone"));
+            return Err(WayError::new(WayFault::Broken, "the connection has ended"));
         };
         if dialled.is_none() && !fresh {
             entry.connection.is_used_for(now, to);
@@ -208,13 +210,13 @@ impl Core {
         Ok(fresh.then_some(number))
     }
 
-    /// What others are told from now on of the addresses that this endpoint listens on.
+    /// Sets the listening addresses that later hellos contain.
     pub(crate) fn listens_on(&mut self, listening: Vec<String>) {
         self.listening = listening;
     }
 
-    /// This host no longer has these addresses: nothing arrives any more on the connections that
-    /// stay with them. `local` is the address of a socket that belongs to one connection.
+    /// Ends the connections that are bound to addresses that this host no longer has. `local`
+    /// returns the address of a socket that belongs to one connection.
     pub(crate) fn lost(&mut self, lost: &HashSet<IpAddr>, local: impl Fn(u32) -> Option<IpAddr>) {
         let numbers: Vec<(u32, IpAddr)> = self
             .connections
@@ -227,17 +229,17 @@ impl Core {
             .collect();
         for (number, ip) in numbers {
             let what = format!("this host no longer has the address {ip}");
-            self.end(number, &End::Broken(what));
+            self.end(number, &ConnectionEnd::Broken(what));
         }
     }
 
-    /// Whether a connection that was made up is still to be opened.
+    /// Whether a new connection has yet to be opened.
     pub(crate) fn is_opening(&self, number: u32) -> bool {
         let entry = self.connections.get(&number);
         entry.is_some_and(|entry| entry.connection.is_opening())
     }
 
-    /// The ways to the peer of a connection that was made up.
+    /// Sets the paths to the peer of a new connection.
     pub(crate) fn begin(&mut self, now: Instant, number: u32, paths: Vec<Path>) {
         self.with(number, |connection, _| {
             if let Some(dialling) = connection.dialling_mut() {
@@ -247,14 +249,14 @@ impl Core {
         });
     }
 
-    /// A connection that was made up cannot be opened.
+    /// Ends a new connection that cannot be opened.
     pub(crate) fn cannot_begin(&mut self, number: u32, error: WayError) {
-        self.end(number, &End::NotOpened(error));
+        self.end(number, &ConnectionEnd::NotOpened(error));
     }
 
     pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
         self.notes
-            .retain(|told| !matches!(told, Told::Concluded(other, _) if *other == attempt));
+            .retain(|told| !matches!(told, CoreEvent::Concluded(other, _) if *other == attempt));
         let mut connections = self.connections.values_mut();
         let unsent = connections.any(|it| it.connection.abandon(attempt) == Abandoned::NotSent);
         match unsent {
@@ -272,7 +274,7 @@ impl Core {
         });
     }
 
-    /// Takes a datagram. `listening` is whether strangers are heard on the socket it came to.
+    /// Handles a datagram. `listening` is whether the socket accepts datagrams of unproved peers.
     pub(crate) fn handle_datagram(
         &mut self,
         now: Instant,
@@ -305,9 +307,9 @@ impl Core {
             } => self.welcome(now, path, to, acceptor, hello),
             Datagram::Refused { to } => {
                 self.of_dialling(to, path, |_, _| {
-                    let detail = "the peer takes no more connections (its max_connections), or is connected \
+                    let detail = "the peer refused the connection: its max_connections is reached, or it is connected \
                                   with this service already";
-                    Err(End::NotOpened(WayError::new(WayFault::Refused, detail)))
+                    Err(ConnectionEnd::NotOpened(WayError::new(WayFault::Refused, detail)))
                 });
             }
             Datagram::Unknown { number } => self.is_unknown(path, number),
@@ -336,15 +338,15 @@ impl Core {
         }
     }
 
-    /// The operating system says that a way does not work.
+    /// Handles an error of the operating system on a path.
     pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
         self.with(number, |connection, _| match connection.dialling_mut() {
             Some(dialling) => dialling.failed(path, what, now),
-            None => Err(End::Broken(what.to_owned())),
+            None => Err(ConnectionEnd::Broken(what.to_owned())),
         });
     }
 
-    /// The datagram that was taken last is larger than what can be sent from here.
+    /// Handles the failure to send the last datagram because of its size.
     pub(crate) fn too_big(&mut self, number: u32, size: usize) {
         self.with(number, |connection, _| connection.too_big(size));
     }
@@ -375,7 +377,7 @@ impl Core {
         None
     }
 
-    pub(crate) fn poll_event(&mut self) -> Option<Told> {
+    pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
         if let Some(told) = self.notes.pop_front() {
             return Some(told);
         }
@@ -383,12 +385,12 @@ impl Core {
             if let Some(entry) = self.connections.get_mut(&number) {
                 match (entry.connection.poll_event(), &entry.peer) {
                     (Some(Event::Concluded(attempt, conclusion)), _) => {
-                        return Some(Told::Concluded(attempt, conclusion));
+                        return Some(CoreEvent::Concluded(attempt, conclusion));
                     }
                     (Some(Event::Arrived { id, parcel }), Some(peer)) => {
                         let ticket = Ticket(u64::from(number) * MAX_ID + id);
                         let from = peer.hop.clone();
-                        return Some(Told::Arrived {
+                        return Some(CoreEvent::Arrived {
                             parcel,
                             from,
                             ticket,
@@ -402,12 +404,12 @@ impl Core {
         None
     }
 
-    /// Whether there is something to be told.
+    /// Whether there are events to deliver.
     pub(crate) fn has_events(&self) -> bool {
         !self.notes.is_empty() || !self.eventful.is_empty()
     }
 
-    /// The next connection that is no more, so that its sockets can be closed.
+    /// Returns the next removed connection, so that its sockets can be closed.
     pub(crate) fn poll_gone(&mut self) -> Option<u32> {
         self.gone.pop()
     }
@@ -417,7 +419,7 @@ impl Core {
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Instant) {
-        // Each once: what is due to be sent stays due until it has been fetched.
+        // Each connection once: its timer stays due until its datagrams have been polled.
         let due: Vec<u32> = self
             .timers
             .iter()
@@ -433,14 +435,14 @@ impl Core {
     pub(crate) fn close(&mut self) {
         let numbers: Vec<u32> = self.connections.keys().copied().collect();
         for number in numbers {
-            self.end(number, &End::Closed);
+            self.end(number, &ConnectionEnd::Closed);
         }
     }
 
-    /// Makes up a connection for a location.
-    fn make_up(&mut self, now: Instant, to: &Location) -> Result<u32, WayError> {
+    /// Creates a connection for a location.
+    fn create(&mut self, now: Instant, to: &Location) -> Result<u32, WayError> {
         if self.connections.len() >= self.limits.max_connections {
-            return Err(End::Crowd.after());
+            return Err(ConnectionEnd::TooManyConnections.after());
         }
         self.last_serial += 1;
         let mut hasher = DefaultHasher::new();
@@ -454,11 +456,11 @@ impl Core {
         Ok(number)
     }
 
-    /// Lets a connection act, and sees to what follows.
+    /// Calls `act` with a connection, and handles its result.
     fn with(
         &mut self,
         number: u32,
-        act: impl FnOnce(&mut Connection, &mut UdpCounters) -> Result<(), End>,
+        act: impl FnOnce(&mut Connection, &mut UdpCounters) -> Result<(), ConnectionEnd>,
     ) {
         let Some(entry) = self.connections.get_mut(&number) else {
             return;
@@ -469,7 +471,7 @@ impl Core {
         }
     }
 
-    /// Something has changed at a connection.
+    /// Schedules a connection that has changed.
     fn touch(&mut self, number: u32) {
         if let Some(entry) = self.connections.get_mut(&number)
             && !std::mem::replace(&mut entry.is_ready, true)
@@ -493,18 +495,18 @@ impl Core {
             }
             entry.timer = due;
         }
-        // Sending may have found out that something cannot be sent.
+        // Sending may have concluded parcels that are too large.
         if entry.connection.has_events() && !std::mem::replace(&mut entry.is_eventful, true) {
             self.eventful.push_back(number);
         }
     }
 
-    fn end(&mut self, number: u32, end: &End) {
+    fn end(&mut self, number: u32, end: &ConnectionEnd) {
         let Some(entry) = self.remove(number) else {
             return;
         };
-        if end.is_misbehaviour() {
-            warn_seldom(
+        if end.is_misbehavior() {
+            warn_limited(
                 self.counters.refused_nonsense,
                 format_args!("connection closed: {}", end.after()),
             );
@@ -512,14 +514,14 @@ impl Core {
         } else {
             tracing::debug!(connection = number, "connection ended: {}", end.after());
         }
-        if let End::NotOpened(_) = end {
+        if let ConnectionEnd::NotOpened(_) = end {
             self.counters.dial_failures += 1;
         }
         let (concluded, goodbye) = entry.connection.end(end);
         let concluded = concluded.into_iter();
         self.notes
-            .extend(concluded.map(|(attempt, what)| Told::Concluded(attempt, what)));
-        self.notes.extend(entry.peer.map(Told::Parted));
+            .extend(concluded.map(|(attempt, what)| CoreEvent::Concluded(attempt, what)));
+        self.notes.extend(entry.peer.map(CoreEvent::Parted));
         // Bounded by the number of connections.
         self.outbox.extend(goodbye);
     }
@@ -552,7 +554,7 @@ impl Core {
         number
     }
 
-    /// The peer of a connection is known.
+    /// Registers the peer of a connection.
     fn enter(&mut self, now: Instant, number: u32, name: Arc<str>, hop: Hop) {
         self.doubt_others(now, number, hop.location.incarnation());
         if let Some(entry) = self.connections.get_mut(&number) {
@@ -563,23 +565,23 @@ impl Core {
                 dialled: entry.dialled.clone(),
                 mandate: Mandate::Unproved,
             };
-            self.notes.push_back(Told::Introduced(peer.clone()));
+            self.notes.push_back(CoreEvent::Introduced(peer.clone()));
             entry.peer = Some(peer);
             self.known.entry(incarnation).or_default().push(number);
             self.counters.connections += 1;
         }
     }
 
-    /// The service of a connection may have moved to where it comes from: its connections from
-    /// elsewhere are in doubt. They are asked, because a stranger must not end the connections of
-    /// the service that it claims to be.
+    /// Puts the connections of the same service from other addresses in doubt, because the service
+    /// may have moved. They get a ping instead of ending, because an unproved peer must not end the
+    /// connections of the service that it claims to be.
     fn doubt_others(&mut self, now: Instant, number: u32, incarnation: Incarnation) {
-        let place = |entry: &Entry| Some(entry.connection.path()?.remote.ip());
-        let here = self.connections.get(&number).and_then(place);
+        let remote = |entry: &Entry| Some(entry.connection.path()?.remote.ip());
+        let here = self.connections.get(&number).and_then(remote);
         let others = self.known.get(&incarnation).cloned().unwrap_or_default();
         for other in others {
             if let Some(entry) = self.connections.get_mut(&other)
-                && place(entry) != here
+                && remote(entry) != here
             {
                 entry.connection.doubt(now, Duration::ZERO);
                 self.touch(other);
@@ -587,7 +589,7 @@ impl Core {
         }
     }
 
-    /// Takes a connection out of every table.
+    /// Removes a connection from every table.
     fn remove(&mut self, number: u32) -> Option<Entry> {
         let entry = self.connections.remove(&number)?;
         self.ids.remove(&entry.connection.id());

@@ -1,14 +1,14 @@
-//! What an endpoint counts, for people who look at it.
+//! Counters of a UDP endpoint, for diagnosis.
 
 use serde::Serialize;
 
-/// What happened at a UDP endpoint since it was made.
+/// Counters of a UDP endpoint since its creation.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct UdpCounters {
-    /// Connections now open with peers that introduced themselves.
+    /// Connections that are open now and whose peer has introduced itself.
     pub connections: u64,
-    /// Connections opened from this side, with a welcome from the other.
+    /// Connections opened by this side whose peer has introduced itself.
     pub dialled: u64,
     /// Connections opened by peers that introduced themselves.
     pub accepted: u64,
@@ -16,20 +16,20 @@ pub struct UdpCounters {
     pub dial_failures: u64,
     /// Parcels (letters, reports, credits) sent, each counted once.
     pub parcels_out: u64,
-    /// Parcels sent again.
+    /// Retransmitted parcels.
     pub sent_again: u64,
     /// Parcels that arrived, each counted once.
     pub parcels_in: u64,
-    /// Packets and parcels that arrived again.
+    /// Duplicate packets and parcels that arrived.
     pub duplicates: u64,
-    /// Parcels to be taken later, because their peer had sent more than it may.
+    /// Parcels not accepted at once because their peer exceeded its rate limit.
     pub held_back: u64,
-    /// Datagrams ignored: garbage, or from strangers.
+    /// Ignored datagrams: malformed, or from unknown peers.
     pub ignored: u64,
-    /// Connections closed because of what the peer sent.
+    /// Connections closed because the peer violated the protocol.
     pub refused_nonsense: u64,
-    /// Connections refused because there were too many.
+    /// Connections refused because a limit was reached.
     pub refused_crowd: u64,
-    /// Connections refused because the service that their peers say to be is connected.
+    /// Connections refused because their peer claimed to be a service that is already connected.
     pub refused_unproved: u64,
 }

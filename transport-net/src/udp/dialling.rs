@@ -1,7 +1,7 @@
-//! Opening a connection: hello, cookie, hello with the cookie, welcome.
+//! The handshake of the dialling side: hello, cookie, hello with the cookie, welcome.
 //!
-//! A peer with several addresses is greeted at all of them, one after the other and without waiting
-//! for the first to fail (RFC 8305); the first that answers counts.
+//! A hello is sent to all addresses of the peer, one after the other and without waiting for the
+//! first to fail (RFC 8305). The first address that answers is used.
 
 use std::time::{Duration, Instant};
 
@@ -9,13 +9,13 @@ use fipa_transport::{WayError, WayFault};
 
 use super::connection::Path;
 use super::packet::{self, Cookie, NO_COOKIE};
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 
-/// How long after one address the next is greeted (RFC 8305 section 5).
+/// Delay between the hellos to two addresses (RFC 8305 section 5).
 const STAGGER: Duration = Duration::from_millis(250);
 
-/// How long the first answer is waited for, and at most.
+/// First and longest pause before a hello is repeated.
 const PATIENCE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_millis(500));
 
 #[derive(Debug)]
@@ -30,10 +30,10 @@ pub(crate) struct Dialling {
 struct Candidate {
     path: Path,
     cookie: Cookie,
-    /// When the next hello leaves; none when this way is known not to work.
+    /// Time of the next hello; `None` when this path has failed.
     next: Option<Instant>,
     tries: u32,
-    /// When the first hello with this cookie left.
+    /// Time of the first hello with this cookie.
     greeted: Option<Instant>,
 }
 
@@ -47,7 +47,7 @@ impl Dialling {
         }
     }
 
-    /// The ways to the peer are known.
+    /// Sets the paths to the peer.
     pub(crate) fn begin(&mut self, paths: impl IntoIterator<Item = Path>, now: Instant) {
         self.candidates = paths
             .into_iter()
@@ -77,22 +77,27 @@ impl Dialling {
         }
     }
 
-    /// The operating system says that a way does not work.
+    /// Handles an error of the operating system on a path.
     ///
     /// # Errors
-    /// When no other is left.
-    pub(crate) fn failed(&mut self, path: Path, what: &str, now: Instant) -> Result<(), End> {
+    /// When no other path is left.
+    pub(crate) fn failed(
+        &mut self,
+        path: Path,
+        what: &str,
+        now: Instant,
+    ) -> Result<(), ConnectionEnd> {
         if let Some(candidate) = self.candidate(path) {
             candidate.next = None;
         }
         let mut left = self.candidates.iter_mut().filter_map(|c| c.next.as_mut());
         match left.next() {
-            // There is no reason to wait any longer.
+            // The next path need not wait any longer.
             Some(next) => *next = now.min(*next),
             None => {
                 let detail = format!("{}: {what}", path.remote);
                 let error = WayError::new(WayFault::Unreachable, detail);
-                return Err(End::NotOpened(error));
+                return Err(ConnectionEnd::NotOpened(error));
             }
         }
         Ok(())
@@ -103,12 +108,19 @@ impl Dialling {
         hello.map_or(self.deadline, |hello| hello.min(self.deadline))
     }
 
-    pub(crate) fn handle_timeout(&mut self, now: Instant, patience: Duration) -> Result<(), End> {
+    pub(crate) fn handle_timeout(
+        &mut self,
+        now: Instant,
+        patience: Duration,
+    ) -> Result<(), ConnectionEnd> {
         if now < self.deadline {
             return Ok(());
         }
         let detail = format!("no answer within {patience:?} (connect_timeout)");
-        Err(End::NotOpened(WayError::new(WayFault::Unreachable, detail)))
+        Err(ConnectionEnd::NotOpened(WayError::new(
+            WayFault::Unreachable,
+            detail,
+        )))
     }
 
     pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<(Path, Vec<u8>)> {
@@ -119,7 +131,8 @@ impl Dialling {
         let wait = PATIENCE.0.saturating_mul(1 << candidate.tries.min(8));
         candidate.next = Some(now + wait.min(PATIENCE.1));
         candidate.tries += 1;
-        // A round trip is measured only where it is certain which hello was answered.
+        // A round trip is only measured when a single hello was sent, because an answer does not
+        // name its hello.
         candidate.greeted = (candidate.tries == 1).then_some(now);
         let datagram = packet::hello(self.id, &candidate.cookie, &self.hello);
         Some((candidate.path, datagram))
@@ -135,7 +148,7 @@ impl Dialling {
     }
 }
 
-/// The own address is not known before the first answer.
+/// The local address is unknown before the first answer, so it is not compared.
 fn is_same(one: Path, other: Path) -> bool {
     one.socket == other.socket && one.remote == other.remote
 }

@@ -1,7 +1,7 @@
 //! The thin shell around [`Core`]: its sockets, its clock and its sink.
 //!
-//! Whoever has something to send hands it to the system at once, on its own thread. One task per
-//! socket reads, and one keeps time; each of them may call the sink, one at a time.
+//! A sending thread hands its datagrams to the system itself. One task per socket reads, and one
+//! task handles timers; each of them may call the sink, one at a time.
 
 use std::collections::HashMap;
 use std::io;
@@ -22,24 +22,24 @@ use tokio::time::{sleep, sleep_until};
 
 use super::config::UdpConfig;
 use super::connection::Path;
-use super::core::{Core, Random, Told};
+use super::core::{Core, CoreEvent, Random};
 use super::counters::UdpCounters;
 use super::socket::{Buffers, Sent, Socket};
 use crate::address::{self, Listening, Target};
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::interfaces::Changes;
 
-/// Most addresses of one name that are greeted.
+/// Maximum number of addresses of one name that get a hello.
 const MAX_TARGETS: usize = 8;
 
-/// How long reading rests after the system has reported an error on a socket that listens.
-const REST: Duration = Duration::from_millis(10);
+/// Pause of reading after an error on a listening socket.
+const READ_RETRY_DELAY: Duration = Duration::from_millis(10);
 
 pub(crate) struct Endpoint {
     pub(crate) config: UdpConfig,
     runtime: Handle,
     state: Mutex<State>,
-    /// Held while the sink is called.
+    /// OutOfOrderParcel while the sink is called.
     delivering: Mutex<()>,
     wake: Notify,
     this: Weak<Self>,
@@ -52,7 +52,7 @@ struct State {
     sink: Option<Arc<dyn Sink>>,
     sockets: HashMap<u32, (Arc<Socket>, AbortHandle)>,
     last_socket: u32,
-    /// When the task that keeps time wakes.
+    /// Time at which the timer task wakes.
     armed: Option<Instant>,
     listening: Listening,
     /// Watches the interfaces.
@@ -84,8 +84,8 @@ impl Endpoint {
         state.core.as_ref().map(Core::counters).unwrap_or_default()
     }
 
-    /// Opens the sockets and begins to work. Returns where the endpoint is reached at present; the
-    /// sink is told when that changes.
+    /// Opens the sockets and starts the tasks. Returns the present locations of the endpoint; the
+    /// sink is notified when they change.
     pub(crate) fn open(
         &self,
         sink: Arc<dyn Sink>,
@@ -135,20 +135,20 @@ impl Endpoint {
                 self.runtime.spawn(watch).abort_handle()
             });
             state.watch = watch;
-            self.runtime.spawn(keep_time(Running(this)));
+            self.runtime.spawn(run_timers(TimerTask(this)));
         }
         Ok(locations)
     }
 
-    /// The interfaces of this host have changed: tells the sink where the endpoint is reached now,
-    /// and ends the connections of addresses that this host has no more.
+    /// Handles a change of the network interfaces: reports the new locations to the sink, and ends
+    /// the connections of local addresses that no longer exist.
     fn interfaces_changed(&self) {
         let (sink, told) = {
             let mut state = self.state.lock();
             let moved = match state.listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
-                    tracing::warn!(kind = %Kind::Udp, %error, "the locations stay as they were");
+                    tracing::warn!(kind = %Kind::Udp, %error, "cannot refresh the locations; keeping the previous ones");
                     return;
                 }
             };
@@ -161,7 +161,7 @@ impl Endpoint {
                     Some(socket.address().ok()?.ip())
                 });
             }
-            self.go_on(&mut state);
+            self.flush_and_wake(&mut state);
             let incarnation = self.config.identity.incarnation;
             let told = moved
                 .relocated
@@ -171,7 +171,7 @@ impl Endpoint {
         match (sink, told) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
-                tracing::warn!(kind = %Kind::Udp, %error, "the locations stay as they were");
+                tracing::warn!(kind = %Kind::Udp, %error, "cannot refresh the locations; keeping the previous ones");
             }
             _ => {}
         }
@@ -188,14 +188,17 @@ impl Endpoint {
         let core = match (state.phase, state.core.as_mut()) {
             (Phase::Open, Some(core)) => core,
             (Phase::New, _) => {
-                return Err(WayError::new(WayFault::Closed, "listen was not called yet"));
+                return Err(WayError::new(
+                    WayFault::Closed,
+                    "`listen` has not been called",
+                ));
             }
-            _ => return Err(End::Closed.after()),
+            _ => return Err(ConnectionEnd::Closed.after()),
         };
         if let Some(fresh) = core.dispatch(now, attempt, to, parcel)? {
             self.dial(&mut state, fresh, to.address());
         }
-        self.go_on(&mut state);
+        self.flush_and_wake(&mut state);
         Ok(())
     }
 
@@ -210,10 +213,10 @@ impl Endpoint {
         if let Some(core) = state.core.as_mut() {
             core.answer(Instant::now(), ticket, answer);
         }
-        self.go_on(&mut state);
+        self.flush_and_wake(&mut state);
     }
 
-    /// Ends everything. The task that keeps time concludes what is outstanding.
+    /// Closes every connection. The timer task concludes outstanding attempts.
     pub(crate) fn close(&self) {
         let mut state = self.state.lock();
         state.phase = Phase::Closed;
@@ -242,7 +245,7 @@ impl Endpoint {
             .insert(socket.number, (socket, task.abort_handle()));
     }
 
-    /// Finds the ways to a peer.
+    /// Resolves the addresses of a peer.
     fn dial(&self, state: &mut State, connection: u32, text: &str) {
         let error = match address::target(text) {
             Ok(Target::Numeric(address)) => return self.begin(state, connection, &[address]),
@@ -251,7 +254,7 @@ impl Endpoint {
                     self.runtime.spawn(look_up(this, connection, name, port));
                     return;
                 }
-                None => End::Closed.after(),
+                None => ConnectionEnd::Closed.after(),
             },
             Err(error) => WayError::new(WayFault::Unreachable, error),
         };
@@ -263,7 +266,7 @@ impl Endpoint {
     fn begin(&self, state: &mut State, connection: u32, addresses: &[SocketAddr]) {
         let core = state.core.as_ref();
         if !core.is_some_and(|core| core.is_opening(connection)) {
-            // Looking up took longer than the connection was waited for: nobody would close these.
+            // The lookup took longer than the connect timeout: these sockets would never be closed.
             return;
         }
         let _inside = self.runtime.enter();
@@ -293,8 +296,8 @@ impl Endpoint {
         }
     }
 
-    /// Sends what there is to send, and sees to it that the rest is done by a task.
-    fn go_on(&self, state: &mut State) {
+    /// Sends pending datagrams, and wakes the timer task when necessary.
+    fn flush_and_wake(&self, state: &mut State) {
         self.flush(state);
         let Some(core) = &state.core else { return };
         let due = core.poll_timeout();
@@ -336,7 +339,7 @@ impl Endpoint {
         }
     }
 
-    /// Tells the sink what happened. Not to be called with the state locked.
+    /// Delivers events to the sink. Must not be called with the state locked.
     fn deliver(&self) {
         let _one_at_a_time = self.delivering.lock();
         loop {
@@ -349,10 +352,10 @@ impl Endpoint {
                 }
             };
             match told {
-                Told::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
-                Told::Introduced(peer) => sink.introduced(&peer),
-                Told::Parted(peer) => sink.parted(&peer),
-                Told::Arrived {
+                CoreEvent::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
+                CoreEvent::Introduced(peer) => sink.introduced(&peer),
+                CoreEvent::Parted(peer) => sink.parted(&peer),
+                CoreEvent::Arrived {
                     parcel,
                     from,
                     ticket,
@@ -403,9 +406,9 @@ async fn read(endpoint: Arc<Endpoint>, socket: Arc<Socket>) {
             continue;
         }
         endpoint.deliver();
-        endpoint.go_on(&mut endpoint.state.lock());
+        endpoint.flush_and_wake(&mut endpoint.state.lock());
         if received.is_err() {
-            sleep(REST).await;
+            sleep(READ_RETRY_DELAY).await;
         }
     }
 }
@@ -424,10 +427,10 @@ async fn look_up(endpoint: Arc<Endpoint>, connection: u32, name: String, port: u
             }
         }
     }
-    endpoint.go_on(&mut state);
+    endpoint.flush_and_wake(&mut state);
 }
 
-/// Tells an endpoint of changes of the interfaces, until it is gone or the task is aborted.
+/// Reports interface changes to an endpoint until the endpoint is dropped or the task is aborted.
 async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
     loop {
         changes.next().await;
@@ -438,9 +441,9 @@ async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
     }
 }
 
-/// Does what is due, until the endpoint is closed.
-async fn keep_time(running: Running) {
-    let endpoint = &running.0;
+/// Handles timers until the endpoint is closed.
+async fn run_timers(task: TimerTask) {
+    let endpoint = &task.0;
     loop {
         {
             let mut state = endpoint.state.lock();
@@ -469,10 +472,10 @@ async fn keep_time(running: Running) {
     }
 }
 
-/// An endpoint that works: whatever happens to the task, every attempt gets its conclusion.
-struct Running(Arc<Endpoint>);
+/// The timer task. Dropping it closes the endpoint and concludes every attempt.
+struct TimerTask(Arc<Endpoint>);
 
-impl Drop for Running {
+impl Drop for TimerTask {
     fn drop(&mut self) {
         self.0.close();
         self.0.deliver();
@@ -488,9 +491,9 @@ mod tests {
     use super::*;
     use crate::{Identity, UdpLimits};
 
-    struct Deaf;
+    struct IgnoringSink;
 
-    impl Sink for Deaf {
+    impl Sink for IgnoringSink {
         fn arrived(&self, _: Arrival) -> Verdict {
             Verdict::Later
         }
@@ -501,7 +504,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn addresses_that_are_found_too_late_take_no_sockets() {
+    async fn addresses_resolved_too_late_open_no_sockets() {
         let config = UdpConfig {
             listen: Vec::new(),
             identity: Identity {
@@ -514,7 +517,7 @@ mod tests {
         };
         let endpoint = Endpoint::new(config, Handle::current());
         let random = Box::new(|| Incarnation::random().as_u64());
-        endpoint.open(Arc::new(Deaf), random).unwrap();
+        endpoint.open(Arc::new(IgnoringSink), random).unwrap();
         let silent = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
         let found = [silent.local_addr().unwrap()];
         let sockets = |state: &State| state.sockets.len();

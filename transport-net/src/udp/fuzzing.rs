@@ -1,5 +1,5 @@
-//! An endpoint of the UDP transport for fuzz targets: datagrams of any peers in, and what must hold of
-//! those that leave.
+//! An endpoint of the UDP transport for fuzz targets: takes datagrams of any peers, and checks the
+//! invariants of the datagrams that it sends.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -9,12 +9,12 @@ use fipa_transport::{Answer, AttemptId, Conclusion, Incarnation, Kind, Location,
 
 use super::config::UdpLimits;
 use super::connection::Path;
-use super::core::{Core, Told};
+use super::core::{Core, CoreEvent};
 use super::packet::{self, Datagram, NO_COOKIE};
 use crate::Identity;
 use crate::hello::Hello;
 
-/// Most datagrams that leave because of one that came.
+/// Maximum number of datagrams sent in response to one.
 const MOST: usize = 4096;
 
 /// An endpoint with peers at a few addresses.
@@ -23,23 +23,23 @@ pub struct Datagrams {
     dispatched: u64,
     concluded: BTreeMap<AttemptId, Conclusion>,
     tickets: Vec<Ticket>,
-    /// What each address was told last: a cookie, and the number of the connection with it.
+    /// The last cookie sent to each address, with the number of the connection.
     cookies: BTreeMap<SocketAddr, packet::Cookie>,
     numbers: BTreeMap<SocketAddr, u64>,
-    /// Addresses that have brought back a cookie, or that this side has written to first.
+    /// Addresses that have returned a cookie, or that this side has sent to first.
     proved: BTreeSet<SocketAddr>,
 }
 
 /// A datagram as a peer writes it.
 #[derive(Debug, Clone, Copy)]
 pub enum Written<'a> {
-    /// These bytes.
+    /// Raw bytes.
     Raw(&'a [u8]),
-    /// A hello of this service, with the cookie that its address was given last, or without one.
+    /// A hello of this service, with the last cookie of its address or without one.
     Hello {
         /// Its number of the connection.
         initiator: u64,
-        /// Whether it brings back the cookie.
+        /// Whether it returns the cookie.
         cookie: bool,
         /// Its incarnation and the number of its connection.
         service: (u64, u64),
@@ -125,8 +125,8 @@ impl Datagrams {
         }
     }
 
-    /// A datagram of this peer arrives. An address that has proved nothing is told less than it has
-    /// written.
+    /// Handles a datagram of this peer. Checks that an unproved address gets fewer bytes than it
+    /// has sent.
     pub fn arrive(&mut self, peer: u8, written: Written<'_>, listening: bool, now: Instant) {
         let from = address(peer);
         let cookie = self.cookies.get(&from).copied();
@@ -169,7 +169,7 @@ impl Datagrams {
         }
     }
 
-    /// This side sends a parcel to this peer.
+    /// Sends a parcel to this peer.
     pub fn send(&mut self, peer: u8, service: u64, parcel: &Parcel, now: Instant) {
         let Ok(to) = Location::new(Kind::Udp, &address(peer).to_string()) else {
             return;
@@ -187,7 +187,7 @@ impl Datagrams {
         self.flush(now);
     }
 
-    /// This side answers one of the parcels that arrived.
+    /// Answers one of the parcels that arrived.
     pub fn answer(&mut self, pick: usize, answer: &Answer, now: Instant) {
         if !self.tickets.is_empty() {
             let ticket = self.tickets.swap_remove(pick % self.tickets.len());
@@ -196,7 +196,7 @@ impl Datagrams {
         }
     }
 
-    /// Time passes; what is due happens when it is.
+    /// Advances the time and handles the timers that are due.
     pub fn pass(&mut self, now: &mut Instant, time: Duration) {
         let until = *now + time;
         let mut steps = 0;
@@ -210,7 +210,7 @@ impl Datagrams {
         *now = until;
     }
 
-    /// The endpoint ends: every attempt has its conclusion then.
+    /// Closes the endpoint and checks that every attempt has a conclusion.
     pub fn close(&mut self, now: Instant) {
         self.core.close();
         self.flush(now);
@@ -219,20 +219,20 @@ impl Datagrams {
         }
     }
 
-    /// Takes what leaves, and says how many bytes go to each address.
+    /// Takes the datagrams to send. Returns the number of bytes sent to each address.
     fn flush(&mut self, now: Instant) -> BTreeMap<SocketAddr, usize> {
         let mut bytes = BTreeMap::new();
         let mut count = 0;
         loop {
             while let Some(told) = self.core.poll_event() {
                 match told {
-                    Told::Arrived { ticket, .. } => self.tickets.push(ticket),
-                    Told::Concluded(attempt, conclusion) => {
+                    CoreEvent::Arrived { ticket, .. } => self.tickets.push(ticket),
+                    CoreEvent::Concluded(attempt, conclusion) => {
                         assert!(attempt.0 < self.dispatched);
                         let twice = self.concluded.insert(attempt, conclusion);
                         assert_eq!(twice, None, "{attempt:?} is concluded twice");
                     }
-                    Told::Introduced(peer) => {
+                    CoreEvent::Introduced(peer) => {
                         let service = peer.hop.location.incarnation();
                         assert_ne!(
                             service,
@@ -240,7 +240,7 @@ impl Datagrams {
                             "it is this service itself"
                         );
                     }
-                    Told::Parted(_) => {}
+                    CoreEvent::Parted(_) => {}
                 }
             }
             let Some(transmit) = self.core.poll_transmit(now) else {

@@ -1,9 +1,9 @@
-//! Letters that fit one datagram, acknowledged.
+//! Acknowledged letters over UDP, one datagram each.
 //!
-//! * [`packet`]: the bytes. [`cookie`]: what strangers must bring back.
-//! * [`core`]: everything but sockets and clock, with the [`connection`]s in it. A connection is
-//!   [`dialling`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
-//! * [`endpoint`]: the tasks around it, with their [`socket`]s.
+//! * [`packet`]: the encoding. [`cookie`]: the address validation of unproved peers.
+//! * [`core`]: the protocol without sockets and clock, with the [`connection`]s in it. A connection
+//!   is [`dialling`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
+//! * [`endpoint`]: the tasks around the core, with their [`socket`]s.
 
 mod config;
 mod connection;
@@ -35,28 +35,29 @@ pub use self::counters::UdpCounters;
 use self::endpoint::Endpoint;
 use self::packet::{BASE, LARGEST, PARCEL_OVERHEAD};
 
-/// Room for the receiver's name in the largest datagram.
+/// Bytes reserved for the receiver's name in the largest datagram.
 const NAME: usize = 255;
 
 /// Carries parcels over UDP, each in one datagram.
 ///
-/// The first parcel to a location opens a connection: a handshake shows both sides that the other
-/// receives what it is sent, before anything is remembered of it. What gets lost is sent again, in
-/// time with the measured round trip; parcels arrive once and in order. What does not fit a
-/// datagram that the path carries unfragmented is [too large](WayFault::TooLarge).
+/// The first parcel to a location opens a connection. Its handshake proves to both sides that the
+/// other receives datagrams at its address, before either stores any state about the other. Lost
+/// packets are retransmitted based on the measured round-trip time; parcels arrive once and in
+/// order. A letter that does not fit an unfragmented datagram on the path is [too
+/// large](WayFault::TooLarge).
 ///
 /// An address is a numeric `address:port`, with a scope where one is needed
 /// (`[fe80::1%eth0]:7788`), or `name:port`.
 ///
-/// Dropping it closes it. After [`close`](Transport::close) the attempts are concluded by the
-/// runtime's threads, so the runtime must live on for a moment.
+/// Dropping it closes it. After [`close`](Transport::close) the threads of the runtime conclude the
+/// attempts, so the runtime must run a moment longer.
 pub struct UdpTransport {
     endpoint: Arc<Endpoint>,
 }
 
 impl UdpTransport {
-    /// An endpoint that does its work on `runtime`, which must have input, output and time
-    /// enabled. Nothing is opened before `listen`.
+    /// Creates an endpoint that runs its tasks on `runtime`, which must have I/O and time enabled.
+    /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: UdpConfig, runtime: Handle) -> Self {
         Self {
@@ -64,7 +65,7 @@ impl UdpTransport {
         }
     }
 
-    /// What happened so far.
+    /// Returns the counters of this endpoint.
     #[must_use]
     pub fn counters(&self) -> UdpCounters {
         self.endpoint.counters()
@@ -72,14 +73,15 @@ impl UdpTransport {
 
     fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
         if to.kind() != Kind::Udp || to.signature() != Signature::Frames {
-            let detail = format!("{to} is no UDP location");
+            let detail = format!("{to} is not a UDP location");
             return Err(WayError::new(WayFault::Unreachable, detail));
         }
         if let Body::Letter(letter) = &parcel.body
             && letter.len() > self.max_letter()
         {
             let (len, max) = (letter.len(), self.max_letter());
-            let detail = format!("{len} bytes; at most {max} fit a datagram");
+            let detail =
+                format!("the letter has {len} bytes; at most {max} fit a datagram (max_datagram)");
             return Err(WayError::new(WayFault::TooLarge, detail));
         }
         Ok(())
@@ -91,7 +93,7 @@ impl Transport for UdpTransport {
         Kind::Udp
     }
 
-    /// What fits the largest datagram. Paths between hosts carry less; see
+    /// Returns the largest letter that fits a datagram. Paths between hosts carry less; see
     /// [`UdpLimits::max_datagram`].
     fn max_letter(&self) -> usize {
         let datagram = self.endpoint.config.limits.max_datagram;

@@ -1,26 +1,25 @@
-//! What the path to a peer carries, as far as is known.
+//! Path MTU discovery.
 //!
-//! It begins as what every path carries. When something larger waits, sizes that links are known
-//! to have are tried from the largest down, with packets of that size that carry nothing and must
-//! not be fragmented; the first that is acknowledged counts. One that the own interface does not
-//! take costs nothing.
+//! The MTU is assumed to be the size that every path must carry. When a larger parcel waits, known
+//! link MTUs are probed from the largest down, with padded, unfragmented packets of that size; the
+//! first acknowledged size is used. A size that the local interface rejects costs no packet.
 
 use super::packet::{BASE, LARGEST};
 
 /// Loopback; jumbo frames; Ethernet; Ethernet through a tunnel. Less the headers of IPv6 and UDP.
 const CANDIDATES: [usize; 4] = [LARGEST, 9000 - 48, 1500 - 48, 1420 - 48];
 
-/// How often a size is tried, since a probe may be lost for other reasons.
+/// Number of probes per size, since a probe may be lost for other reasons.
 const TRIES: u8 = 2;
 
 #[derive(Debug)]
 pub(crate) struct Mtu {
     current: usize,
     max: usize,
-    /// The next candidate, and how often it has been tried.
+    /// The next candidate and the number of its probes.
     next: usize,
     tries: u8,
-    /// Whether a probe is under way.
+    /// Whether a probe is in flight.
     probing: bool,
 }
 
@@ -35,17 +34,17 @@ impl Mtu {
         }
     }
 
-    /// Largest datagram that is known to get through.
+    /// Returns the size of the largest datagram that is known to arrive.
     pub(crate) fn current(&self) -> usize {
         self.current
     }
 
-    /// Whether more than `current` cannot be expected.
+    /// Whether no larger size is left to probe.
     pub(crate) fn is_settled(&self) -> bool {
         self.candidate().is_none()
     }
 
-    /// The size of a probe that should be sent now, which counts as sent with this.
+    /// Returns the size of a probe to send now, which counts as sent.
     pub(crate) fn take_probe(&mut self) -> Option<usize> {
         let size = self.candidate().filter(|_| !self.probing)?;
         self.probing = true;
@@ -53,7 +52,7 @@ impl Mtu {
         Some(size)
     }
 
-    /// A packet of that size got through.
+    /// Records the arrival of a packet of this size.
     pub(crate) fn arrived(&mut self, size: usize) {
         if Some(size) == self.candidate() {
             self.probing = false;
@@ -62,7 +61,7 @@ impl Mtu {
         self.current = self.current.max(size.min(self.max));
     }
 
-    /// A probe got lost.
+    /// Records the loss of a probe.
     pub(crate) fn lost(&mut self, size: usize) {
         if Some(size) == self.candidate() && self.probing {
             self.probing = false;
@@ -72,7 +71,7 @@ impl Mtu {
         }
     }
 
-    /// The own interface does not take that size, or the path no longer does.
+    /// Records that the local interface or the path does not carry this size.
     pub(crate) fn too_big(&mut self, size: usize) {
         if Some(size) == self.candidate() {
             self.probing = false;
@@ -95,7 +94,7 @@ impl Mtu {
 
     fn candidate(&self) -> Option<usize> {
         let left = CANDIDATES.get(self.next..)?;
-        // The limit of the configuration is a size to be tried like the others.
+        // The configured limit is probed like the other sizes.
         left.iter()
             .map(|size| (*size).min(self.max))
             .find(|size| *size > self.current)
@@ -107,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_largest_that_gets_through_is_found() {
+    fn the_largest_size_that_arrives_is_found() {
         for (interface, path, found) in [
             (65_536, 65_536, LARGEST),
             (1452, 1452, 1452),
@@ -119,7 +118,7 @@ mod tests {
             let mut probes = 0;
             while !mtu.is_settled() {
                 let size = mtu.take_probe().unwrap();
-                assert_eq!(mtu.take_probe(), None, "one at a time");
+                assert_eq!(mtu.take_probe(), None, "one probe at a time");
                 if size > interface {
                     mtu.too_big(size);
                 } else if size > path {
@@ -135,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_of_the_configuration_holds() {
+    fn the_configured_limit_is_respected() {
         let mut mtu = Mtu::new(2000);
         assert_eq!(mtu.take_probe(), Some(2000));
         mtu.arrived(2000);
@@ -145,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_that_shrinks_is_found_out_about() {
+    fn a_smaller_path_mtu_is_detected() {
         let mut mtu = Mtu::new(LARGEST);
         assert_eq!(mtu.take_probe(), Some(LARGEST));
         mtu.arrived(LARGEST);

@@ -8,8 +8,8 @@
 //! | 1 hello | 0 | the sender's number (8), a cookie (16, zeros at first), length of the hello (2), [`crate::hello`]; padded to [`BASE`] |
 //! | 2 cookie | the number in the hello | a cookie (16) |
 //! | 3 welcome | the number in the hello | the sender's number (8), length of the hello (2), [`crate::hello`] |
-//! | 4 refused | the number in the hello | nothing: there are too many connections |
-//! | 5 unknown | 0 | the number that means nothing here (8) |
+//! | 4 refused | the number in the hello | nothing |
+//! | 5 unknown | 0 | the number of the unknown connection (8) |
 //! | 6 data | | number of the packet (8), then frames |
 //!
 //! Frames of a data packet:
@@ -17,15 +17,15 @@
 //! | frame | what follows |
 //! |---|---|
 //! | 0 padding | ignored, to the end |
-//! | 1 acknowledgement | highest packet (8), its delay in µs (4), length n (1), n bytes: bit i says whether the packet i + 1 below it arrived, too |
-//! | 2 parcel | its number, rising by one (8), [`ParcelHeader`], its body, to the end |
+//! | 1 acknowledgment | highest packet (8), its delay in µs (4), length n (1), n bytes: bit i is set if the packet i + 1 below it arrived |
+//! | 2 parcel | its number, increasing by one (8), [`ParcelHeader`], its body, to the end |
 //! | 3 answer | the parcel it answers (8), length (1), see [`crate::answer`] |
 //! | 4 ping | nothing; is acknowledged |
 //! | 5 skipped | the number of a parcel that never comes (8) |
-//! | 6 goodbye | the last parcel that was taken; later ones have not been and never will be (8) |
+//! | 6 goodbye | the last accepted parcel; later ones are never accepted (8) |
 //!
-//! A hello is larger than whatever answers it, and costs its receiver no memory before the cookie
-//! came back: who writes under a false address reaches nothing with it.
+//! A hello is larger than every reply to it, and its receiver stores no state before the cookie has
+//! come back. A spoofed source address therefore neither amplifies traffic nor consumes memory.
 
 use bytes::{Buf, BufMut};
 use fipa_transport::Answer;
@@ -36,22 +36,22 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 use crate::answer::{self, MAX_ANSWER};
 use crate::hello::Hello;
 
-/// Bytes that every path carries (RFC 8200 section 5: 1,280, less the headers of IPv6 and UDP and
-/// some room for tunnels), as in QUIC.
+/// Size of a datagram that every path must carry (RFC 8200 section 5: 1,280 bytes, less the headers
+/// of IPv6 and UDP and a margin for tunnels), as in QUIC.
 pub(crate) const BASE: usize = 1200;
 
-/// Largest datagram: what fits the loopback interface's 65,536 bytes with IPv6.
+/// Size of the largest datagram, which fits the loopback interface's 65,536 bytes with IPv6.
 pub(crate) const LARGEST: usize = 65_487;
 
-/// What stands in front of a parcel's name in a packet that carries nothing else.
+/// Number of bytes in front of a parcel's name in a packet that carries nothing else.
 pub(crate) const PARCEL_OVERHEAD: usize = DATA_LEN + 1 + 8 + PARCEL_HEADER_LEN;
 
 pub(crate) const HEADER_LEN: usize = size_of::<Header>();
 /// Header and number of a data packet.
 pub(crate) const DATA_LEN: usize = HEADER_LEN + 8;
-/// Longest acknowledgement.
+/// Maximum length of an acknowledgment.
 pub(crate) const MAX_ACK: usize = 1 + 8 + 4 + 1 + BITMAP;
-/// Longest bitmap in an acknowledgement, in bytes.
+/// Maximum length of the bitmap in an acknowledgment, in bytes.
 pub(crate) const BITMAP: usize = 32;
 pub(crate) const ANSWER_OVERHEAD: usize = 1 + 8 + 1;
 
@@ -73,7 +73,7 @@ const PING: u8 = 4;
 const SKIPPED: u8 = 5;
 const GOODBYE: u8 = 6;
 
-/// What proves that somebody receives what is sent to the address they write from.
+/// Proves that a peer receives datagrams at its source address.
 pub(crate) type Cookie = [u8; 16];
 
 pub(crate) const NO_COOKIE: Cookie = [0; 16];
@@ -90,13 +90,13 @@ struct Header {
     to: U64,
 }
 
-/// A datagram as it arrived.
+/// A decoded datagram.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Datagram<'a> {
     Hello {
         initiator: u64,
         cookie: Cookie,
-        /// Not read before the cookie has been found right.
+        /// Not decoded before the cookie has been checked.
         hello: &'a [u8],
     },
     Cookie {
@@ -122,7 +122,7 @@ pub(crate) enum Datagram<'a> {
 }
 
 impl<'a> Datagram<'a> {
-    /// Nothing for what is no datagram of this protocol and version.
+    /// Decodes a datagram. Returns `None` when it is not one of this protocol and version.
     pub(crate) fn read(bytes: &'a [u8]) -> Option<Self> {
         let (header, mut rest) = Header::read_from_prefix(bytes).ok()?;
         if header.magic != MAGIC || header.version != VERSION {
@@ -220,8 +220,8 @@ pub(crate) fn unknown(number: u64) -> Vec<u8> {
     out
 }
 
-/// A hello has to fit one datagram that every path carries: addresses that do not fit are left
-/// out, the worst first.
+/// Appends a hello that fits one datagram of size [`BASE`]: listening addresses that do not fit are
+/// left out, the last first.
 fn put_hello(out: &mut Vec<u8>, hello: &Hello) {
     let room = BASE - out.len() - 2;
     let mut hello = hello.clone();
@@ -239,7 +239,7 @@ pub(crate) fn put_data(out: &mut Vec<u8>, to: u64, number: u64) {
     out.put_u64_le(number);
 }
 
-/// What acknowledges packets.
+/// An acknowledgment of packets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Ack {
     pub(crate) largest: u64,
@@ -274,7 +274,7 @@ pub(crate) fn put_ack(out: &mut Vec<u8>, ack: &Ack) {
     out.put_slice(told);
 }
 
-/// Puts what stands in front of a parcel's own bytes.
+/// Appends the header of a parcel frame.
 pub(crate) fn put_parcel(out: &mut Vec<u8>, id: u64) {
     out.put_u8(PARCEL);
     out.put_u64_le(id);
@@ -380,7 +380,7 @@ impl<'a> Frames<'a> {
     }
 }
 
-/// The header of a parcel in a packet, and its body.
+/// Splits a parcel frame into the header of the parcel and its body.
 pub(crate) fn split_parcel(bytes: &[u8]) -> Option<(ParcelHeader, &[u8])> {
     ParcelHeader::read_from_prefix(bytes).ok()
 }
@@ -393,7 +393,7 @@ mod tests {
     use super::*;
     use crate::Identity;
 
-    fn someone(listening: usize) -> Hello {
+    fn sample(listening: usize) -> Hello {
         Hello {
             identity: Identity {
                 name: "n".repeat(Identity::MAX_TEXT),
@@ -411,7 +411,7 @@ mod tests {
 
     #[test]
     fn the_longest_hello_fits_what_every_path_carries() {
-        let longest = someone(16);
+        let longest = sample(16);
         let first = hello(3, &[9; 16], &longest);
         assert_eq!(first.len(), BASE);
         let Some(Datagram::Hello { hello, .. }) = Datagram::read(&first) else {
@@ -434,14 +434,14 @@ mod tests {
     }
 
     #[test]
-    fn a_short_hello_is_none() {
-        let mut bytes = hello(3, &NO_COOKIE, &someone(0));
+    fn a_hello_below_the_minimum_size_is_ignored() {
+        let mut bytes = hello(3, &NO_COOKIE, &sample(0));
         bytes.pop();
         assert_eq!(Datagram::read(&bytes), None);
     }
 
     #[test]
-    fn frames_come_back_as_they_were_put() {
+    fn frames_round_trip() {
         let mut before = [0; BITMAP];
         before[4] = 0x81;
         let ack = Ack {
@@ -481,7 +481,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn arbitrary_bytes_do_no_harm(mut bytes in prop::collection::vec(any::<u8>(), 0..1300), ours: bool) {
+        fn arbitrary_bytes_decode_without_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..1300), ours: bool) {
             if ours && bytes.len() > 5 {
                 bytes[..4].copy_from_slice(&MAGIC);
                 bytes[4] = VERSION;

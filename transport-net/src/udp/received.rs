@@ -1,18 +1,18 @@
-//! Which packets have arrived: duplicates are told, and acknowledgements written.
+//! The set of received packets: detects duplicates and builds acknowledgments.
 
 use std::time::{Duration, Instant};
 
 use super::packet::{Ack, BITMAP};
 
-/// How long an acknowledgement may wait for something to travel with.
+/// Maximum delay of an acknowledgment that waits for another frame.
 pub(crate) const MAX_DELAY: Duration = Duration::from_millis(10);
 
-/// How far below the highest packet is remembered; what is older counts as seen.
+/// Number of packets below the highest one that are tracked; older ones count as received.
 const WINDOW: u64 = BITMAP as u64 * 8;
 
 #[derive(Debug, Default)]
 pub(crate) struct Received {
-    /// The highest packet, and when it arrived.
+    /// The highest packet and its time of arrival.
     largest: Option<(u64, Instant)>,
     /// Bit i: the packet `largest - 1 - i`.
     before: [u64; BITMAP / 8],
@@ -20,7 +20,7 @@ pub(crate) struct Received {
 }
 
 impl Received {
-    /// Whether a packet has not arrived before, as far as is remembered.
+    /// Whether a packet has not arrived before, within [`WINDOW`].
     pub(crate) fn is_new(&self, number: u64) -> bool {
         let Some((largest, _)) = self.largest else {
             return true;
@@ -32,7 +32,7 @@ impl Received {
         }
     }
 
-    /// Notes a packet that is new.
+    /// Records a new packet.
     pub(crate) fn note(&mut self, number: u64, now: Instant) {
         match self.largest {
             None => self.largest = Some((number, now)),
@@ -44,18 +44,18 @@ impl Received {
         }
     }
 
-    /// It is to be acknowledged, at once or with what comes next.
+    /// Requests an acknowledgment, at once or with the next frames.
     pub(crate) fn wants_ack(&mut self, now: Instant, at_once: bool) {
         let due = if at_once { now } else { now + MAX_DELAY };
         self.due = Some(self.due.map_or(due, |before| before.min(due)));
     }
 
-    /// When an acknowledgement must leave, if one is owed.
+    /// Returns the time at which an acknowledgment must be sent, if one is due.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.due
     }
 
-    /// The acknowledgement, which counts as sent with this.
+    /// Returns the acknowledgment, which counts as sent.
     pub(crate) fn take_ack(&mut self, now: Instant) -> Option<Ack> {
         let (largest, at) = self.largest?;
         self.due = None;
@@ -71,7 +71,7 @@ impl Received {
         })
     }
 
-    /// The bits move up by `distance`, and the packet that was the highest becomes one of them.
+    /// Shifts the bits by `distance` and sets the bit of the previous highest packet.
     fn shift(&mut self, distance: u64) {
         let whole = (distance / 64) as usize;
         let part = (distance % 64) as u32;
@@ -114,7 +114,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_remembers_what_a_set_would(
+        fn it_matches_a_set_of_received_packets(
             numbers in prop::collection::vec(
                 prop_oneof![0..40_u64, 0..600_u64, Just(1 << 40), 0..u64::MAX], 1..200),
         ) {

@@ -1,8 +1,9 @@
-//! Packets under way: round-trip time, what got lost, and how much may be under way at once.
+//! Packets in flight: round-trip time, loss detection and the congestion window.
 //!
-//! As in RFC 9002, simplified: a packet is lost when one sent three later has been acknowledged; if
-//! nothing is heard for some measured time, the oldest go out again, with back-off. What was in
-//! a lost packet goes out in a new one, so every acknowledgement is of one certain packet.
+//! A simplified form of RFC 9002: a packet is lost when one sent three later has been acknowledged.
+//! Without any acknowledgment for some measured time, the contents of the oldest packets are
+//! retransmitted, with backoff. The contents of a lost packet are sent in a new packet, so every
+//! acknowledgment refers to one certain packet.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -10,9 +11,9 @@ use std::time::{Duration, Instant};
 use super::packet::{Ack, BASE};
 use super::received::MAX_DELAY;
 
-/// What a packet carried, to be sent again if it got lost.
+/// The content of a packet, which is retransmitted after a loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kept {
+pub(crate) enum SentContent {
     Parcel(u64),
     Answer(u64),
     Skipped(u64),
@@ -21,23 +22,23 @@ pub(crate) enum Kept {
     Probe(usize),
 }
 
-/// How many later packets must have arrived before one counts as lost.
+/// Number of later packets that must have arrived before a packet counts as lost.
 const REORDERING: u64 = 3;
 
-/// Time-out before the first round trip was measured.
+/// Timeout before the first round trip was measured.
 const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// Room for the coarseness of timers.
+/// Margin for the granularity of timers.
 const GRANULARITY: Duration = Duration::from_millis(10);
 
-/// Back-off stops here, unless the round trip takes longer: a way that is silent must be found
-/// broken, or working again, soon.
+/// Maximum backoff, unless the round trip takes longer: a silent path must be detected as broken or
+/// working again soon.
 const LONGEST_BACKOFF: Duration = Duration::from_millis(300);
 
-/// Bytes that may be under way: at first, at least and at most.
+/// Congestion window in bytes: initial, minimum and maximum.
 const WINDOW: (usize, usize, usize) = (32 << 10, 4 * BASE, 1 << 20);
 
-/// Numbers of packets under way span at most this: an acknowledgement tells of 256.
+/// Maximum span of the numbers of packets in flight: an acknowledgment covers 256.
 const MAX_SPAN: u64 = 200;
 
 #[derive(Debug)]
@@ -48,7 +49,7 @@ pub(crate) struct Recovery {
     rtt: Option<Rtt>,
     window: usize,
     threshold: usize,
-    /// Losses among packets below this have been answered with a smaller window already.
+    /// The window has already been reduced for losses of packets below this number.
     answered: u64,
     backoff: u32,
     last_sent: Instant,
@@ -59,7 +60,7 @@ pub(crate) struct Recovery {
 struct Packet {
     at: Instant,
     size: usize,
-    kept: Vec<Kept>,
+    kept: Vec<SentContent>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -68,11 +69,11 @@ struct Rtt {
     variation: Duration,
 }
 
-/// What an acknowledgement told.
+/// The result of an acknowledgment.
 #[derive(Debug, Default)]
-pub(crate) struct Told {
-    pub(crate) arrived: Vec<Kept>,
-    pub(crate) lost: Vec<Kept>,
+pub(crate) struct AckResult {
+    pub(crate) arrived: Vec<SentContent>,
+    pub(crate) lost: Vec<SentContent>,
 }
 
 impl Recovery {
@@ -91,7 +92,7 @@ impl Recovery {
         }
     }
 
-    /// Whether a packet of that size may leave now.
+    /// Whether a packet of this size may be sent now.
     pub(crate) fn has_room(&self, size: usize) -> bool {
         let span = self
             .sent
@@ -101,14 +102,14 @@ impl Recovery {
         fits && span < MAX_SPAN
     }
 
-    /// The number of the next packet.
+    /// Returns the number of the next packet.
     pub(crate) fn take_number(&mut self) -> u64 {
         self.next += 1;
         self.next - 1
     }
 
-    /// A packet that wants to be acknowledged has been sent.
-    pub(crate) fn sent(&mut self, number: u64, now: Instant, size: usize, kept: Vec<Kept>) {
+    /// Records a sent packet that elicits an acknowledgment.
+    pub(crate) fn sent(&mut self, number: u64, now: Instant, size: usize, kept: Vec<SentContent>) {
         self.in_flight += size;
         self.last_sent = now;
         self.waiting_since.get_or_insert(now);
@@ -116,7 +117,7 @@ impl Recovery {
         self.sent.insert(number, Packet { at, size, kept });
     }
 
-    /// A round trip was measured by other means.
+    /// Records a round-trip time.
     pub(crate) fn measured(&mut self, sample: Duration) {
         self.rtt = Some(match self.rtt {
             None => Rtt {
@@ -133,12 +134,12 @@ impl Recovery {
         });
     }
 
-    /// Takes an acknowledgement; nothing when it is of a packet that was never sent.
-    pub(crate) fn acknowledged(&mut self, ack: &Ack, now: Instant) -> Option<Told> {
+    /// Handles an acknowledgment. Returns `None` when it covers a packet that was never sent.
+    pub(crate) fn acknowledged(&mut self, ack: &Ack, now: Instant) -> Option<AckResult> {
         if ack.largest >= self.next {
             return None;
         }
-        let mut told = Told::default();
+        let mut told = AckResult::default();
         let numbers: Vec<u64> = self.sent.range(..=ack.largest).map(|(n, _)| *n).collect();
         let mut grown = 0;
         for number in numbers {
@@ -174,8 +175,8 @@ impl Recovery {
         Some(told)
     }
 
-    /// Nothing was heard for too long: what was in the oldest packets is to be sent again.
-    pub(crate) fn timed_out(&mut self) -> Vec<Kept> {
+    /// Handles a timeout: returns the contents of the oldest packets for retransmission.
+    pub(crate) fn timed_out(&mut self) -> Vec<SentContent> {
         self.backoff = self.backoff.saturating_add(1);
         let oldest: Vec<u64> = self.sent.keys().take(2).copied().collect();
         oldest
@@ -184,8 +185,8 @@ impl Recovery {
             .collect()
     }
 
-    /// The packet sent last did not leave. What it carried is to be sent otherwise.
-    pub(crate) fn withdraw(&mut self) -> Vec<Kept> {
+    /// Withdraws the last packet, which could not be sent. Returns its contents.
+    pub(crate) fn withdraw(&mut self) -> Vec<SentContent> {
         let last = self.next.checked_sub(1);
         let packet = last.and_then(|number| self.remove(number));
         if self.sent.is_empty() && self.backoff == 0 {
@@ -194,24 +195,23 @@ impl Recovery {
         packet.map_or_else(Vec::new, |packet| packet.kept)
     }
 
-    /// Nothing is awaited any more.
-    pub(crate) fn calm(&mut self) {
+    /// Resets the backoff when no acknowledgment is awaited.
+    pub(crate) fn reset_backoff(&mut self) {
         self.backoff = 0;
         self.waiting_since = None;
     }
 
-    /// When nothing will have been heard for too long.
+    /// Returns the time of the retransmission timeout.
     pub(crate) fn timeout(&self) -> Option<Instant> {
         (!self.sent.is_empty()).then(|| self.last_sent + self.patience())
     }
 
-    /// Since when acknowledgements are awaited in vain, and how often what was sent has been sent
-    /// again.
+    /// Returns the time since which acknowledgments are missing, and the number of timeouts since.
     pub(crate) fn waiting_since(&self) -> Option<(Instant, u32)> {
         self.waiting_since.map(|since| (since, self.backoff))
     }
 
-    /// Whether packets are under way.
+    /// Whether packets are in flight.
     pub(crate) fn is_waiting(&self) -> bool {
         !self.sent.is_empty()
     }
@@ -231,12 +231,15 @@ impl Recovery {
         Some(packet)
     }
 
-    fn lose(&mut self, number: u64) -> Vec<Kept> {
+    fn lose(&mut self, number: u64) -> Vec<SentContent> {
         let Some(packet) = self.remove(number) else {
             return Vec::new();
         };
-        // A probe that gets lost tells of the size of the path, not of its load.
-        let is_probe = packet.kept.iter().any(|k| matches!(k, Kept::Probe(_)));
+        // The loss of a probe indicates the MTU of the path, not congestion.
+        let is_probe = packet
+            .kept
+            .iter()
+            .any(|k| matches!(k, SentContent::Probe(_)));
         if !is_probe && number >= self.answered {
             self.answered = self.next;
             self.window = (self.window / 2).max(WINDOW.1);
@@ -270,7 +273,7 @@ mod tests {
 
     fn send(recovery: &mut Recovery, now: Instant) -> u64 {
         let number = recovery.take_number();
-        recovery.sent(number, now, 1000, vec![Kept::Parcel(number)]);
+        recovery.sent(number, now, 1000, vec![SentContent::Parcel(number)]);
         number
     }
 
@@ -288,7 +291,7 @@ mod tests {
         let wait = |recovery: &Recovery| recovery.timeout().unwrap() - now;
         let first = wait(&recovery);
         assert!(first > Duration::from_millis(55) && first < Duration::from_millis(70));
-        assert_eq!(recovery.timed_out(), [Kept::Parcel(30)]);
+        assert_eq!(recovery.timed_out(), [SentContent::Parcel(30)]);
         send(&mut recovery, now);
         assert_eq!(wait(&recovery), first * 2);
         for _ in 0..20 {
@@ -303,27 +306,27 @@ mod tests {
     }
 
     #[test]
-    fn what_later_packets_overtook_is_lost() {
+    fn a_packet_overtaken_by_later_ones_is_lost() {
         let now = Instant::now();
         let mut recovery = Recovery::new(now);
         for _ in 0..5 {
             send(&mut recovery, now);
         }
         let told = recovery.acknowledged(&ack(2), now).unwrap();
-        assert_eq!(told.arrived, [Kept::Parcel(2)]);
+        assert_eq!(told.arrived, [SentContent::Parcel(2)]);
         assert!(told.lost.is_empty());
         let before = recovery.window;
         let told = recovery.acknowledged(&ack(4), now).unwrap();
-        assert_eq!(told.lost, [Kept::Parcel(0), Kept::Parcel(1)]);
+        assert_eq!(told.lost, [SentContent::Parcel(0), SentContent::Parcel(1)]);
         assert!(recovery.window < before);
         assert!(recovery.acknowledged(&ack(5), now).is_none());
     }
 
     #[test]
-    fn what_may_be_under_way_is_bounded() {
+    fn bytes_in_flight_are_bounded() {
         let now = Instant::now();
         let mut recovery = Recovery::new(now);
-        assert!(recovery.has_room(100_000), "one always may");
+        assert!(recovery.has_room(100_000), "one packet is always allowed");
         let mut count = 0;
         while recovery.has_room(1000) {
             send(&mut recovery, now);

@@ -1,5 +1,5 @@
-//! Two endpoints on virtual time, with a network between them that a seed makes lose, delay,
-//! reorder and repeat datagrams, and the promises checked in every run.
+//! Two endpoints on virtual time. The network between them loses, delays, reorders and repeats
+//! datagrams depending on a seed. Every run checks the guarantees of the transport.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::SocketAddr;
@@ -14,26 +14,26 @@ use fipa_transport::{
 
 use super::config::UdpLimits;
 use super::connection::Path;
-use super::core::{Core, Told, Transmit};
+use super::core::{Core, CoreEvent, Transmit};
 use super::packet::{self, BASE, Datagram, NO_COOKIE};
 use crate::Identity;
 
 const A: usize = 0;
 const B: usize = 1;
 
-/// How the network treats datagrams.
+/// The conditions of the simulated network.
 #[derive(Debug, Clone, Copy)]
-struct Weather {
+struct LinkConditions {
     loss: f64,
     twice: f64,
     delay: (u64, u64),
-    /// Largest datagram that gets through.
+    /// Size of the largest datagram that the path carries.
     path: usize,
-    /// Largest datagram that the own interface takes.
+    /// Size of the largest datagram that the local interface accepts.
     interface: usize,
 }
 
-const FAIR: Weather = Weather {
+const FAIR: LinkConditions = LinkConditions {
     loss: 0.0,
     twice: 0.0,
     delay: (100, 200),
@@ -41,19 +41,19 @@ const FAIR: Weather = Weather {
     interface: 1452,
 };
 
-struct World {
+struct Simulation {
     now: Instant,
     random: fastrand::Rng,
-    weather: Weather,
+    conditions: LinkConditions,
     cores: [Core; 2],
-    /// Datagrams under way: when they arrive, at whom, from whom.
+    /// Datagrams in flight: time of arrival, receiver, sender.
     wire: BTreeMap<(Instant, u64), (usize, SocketAddr, Vec<u8>)>,
     count: u64,
     arrived: [Vec<Parcel>; 2],
     concluded: [HashMap<AttemptId, Vec<Conclusion>>; 2],
-    /// Answers that come later.
+    /// Delayed answers.
     owed: BTreeMap<(Instant, u64), (usize, Ticket)>,
-    /// How many of the arrivals are answered late.
+    /// Fraction of the arrivals that are answered late.
     late: f64,
     cut: bool,
 }
@@ -75,13 +75,13 @@ fn core(who: usize, seed: u64, limits: &UdpLimits, now: Instant) -> Core {
     Core::new(identity, limits.clone(), listening, draw, now)
 }
 
-impl World {
-    fn new(seed: u64, weather: Weather, limits: &UdpLimits) -> Self {
+impl Simulation {
+    fn new(seed: u64, conditions: LinkConditions, limits: &UdpLimits) -> Self {
         let now = Instant::now();
         Self {
             now,
             random: fastrand::Rng::with_seed(seed),
-            weather,
+            conditions,
             cores: [core(A, seed, limits, now), core(B, seed, limits, now)],
             wire: BTreeMap::new(),
             count: 0,
@@ -111,7 +111,7 @@ impl World {
         Ok(())
     }
 
-    /// Everybody sends what there is to send, and tells what there is to tell.
+    /// Sends all pending datagrams and handles all events.
     fn flush(&mut self) {
         for who in [A, B] {
             loop {
@@ -129,14 +129,14 @@ impl World {
         }
     }
 
-    fn tell(&mut self, who: usize, told: Told) {
+    fn tell(&mut self, who: usize, told: CoreEvent) {
         match told {
-            Told::Concluded(attempt, conclusion) => {
+            CoreEvent::Concluded(attempt, conclusion) => {
                 let heard = self.concluded[who].entry(attempt).or_default();
                 heard.push(conclusion);
             }
-            Told::Introduced(_) | Told::Parted(_) => {}
-            Told::Arrived { parcel, ticket, .. } => {
+            CoreEvent::Introduced(_) | CoreEvent::Parted(_) => {}
+            CoreEvent::Arrived { parcel, ticket, .. } => {
                 self.arrived[who].push(*parcel);
                 if self.random.f64() < self.late {
                     let after = Duration::from_micros(self.random.u64(0..400_000));
@@ -155,19 +155,19 @@ impl World {
             return;
         }
         let len = transmit.contents.len();
-        if len > self.weather.interface {
+        if len > self.conditions.interface {
             if let Some(number) = transmit.connection {
                 self.cores[who].too_big(number, len);
             }
             return;
         }
-        let weather = self.weather;
-        let copies = 1 + usize::from(self.random.f64() < weather.twice);
+        let conditions = self.conditions;
+        let copies = 1 + usize::from(self.random.f64() < conditions.twice);
         for _ in 0..copies {
-            if self.cut || len > weather.path || self.random.f64() < weather.loss {
+            if self.cut || len > conditions.path || self.random.f64() < conditions.loss {
                 continue;
             }
-            let delay = self.random.u64(weather.delay.0..=weather.delay.1);
+            let delay = self.random.u64(conditions.delay.0..=conditions.delay.1);
             self.count += 1;
             self.wire.insert(
                 (self.now + Duration::from_micros(delay), self.count),
@@ -176,7 +176,7 @@ impl World {
         }
     }
 
-    /// When something happens next.
+    /// Returns the time of the next event.
     fn next(&self) -> Option<Instant> {
         let next = [
             self.wire.keys().next().map(|(at, _)| *at),
@@ -187,7 +187,7 @@ impl World {
         next.into_iter().flatten().min()
     }
 
-    /// Goes on to what happens next. Nothing happens any more when it says no.
+    /// Advances to the next event. Returns false when there is none.
     fn step(&mut self) -> bool {
         let Some(next) = self.next() else {
             return false;
@@ -229,11 +229,12 @@ impl World {
         }
     }
 
-    /// What every run must keep, whatever the weather. Says how many were accepted.
+    /// Checks the guarantees that hold under all conditions. Returns the number of accepted
+    /// letters.
     fn check(&self, from: usize, attempts: &BTreeSet<u64>) -> usize {
         let order: Vec<u64> = self.arrived[1 - from].iter().map(|p| p.sequence).collect();
         let arrived: BTreeSet<u64> = order.iter().copied().collect();
-        assert_eq!(arrived.len(), order.len(), "something arrived twice");
+        assert_eq!(arrived.len(), order.len(), "a parcel arrived twice");
         assert!(order.is_sorted(), "out of order: {order:?}");
         let mut accepted = 0;
         for attempt in attempts {
@@ -242,7 +243,7 @@ impl World {
             let arrived = arrived.contains(attempt);
             match &heard[0] {
                 Conclusion::Answered(Answer::Accepted) => {
-                    assert!(arrived, "{attempt} was accepted by nobody");
+                    assert!(arrived, "{attempt} was accepted but did not arrive");
                     accepted += 1;
                 }
                 Conclusion::NotSent(error) => {
@@ -282,49 +283,50 @@ fn seeds() -> std::ops::Range<u64> {
     }
 }
 
-/// Many letters of many sizes in a weather, both ways; says how many were sent and accepted.
-fn run(seed: u64, weather: Weather, late: f64) -> (usize, usize) {
+/// Sends many letters of many sizes in both directions under some conditions. Returns the numbers
+/// of sent and accepted letters.
+fn run(seed: u64, conditions: LinkConditions, late: f64) -> (usize, usize) {
     let limits = UdpLimits {
-        // 30 % lost each way is no silence.
+        // A loss of 30 % in each direction must not count as silence.
         silence: Duration::from_secs(20),
         connect_timeout: Duration::from_secs(20),
         ..UdpLimits::default()
     };
-    let mut world = World::new(seed, weather, &limits);
-    world.late = late;
+    let mut simulation = Simulation::new(seed, conditions, &limits);
+    simulation.late = late;
     let mut attempts = [BTreeSet::new(), BTreeSet::new()];
     for number in 0..200 {
-        let from = usize::from(world.random.bool());
-        let len = match world.random.u8(..) {
-            0..200 => world.random.usize(0..300),
-            200..250 => world.random.usize(0..1300),
-            _ => world.random.usize(0..3000),
+        let from = usize::from(simulation.random.bool());
+        let len = match simulation.random.u8(..) {
+            0..200 => simulation.random.usize(0..300),
+            200..250 => simulation.random.usize(0..1300),
+            _ => simulation.random.usize(0..3000),
         };
-        match world.send(from, number, len) {
+        match simulation.send(from, number, len) {
             Ok(()) => {
                 attempts[from].insert(number);
             }
             Err(fault) => assert_eq!(fault, WayFault::TooLarge, "seed {seed}"),
         }
-        for _ in 0..world.random.u8(0..4) {
-            world.step();
+        for _ in 0..simulation.random.u8(0..4) {
+            simulation.step();
         }
-        if world.random.u8(..) < 8
+        if simulation.random.u8(..) < 8
             && let Some(open) = attempts[from].last().copied()
-            && !world.concluded[from].contains_key(&AttemptId(open))
+            && !simulation.concluded[from].contains_key(&AttemptId(open))
         {
-            world.cores[from].abandon(AttemptId(open));
+            simulation.cores[from].abandon(AttemptId(open));
             attempts[from].remove(&open);
         }
     }
-    world.until_concluded(A, &attempts[A]);
-    world.until_concluded(B, &attempts[B]);
+    simulation.until_concluded(A, &attempts[A]);
+    simulation.until_concluded(B, &attempts[B]);
     let sent = attempts[A].len() + attempts[B].len();
-    let accepted = world.check(A, &attempts[A]) + world.check(B, &attempts[B]);
+    let accepted = simulation.check(A, &attempts[A]) + simulation.check(B, &attempts[B]);
     (sent, accepted)
 }
 
-/// Runs every seed, and says which one it was when something breaks.
+/// Runs every seed, and reports the seed of a failure.
 fn every_seed(test: impl Fn(u64)) {
     for seed in seeds() {
         let run = std::panic::AssertUnwindSafe(|| test(seed));
@@ -340,7 +342,7 @@ fn every_seed(test: impl Fn(u64)) {
 }
 
 #[test]
-fn in_fair_weather_everything_that_fits_is_accepted() {
+fn without_loss_every_letter_that_fits_is_accepted() {
     every_seed(|seed| {
         let (sent, accepted) = run(seed, FAIR, 0.0);
         assert!(sent - accepted <= 10, "{accepted} of {sent}");
@@ -348,108 +350,111 @@ fn in_fair_weather_everything_that_fits_is_accepted() {
 }
 
 #[test]
-fn in_bad_weather_the_promises_hold() {
+fn guarantees_hold_under_loss() {
     every_seed(|seed| {
-        let weather = Weather {
+        let conditions = LinkConditions {
             loss: [0.01, 0.1, 0.3][seed as usize % 3],
             twice: 0.1,
             delay: (100, 30_000),
             ..FAIR
         };
-        let (sent, accepted) = run(seed, weather, 0.3);
+        let (sent, accepted) = run(seed, conditions, 0.3);
         assert!(accepted * 10 > sent * 8, "{accepted} of {sent}");
     });
 }
 
 #[test]
-fn over_any_path_the_promises_hold() {
+fn guarantees_hold_over_any_path() {
     every_seed(|seed| {
         let mut random = fastrand::Rng::with_seed(seed);
         let interface = random.usize(BASE..70_000);
-        let weather = Weather {
+        let conditions = LinkConditions {
             loss: 0.02,
             path: random.usize(BASE..=interface),
             interface,
             delay: (50, random.u64(60..50_000)),
             twice: 0.02,
         };
-        run(seed, weather, 0.1);
+        run(seed, conditions, 0.1);
     });
 }
 
 #[test]
-fn a_peer_that_vanishes_is_noticed_and_nothing_is_claimed() {
+fn a_vanished_peer_is_detected_and_no_letter_counts_as_accepted() {
     every_seed(|seed| {
-        let mut world = World::new(seed, FAIR, &UdpLimits::default());
+        let mut simulation = Simulation::new(seed, FAIR, &UdpLimits::default());
         let mut attempts = BTreeSet::new();
         for number in 0..40 {
             if number == 20 {
-                world.cut = true;
-                world.wire.clear();
+                simulation.cut = true;
+                simulation.wire.clear();
             }
-            if world.send(A, number, 100).is_ok() {
+            if simulation.send(A, number, 100).is_ok() {
                 attempts.insert(number);
             }
-            world.step();
+            simulation.step();
         }
-        let cut = world.now;
-        world.until_concluded(A, &attempts);
-        let accepted = world.check(A, &attempts);
+        let cut = simulation.now;
+        simulation.until_concluded(A, &attempts);
+        let accepted = simulation.check(A, &attempts);
         assert!(accepted < attempts.len());
-        assert!(world.now < cut + Duration::from_secs(5), "noticed too late");
-        // What comes next begins anew, and fails while nobody is there.
-        world.send(A, 100, 1).unwrap();
-        while !world.concluded[A].contains_key(&AttemptId(100)) {
-            assert!(world.step());
+        assert!(
+            simulation.now < cut + Duration::from_secs(5),
+            "noticed too late"
+        );
+        // Later letters open a new connection, which fails while the peer is absent.
+        simulation.send(A, 100, 1).unwrap();
+        while !simulation.concluded[A].contains_key(&AttemptId(100)) {
+            assert!(simulation.step());
         }
         assert!(matches!(
-            &world.concluded[A][&AttemptId(100)][0],
+            &simulation.concluded[A][&AttemptId(100)][0],
             Conclusion::NotSent(error) if error.fault == WayFault::Unreachable
         ));
-        world.cut = false;
-        world.send(A, 101, 1).unwrap();
-        while !world.concluded[A].contains_key(&AttemptId(101)) {
-            assert!(world.step());
+        simulation.cut = false;
+        simulation.send(A, 101, 1).unwrap();
+        while !simulation.concluded[A].contains_key(&AttemptId(101)) {
+            assert!(simulation.step());
         }
         let accepted = Conclusion::Answered(Answer::Accepted);
-        assert_eq!(world.concluded[A][&AttemptId(101)], [accepted]);
+        assert_eq!(simulation.concluded[A][&AttemptId(101)], [accepted]);
     });
 }
 
 #[test]
-fn a_peer_that_restarted_says_so() {
+fn a_restarted_peer_reports_the_unknown_connection() {
     let limits = UdpLimits::default();
-    let mut world = World::new(1, FAIR, &limits);
-    world.send(A, 1, 10).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1]));
-    world.cores[B] = core(B, 2, &limits, world.now);
-    let restarted = world.now;
-    world.send(A, 2, 10).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1, 2]));
+    let mut simulation = Simulation::new(1, FAIR, &limits);
+    simulation.send(A, 1, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1]));
+    simulation.cores[B] = core(B, 2, &limits, simulation.now);
+    let restarted = simulation.now;
+    simulation.send(A, 2, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1, 2]));
     assert!(matches!(
-        &world.concluded[A][&AttemptId(2)][0],
+        &simulation.concluded[A][&AttemptId(2)][0],
         Conclusion::Unconfirmed(error) if error.fault == WayFault::Broken
     ));
-    assert!(world.now < restarted + Duration::from_millis(50));
-    world.send(A, 3, 10).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1, 2, 3]));
-    assert_eq!(world.check(A, &BTreeSet::from([1, 3])), 1 + 1);
+    assert!(simulation.now < restarted + Duration::from_millis(50));
+    simulation.send(A, 3, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1, 2, 3]));
+    assert_eq!(simulation.check(A, &BTreeSet::from([1, 3])), 1 + 1);
 }
 
 #[test]
-fn what_is_idle_is_forgotten_at_both_sides() {
-    let mut world = World::new(1, FAIR, &UdpLimits::default());
-    world.send(A, 1, 10).unwrap();
-    while world.step() {}
-    assert_eq!(world.check(A, &BTreeSet::from([1])), 1);
-    for core in &world.cores {
+fn idle_connections_are_removed_on_both_sides() {
+    let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
+    simulation.send(A, 1, 10).unwrap();
+    while simulation.step() {}
+    assert_eq!(simulation.check(A, &BTreeSet::from([1])), 1);
+    for core in &simulation.cores {
         assert_eq!(core.counters().connections, 0);
     }
 }
 
 #[test]
-fn strangers_leave_nothing_behind_and_get_less_than_they_sent() {
-    let mut world = World::new(1, FAIR, &UdpLimits::default());
+fn unproved_peers_leave_no_state_and_get_fewer_bytes_than_they_sent() {
+    let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
     let hello = crate::hello::Hello {
         identity: Identity {
             name: "x".into(),
@@ -468,74 +473,74 @@ fn strangers_leave_nothing_behind_and_get_less_than_they_sent() {
     for n in 1..2000_u32 {
         let cookie = if n % 2 == 0 { NO_COOKIE } else { [n as u8; 16] };
         let first = packet::hello(n.into(), &cookie, &hello);
-        world.receive(B, spoofed(n), &first);
+        simulation.receive(B, spoofed(n), &first);
         let mut data = Vec::new();
         packet::put_data(&mut data, n.into(), 1);
         packet::put_ping(&mut data);
-        world.receive(B, spoofed(n), &data);
-        while let Some(reply) = world.cores[B].poll_transmit(world.now) {
+        simulation.receive(B, spoofed(n), &data);
+        while let Some(reply) = simulation.cores[B].poll_transmit(simulation.now) {
             assert_eq!(reply.path.remote, spoofed(n));
             assert!(reply.contents.len() <= data.len().max(first.len() / 30));
             told += 1;
         }
     }
     assert_eq!(told, 2 * 1999);
-    assert_eq!(world.cores[B].counters().accepted, 0);
-    assert_eq!(world.cores[B].poll_timeout(), None);
+    assert_eq!(simulation.cores[B].counters().accepted, 0);
+    assert_eq!(simulation.cores[B].poll_timeout(), None);
 }
 
 #[test]
 fn replayed_and_forged_datagrams_change_nothing() {
-    let mut world = World::new(1, FAIR, &UdpLimits::default());
+    let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
     let mut recorded: Vec<(SocketAddr, Vec<u8>)> = Vec::new();
     for number in 0..20 {
-        world.send(A, number, 50).unwrap();
-        while !world.concluded[A].contains_key(&AttemptId(number)) {
+        simulation.send(A, number, 50).unwrap();
+        while !simulation.concluded[A].contains_key(&AttemptId(number)) {
             recorded.extend(
-                world
+                simulation
                     .wire
                     .values()
                     .filter(|(to, ..)| *to == B)
                     .map(|(_, from, bytes)| (*from, bytes.clone())),
             );
-            world.step();
+            simulation.step();
         }
     }
     let stranger: SocketAddr = "203.0.113.9:7788".parse().unwrap();
     for (from, bytes) in recorded.clone() {
-        // Again from the same address, from another, and with a connection that does not exist.
-        world.receive(B, from, &bytes);
-        world.receive(B, stranger, &bytes);
+        // Again from the same address, from another, and with an unknown connection.
+        simulation.receive(B, from, &bytes);
+        simulation.receive(B, stranger, &bytes);
         let mut forged = bytes.clone();
         forged[8] ^= 1;
-        world.receive(B, from, &forged);
-        world.flush();
+        simulation.receive(B, from, &forged);
+        simulation.flush();
     }
-    assert_eq!(world.arrived[B].len(), 20);
-    assert_eq!(world.cores[B].counters().connections, 1);
-    world.send(A, 100, 10).unwrap();
-    while !world.concluded[A].contains_key(&AttemptId(100)) {
-        assert!(world.step());
+    assert_eq!(simulation.arrived[B].len(), 20);
+    assert_eq!(simulation.cores[B].counters().connections, 1);
+    simulation.send(A, 100, 10).unwrap();
+    while !simulation.concluded[A].contains_key(&AttemptId(100)) {
+        assert!(simulation.step());
     }
-    assert_eq!(world.arrived[B].len(), 21);
-    // Somebody who has not seen the number of the connection cannot end it.
+    assert_eq!(simulation.arrived[B].len(), 21);
+    // An attacker that does not know the number of the connection cannot end it.
     let unknown = packet::unknown(12345);
-    world.receive(A, address(B), &unknown);
+    simulation.receive(A, address(B), &unknown);
     assert!(matches!(
         Datagram::read(&unknown),
         Some(Datagram::Unknown { .. })
     ));
-    assert_eq!(world.cores[A].counters().connections, 1);
+    assert_eq!(simulation.cores[A].counters().connections, 1);
 }
 
 #[test]
-fn one_address_opens_so_many_connections_and_no_more() {
+fn connections_of_one_address_are_bounded() {
     let limits = UdpLimits {
         max_connections: 16,
         max_per_address: 3,
         ..UdpLimits::default()
     };
-    let mut world = World::new(1, FAIR, &limits);
+    let mut simulation = Simulation::new(1, FAIR, &limits);
     for n in 0..30_u64 {
         let hello = crate::hello::Hello {
             identity: Identity {
@@ -552,87 +557,87 @@ fn one_address_opens_so_many_connections_and_no_more() {
         };
         let from = match n {
             0..10 => "198.51.100.7".to_owned(),
-            // A host of IPv6 takes as many addresses as it likes.
+            // A host of IPv6 can use any number of addresses.
             10..20 => format!("[2001:db8::{n}]"),
-            // All of loopback has half of all places.
+            // All loopback addresses together have half of all slots.
             _ => format!("127.0.0.{n}"),
         };
         let from: SocketAddr = format!("{from}:{}", 1000 + n).parse().unwrap();
-        world.receive(B, from, &packet::hello(n + 1, &NO_COOKIE, &hello));
-        let reply = world.cores[B].poll_transmit(world.now).unwrap();
+        simulation.receive(B, from, &packet::hello(n + 1, &NO_COOKIE, &hello));
+        let reply = simulation.cores[B].poll_transmit(simulation.now).unwrap();
         let Some(Datagram::Cookie { cookie, .. }) = Datagram::read(&reply.contents) else {
             panic!("no cookie");
         };
-        world.receive(B, from, &packet::hello(n + 1, &cookie, &hello));
-        while world.cores[B].poll_transmit(world.now).is_some() {}
+        simulation.receive(B, from, &packet::hello(n + 1, &cookie, &hello));
+        while simulation.cores[B].poll_transmit(simulation.now).is_some() {}
     }
-    let counters = world.cores[B].counters();
+    let counters = simulation.cores[B].counters();
     assert_eq!(
         (counters.accepted, counters.refused_crowd),
         (3 + 3 + 8, 7 + 7 + 2)
     );
-    // They never said anything more, and are forgotten.
-    while world.step() {}
-    assert_eq!(world.cores[B].counters().connections, 0);
+    // Unused connections are removed.
+    while simulation.step() {}
+    assert_eq!(simulation.cores[B].counters().connections, 0);
 }
 
 #[test]
-fn a_peer_that_sends_more_than_it_may_is_held_back_and_loses_nothing() {
+fn a_peer_beyond_its_rate_limit_is_delayed_without_loss() {
     let limits = UdpLimits {
         peer_letters: 20,
         ..UdpLimits::default()
     };
-    let mut world = World::new(1, FAIR, &limits);
-    let begun = world.now;
+    let mut simulation = Simulation::new(1, FAIR, &limits);
+    let begun = simulation.now;
     let attempts: BTreeSet<u64> = (0..100).collect();
     for number in &attempts {
-        world.send(A, *number, 10).unwrap();
+        simulation.send(A, *number, 10).unwrap();
     }
-    world.until_concluded(A, &attempts);
-    assert_eq!(world.check(A, &attempts), attempts.len());
-    assert!(world.now - begun >= Duration::from_secs(3), "too fast");
-    let counters = world.cores[B].counters();
+    simulation.until_concluded(A, &attempts);
+    assert_eq!(simulation.check(A, &attempts), attempts.len());
+    assert!(simulation.now - begun >= Duration::from_secs(3), "too fast");
+    let counters = simulation.cores[B].counters();
     assert!(counters.held_back > 0);
     assert_eq!((counters.accepted, counters.connections), (1, 1));
 }
 
 #[test]
-fn an_interface_that_takes_less_than_every_path_carries_ends_the_connection() {
-    let mut world = World::new(1, FAIR, &UdpLimits::default());
-    world.send(A, 1, 500).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1]));
-    // Packets leave by another interface from now on.
-    world.weather.interface = 1000;
+fn an_interface_below_the_minimum_mtu_ends_the_connection() {
+    let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
+    simulation.send(A, 1, 500).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1]));
+    // Packets now leave by another interface.
+    simulation.conditions.interface = 1000;
     let attempts = BTreeSet::from([1, 2, 3]);
-    world.send(A, 2, 500).unwrap();
-    world.send(A, 3, 1000).unwrap();
-    world.until_concluded(A, &attempts);
-    world.check(A, &attempts);
-    let [Conclusion::Unconfirmed(error)] = &world.concluded[A][&AttemptId(3)][..] else {
-        panic!("{:?}", world.concluded[A]);
+    simulation.send(A, 2, 500).unwrap();
+    simulation.send(A, 3, 1000).unwrap();
+    simulation.until_concluded(A, &attempts);
+    simulation.check(A, &attempts);
+    let [Conclusion::Unconfirmed(error)] = &simulation.concluded[A][&AttemptId(3)][..] else {
+        panic!("{:?}", simulation.concluded[A]);
     };
     assert_eq!(error.fault, WayFault::Broken);
     assert!(error.detail.contains("1200"), "{error}");
 }
 
-/// A peer that says to be another one.
-struct Stranger {
+/// A peer that claims to be another one.
+struct UnprovedSlot {
     from: SocketAddr,
     hello: crate::hello::Hello,
     cookie: packet::Cookie,
 }
 
-impl Stranger {
+impl UnprovedSlot {
     /// A peer with the identity of B gets a cookie from A.
-    fn as_b(world: &mut World, from: &str, dialled: &str) -> Self {
+    fn as_b(simulation: &mut Simulation, from: &str, dialled: &str) -> Self {
         let hello = crate::hello::Hello {
             serial: 1 << 60,
             dialled: dialled.into(),
-            ..world.cores[B].own_hello(0, String::new())
+            ..simulation.cores[B].own_hello(0, String::new())
         };
         let from: SocketAddr = from.parse().unwrap();
-        world.receive(A, from, &packet::hello(99, &NO_COOKIE, &hello));
-        let reply = world.cores[A].poll_transmit(world.now).unwrap();
+        simulation.receive(A, from, &packet::hello(99, &NO_COOKIE, &hello));
+        let reply = simulation.cores[A].poll_transmit(simulation.now).unwrap();
         let Some(Datagram::Cookie { cookie, .. }) = Datagram::read(&reply.contents) else {
             panic!("no cookie");
         };
@@ -643,23 +648,23 @@ impl Stranger {
         }
     }
 
-    /// Says hello every 100 ms for this time. What A sends it goes nowhere.
-    fn greets(&self, world: &mut World, time: Duration) {
-        let end = world.now + time;
-        while world.now < end {
+    /// Sends a hello every 100 ms for this time. Datagrams of A to it are dropped.
+    fn greets(&self, simulation: &mut Simulation, time: Duration) {
+        let end = simulation.now + time;
+        while simulation.now < end {
             let hello = packet::hello(99, &self.cookie, &self.hello);
-            world.receive(A, self.from, &hello);
-            world.flush();
-            let next = world.now + Duration::from_millis(100);
-            while world.next().is_some_and(|due| due <= next) {
-                world.step();
+            simulation.receive(A, self.from, &hello);
+            simulation.flush();
+            let next = simulation.now + Duration::from_millis(100);
+            while simulation.next().is_some_and(|due| due <= next) {
+                simulation.step();
             }
-            world.now = next;
+            simulation.now = next;
         }
     }
 }
 
-/// Nothing but what the tests are about ends a connection.
+/// Limits with which no timeout ends a connection.
 fn patient() -> UdpLimits {
     UdpLimits {
         connect_timeout: Duration::from_secs(1000),
@@ -669,23 +674,23 @@ fn patient() -> UdpLimits {
 }
 
 #[test]
-fn a_stranger_elsewhere_is_served_when_the_service_gives_no_sign_of_life() {
+fn an_unproved_peer_elsewhere_is_admitted_when_the_service_does_not_respond() {
     for gone in [false, true] {
-        let mut world = World::new(1, FAIR, &patient());
-        world.send(A, 1, 10).unwrap();
-        world.until_concluded(A, &BTreeSet::from([1]));
-        let before = world.cores[A].counters();
+        let mut simulation = Simulation::new(1, FAIR, &patient());
+        simulation.send(A, 1, 10).unwrap();
+        simulation.until_concluded(A, &BTreeSet::from([1]));
+        let before = simulation.cores[A].counters();
         assert_eq!(before.connections, 1);
-        world.cut = gone;
-        let stranger = Stranger::as_b(&mut world, "192.0.2.99:7788", "x");
-        stranger.greets(&mut world, Duration::from_millis(900));
+        simulation.cut = gone;
+        let stranger = UnprovedSlot::as_b(&mut simulation, "192.0.2.99:7788", "x");
+        stranger.greets(&mut simulation, Duration::from_millis(900));
         assert_eq!(
-            world.cores[A].counters().accepted,
+            simulation.cores[A].counters().accepted,
             before.accepted,
             "{gone}"
         );
-        stranger.greets(&mut world, Duration::from_millis(900));
-        let after = world.cores[A].counters();
+        stranger.greets(&mut simulation, Duration::from_millis(900));
+        let after = simulation.cores[A].counters();
         assert_eq!(after.connections, 1);
         assert_eq!(after.accepted - before.accepted, u64::from(gone));
         assert_eq!(after.refused_unproved > 0, !gone);
@@ -693,92 +698,95 @@ fn a_stranger_elsewhere_is_served_when_the_service_gives_no_sign_of_life() {
 }
 
 #[test]
-fn a_stranger_at_the_address_of_the_service_is_served_when_that_gives_no_sign_of_life() {
+fn an_unproved_peer_at_the_service_address_is_admitted_when_the_service_does_not_respond() {
     for gone in [false, true] {
-        let mut world = World::new(1, FAIR, &patient());
-        world.send(B, 1, 10).unwrap();
-        let hello = world
-            .wire
-            .values()
-            .find_map(|(_, _, bytes)| match Datagram::read(bytes) {
-                Some(Datagram::Hello { hello, .. }) => crate::hello::Hello::decode(hello),
-                _ => None,
-            });
+        let mut simulation = Simulation::new(1, FAIR, &patient());
+        simulation.send(B, 1, 10).unwrap();
+        let hello =
+            simulation
+                .wire
+                .values()
+                .find_map(|(_, _, bytes)| match Datagram::read(bytes) {
+                    Some(Datagram::Hello { hello, .. }) => crate::hello::Hello::decode(hello),
+                    _ => None,
+                });
         let dialled = hello.unwrap().dialled;
-        world.until_concluded(B, &BTreeSet::from([1]));
-        assert_eq!(world.cores[A].counters().accepted, 1);
-        world.cut = gone;
-        let stranger = Stranger::as_b(&mut world, "192.0.2.2:99", &dialled);
-        stranger.greets(&mut world, Duration::from_secs(2));
-        let after = world.cores[A].counters();
+        simulation.until_concluded(B, &BTreeSet::from([1]));
+        assert_eq!(simulation.cores[A].counters().accepted, 1);
+        simulation.cut = gone;
+        let stranger = UnprovedSlot::as_b(&mut simulation, "192.0.2.2:99", &dialled);
+        stranger.greets(&mut simulation, Duration::from_secs(2));
+        let after = simulation.cores[A].counters();
         assert_eq!(
             (after.connections, after.accepted),
             (1, 1 + u64::from(gone))
         );
         // The letters of the service still arrive.
         if !gone {
-            world.send(B, 2, 10).unwrap();
-            world.until_concluded(B, &BTreeSet::from([1, 2]));
-            assert_eq!(world.check(B, &BTreeSet::from([1, 2])), 2);
+            simulation.send(B, 2, 10).unwrap();
+            simulation.until_concluded(B, &BTreeSet::from([1, 2]));
+            assert_eq!(simulation.check(B, &BTreeSet::from([1, 2])), 2);
         }
     }
 }
 
 #[test]
-fn a_service_is_served_at_once_at_each_address_that_its_first_connection_lists() {
-    let mut world = World::new(1, FAIR, &patient());
+fn a_service_is_admitted_at_once_at_each_listed_address() {
+    let mut simulation = Simulation::new(1, FAIR, &patient());
     let other = "192.0.2.99:7788";
-    world.cores[B].listens_on(vec![address(B).to_string(), other.to_owned()]);
-    world.send(A, 1, 10).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1]));
-    let begun = world.now;
-    let second = Stranger::as_b(&mut world, other, "x");
-    second.greets(&mut world, Duration::from_millis(100));
-    assert_eq!(world.cores[A].counters().connections, 2);
-    // When it has moved there, the first connection ends.
-    world.cut = true;
-    let third = Stranger::as_b(&mut world, other, "y");
-    third.greets(&mut world, UdpLimits::default().silence);
+    simulation.cores[B].listens_on(vec![address(B).to_string(), other.to_owned()]);
+    simulation.send(A, 1, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1]));
+    let begun = simulation.now;
+    let second = UnprovedSlot::as_b(&mut simulation, other, "x");
+    second.greets(&mut simulation, Duration::from_millis(100));
+    assert_eq!(simulation.cores[A].counters().connections, 2);
+    // When the service has moved there, the first connection ends.
+    simulation.cut = true;
+    let third = UnprovedSlot::as_b(&mut simulation, other, "y");
+    third.greets(&mut simulation, UdpLimits::default().silence);
     assert_eq!(
-        world.cores[A].counters().connections,
+        simulation.cores[A].counters().connections,
         2,
         "{:?}",
-        world.now - begun
+        simulation.now - begun
     );
 }
 
 #[test]
-fn a_peer_that_is_looked_for_elsewhere_is_asked_where_it_was() {
+fn a_peer_used_at_another_location_is_pinged_at_the_old_one() {
     let limits = UdpLimits {
         idle_close: Duration::from_secs(1000),
         ..UdpLimits::default()
     };
-    let mut world = World::new(1, FAIR, &limits);
-    world.send(A, 1, 10).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1]));
-    world.cut = true;
-    let begun = world.now;
-    world.now += limits.silence / 4;
-    let peer = world.cores[B].own_hello(0, String::new()).identity;
+    let mut simulation = Simulation::new(1, FAIR, &limits);
+    simulation.send(A, 1, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1]));
+    simulation.cut = true;
+    let begun = simulation.now;
+    simulation.now += limits.silence / 4;
+    let peer = simulation.cores[B].own_hello(0, String::new()).identity;
     let elsewhere = Location::new(Kind::Udp, "192.0.2.99:7788").unwrap();
     let elsewhere = elsewhere.with_incarnation(peer.incarnation);
-    let fresh = world.cores[A].dispatch(world.now, AttemptId(2), &elsewhere, &parcel(2, 10));
-    assert_eq!(fresh.unwrap(), None, "by the connection that is there");
-    world.flush();
-    world.until_concluded(A, &BTreeSet::from([1, 2]));
-    assert!(world.now - begun <= limits.silence / 2);
-    let fresh = world.cores[A].dispatch(world.now, AttemptId(3), &elsewhere, &parcel(3, 10));
-    assert!(fresh.unwrap().is_some(), "by another one");
+    let fresh =
+        simulation.cores[A].dispatch(simulation.now, AttemptId(2), &elsewhere, &parcel(2, 10));
+    assert_eq!(fresh.unwrap(), None, "over the existing connection");
+    simulation.flush();
+    simulation.until_concluded(A, &BTreeSet::from([1, 2]));
+    assert!(simulation.now - begun <= limits.silence / 2);
+    let fresh =
+        simulation.cores[A].dispatch(simulation.now, AttemptId(3), &elsewhere, &parcel(3, 10));
+    assert!(fresh.unwrap().is_some(), "over another connection");
 }
 
 #[test]
-fn connections_of_an_address_that_is_gone_end() {
-    let mut world = World::new(1, FAIR, &UdpLimits::default());
-    world.send(A, 1, 10).unwrap();
-    world.until_concluded(A, &BTreeSet::from([1]));
+fn connections_of_a_removed_address_end() {
+    let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
+    simulation.send(A, 1, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([1]));
     let lost = HashSet::from([address(A).ip()]);
-    world.cores[A].lost(&lost, |_| Some(address(B).ip()));
-    assert_eq!(world.cores[A].counters().connections, 1);
-    world.cores[A].lost(&lost, |_| Some(address(A).ip()));
-    assert_eq!(world.cores[A].counters().connections, 0);
+    simulation.cores[A].lost(&lost, |_| Some(address(B).ip()));
+    assert_eq!(simulation.cores[A].counters().connections, 1);
+    simulation.cores[A].lost(&lost, |_| Some(address(A).ip()));
+    assert_eq!(simulation.cores[A].counters().connections, 0);
 }

@@ -10,39 +10,40 @@ use tokio::net::UdpSocket;
 
 use super::connection::Path;
 
-/// Room for what arrives while nobody reads; the system may allow less.
+/// Size of the receive buffer in bytes; the system may allow less.
 const BUFFER: usize = 4 << 20;
 
-/// Datagrams, or runs of them, fetched in one call.
+/// Maximum number of datagrams, or runs of datagrams, received in one call.
 const BATCH: usize = 8;
 
-/// Bytes of one of them.
+/// Size of the buffer of each.
 const LARGEST: usize = 1 << 16;
 
 pub(crate) struct Socket {
     pub(crate) number: u32,
-    /// The connection it has been opened for; without one, strangers are heard.
+    /// The connection that the socket was opened for. A socket without one accepts datagrams of
+    /// unproved peers.
     pub(crate) owner: Option<u32>,
     io: UdpSocket,
     state: UdpSocketState,
 }
 
-/// What sending a datagram came to.
+/// The result of sending a datagram.
 pub(crate) enum Sent {
-    /// It left, or might as well have been lost on the way.
+    /// Sent, or dropped in a way that is equivalent to a loss in the network.
     Perhaps,
     TooBig,
     Broken(io::Error),
 }
 
 impl Socket {
-    /// A socket that listens. To be called in the context of the runtime.
+    /// Opens a listening socket. Must be called within a runtime.
     pub(crate) fn listen(number: u32, address: SocketAddr) -> io::Result<Self> {
         Self::open(number, None, address, |socket| socket.bind(&address.into()))
     }
 
-    /// A socket for the connection to one peer: of this one alone the operating system then says
-    /// that nobody is there. To be called in the context of the runtime.
+    /// Opens a socket for the connection to one peer. Only for a connected socket the operating
+    /// system reports that the peer is unreachable. Must be called within a runtime.
     pub(crate) fn connect(number: u32, owner: u32, remote: SocketAddr) -> io::Result<Self> {
         let any: SocketAddr = if remote.is_ipv4() {
             (Ipv4Addr::UNSPECIFIED, 0).into()
@@ -85,7 +86,7 @@ impl Socket {
         self.io.local_addr()
     }
 
-    /// Whom it is connected to.
+    /// Returns the address of the connected peer.
     pub(crate) fn peer(&self) -> io::Result<SocketAddr> {
         self.io.peer_addr()
     }
@@ -98,7 +99,7 @@ impl Socket {
             segment_size: None,
             src_ip: path.local,
         };
-        // Past the runtime, which knows a new socket as writable only after a while.
+        // Bypasses the runtime, which learns that a new socket is writable only after a while.
         let Err(error) = self.state.try_send((&self.io).into(), &transmit) else {
             return Sent::Perhaps;
         };
@@ -106,7 +107,8 @@ impl Socket {
             return Sent::TooBig;
         }
         match error.kind() {
-            // The system's buffers are full, or a filter dropped it: that is what networks do.
+            // The buffers of the system are full, or a filter dropped the datagram: equivalent to a
+            // loss in the network.
             io::ErrorKind::WouldBlock
             | io::ErrorKind::PermissionDenied
             | io::ErrorKind::OutOfMemory
@@ -126,8 +128,8 @@ impl Socket {
         })
     }
 
-    /// Fetches what has arrived, after it was [ready](Self::readable), and tells of each datagram and where it came from. Says how many
-    /// there were; none when there is nothing now.
+    /// Receives datagrams after [`readable`](Self::readable), and calls `tell` with each datagram
+    /// and its path. Returns their number; 0 when there are none now.
     pub(crate) fn receive(
         &self,
         readiness: Interest,
@@ -165,10 +167,10 @@ impl Socket {
     }
 }
 
-/// No buffer space available: `std` has no name for it.
+/// No buffer space available; `std` has no constant for it.
 const ENOBUFS: i32 = 105;
 
-/// What datagrams are received into.
+/// Receive buffers.
 pub(crate) struct Buffers(Vec<Vec<u8>>);
 
 impl Buffers {

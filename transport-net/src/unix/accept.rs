@@ -1,4 +1,4 @@
-//! The listening side: accepting connections of this user.
+//! The listening side: accepts connections of this user.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -7,10 +7,10 @@ use bytes::BytesMut;
 use tokio::net::{UnixListener, UnixStream};
 
 use super::directory::peer;
-use crate::seldom::warn_seldom;
-use crate::stream::endpoint::{Endpoint, Stranger};
+use crate::log_limit::warn_limited;
+use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
-use crate::stream::link::Running;
+use crate::stream::link::LinkTask;
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire;
@@ -32,26 +32,26 @@ fn serve(endpoint: &Arc<Endpoint>, stream: UnixStream) {
         Err(error) => {
             let counter = &endpoint.tally().refused_unproved;
             let before = counter.fetch_add(1, Ordering::Relaxed);
-            warn_seldom(before, format_args!("connection refused: {error}"));
+            warn_limited(before, format_args!("connection refused: {error}"));
             return;
         }
     };
-    let Some(place) = endpoint.receive_stranger(from) else {
+    let Some(slot) = endpoint.admit_unproved(from) else {
         return;
     };
-    let number = place.number;
-    let task = tokio::spawn(receive(endpoint.clone(), place, stream, from)).abort_handle();
-    endpoint.stranger_started(number, task);
+    let number = slot.number;
+    let task = tokio::spawn(receive(endpoint.clone(), slot, stream, from)).abort_handle();
+    endpoint.unproved_started(number, task);
 }
 
-async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: UnixStream, from: Source) {
+async fn receive(endpoint: Arc<Endpoint>, slot: UnprovedSlot, stream: UnixStream, from: Source) {
     let Some((link, sink)) = endpoint.accepted() else {
         return;
     };
     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
-    Running::new(endpoint, link, sink, None)
+    LinkTask::new(endpoint, link, sink, None)
         .serve(wire::unix(stream), Proof::default(), reader, from, || {
-            drop(place);
+            drop(slot);
         })
         .await;
 }

@@ -1,4 +1,4 @@
-//! The calling side: opening a connection to a location.
+//! The dialling side: opens a connection to a location.
 
 use std::io;
 use std::sync::Arc;
@@ -10,15 +10,15 @@ use tokio::net::UnixStream;
 use tokio::time::timeout;
 
 use super::directory::Directory;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::stream::endpoint::Endpoint;
 use crate::stream::frame::FrameReader;
-use crate::stream::link::{Link, Running};
+use crate::stream::link::{Link, LinkTask};
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire;
 
-/// Opens the connection of a link that has been made up, and serves it.
+/// Opens the connection of a new link, and serves it.
 pub(super) async fn dial(
     endpoint: Arc<Endpoint>,
     directory: Option<Arc<Directory>>,
@@ -27,9 +27,9 @@ pub(super) async fn dial(
     to: Location,
 ) {
     let limits = endpoint.limits().clone();
-    let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
+    let running = LinkTask::new(endpoint, link.clone(), sink, Some(to.clone()));
     let Some(directory) = directory else {
-        return running.fail(End::Closed);
+        return running.fail(ConnectionEnd::Closed);
     };
     let connected = tokio::select! {
         connected = connect(&directory, to.address(), limits.connect_timeout) => connected,
@@ -37,7 +37,7 @@ pub(super) async fn dial(
     };
     let (stream, number) = match connected {
         Ok(connected) => connected,
-        Err(error) => return running.fail(End::unreachable(&to, &error)),
+        Err(error) => return running.fail(ConnectionEnd::unreachable(&to, &error)),
     };
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
@@ -56,7 +56,7 @@ async fn connect(
         Ok(connected) => connected,
         Err(_) => Err(io::Error::new(
             io::ErrorKind::TimedOut,
-            format!("no connection within {patience:?} (connect_timeout)"),
+            format!("timed out connecting after {patience:?} (connect_timeout)"),
         )),
     }
 }

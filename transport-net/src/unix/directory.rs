@@ -23,7 +23,7 @@ use rustix::net::{
 use tokio::net::UnixStream;
 use tokio::time::sleep;
 
-/// Connections that wait to be accepted.
+/// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 1024;
 
 /// Time before a socket whose backlog is full is tried again.
@@ -32,31 +32,31 @@ const RETRY_AFTER: Duration = Duration::from_millis(2);
 /// Time to wait for the lock of the directory, which is held for some milliseconds at most.
 const LOCKING: Duration = Duration::from_secs(1);
 
-/// Why the sockets of a domain cannot be used.
+/// The reason for which the sockets of a domain cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum UnixError {
-    /// The operating system refuses something.
+    /// An operation of the operating system failed.
     #[error("cannot {what} {}: {source}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation, as a verb for the error text.
         what: &'static str,
         /// The directory of the sockets.
         path: PathBuf,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// Another user could use what is in the directory.
-    #[error("{} must be a directory that only this user may enter, and {why}", path.display())]
+    /// The directory is not private to this user.
+    #[error("{} must be a directory that only this user may enter, but {why}", path.display())]
     NotPrivate {
         /// The directory of the sockets.
         path: PathBuf,
-        /// What is wrong.
+        /// The violated requirement.
         why: String,
     },
 }
 
-/// A file, however it is called.
+/// The identity of a file, independent of its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct FileId {
     device: u64,
@@ -79,11 +79,11 @@ pub(super) struct Directory {
     dir: OwnedFd,
 }
 
-/// The lock of the directory, until this is dropped.
+/// The lock of the directory. Dropping it unlocks the directory.
 struct Locked(#[expect(dead_code, reason = "closing it unlocks")] OwnedFd);
 
 impl Directory {
-    /// Opens the directory, and makes it if need be.
+    /// Opens the directory, and creates it if it is missing.
     pub(super) fn open(path: &Path) -> Result<Self, UnixError> {
         let io_error = |what, source| UnixError::Io {
             what,
@@ -94,7 +94,7 @@ impl Directory {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
                 return Err(io_error("create", error));
             }
-            // What exists, perhaps as something else, is checked next.
+            // An existing entry is checked next.
             _ => {}
         }
         let refused = |why: String| UnixError::NotPrivate {
@@ -122,7 +122,7 @@ impl Directory {
         })
     }
 
-    /// The error of this directory for a failure of the system.
+    /// Returns the error of an operation on this directory.
     pub(super) fn failed(&self, what: &'static str, source: io::Error) -> UnixError {
         UnixError::Io {
             what,
@@ -131,12 +131,12 @@ impl Directory {
         }
     }
 
-    /// Makes a listening, non-blocking socket with this name that only this user may connect to.
+    /// Creates a listening, non-blocking socket with this name that only this user may connect to.
     pub(super) fn bind(&self, name: &str) -> Result<(UnixListener, FileId), UnixError> {
         let make = || {
             // The file is there a moment before the kernel finds the socket by it; a sweep must not
-            // come in between. Without the lock, because a process that sweeps was stopped, the
-            // worst is that the file is removed, and made again.
+            // come in between. Without the lock, because a sweeping process was stopped, the file
+            // may at worst be removed, and is then created again.
             let _lock = self.lock(FlockOperation::NonBlockingLockShared, LOCKING);
             self.remove_file(name)?;
             let socket = new_socket(SocketType::STREAM)?;
@@ -148,7 +148,7 @@ impl Directory {
             listen(&socket, BACKLOG)?;
             Ok((socket.into(), FileId::of(&stat)))
         };
-        make().map_err(|error: Errno| self.failed("make a socket in", error.into()))
+        make().map_err(|error: Errno| self.failed("create a socket in", error.into()))
     }
 
     /// Connects to the socket with this name. Returns the connection and the number of the process
@@ -158,14 +158,15 @@ impl Directory {
             let what = "not the address of a Unix domain socket (16 hexadecimal digits expected)";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
         }
-        // What is examined here is what is connected to below, whatever the name is given to.
+        // The descriptor guarantees that the examined file is the one connected to below, even if
+        // the name is reassigned.
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(&self.dir, name, flags, Mode::empty())?;
         let stat = rustix::fs::fstat(&file)?;
         if FileType::from_raw_mode(stat.st_mode) != FileType::Socket
             || stat.st_uid != rustix::process::geteuid().as_raw()
         {
-            let what = "it is not a socket of this user";
+            let what = "the file is not a socket of this user";
             return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
         }
         let address = SocketAddrUnix::new(format!("/proc/self/fd/{}", file.as_raw_fd()))?;
@@ -184,8 +185,8 @@ impl Directory {
         Ok((stream, number))
     }
 
-    /// Removes the sockets that dead processes have left, unless another process is at it, or makes
-    /// its own.
+    /// Removes the sockets of dead processes, unless another process sweeps or creates its own
+    /// socket.
     pub(super) fn sweep(&self) {
         let exclusive = FlockOperation::NonBlockingLockExclusive;
         let Some(_lock) = self.lock(exclusive, Duration::ZERO) else {
@@ -198,13 +199,13 @@ impl Directory {
             };
             if name.parse::<Incarnation>().is_ok() && self.is_dead(name) {
                 let removed = self.remove_file(name);
-                tracing::debug!(name, ?removed, "the socket of a dead process");
+                tracing::debug!(name, ?removed, "removing the socket of a dead process");
             }
         }
     }
 
     /// Whether no process has the socket with this name open. Connecting with another type of
-    /// socket tells that without reaching the process: the kernel compares the types when it has
+    /// socket tests this without reaching the process: the kernel compares the types when it has
     /// found the socket, and refuses the connection when there is none.
     fn is_dead(&self, name: &str) -> bool {
         let probe = || {
@@ -215,8 +216,8 @@ impl Directory {
         probe() == Err(Errno::CONNREFUSED)
     }
 
-    /// Whether this directory is that of its path, and has this socket. What cannot be examined
-    /// counts as there.
+    /// Whether the path still denotes this directory, and the directory has this socket. Entries
+    /// that cannot be examined count as present.
     pub(super) fn is_there(&self, name: &str, file: FileId) -> bool {
         let is = |found: rustix::io::Result<Stat>, id: Option<FileId>| match found {
             Ok(found) => id.is_none_or(|id| FileId::of(&found) == id),
@@ -244,7 +245,7 @@ impl Directory {
         }
     }
 
-    /// Locks the directory, if that is possible within this time.
+    /// Locks the directory. Returns `None` when that is not possible within `patience`.
     fn lock(&self, operation: FlockOperation, patience: Duration) -> Option<Locked> {
         // Opened again: a lock belongs to the open file, which the threads of a process share.
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
@@ -263,17 +264,19 @@ impl Directory {
     }
 }
 
-/// The number of the process at the other end, which is 0 when it is in another PID namespace.
+/// Returns the process number of the peer, which is 0 when it is in another PID namespace.
 ///
 /// # Errors
-/// When it belongs to another user, or the system does not tell.
+/// When the peer belongs to another user, or the system does not report it.
 pub(super) fn peer(stream: &UnixStream) -> io::Result<i32> {
     let peer = stream.peer_cred()?;
     let own = rustix::process::geteuid().as_raw();
     let number = peer.pid().unwrap_or_default();
     if peer.uid() != own {
         let user = peer.uid();
-        let what = format!("process {number} belongs to user {user}, and this one to user {own}");
+        let what = format!(
+            "process {number} belongs to user {user}, but this process belongs to user {own}"
+        );
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
     }
     Ok(number)

@@ -1,10 +1,11 @@
-//! Letters between the processes of one domain on one host, over Unix domain sockets.
+//! Letters over Unix domain sockets, between the processes of one domain on one host.
 //!
-//! Frames, hello, limits and the account of parcels are those of [`crate::stream`]; here is what
-//! differs: where sockets are, how connections are made, and how the kernel proves the peer's user.
+//! Frames, hello, limits and the states of parcels are those of [`crate::stream`]. This module
+//! contains the differences: the socket files, the opening of connections, and the proof of the
+//! peer's user by the kernel.
 //!
 //! * [`directory`]: the socket files of a domain.
-//! * [`accept`] and [`dial`] make connections.
+//! * [`accept`] and [`dial`] open connections.
 
 mod accept;
 mod dial;
@@ -33,11 +34,12 @@ use crate::stream::config::{Limits, StreamConfig};
 use crate::stream::counters::Counters;
 use crate::stream::endpoint::Endpoint;
 
-/// Time between the end of a process and the look for its socket, in which the kernel closes it, and
-/// further processes may end.
+/// Delay of the sweep after a process has ended, in which the kernel closes its socket and further
+/// processes may end.
 const TIDY_AFTER: Duration = Duration::from_millis(100);
 
-/// How often the directory is opened again when a process that leaves has just removed it.
+/// Maximum number of times that the directory is opened again after an ending process has just
+/// removed it.
 const RETRIES: u32 = 20;
 
 /// Configuration of a [`UnixTransport`].
@@ -46,9 +48,9 @@ pub struct UnixConfig {
     /// The directory of the domain's sockets, private to this user. Created when it is missing, in
     /// a directory that exists. Its path may be longer than the address of a socket.
     pub directory: PathBuf,
-    /// How this endpoint introduces itself. Its socket is named after the incarnation.
+    /// Identity of this endpoint. Its socket is named after the incarnation.
     pub identity: Identity,
-    /// What it takes and how long it waits.
+    /// Limits and timeouts.
     pub limits: Limits,
 }
 
@@ -58,8 +60,8 @@ pub struct UnixConfig {
 /// the directory of the domain. Both sides check that the peer belongs to the same user
 /// (`SO_PEERCRED`). Connections are kept, shared and closed as those of TCP.
 ///
-/// Dropping it closes it and removes the socket. After [`close`](Transport::close) the attempts are
-/// concluded by the runtime's threads, so the runtime must live on for a moment.
+/// Dropping it closes it and removes the socket. After [`close`](Transport::close) the threads of
+/// the runtime conclude the attempts, so the runtime must run a moment longer.
 #[derive(Debug)]
 pub struct UnixTransport {
     path: PathBuf,
@@ -67,7 +69,7 @@ pub struct UnixTransport {
     /// The socket, while the endpoint listens.
     bound: Arc<Mutex<Option<Bound>>>,
     closed: AtomicBool,
-    /// Whether a look for sockets of dead processes is due.
+    /// Whether a sweep for sockets of dead processes is scheduled.
     tidying: Arc<AtomicBool>,
     owner: OwnerProcess,
 }
@@ -80,8 +82,8 @@ struct Bound {
 }
 
 impl UnixTransport {
-    /// An endpoint that does its work on `runtime`, which must have input, output and time
-    /// enabled. Nothing is opened before `listen`.
+    /// Creates an endpoint that runs its tasks on `runtime`, which must have I/O and time enabled.
+    /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: UnixConfig, runtime: Handle) -> Self {
         let UnixConfig {
@@ -107,14 +109,14 @@ impl UnixTransport {
         }
     }
 
-    /// What happened so far.
+    /// Returns the counters of this endpoint.
     #[must_use]
     pub fn counters(&self) -> Counters {
         self.endpoint.tally().read()
     }
 
-    /// Processes of this domain have ended: removes the sockets that dead ones have left, in the
-    /// background.
+    /// Removes the sockets of dead processes of this domain in the background. Called when
+    /// processes of the domain have ended.
     pub fn tidy(&self) {
         if self.tidying.swap(true, Ordering::AcqRel) {
             return;
@@ -125,15 +127,15 @@ impl UnixTransport {
             tidying.store(false, Ordering::Release);
             let directory = bound.lock().as_ref().map(|it| it.directory.clone());
             if let Some(directory) = directory {
-                // An error is that the runtime ends.
+                // An error means that the runtime shuts down.
                 let _ = spawn_blocking(move || directory.sweep()).await;
             }
         });
     }
 
-    /// Whether other processes find the socket. False when another program has removed it, or the
-    /// directory. What cannot be examined counts as there, and so does an endpoint that does not
-    /// listen.
+    /// Whether other processes find the socket. False when another program has removed it or the
+    /// directory. A socket that cannot be examined counts as present, and so does the socket of an
+    /// endpoint that does not listen.
     #[must_use]
     pub fn is_there(&self) -> bool {
         let bound = self.bound.lock();
@@ -142,11 +144,11 @@ impl UnixTransport {
             .is_none_or(|bound| bound.directory.is_there(&self.name(), bound.file))
     }
 
-    /// Makes the socket again if it was removed, and says whether that was necessary. Connections
-    /// that are open stay so.
+    /// Creates the socket again if it was removed. Returns whether that was necessary. Open
+    /// connections stay open.
     ///
     /// # Errors
-    /// When the directory or the socket cannot be made; to be tried again.
+    /// When the directory or the socket cannot be created; the call may be repeated.
     pub fn rejoin(&self) -> Result<bool, UnixError> {
         let is_closed = self.closed.load(Ordering::SeqCst) || !self.owner.is_this();
         if is_closed || self.is_there() {
@@ -164,7 +166,7 @@ impl UnixTransport {
         Ok(true)
     }
 
-    /// The name of this endpoint's socket.
+    /// Returns the name of this endpoint's socket.
     fn name(&self) -> String {
         self.endpoint.config.identity.incarnation.to_string()
     }
@@ -180,7 +182,7 @@ impl UnixTransport {
         let mut bound = bind();
         for _ in 0..RETRIES {
             match &bound {
-                // The last process has left in between, and taken the directory with it.
+                // The last process has ended meanwhile and removed the directory.
                 Err(UnixError::Io { source, .. })
                     if source.kind() == std::io::ErrorKind::NotFound =>
                 {
@@ -215,7 +217,7 @@ impl Transport for UnixTransport {
                 bound.directory.remove(&self.name(), bound.file);
                 unavailable(bound.directory.failed("use a socket in", source))
             })?;
-            // What processes left that were killed.
+            // Removes the sockets of killed processes.
             bound.directory.sweep();
             *self.bound.lock() = Some(bound);
             Ok((listener, self.name()))
@@ -258,7 +260,7 @@ impl Drop for UnixTransport {
         if self.owner.is_this() {
             self.close();
         } else {
-            // In a forked child the socket and the connections stay the parent's.
+            // In a forked child the socket and the connections belong to the parent.
             std::mem::forget(self.endpoint.clone());
         }
     }

@@ -1,4 +1,4 @@
-//! Keys and certificates made for one test.
+//! Keys and certificates generated for one test.
 
 use std::time::{Duration, SystemTime};
 
@@ -13,15 +13,15 @@ pub(crate) struct Host {
 }
 
 impl Host {
-    /// A host whose service has this name and speaks for these agents, or for all when there are
-    /// none.
+    /// Creates a host whose service has this name and speaks for these agents, or for all if there
+    /// are none.
     pub(crate) fn new(name: &str, agents: &[&str]) -> Self {
         let day = Duration::from_secs(86_400);
         let now = SystemTime::now();
         Self::valid(name, agents, now - day, now + day)
     }
 
-    /// One whose certificate holds from then until then.
+    /// Creates a host whose certificate is valid in this period.
     pub(crate) fn valid(name: &str, agents: &[&str], from: SystemTime, until: SystemTime) -> Self {
         let agents: Vec<String> = agents.iter().map(|agent| (*agent).to_owned()).collect();
         let mut params = CertificateParams::default();
@@ -39,7 +39,7 @@ impl Host {
         }
     }
 
-    /// What it knows, and whom.
+    /// Returns its credentials with these trusted peers.
     pub(crate) fn credentials(&self, trusted: &[&Self]) -> Credentials {
         Credentials {
             own: self.certificate.clone(),
@@ -51,7 +51,7 @@ impl Host {
         }
     }
 
-    /// It speaks with these and nobody else, on loopback too.
+    /// Returns its security, which admits only these peers, on loopback too.
     pub(crate) fn security(&self, trusted: &[&Self]) -> Security {
         let rules = Rules {
             loopback: true,
@@ -60,7 +60,7 @@ impl Host {
         Security::new(self.credentials(trusted), rules).unwrap()
     }
 
-    /// Somebody who has its certificate, which is no secret, and not its key.
+    /// Returns a host with the same certificate, which is public, but another key.
     pub(crate) fn thief(&self) -> Self {
         Self {
             certificate: self.certificate.clone(),
@@ -68,7 +68,7 @@ impl Host {
         }
     }
 
-    /// This certificate, with somebody else's key.
+    /// Returns this certificate with the key of another host.
     pub(crate) fn with_key_of(mut self, other: &Self) -> Self {
         self.key = KeyPair::try_from(other.key.serialize_der()).unwrap();
         self

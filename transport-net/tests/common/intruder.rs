@@ -1,4 +1,4 @@
-//! Somebody who speaks TLS and QUIC on terms of his own, with or without a certificate.
+//! A hostile TLS and QUIC peer with settings of its own, with or without a certificate.
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -20,21 +20,21 @@ use rustls::{
 use super::certificates::Host;
 use super::{hello_of, parcel, runtime, written};
 
-/// What he is called; certificates have to be of this name.
+/// Name of the hostile peer, which its certificate must have.
 pub(crate) const ROGUE: &str = "rogue";
 
-/// The protocol that QUIC connections are for.
+/// The ALPN protocol of QUIC connections.
 pub(crate) const PROTOCOL: &[u8] = b"fipa/1";
 
 const HELLO: u8 = 1;
 const PARCEL: u8 = 2;
 
-/// Ends what hangs.
+/// Timeout of a hung operation.
 const WATCHDOG: Duration = Duration::from_secs(30);
 
 pub(crate) type Versions = &'static [&'static SupportedProtocolVersion];
 
-/// With this certificate and key, over these versions of TLS.
+/// Returns a client configuration with this certificate and key, and these versions of TLS.
 pub(crate) fn client(own: Option<&Host>, versions: Versions) -> ClientConfig {
     let own = own.map(|host| {
         let credentials = host.credentials(&[]);
@@ -49,7 +49,7 @@ pub(crate) fn client(own: Option<&Host>, versions: Versions) -> ClientConfig {
         .with_client_cert_resolver(Arc::new(Own(own.map(Arc::new))))
 }
 
-/// The same for the other side, which asks nobody who he is.
+/// Returns a server configuration that requires no client certificate.
 pub(crate) fn server(own: &Host, versions: Versions) -> ServerConfig {
     let credentials = own.credentials(&[]);
     ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
@@ -60,14 +60,14 @@ pub(crate) fn server(own: &Host, versions: Versions) -> ServerConfig {
         .unwrap()
 }
 
-/// What he says when he has got in: who he is, and a letter.
-pub(crate) fn said() -> Vec<u8> {
+/// Returns the bytes that the peer sends after the handshake: a hello and a letter.
+pub(crate) fn hello_and_letter() -> Vec<u8> {
     let mut said = frame(HELLO, 0, &hello_of(ROGUE, 77));
     said.extend(frame(PARCEL, 1, &written(&parcel(1, "let me in"))));
     said
 }
 
-/// Says it over TLS, and returns what is said to that.
+/// Sends them over TLS, and returns the reply.
 pub(crate) fn greet_tls(config: ClientConfig, at: &str) -> Result<Vec<u8>, String> {
     let stream = TcpStream::connect(at).unwrap();
     stream.set_read_timeout(Some(WATCHDOG)).unwrap();
@@ -75,7 +75,7 @@ pub(crate) fn greet_tls(config: ClientConfig, at: &str) -> Result<Vec<u8>, Strin
     let session = ClientConnection::new(Arc::new(config), name).unwrap();
     let mut stream = StreamOwned::new(session, stream);
     stream
-        .write_all(&said())
+        .write_all(&hello_and_letter())
         .map_err(|error| error.to_string())?;
     let mut answer = vec![0; 24];
     match stream.read_exact(&mut answer) {
@@ -84,7 +84,7 @@ pub(crate) fn greet_tls(config: ClientConfig, at: &str) -> Result<Vec<u8>, Strin
     }
 }
 
-/// Listens and takes one TLS connection: what the other side says over it.
+/// Accepts one TLS connection, and returns the bytes of the other side.
 pub(crate) fn hear_tls(
     config: ServerConfig,
 ) -> (SocketAddr, std::thread::JoinHandle<Result<Vec<u8>, String>>) {
@@ -103,7 +103,7 @@ pub(crate) fn hear_tls(
     (at, heard)
 }
 
-/// The settings of QUIC with this TLS for a protocol, in a version.
+/// Returns a QUIC configuration with this TLS configuration, protocol and version.
 pub(crate) fn quic(mut tls: ClientConfig, protocol: &[u8], version: u32) -> quinn::ClientConfig {
     tls.alpn_protocols = vec![protocol.to_vec()];
     let mut config = quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()));
@@ -111,7 +111,7 @@ pub(crate) fn quic(mut tls: ClientConfig, protocol: &[u8], version: u32) -> quin
     config
 }
 
-/// Says it over QUIC, and returns what is said to that.
+/// Sends them over QUIC, and returns the reply.
 pub(crate) fn greet_quic(config: quinn::ClientConfig, at: &str) -> Result<Vec<u8>, String> {
     runtime().block_on(async {
         let endpoint = quinn::Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
@@ -125,7 +125,7 @@ pub(crate) fn greet_quic(config: quinn::ClientConfig, at: &str) -> Result<Vec<u8
                 .await
                 .map_err(|error| error.to_string());
             let (mut send, mut receive) = opened?;
-            let sent = send.write_all(&said()).await;
+            let sent = send.write_all(&hello_and_letter()).await;
             sent.map_err(|error| error.to_string())?;
             let mut answer = vec![0; 24];
             let read = receive.read_exact(&mut answer).await;
@@ -136,7 +136,7 @@ pub(crate) fn greet_quic(config: quinn::ClientConfig, at: &str) -> Result<Vec<u8
     })
 }
 
-/// Somebody who listens for QUIC of this protocol.
+/// Returns a QUIC listener for this protocol.
 pub(crate) fn listen_quic(mut tls: ServerConfig, protocol: &[u8]) -> quinn::Endpoint {
     tls.alpn_protocols = vec![protocol.to_vec()];
     let config = QuicServerConfig::try_from(tls).unwrap();
@@ -144,7 +144,7 @@ pub(crate) fn listen_quic(mut tls: ServerConfig, protocol: &[u8]) -> quinn::Endp
     quinn::Endpoint::server(config, "127.0.0.1:0".parse().unwrap()).unwrap()
 }
 
-/// Shows this certificate, whether the key belongs to it or not.
+/// Presents this certificate even if the key does not belong to it.
 #[derive(Debug)]
 struct Own(Option<Arc<CertifiedKey>>);
 
@@ -158,5 +158,5 @@ impl ResolvesClientCert for Own {
     }
 }
 
-/// TLS as it has to be.
+/// The versions of TLS that endpoints require.
 pub(crate) const ONLY_13: Versions = &[&TLS13];

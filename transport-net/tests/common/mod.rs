@@ -1,5 +1,5 @@
-//! What the tests of the endpoints share: endpoints on loopback, a sink that records, and
-//! waiting for a condition.
+//! Support for the tests of the endpoints: endpoints on loopback, a recording sink, and waiting for
+//! a condition.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
 #[cfg(feature = "secure")]
@@ -37,7 +37,7 @@ pub(crate) fn runtime() -> Threads {
     Threads(Some(runtime.unwrap()))
 }
 
-/// A runtime. A task that never lets go of its thread fails the test instead of holding it up.
+/// A runtime. A task that blocks its thread forever fails the test instead of hanging it.
 pub(crate) struct Threads(Option<Runtime>);
 
 impl Deref for Threads {
@@ -56,15 +56,15 @@ impl Drop for Threads {
         }
         assert!(
             began.elapsed() < PATIENCE || std::thread::panicking(),
-            "a task does not let go of its thread"
+            "a task blocks its thread"
         );
     }
 }
 
-/// Whoever waits this long in a test waits for ever.
+/// A test that waits this long has failed.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What every endpoint of the tests is called.
+/// The name of every endpoint of the tests.
 pub(crate) const NAME: &str = "test-mts";
 
 fn identity() -> Identity {
@@ -81,7 +81,7 @@ pub(crate) fn udp_config(listen: &[&str]) -> UdpConfig {
         listen: listen.iter().map(|text| (*text).into()).collect(),
         identity: identity(),
         limits: UdpLimits {
-            // Whoever waits this long in a test waits for ever.
+            // A test that waits this long has failed.
             connect_timeout: Duration::from_secs(30),
             silence: Duration::from_secs(30),
             ..UdpLimits::default()
@@ -89,7 +89,7 @@ pub(crate) fn udp_config(listen: &[&str]) -> UdpConfig {
     }
 }
 
-/// An endpoint whose socket is in this directory.
+/// The configuration of an endpoint whose socket is in this directory.
 pub(crate) fn unix_config(directory: &Path) -> UnixConfig {
     UnixConfig {
         directory: directory.to_owned(),
@@ -104,7 +104,7 @@ pub(crate) fn config(listen: &[&str]) -> TcpConfig {
         processes: true,
         identity: identity(),
         limits: Limits {
-            // Whoever waits this long in a test waits for ever.
+            // A test that waits this long has failed.
             connect_timeout: Duration::from_secs(30),
             handshake_timeout: Duration::from_secs(30),
             ..Limits::default()
@@ -124,7 +124,7 @@ pub(crate) fn quic_config(
         listen: config.listen,
         identity: config.identity,
         limits: Limits {
-            // Nobody says that nobody is there.
+            // The network does not report an unreachable peer.
             connect_timeout: Duration::from_secs(3),
             ..config.limits
         },
@@ -143,9 +143,9 @@ pub(crate) struct Record {
 pub(crate) struct Recorder {
     pub(crate) record: Mutex<Record>,
     verdict: Verdict,
-    /// Bytes of memory for contents that are lent now, and were at most, if any is.
+    /// Bytes of lent memory now and at most, if memory is lent.
     lent: Option<Arc<Mutex<(usize, usize)>>>,
-    /// Where every service is as well.
+    /// Further locations of every service.
     pub(crate) also_at: Mutex<Vec<Location>>,
     /// Whether the sink refuses each peer that introduces itself.
     pub(crate) refuses_peers: AtomicBool,
@@ -215,7 +215,7 @@ impl Sink for Recorder {
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {
         assert!(
             from.address.is_loopback(),
-            "the tests' peers are here, not at {from:?}"
+            "the peers of the tests are on loopback, not at {from:?}"
         );
         self.record.lock().unframed.push((letter, via));
     }
@@ -263,7 +263,7 @@ impl Party {
         Self::over(sink, |runtime| TcpTransport::new(config, runtime))
     }
 
-    /// One whose sink lends memory for contents.
+    /// An endpoint whose sink lends memory for contents.
     pub(crate) fn lending(config: TcpConfig) -> Self {
         let sink = Recorder {
             lent: Some(Arc::default()),
@@ -287,7 +287,7 @@ impl<T: Transport> Party<T> {
         }
     }
 
-    /// Bytes that its sink lends now, and lent at most.
+    /// Returns the bytes that its sink lends now, and lent at most.
     pub(crate) fn lent(&self) -> (usize, usize) {
         let lent = self.sink.lent.as_ref();
         lent.map(|lent| *lent.lock()).unwrap_or_default()
@@ -313,7 +313,7 @@ impl<T: Transport> Party<T> {
         self.sink.record.lock().arrivals.len()
     }
 
-    /// A letter gets through to there and back.
+    /// Asserts that letters arrive in both directions.
     pub(crate) fn assert_reaches(&self, attempt: u64, to: &Self) {
         self.send(attempt, to.location(), parcel(1, "still there?"))
             .unwrap();
@@ -349,12 +349,12 @@ pub(crate) fn parcel(sequence: u64, content: impl Into<Bytes>) -> Parcel {
     )
 }
 
-/// What somebody says of himself who means no good.
+/// Encodes the hello of a hostile peer.
 pub(crate) fn rogue_hello(incarnation: u64) -> Vec<u8> {
     hello_of("rogue", incarnation)
 }
 
-/// What somebody with this name says of himself.
+/// Encodes the hello of a hostile peer with this name.
 pub(crate) fn hello_of(name: &str, incarnation: u64) -> Vec<u8> {
     let mut body = Vec::new();
     body.extend(incarnation.to_le_bytes());
@@ -369,7 +369,7 @@ pub(crate) fn hello_of(name: &str, incarnation: u64) -> Vec<u8> {
     body
 }
 
-/// A parcel as it stands in frames and packets.
+/// Encodes a parcel as in frames and packets.
 pub(crate) fn written(parcel: &Parcel) -> Vec<u8> {
     let (header, pieces) = ParcelHeader::of(parcel).unwrap();
     let mut bytes = header.as_bytes().to_vec();

@@ -1,14 +1,14 @@
-//! Bytes in pieces of any size in, frames out.
+//! Decodes frames from bytes in pieces of any size.
 //!
-//! Small bodies are read together with what follows them, into a chunk, and moved into memory of
-//! their own. A large body is read straight into one buffer of its own, which grows as the bytes
-//! arrive: announcing much takes no memory.
+//! Small bodies are read together with the following bytes into a chunk, and copied into memory of
+//! their own. A large body is read directly into a buffer of its own, which grows as the bytes
+//! arrive: an announced length alone allocates no memory.
 //!
-//! The content of a large letter can be read straight into memory that the sink offers, from which
-//! the letter is passed on: nobody but the kernel touches it then. So that no part of it is fetched
-//! together with what stands in front, the reader is *careful* after a large letter: it reads
-//! headers alone, until a small letter comes. What it had fetched of the first large letter after
-//! small ones, less than a chunk, is moved.
+//! The content of a large letter can be read directly into memory of the sink, from which the
+//! letter is passed on without another copy. To avoid reading a part of the content into the chunk,
+//! the reader is *careful* after a large letter: it reads headers alone until a small letter comes.
+//! The bytes of the first large letter after small ones that are already in the chunk, less than a
+//! chunk, are copied.
 
 use bytes::buf::Limit;
 use bytes::{Buf, BufMut, BytesMut};
@@ -16,35 +16,35 @@ use fipa_transport::Arriving;
 use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader};
 use zerocopy::FromBytes;
 
-use super::super::place::{Meter, Place, Room};
+use super::super::budget::{ContentBuffer, Meter, ReservedBytes};
 use super::{Frame, FrameError, FrameHeader, HEADER_LEN, MAGIC, PARCEL, PARCEL_ALLOWANCE};
 
-/// Bytes of the buffer that headers and small bodies are read into.
+/// Size of the buffer for headers and small bodies, in bytes.
 pub(super) const CHUNK: usize = 16 * 1024;
 
-/// A body's own buffer begins with at most this much, and grows to at most four times what has
-/// arrived. Memory that nothing was put into is not really taken from the system.
+/// Maximum initial size of the buffer of a body; it grows to at most four times the received bytes.
+/// The system does not back untouched pages with memory.
 pub(super) const FIRST_STEP: usize = 4 << 20;
 
-/// From this length on, content is read into memory that the sink offers.
+/// Minimum length of content that is read into memory of the sink.
 pub(super) const APART_FROM: u64 = 32 * 1024;
 
-/// Both headers of a parcel: what can be read of the next frame without any of its content.
+/// Length of both headers of a parcel: these bytes can be read without any content.
 const HEADERS: usize = HEADER_LEN + PARCEL_HEADER_LEN;
 
-/// Where the next bytes are to be put.
+/// Destination of the next bytes that are read.
 #[derive(Debug)]
 pub(crate) enum Space<'a> {
-    /// Behind what is there.
+    /// The end of a buffer.
     Buffer(Limit<&'a mut BytesMut>),
-    /// Into content, from its first byte on that is still missing. How many were put there is for
+    /// The missing part of content. The number of bytes put there is passed to
     /// [`FrameReader::put`].
     Content(&'a mut [u8]),
 }
 
 #[cfg(feature = "secure")]
 impl Space<'_> {
-    /// How many bytes there is room for.
+    /// Returns the number of bytes that fit.
     #[cfg(feature = "quic")]
     pub(crate) fn room(&self) -> usize {
         match self {
@@ -53,7 +53,7 @@ impl Space<'_> {
         }
     }
 
-    /// Puts there what there is room for, and says how much that was.
+    /// Copies as many bytes as fit. Returns their number.
     pub(crate) fn fill(&mut self, bytes: &[u8]) -> usize {
         match self {
             Self::Buffer(buffer) => {
@@ -72,66 +72,66 @@ impl Space<'_> {
     }
 }
 
-/// What has been read into memory of the sink's.
+/// Counts of content that was read into memory of the sink.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Placed {
-    /// Contents.
+    /// Number of contents.
     pub(crate) contents: u64,
-    /// Bytes of them that had been fetched with what stands in front, and were moved.
+    /// Bytes of them that were read into the chunk first and copied.
     pub(crate) moved: u64,
 }
 
-/// Bytes in, frames out.
+/// Decodes frames from bytes.
 #[derive(Debug)]
 pub(crate) struct FrameReader {
-    /// Longest body of a parcel frame.
+    /// Maximum length of the body of a parcel frame.
     max_parcel: u64,
     /// Headers, small bodies and the beginnings of large ones.
     pub(super) chunk: BytesMut,
     /// The frame whose body is arriving.
     pub(super) body: Option<PartialBody>,
-    /// Whether the letter before was a large one.
+    /// Whether the previous letter was large.
     careful: bool,
     placed: Placed,
-    /// Takes the memory for large bodies, if that is counted.
+    /// Reserves the memory of large bodies, if it is counted.
     meter: Option<Meter>,
-    /// The header of a frame for whose body there is no room yet.
+    /// The header of a frame whose body waits for memory.
     blocked: Option<FrameHeader>,
 }
 
 #[derive(Debug)]
 pub(super) struct PartialBody {
     header: FrameHeader,
-    /// What has arrived of it, without a content that lies apart.
+    /// The received bytes without content in separate memory.
     pub(super) bytes: BytesMut,
     /// Length of the whole body.
     len: usize,
     content: Content,
-    /// Until the body is complete.
-    room: Option<Room>,
+    /// The reservation, held until the body is complete.
+    room: Option<ReservedBytes>,
 }
 
-/// Where the content of a body lies.
+/// The location of the content of a body.
 #[derive(Debug)]
 enum Content {
-    /// To be decided when everything in front of it is there.
+    /// Undecided until all bytes in front of the content have arrived.
     Undecided,
-    /// With the rest.
+    /// Together with the other bytes.
     Along,
-    /// In memory of its own.
+    /// In memory of the sink.
     Apart(Apart),
 }
 
 #[derive(Debug)]
 struct Apart {
-    /// So many bytes of the body stand in front.
+    /// Number of bytes of the body in front of the content.
     at: usize,
-    place: Place,
+    buffer: ContentBuffer,
     filled: usize,
 }
 
 impl FrameReader {
-    /// A reader for a connection on which `begun` has arrived already, with room for letters of
+    /// Creates a reader for a connection on which `begun` has arrived already, for letters of up to
     /// `max_letter` bytes.
     pub(crate) fn new(max_letter: usize, begun: BytesMut) -> Self {
         Self {
@@ -145,25 +145,26 @@ impl FrameReader {
         }
     }
 
-    /// Large bodies get memory from this meter from now on.
+    /// Sets the meter that reserves the memory of large bodies.
     pub(crate) fn count_with(&mut self, meter: Meter) {
         self.meter = Some(meter);
     }
 
-    /// Whether a body waits for memory: nothing is to be read until [`next`](Self::next) has got it.
+    /// Whether a body waits for memory. Nothing must be read until [`next`](Self::next) has
+    /// reserved it.
     pub(crate) fn is_blocked(&self) -> bool {
         self.blocked.is_some()
     }
 
-    /// How many bytes of the body that is arriving have to arrive in each period in which progress
-    /// is measured; see [`Room::least_progress`].
+    /// Returns the number of bytes of the arriving body that must arrive in each measuring period;
+    /// see [`ReservedBytes::least_progress`].
     pub(crate) fn least_progress(&self) -> u64 {
         let room = self.body.as_ref().and_then(|body| body.room.as_ref());
-        room.map_or(0, Room::least_progress)
+        room.map_or(0, ReservedBytes::least_progress)
     }
 
-    /// Where the next bytes are to be put. Each time bytes were put there, [`put`](Self::put) is to
-    /// be told, and [`next`](Self::next) called until it has no more.
+    /// Returns the destination of the next bytes. After putting bytes there, the caller calls
+    /// [`put`](Self::put), and [`next`](Self::next) until it returns no frame.
     pub(crate) fn space(&mut self) -> Space<'_> {
         let Self {
             body,
@@ -173,10 +174,10 @@ impl FrameReader {
         } = self;
         let mut most = HEADERS.saturating_sub(chunk.len());
         if let Some(body) = body {
-            // What is missing of a large body goes where it stays. Its rest, once smaller than
-            // the chunk, is fetched together with what follows it.
+            // The missing bytes of a large body are read into their final memory. The last part,
+            // once smaller than the chunk, is read together with the following bytes.
             let in_place = match &body.content {
-                Content::Apart(apart) => apart.filled < apart.place.len(),
+                Content::Apart(apart) => apart.filled < apart.buffer.len(),
                 Content::Along => body.missing() >= CHUNK,
                 Content::Undecided => false,
             };
@@ -196,23 +197,24 @@ impl FrameReader {
         Space::Buffer(chunk.limit(limit))
     }
 
-    /// So many bytes were put where they were to be put.
+    /// Notes that `bytes` were put into the last [`space`](Self::space).
     pub(crate) fn put(&mut self, bytes: usize) {
         if let Some(body) = &mut self.body
             && let Content::Apart(apart) = &mut body.content
-            && apart.filled < apart.place.len()
+            && apart.filled < apart.buffer.len()
         {
-            apart.filled = apart.filled.saturating_add(bytes).min(apart.place.len());
+            apart.filled = apart.filled.saturating_add(bytes).min(apart.buffer.len());
         }
     }
 
-    /// The next whole frame, if it has arrived. `memory` is asked for a place for large content.
+    /// Returns the next complete frame, if it has arrived. `memory` offers memory for large
+    /// content.
     ///
     /// # Errors
-    /// When what arrived is no frame. The connection is of no use then.
+    /// When the bytes are not a frame. The connection is unusable then.
     pub(crate) fn next(
         &mut self,
-        mut memory: impl FnMut(&Arriving<'_>) -> Option<Place>,
+        mut memory: impl FnMut(&Arriving<'_>) -> Option<ContentBuffer>,
     ) -> Result<Option<Frame>, FrameError> {
         let mut body = match self.body.take() {
             Some(body) => body,
@@ -237,12 +239,12 @@ impl FrameReader {
         body.finish().map(Some)
     }
 
-    /// Whether a frame has begun to arrive, is not complete, and is read.
+    /// Whether a frame has partly arrived and does not wait for memory.
     pub(crate) fn is_partial(&self) -> bool {
         self.body.is_some() || !self.chunk.is_empty() && !self.is_blocked()
     }
 
-    /// What has been read into memory of the sink's since this was last asked.
+    /// Returns the counts of content in memory of the sink since the last call.
     pub(crate) fn take_placed(&mut self) -> Placed {
         std::mem::take(&mut self.placed)
     }
@@ -279,9 +281,9 @@ impl FrameReader {
         }))
     }
 
-    /// Takes the header of the next frame, if it has arrived.
+    /// Removes the header of the next frame from the chunk, if it has arrived.
     fn take_header(&mut self) -> Result<Option<FrameHeader>, FrameError> {
-        // Nonsense is recognised by its first bytes, not only once there is enough of it.
+        // A wrong start is reported at its first byte, before a whole header has arrived.
         let begun = self.chunk.len().min(MAGIC.len());
         if self.chunk[..begun] != MAGIC[..begun] {
             let mut found = [0; 4];
@@ -298,24 +300,24 @@ impl FrameReader {
 }
 
 impl PartialBody {
-    /// Moves what there is of this body from the chunk, and says whether it is to be decided where
-    /// the content goes.
+    /// Moves the bytes of this body out of the chunk. Returns whether the location of the content
+    /// is to be decided now.
     fn take_from(&mut self, chunk: &mut BytesMut, placed: &mut Placed) -> bool {
         if let Content::Apart(apart) = &mut self.content
-            && let Some(missing) = apart.place.missing(apart.filled)
+            && let Some(missing) = apart.buffer.missing(apart.filled)
         {
             let there = missing.len().min(chunk.len());
-            if let Some(place) = missing.get_mut(..there) {
-                chunk.copy_to_slice(place);
+            if let Some(buffer) = missing.get_mut(..there) {
+                chunk.copy_to_slice(buffer);
                 apart.filled += there;
                 placed.moved += there as u64;
             }
-            if apart.filled < apart.place.len() {
+            if apart.filled < apart.buffer.len() {
                 return false;
             }
         }
         loop {
-            // With the parcel's header it is known how much stands in front.
+            // The parcel header determines the number of bytes in front of the content.
             let there = self.wanted().min(chunk.len());
             if there == 0 {
                 return matches!(self.content, Content::Undecided) && self.wanted() == 0;
@@ -325,8 +327,8 @@ impl PartialBody {
         }
     }
 
-    /// How many bytes are missing until the next thing is to be done; of content that lies apart,
-    /// all are there.
+    /// Returns the number of bytes missing until the next step. Content in separate memory is
+    /// complete here.
     fn wanted(&self) -> usize {
         match &self.content {
             Content::Undecided => self.front().saturating_sub(self.bytes.len()),
@@ -334,7 +336,7 @@ impl PartialBody {
         }
     }
 
-    /// How many bytes of the body stand in front of the content, as far as is known.
+    /// Returns the number of bytes of the body in front of the content, as far as known.
     fn front(&self) -> usize {
         match ParcelHeader::read_from_prefix(&self.bytes) {
             Ok((header, _)) => {
@@ -345,8 +347,8 @@ impl PartialBody {
         }
     }
 
-    /// Decides where the content goes, when there is enough to see it by.
-    fn decide(&mut self, memory: &mut impl FnMut(&Arriving<'_>) -> Option<Place>) {
+    /// Decides the location of the content when enough bytes have arrived.
+    fn decide(&mut self, memory: &mut impl FnMut(&Arriving<'_>) -> Option<ContentBuffer>) {
         let Ok((header, front)) = ParcelHeader::read_from_prefix(&self.bytes) else {
             return self.keep_along();
         };
@@ -358,15 +360,15 @@ impl PartialBody {
         if self.front() > self.bytes.len() {
             return;
         }
-        let place = header.arriving(front).and_then(|arriving| {
-            let place = memory(&arriving)?;
-            (place.len() == arriving.len).then_some(place)
+        let buffer = header.arriving(front).and_then(|arriving| {
+            let buffer = memory(&arriving)?;
+            (buffer.len() == arriving.len).then_some(buffer)
         });
-        match place {
-            Some(place) => {
+        match buffer {
+            Some(buffer) => {
                 self.content = Content::Apart(Apart {
                     at: self.bytes.len(),
-                    place,
+                    buffer,
                     filled: 0,
                 });
             }
@@ -387,11 +389,11 @@ impl PartialBody {
         self.len - self.bytes.len() - apart
     }
 
-    /// Memory that what is missing goes to.
+    /// Returns the destination of the missing bytes.
     fn space(&mut self) -> Space<'_> {
         let all_missing = self.missing();
         if let Content::Apart(apart) = &mut self.content {
-            let missing = apart.place.missing(apart.filled);
+            let missing = apart.buffer.missing(apart.filled);
             return Space::Content(missing.unwrap_or_default());
         }
         if self.bytes.len() == self.bytes.capacity() {
@@ -408,7 +410,7 @@ impl PartialBody {
         match self.content {
             Content::Apart(apart) => {
                 let tail = front.split_off(apart.at);
-                super::finish_apart(self.header, front, apart.place.freeze(), tail)
+                super::finish_apart(self.header, front, apart.buffer.freeze(), tail)
             }
             Content::Undecided | Content::Along => super::finish(self.header, front),
         }

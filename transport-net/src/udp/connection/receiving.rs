@@ -1,4 +1,5 @@
-//! What a connection receives: packets, and the parcels and answers in them, in their order.
+//! The receiving side of a connection: packets, and the parcels and answers in them, in their
+//! order.
 
 use std::time::Instant;
 
@@ -7,23 +8,23 @@ use fipa_transport::{Answer, Conclusion, Parcel};
 
 use super::super::counters::UdpCounters;
 use super::super::packet::{Frame, Frames, split_parcel};
-use super::{Connection, Event, Held, MAX_ID};
-use crate::end::End;
+use super::{Connection, Event, MAX_ID, OutOfOrderParcel};
+use crate::end::ConnectionEnd;
 
 impl Connection {
-    /// Takes a data packet.
+    /// Handles a data packet.
     ///
     /// # Errors
-    /// When the connection is over because of it.
+    /// When the packet ends the connection.
     pub(crate) fn handle_packet(
         &mut self,
         number: u64,
         frames: &[u8],
         now: Instant,
         counters: &mut UdpCounters,
-    ) -> Result<(), End> {
+    ) -> Result<(), ConnectionEnd> {
         if self.dialling.is_some() {
-            // The welcome is late, or lost; all this comes again.
+            // The welcome is late or lost; the peer retransmits these frames.
             return Ok(());
         }
         self.heard = Some(now);
@@ -36,13 +37,15 @@ impl Connection {
         let (mut elicits, mut at_once, mut taken) = (false, false, true);
         for frame in Frames(frames) {
             let Ok(frame) = frame else {
-                return Err(End::Nonsense("a packet that cannot be read".into()));
+                return Err(ConnectionEnd::ProtocolViolation(
+                    "a malformed packet".into(),
+                ));
             };
             match frame {
                 Frame::Ack(ack) => {
                     let Some(told) = self.recovery.acknowledged(&ack, now) else {
-                        let what = "an acknowledgement of what was never sent";
-                        return Err(End::Nonsense(what.into()));
+                        let what = "an acknowledgment of a packet that was not sent";
+                        return Err(ConnectionEnd::ProtocolViolation(what.into()));
                     };
                     told.arrived.into_iter().for_each(|kept| self.arrived(kept));
                     told.lost.into_iter().for_each(|kept| self.lost(kept));
@@ -56,7 +59,7 @@ impl Connection {
                     elicits = true;
                     taken &= self.hold(id, None, 0)?;
                 }
-                Frame::Goodbye { last } => return Err(End::Goodbye { last }),
+                Frame::Goodbye { last } => return Err(ConnectionEnd::Goodbye { last }),
                 Frame::Parcel { id, bytes } => {
                     (elicits, at_once) = (true, true);
                     taken &= self.take_parcel(id, bytes, now, counters)?;
@@ -78,16 +81,17 @@ impl Connection {
         bytes: &[u8],
         now: Instant,
         counters: &mut UdpCounters,
-    ) -> Result<bool, End> {
+    ) -> Result<bool, ConnectionEnd> {
         if id < self.next_arrival || self.held.contains_key(&id) {
             counters.duplicates += 1;
             return Ok(true);
         }
-        let nonsense = |what: &dyn std::fmt::Display| Err(End::Nonsense(what.to_string()));
+        let nonsense =
+            |what: &dyn std::fmt::Display| Err(ConnectionEnd::ProtocolViolation(what.to_string()));
         let Some((header, body)) = split_parcel(bytes) else {
             return nonsense(&"a parcel without a header");
         };
-        if self.resting.is_some_and(|until| now < until) {
+        if self.paused_until.is_some_and(|until| now < until) {
             counters.held_back += 1;
             return Ok(false);
         }
@@ -103,26 +107,29 @@ impl Connection {
         if held {
             self.busy = now;
             counters.parcels_in += 1;
-            let ration = self.ration.as_ref();
-            self.resting = ration.and_then(|ration| ration.spend(1, bytes.len(), now));
+            let rate_limit = self.rate_limit.as_ref();
+            self.paused_until =
+                rate_limit.and_then(|rate_limit| rate_limit.spend(1, bytes.len(), now));
         }
         Ok(held)
     }
 
-    /// Notes what has this number (a parcel, or that there never is one), and hands on whatever
-    /// has its turn. Says whether there was room.
+    /// Stores the parcel with this number, or the notice that the number is skipped, and delivers
+    /// all parcels that are next in order. Returns whether there was room.
     pub(super) fn hold(
         &mut self,
         id: u64,
         parcel: Option<Box<Parcel>>,
         len: usize,
-    ) -> Result<bool, End> {
+    ) -> Result<bool, ConnectionEnd> {
         if id < self.next_arrival || self.held.contains_key(&id) {
             return Ok(true);
         }
         let max = self.limits.max_in_flight.max(1);
         if id >= MAX_ID || self.arrivals.len() >= max {
-            return Err(End::Nonsense("more parcels than may be in flight".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "more unanswered parcels than max_in_flight".into(),
+            ));
         }
         let crowded = self.held.len() >= max
             || self.held_bytes.saturating_add(len) > self.limits.max_queued_bytes;
@@ -138,7 +145,7 @@ impl Connection {
             }
         }
         self.held_bytes += len;
-        let held = Held {
+        let held = OutOfOrderParcel {
             parcel,
             _room: room,
         };
@@ -157,11 +164,18 @@ impl Connection {
         Ok(true)
     }
 
-    pub(super) fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), End> {
+    pub(super) fn conclude(
+        &mut self,
+        id: u64,
+        answer: Answer,
+        now: Instant,
+    ) -> Result<(), ConnectionEnd> {
         if id > self.last_sent {
-            return Err(End::Nonsense("an answer to what was never sent".into()));
+            return Err(ConnectionEnd::ProtocolViolation(
+                "an answer to a parcel that was not sent".into(),
+            ));
         }
-        // Otherwise it has been concluded before.
+        // An absent parcel has been concluded before.
         if let Some(sent) = self.sent.remove(&id) {
             self.resend.remove(&id);
             self.busy = now;

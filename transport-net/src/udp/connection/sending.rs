@@ -1,5 +1,5 @@
-//! What a connection sends: which parcel goes next, what fits beside it, and what becomes of what
-//! got lost.
+//! The sending side of a connection: the next parcel, the small frames beside it, and the handling
+//! of losses.
 
 use std::time::Instant;
 
@@ -9,34 +9,34 @@ use zerocopy::IntoBytes;
 
 use super::super::counters::UdpCounters;
 use super::super::packet::{self, ANSWER_OVERHEAD};
-use super::super::recovery::Kept;
+use super::super::recovery::SentContent;
 use super::{Connection, Event, LOSSES_OF_LARGE, Sent, too_large};
 
 impl Connection {
-    /// What a packet carried is with the peer.
-    pub(super) fn arrived(&mut self, kept: Kept) {
+    /// Handles the acknowledgment of content.
+    pub(super) fn arrived(&mut self, kept: SentContent) {
         match kept {
-            Kept::Parcel(id) => {
+            SentContent::Parcel(id) => {
                 self.resend.remove(&id);
                 if let Some(sent) = self.sent.get_mut(&id) {
                     sent.outgoing = None;
                 }
             }
-            Kept::Answer(id) => {
+            SentContent::Answer(id) => {
                 self.answers.remove(&id);
             }
-            Kept::Skipped(id) => {
+            SentContent::Skipped(id) => {
                 self.sent.remove(&id);
             }
-            Kept::Ping => {}
-            Kept::Probe(size) => self.mtu.arrived(size),
+            SentContent::Ping => {}
+            SentContent::Probe(size) => self.mtu.arrived(size),
         }
     }
 
-    /// What a packet carried is to be sent again.
-    pub(super) fn lost(&mut self, kept: Kept) {
+    /// Handles the loss of content.
+    pub(super) fn lost(&mut self, kept: SentContent) {
         match kept {
-            Kept::Parcel(id) => {
+            SentContent::Parcel(id) => {
                 let Some(sent) = self.sent.get_mut(&id) else {
                     return;
                 };
@@ -50,16 +50,18 @@ impl Connection {
                 }
                 self.resend.insert(id);
             }
-            Kept::Answer(id) if self.answers.contains_key(&id) => self.urgent.push_front(kept),
-            Kept::Skipped(id) if self.sent.contains_key(&id) => self.urgent.push_front(kept),
-            Kept::Answer(_) | Kept::Skipped(_) => {}
-            Kept::Ping => self.urgent.push_front(kept),
-            Kept::Probe(size) => self.mtu.lost(size),
+            SentContent::Answer(id) if self.answers.contains_key(&id) => {
+                self.urgent.push_front(kept)
+            }
+            SentContent::Skipped(id) if self.sent.contains_key(&id) => self.urgent.push_front(kept),
+            SentContent::Answer(_) | SentContent::Skipped(_) => {}
+            SentContent::Ping => self.urgent.push_front(kept),
+            SentContent::Probe(size) => self.mtu.lost(size),
         }
     }
 
-    /// Takes out what cannot be sent any more: what nobody waits for, and what is too large.
-    pub(super) fn sift(&mut self) {
+    /// Removes parcels that are abandoned or too large for the path.
+    pub(super) fn drop_unsendable(&mut self) {
         let current = self.mtu.current();
         while let Some(id) = self.resend.first().copied() {
             let Some(sent) = self.sent.get_mut(&id) else {
@@ -72,8 +74,8 @@ impl Connection {
             }
             self.resend.remove(&id);
             sent.outgoing = None;
-            // The peer must not wait for it.
-            self.urgent.push_back(Kept::Skipped(id));
+            // Tells the peer not to wait for it.
+            self.urgent.push_back(SentContent::Skipped(id));
             if let Some(attempt) = sent.attempt.take() {
                 self.attempts.remove(&attempt);
                 let concluded = Conclusion::Unconfirmed(too_large(size, current));
@@ -92,7 +94,7 @@ impl Connection {
         }
     }
 
-    /// The parcel that may go next: whether it is a fresh one, and the size of its datagram.
+    /// Returns the parcel that may be sent next: whether it is new, and the size of its datagram.
     pub(super) fn next_parcel(&self) -> Option<(bool, usize)> {
         if let Some(id) = self.resend.first() {
             let size = self.sent.get(id)?.outgoing.as_ref()?.size;
@@ -109,7 +111,7 @@ impl Connection {
         fresh: bool,
         now: Instant,
         counters: &mut UdpCounters,
-    ) -> Option<Kept> {
+    ) -> Option<SentContent> {
         let id = if fresh {
             let outgoing = self.waiting.pop_front()?;
             self.waiting_bytes -= outgoing.size;
@@ -134,32 +136,34 @@ impl Connection {
         for piece in &outgoing.pieces {
             out.extend_from_slice(piece);
         }
-        Some(Kept::Parcel(id))
+        Some(SentContent::Parcel(id))
     }
 
-    pub(super) fn frame_len(&self, small: Kept) -> usize {
+    pub(super) fn frame_len(&self, small: SentContent) -> usize {
         match small {
-            Kept::Answer(id) => ANSWER_OVERHEAD + self.answers.get(&id).map_or(0, Bytes::len),
-            Kept::Skipped(_) => 9,
+            SentContent::Answer(id) => {
+                ANSWER_OVERHEAD + self.answers.get(&id).map_or(0, Bytes::len)
+            }
+            SentContent::Skipped(_) => 9,
             _ => 1,
         }
     }
 
-    /// Whether there was anything to put.
-    pub(super) fn put_small(&self, out: &mut Vec<u8>, small: Kept) -> bool {
+    /// Appends a small frame. Returns whether there was one to append.
+    pub(super) fn put_small(&self, out: &mut Vec<u8>, small: SentContent) -> bool {
         match small {
-            Kept::Answer(id) => match self.answers.get(&id) {
+            SentContent::Answer(id) => match self.answers.get(&id) {
                 Some(body) => packet::put_answer(out, id, body),
                 None => return false,
             },
-            Kept::Skipped(id) => packet::put_skipped(out, id),
-            Kept::Ping => packet::put_ping(out),
-            Kept::Parcel(_) | Kept::Probe(_) => return false,
+            SentContent::Skipped(id) => packet::put_skipped(out, id),
+            SentContent::Ping => packet::put_ping(out),
+            SentContent::Parcel(_) | SentContent::Probe(_) => return false,
         }
         true
     }
 
-    /// Whether something waits that is larger than what is known to get through.
+    /// Whether a parcel waits that is larger than the known MTU.
     pub(super) fn wants_probe(&self) -> bool {
         let current = self.mtu.current();
         let again = self.resend.first().and_then(|id| self.sent.get(id));

@@ -1,4 +1,5 @@
-//! How connections begin: strangers are given cookies, and those who bring one back a connection.
+//! The handshake: an unproved peer gets a cookie, and a peer that returns the cookie gets a
+//! connection.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -9,30 +10,31 @@ use super::super::connection::{Connection, Path};
 use super::super::packet::{self, NO_COOKIE};
 use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
-use crate::end::End;
+use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
-use crate::ration::whose;
-use crate::seldom::warn_seldom;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::quota_address;
 
-/// How long a connected service has to give a sign of life when a stranger says that it is the service.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
+/// Time in which a connected service must respond to a ping when an unproved peer claims to be that
+/// service.
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// For how long such a question and its answer count. Longer than [`SIGN_OF_LIFE`] and the longest pause
-/// between two hellos.
-const ASKED_FOR: Duration = Duration::from_secs(3);
+/// Time for which such a ping and its response are valid. It is longer than [`RESPONSE_TIMEOUT`] and
+/// the longest pause between two hellos.
+const PING_VALIDITY: Duration = Duration::from_secs(3);
 
-/// Whether a new connection of a service that may be connected begins.
-enum Standing {
-    /// It begins.
+/// The result of checking a claimed incarnation.
+enum ClaimStatus {
+    /// No other connection has it.
     Free,
-    /// The connected service has been asked for a sign of life.
+    /// A ping was sent on the other connection.
     Asked,
-    /// The connected service has given one.
+    /// The other connection responded.
     Taken,
 }
 
 impl Core {
-    /// A stranger says hello.
+    /// Handles the hello of an unproved peer.
     pub(super) fn greet(
         &mut self,
         now: Instant,
@@ -56,7 +58,7 @@ impl Core {
             }
             return;
         }
-        // One that says that it is this service itself would make it write to itself.
+        // A peer that claims to be this service itself would make it send letters to itself.
         let own = self.identity.incarnation;
         let is_fit = |it: &Hello| it.max_in_flight > 0 && it.identity.incarnation != own;
         let Some(peer) = Hello::decode(hello).filter(is_fit) else {
@@ -73,16 +75,16 @@ impl Core {
             self.counters.ignored += 1;
             return;
         }
-        match self.standing(now, &inbound) {
-            Standing::Free => {}
-            // The peer sends its hello again, because it gets no answer.
-            Standing::Asked => return,
-            Standing::Taken => {
+        match self.claim_status(now, &inbound) {
+            ClaimStatus::Free => {}
+            // The peer repeats its hello because it gets no reply.
+            ClaimStatus::Asked => return,
+            ClaimStatus::Taken => {
                 let before = self.counters.refused_unproved;
-                warn_seldom(
+                warn_limited(
                     before,
                     format_args!(
-                        "{from}: connection refused: its incarnation has a connection that is alive"
+                        "{from}: connection refused: it claims the incarnation of a connected service whose connection is alive"
                     ),
                 );
                 self.counters.refused_unproved += 1;
@@ -90,9 +92,12 @@ impl Core {
                 return;
             }
         }
-        let home = whose(from.ip());
-        let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
-        let greedy = same_address.count() >= self.limits.places_of(home);
+        let home = quota_address(from.ip());
+        let same_address = self
+            .greeted
+            .keys()
+            .filter(|(a, _)| quota_address(a.ip()) == home);
+        let greedy = same_address.count() >= self.limits.max_connections_of(home);
         if greedy || self.connections.len() >= self.limits.max_connections {
             self.counters.refused_crowd += 1;
             self.reply(path, packet::refused(initiator));
@@ -107,7 +112,7 @@ impl Core {
         let name = peer.identity.name.as_str().into();
         let limits = self.limits.clone();
         let connection = Connection::accepted(limits, id, initiator, peer, path, now)
-            .bounded(self.ration(from.ip(), now), self.meter(from.ip()));
+            .bounded(self.rate_limit(from.ip(), now), self.meter(from.ip()));
         let number = self.insert(connection, None, Some((from, initiator)));
         self.greeted.insert((from, initiator), number);
         self.inbound.insert(inbound, (serial, number));
@@ -118,42 +123,43 @@ impl Core {
         self.touch(number);
     }
 
-    /// Whether the service with this incarnation may be the peer of a new connection. A stranger must
-    /// not end the connections of the service that it claims to be: these are asked for a sign of life,
-    /// and end if there is none within [`SIGN_OF_LIFE`]. Nothing is remembered of the stranger.
-    fn standing(&mut self, now: Instant, inbound: &Inbound) -> Standing {
-        let mut standing = Standing::Free;
-        for number in self.rivals(inbound) {
-            let Some(rival) = self.connections.get_mut(&number) else {
+    /// Checks whether the service with this incarnation may be the peer of a new connection. An
+    /// unproved peer must not end the connections of the service that it claims to be: these get a
+    /// ping, and end if there is no response within [`RESPONSE_TIMEOUT`]. No state about the unproved
+    /// peer is stored.
+    fn claim_status(&mut self, now: Instant, inbound: &Inbound) -> ClaimStatus {
+        let mut status = ClaimStatus::Free;
+        for number in self.conflicting(inbound) {
+            let Some(other) = self.connections.get_mut(&number) else {
                 continue;
             };
-            let asked = rival.asked.filter(|asked| now < *asked + ASKED_FOR);
+            let asked = other.asked.filter(|asked| now < *asked + PING_VALIDITY);
             match asked {
                 None => {
-                    rival.asked = Some(now);
-                    rival.connection.ask();
+                    other.asked = Some(now);
+                    other.connection.ask();
                     self.touch(number);
                 }
-                Some(asked) if rival.connection.is_heard_since(asked) => return Standing::Taken,
-                Some(asked) if now >= asked + SIGN_OF_LIFE => {
-                    // What the peer sent on its connection before this one must not arrive after what
-                    // it sends now.
-                    self.end(number, &End::Superseded);
+                Some(asked) if other.connection.received_since(asked) => return ClaimStatus::Taken,
+                Some(asked) if now >= asked + RESPONSE_TIMEOUT => {
+                    // Letters that the peer sent on the previous connection must not arrive after
+                    // letters on this one.
+                    self.end(number, &ConnectionEnd::Superseded);
                     continue;
                 }
                 Some(_) => {}
             }
-            standing = Standing::Asked;
+            status = ClaimStatus::Asked;
         }
-        standing
+        status
     }
 
-    /// The connections that end if this one begins: the earlier one for the same location, and those at
-    /// other addresses than this, unless their peers list this one as their own.
-    fn rivals(&self, inbound: &Inbound) -> Vec<u32> {
+    /// Returns the connections that end if this one is accepted: the earlier one for the same
+    /// location, and those at other addresses, unless their peers list this address as their own.
+    fn conflicting(&self, inbound: &Inbound) -> Vec<u32> {
         let same = self.inbound.get(inbound).map(|(_, number)| *number);
         let known = self.known.get(&inbound.incarnation);
-        let is_rival = |number: &u32| {
+        let conflicts = |number: &u32| {
             let Some(entry) = self.connections.get(number) else {
                 return false;
             };
@@ -165,10 +171,10 @@ impl Core {
             !peer.is_some_and(|peer| address::lists(&peer.listening, inbound.ip))
         };
         let known = known.into_iter().flatten().copied();
-        known.filter(is_rival).collect()
+        known.filter(conflicts).collect()
     }
 
-    /// A peer has answered the hello of a connection.
+    /// Handles the welcome that answers the hello of a connection.
     pub(super) fn welcome(
         &mut self,
         now: Instant,
@@ -182,16 +188,16 @@ impl Core {
             return;
         };
         let hop = self.hop(&peer, path.remote);
-        let ration = self.ration(path.remote.ip(), now);
+        let rate_limit = self.rate_limit(path.remote.ip(), now);
         let meter = self.meter(path.remote.ip());
         let (own, mut greeted) = (self.identity.incarnation, None);
         self.of_dialling(to, path, |number, connection| {
             if peer.identity.incarnation == own {
-                return Err(End::Nonsense(OWN_INCARNATION.into()));
+                return Err(ConnectionEnd::ProtocolViolation(OWN_INCARNATION.into()));
             }
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
-            connection.ration = ration;
+            connection.rate_limit = rate_limit;
             connection.meter = Some(meter);
             greeted = Some((number, name));
             Ok(())
@@ -202,7 +208,7 @@ impl Core {
         }
     }
 
-    /// Somebody knows nothing of a connection.
+    /// Handles a datagram that reports a connection as unknown.
     pub(super) fn is_unknown(&mut self, path: Path, peer_id: u64) {
         let is_meant = |connection: &Connection| {
             connection.peer().is_some()
@@ -216,19 +222,20 @@ impl Core {
             .next();
         match meant {
             Some(number) => {
-                let what = "the peer has forgotten the connection; was it restarted?";
-                self.end(number, &End::Broken(what.into()));
+                let what =
+                    "the peer no longer has this connection, probably because it was restarted";
+                self.end(number, &ConnectionEnd::Broken(what.into()));
             }
             None => self.counters.ignored += 1,
         }
     }
 
-    /// Lets a connection that is being opened have what came for it.
+    /// Calls `act` with the connection that is being opened over this path.
     pub(super) fn of_dialling(
         &mut self,
         to: u64,
         path: Path,
-        act: impl FnOnce(u32, &mut Connection) -> Result<(), End>,
+        act: impl FnOnce(u32, &mut Connection) -> Result<(), ConnectionEnd>,
     ) {
         let number = self.ids.get(&to).copied();
         let entry = number.and_then(|number| self.connections.get_mut(&number));
@@ -242,7 +249,7 @@ impl Core {
     }
 
     pub(super) fn hop(&self, peer: &Hello, from: SocketAddr) -> Option<Hop> {
-        let back = address::way_back(&peer.listening, from).to_string();
+        let back = address::return_address(&peer.listening, from).to_string();
         let location = Location::new(Kind::Udp, &back).ok()?;
         Some(Hop {
             location: location.with_incarnation(peer.identity.incarnation),

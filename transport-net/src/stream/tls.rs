@@ -1,7 +1,7 @@
 //! TLS over the socket of a link: the handshake, and records in both directions.
 //!
-//! The handshake is tokio-rustls's. Afterwards the session is taken apart from its stream, because
-//! a link is written by whoever has something to send, on its own thread, and read by its task.
+//! tokio-rustls performs the handshake. Afterwards the session is separated from its stream,
+//! because sending threads write to a link directly, and its task reads.
 
 use std::io::{self, BufRead as _, IoSlice, Write as _};
 use std::net::SocketAddr;
@@ -17,40 +17,42 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::time::timeout;
 use tokio_rustls::{TlsAcceptor, TlsConnector};
 
+use super::frame::Space;
+use super::wire::{Reading, Writing};
 use crate::secure::{Certificate, Security, advice};
-use crate::stream::frame::Space;
-use crate::stream::wire::{Reading, Writing};
 
-/// The first byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
+/// First byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
 pub(crate) const FIRST_BYTE: u8 = 22;
 
-/// Bytes read from the socket at once: the longest record (RFC 8446 section 5.2).
+/// Maximum number of bytes read from the socket at once: the longest record (RFC 8446 section 5.2).
 const RECORD: usize = 5 + (1 << 14) + 256;
 
-/// Encrypted bytes that wait for the kernel before no more are taken.
+/// Maximum number of encrypted bytes that wait for the kernel.
 const MAX_WAITING: usize = 1 << 18;
 
-/// A connection over which the peer has proved who it is.
+/// A connection whose peer has proved its identity.
 pub(crate) struct Secured {
     pub(crate) ends: (Reading, Writing),
-    /// The peer's.
+    /// The certificate of the peer.
     pub(crate) certificate: Certificate,
 }
 
-/// Answers a peer that begins TLS.
+/// Performs the handshake with a peer that begins TLS.
 pub(crate) async fn accept(
     security: &Security,
     stream: TcpStream,
     patience: Duration,
 ) -> Result<Secured, String> {
     let acceptor = TlsAcceptor::from(security.server());
-    let shaken = timeout(patience, acceptor.accept(stream)).await;
-    let shaken = shaken.map_err(|_| too_slow(patience))?;
-    let (stream, session) = shaken.map_err(|error| told(&error))?.into_inner();
+    let handshake = timeout(patience, acceptor.accept(stream)).await;
+    let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
+    let (stream, session) = handshake
+        .map_err(|error| handshake_error(&error))?
+        .into_inner();
     secured(security, stream, session.into())
 }
 
-/// Begins TLS with the peer at this address.
+/// Performs the handshake with the peer at this address.
 pub(crate) async fn connect(
     security: &Security,
     stream: TcpStream,
@@ -58,23 +60,28 @@ pub(crate) async fn connect(
     patience: Duration,
 ) -> Result<Secured, String> {
     let connector = TlsConnector::from(security.client());
-    // Neither told to the peer nor compared with anything: who is there says the certificate.
+    // The name is neither sent nor verified: the certificate identifies the peer.
     let name = ServerName::from(peer.ip());
-    let shaken = timeout(patience, connector.connect(name, stream)).await;
-    let shaken = shaken.map_err(|_| too_slow(patience))?;
-    let (stream, session) = shaken.map_err(|error| told(&error))?.into_inner();
+    let handshake = timeout(patience, connector.connect(name, stream)).await;
+    let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
+    let (stream, session) = handshake
+        .map_err(|error| handshake_error(&error))?
+        .into_inner();
     secured(security, stream, session.into())
 }
 
-fn too_slow(patience: Duration) -> String {
-    format!("no TLS handshake within {patience:?} (handshake_timeout)")
+fn handshake_timeout(patience: Duration) -> String {
+    format!("TLS handshake not complete within {patience:?} (handshake_timeout)")
 }
 
-fn told(error: &io::Error) -> String {
+fn handshake_error(error: &io::Error) -> String {
     let inner = error.get_ref().and_then(|it| it.downcast_ref());
     match inner {
-        Some(inner) => format!("no TLS connection: {error} ({})", advice::of_error(inner)),
-        None => format!("no TLS connection: {error}"),
+        Some(inner) => format!(
+            "TLS handshake failed: {error} ({})",
+            advice::of_error(inner)
+        ),
+        None => format!("TLS handshake failed: {error}"),
     }
 }
 
@@ -84,7 +91,7 @@ fn secured(
     mut session: Connection,
 ) -> Result<Secured, String> {
     let certificate = security.peer(session.peer_certificates());
-    let certificate = certificate.ok_or("the peer's certificate is not trusted any more")?;
+    let certificate = certificate.ok_or("the peer's certificate is no longer trusted")?;
     session.set_buffer_limit(Some(MAX_WAITING));
     let (read, write) = stream.into_split();
     let session = Arc::new(Session(Mutex::new(session)));
@@ -103,7 +110,7 @@ fn secured(
 pub(crate) struct Session(Mutex<Connection>);
 
 impl Session {
-    /// Encrypts what there is room for, and hands it to the kernel as far as that takes it.
+    /// Encrypts as many bytes as there is room for, and hands them to the kernel.
     pub(crate) fn write(
         &self,
         socket: &OwnedWriteHalf,
@@ -113,7 +120,7 @@ impl Session {
         let pushed = push(&mut session, socket);
         let taken = session.writer().write_vectored(slices)?;
         if taken == 0 {
-            // There is no room: what the kernel said counts.
+            // No room: the result of the kernel counts.
             return pushed.and(Err(io::ErrorKind::WouldBlock.into()));
         }
         match push(&mut session, socket) {
@@ -122,7 +129,7 @@ impl Session {
         }
     }
 
-    /// Hands the kernel what is encrypted.
+    /// Hands encrypted bytes to the kernel.
     pub(crate) fn push(&self, socket: &OwnedWriteHalf) -> io::Result<()> {
         push(&mut self.0.lock(), socket)
     }
@@ -135,7 +142,7 @@ fn push(session: &mut Connection, socket: &OwnedWriteHalf) -> io::Result<()> {
     Ok(())
 }
 
-/// The socket as what TLS writes to.
+/// The socket as a writer for rustls.
 struct Kernel<'a>(&'a OwnedWriteHalf);
 
 impl io::Write for Kernel<'_> {
@@ -180,8 +187,8 @@ impl Incoming {
         }
     }
 
-    /// Takes what is decrypted, or can be; none when more has to come. Nothing, when the peer has
-    /// closed its direction.
+    /// Copies decrypted bytes into `space`. Returns `None` when more records are needed, and 0 when
+    /// the peer has closed its direction.
     fn decrypt(&mut self, space: &mut Space<'_>) -> io::Result<Option<usize>> {
         let mut session = self.session.0.lock();
         loop {
@@ -200,7 +207,8 @@ impl Incoming {
             }
             session.read_tls(&mut (&mut self.records).reader())?;
             let processed = session.process_new_packets();
-            // In TLS 1.3 a client is done before its peer has said whether it is let in.
+            // In TLS 1.3 a client completes the handshake before the server has accepted its
+            // certificate.
             processed.map_err(|error| {
                 let told = format!("{error} ({})", advice::of_error(&error));
                 io::Error::new(io::ErrorKind::InvalidData, told)

@@ -1,8 +1,8 @@
-//! Letters to old peers: one connection per letter, closed behind it, and no answer.
+//! Letters to legacy peers: one connection per letter, closed after it, without an answer.
 //!
-//! Each location has a queue of its own and at most one connection at a time, so that letters arrive
-//! in order. The end of the stream is what ends a letter there; whether the peer took it cannot be
-//! known, but a peer that hangs up without an error has read it to its end.
+//! Each location has its own queue and at most one connection at a time, so that letters arrive in
+//! order. The end of the stream ends a letter. This side cannot know whether the peer accepted it,
+//! but a peer that closes the connection without an error has read it to its end.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -21,44 +21,45 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::accept::prepare;
-use super::dial::{self, Unreachable};
+use super::dial;
 use super::dialect::translate;
-use crate::end::End;
+use super::endpoint::TcpEndpoint;
+use crate::end::ConnectionEnd;
 use crate::stream::counters::count;
-use crate::stream::endpoint::Endpoint;
+use crate::stream::dialing::Unreachable;
 
-/// How long a peer may take to hang up after it has got its letter, before the next one is begun.
-const FAREWELL: Duration = Duration::from_millis(50);
+/// Time that a peer has to close the connection after its letter, before the next letter is sent.
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(50);
 
-/// Bytes written at a time: between two, progress is looked at.
+/// Maximum number of bytes per write; the stall timeout applies to each write.
 const STEP: usize = 256 << 10;
 
-/// The letters to old peers.
+/// The letters to legacy peers.
 #[derive(Debug)]
-pub(crate) struct Couriers {
+pub(crate) struct LegacySenders {
     queues: Mutex<HashMap<Location, Queue>>,
     closed: watch::Sender<bool>,
 }
 
-/// Letters to one location. It is there as long as its task is.
+/// The letters to one location. The queue exists as long as its task.
 #[derive(Debug, Default)]
 struct Queue {
-    waiting: VecDeque<Errand>,
+    waiting: VecDeque<LegacyDelivery>,
     bytes: usize,
     /// The letter whose connection is open or being opened.
     current: Option<AttemptId>,
-    /// Whether the first byte of the current letter has been written, or is about to be.
+    /// Whether the first byte of the current letter has been or is about to be written.
     begun: bool,
 }
 
 #[derive(Debug)]
-struct Errand {
+struct LegacyDelivery {
     attempt: AttemptId,
     receiver: Arc<str>,
     letter: Letter,
 }
 
-impl Default for Couriers {
+impl Default for LegacySenders {
     fn default() -> Self {
         Self {
             queues: Mutex::default(),
@@ -67,29 +68,30 @@ impl Default for Couriers {
     }
 }
 
-impl Couriers {
-    /// Takes a parcel for an old peer. Says whether a task is to be [run](run) for its location.
+impl LegacySenders {
+    /// Queues a parcel for a legacy peer. Returns whether a task must be [started](run) for its
+    /// location.
     ///
     /// # Errors
-    /// When it does not go.
+    /// When the parcel cannot be queued.
     pub(crate) fn take(
         &self,
-        endpoint: &Endpoint,
+        endpoint: &TcpEndpoint,
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
     ) -> Result<bool, WayError> {
         let limits = endpoint.limits();
         let Body::Letter(letter) = parcel.body else {
-            let detail = "an old peer takes letters only";
+            let detail = "a legacy peer accepts letters only";
             return Err(WayError::new(WayFault::Incompatible, detail));
         };
         if *self.closed.borrow() {
-            return Err(End::Closed.after());
+            return Err(ConnectionEnd::Closed.after());
         }
         let mut queues = self.queues.lock();
         if !queues.contains_key(to) && queues.len() >= limits.max_connections {
-            return Err(End::Crowd.after());
+            return Err(ConnectionEnd::TooManyConnections.after());
         }
         let fresh = !queues.contains_key(to);
         let queue = queues.entry(to.clone()).or_default();
@@ -98,11 +100,13 @@ impl Couriers {
         if count >= limits.max_in_flight
             || (bytes > 0 && bytes.saturating_add(len) > limits.max_queued_bytes)
         {
-            let detail = format!("{count} letters wait for this peer (max_in_flight)");
+            let detail = format!(
+                "{count} letters of {bytes} bytes wait for this legacy peer (max_in_flight, max_queued_bytes)"
+            );
             return Err(WayError::new(WayFault::Congested, detail));
         }
         queue.bytes += len;
-        queue.waiting.push_back(Errand {
+        queue.waiting.push_back(LegacyDelivery {
             attempt,
             receiver: parcel.receiver,
             letter,
@@ -110,7 +114,7 @@ impl Couriers {
         Ok(fresh)
     }
 
-    /// Ends an attempt: the letter is not sent if nothing of it has been written.
+    /// Ends an attempt. The letter is not sent if no byte of it has been written.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         for queue in self.queues.lock().values_mut() {
             if queue.current == Some(attempt) {
@@ -121,28 +125,32 @@ impl Couriers {
                 };
             }
             let place = queue.waiting.iter().position(|e| e.attempt == attempt);
-            if let Some(errand) = place.and_then(|place| queue.waiting.remove(place)) {
-                queue.bytes -= errand.letter.len();
+            if let Some(delivery) = place.and_then(|place| queue.waiting.remove(place)) {
+                queue.bytes -= delivery.letter.len();
                 return Abandoned::NotSent;
             }
         }
         Abandoned::Unconfirmed
     }
 
-    /// The first byte of the current letter is about to be written. Returns false when the letter
-    /// was abandoned, and must not be sent.
+    /// Notes that the first byte of the current letter is about to be written. Returns false when
+    /// the letter was abandoned and must not be sent.
     fn begin(&self, to: &Location) -> bool {
         let mut queues = self.queues.lock();
         let wanted = queues.get_mut(to).filter(|queue| queue.current.is_some());
         wanted.map(|queue| queue.begun = true).is_some()
     }
 
-    /// Takes back the first letter for a location. Says whether its task had not begun.
+    /// Removes the queue of a location whose task has not begun. Returns whether the letter was
+    /// still queued.
     pub(crate) fn take_back(&self, attempt: AttemptId, to: &Location) -> bool {
         let mut queues = self.queues.lock();
-        let waits = queues
-            .get(to)
-            .is_some_and(|queue| queue.waiting.iter().any(|errand| errand.attempt == attempt));
+        let waits = queues.get(to).is_some_and(|queue| {
+            queue
+                .waiting
+                .iter()
+                .any(|delivery| delivery.attempt == attempt)
+        });
         if waits {
             queues.remove(to);
         }
@@ -153,16 +161,16 @@ impl Couriers {
         self.closed.send_replace(true);
     }
 
-    /// The next letter for a location; without one the queue is gone.
-    fn next(&self, to: &Location) -> Option<Errand> {
+    /// Removes the next letter for a location. Removes the queue when it is empty.
+    fn next(&self, to: &Location) -> Option<LegacyDelivery> {
         let mut queues = self.queues.lock();
         let queue = queues.get_mut(to)?;
         match queue.waiting.pop_front() {
-            Some(errand) => {
-                queue.bytes -= errand.letter.len();
-                queue.current = Some(errand.attempt);
+            Some(delivery) => {
+                queue.bytes -= delivery.letter.len();
+                queue.current = Some(delivery.attempt);
                 queue.begun = false;
-                Some(errand)
+                Some(delivery)
             }
             None => {
                 queues.remove(to);
@@ -171,15 +179,15 @@ impl Couriers {
         }
     }
 
-    /// The letter that was fetched last has come to its end. Says whether anybody wants to know.
+    /// Ends the current letter. Returns whether its attempt still needs a conclusion.
     fn ended(&self, to: &Location) -> bool {
         let mut queues = self.queues.lock();
         let current = queues.get_mut(to).and_then(|queue| queue.current.take());
         current.is_some()
     }
 
-    /// Everything that waits for a location.
-    fn drain(&self, to: &Location) -> VecDeque<Errand> {
+    /// Removes all waiting letters for a location.
+    fn drain(&self, to: &Location) -> VecDeque<LegacyDelivery> {
         let mut queues = self.queues.lock();
         let queue = queues.get_mut(to);
         queue.map_or_else(VecDeque::new, |queue| {
@@ -193,22 +201,22 @@ impl Couriers {
     }
 }
 
-/// Delivers what waits for a location, letter by letter.
-pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Location) {
-    let mut round = Round {
+/// Sends the waiting letters of a location, one by one.
+pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Location) {
+    let mut task = QueueTask {
         endpoint,
         sink,
         to,
         done: false,
     };
-    let mut closed = round.endpoint.legacy.couriers.closed.subscribe();
-    while let Some(errand) = round.endpoint.legacy.couriers.next(&round.to) {
+    let mut closed = task.endpoint.legacy.senders.closed.subscribe();
+    while let Some(delivery) = task.endpoint.legacy.senders.next(&task.to) {
         let progress = Mutex::new(false);
         let conclusion = tokio::select! {
-            conclusion = deliver(&round, &errand, &progress) => conclusion,
+            conclusion = deliver(&task, &delivery, &progress) => conclusion,
             _ = closed.wait_for(|closed| *closed) => {
-                // What remains is concluded by the end of the round.
-                round.conclude(errand.attempt, broken(*progress.lock(), End::Closed.after()));
+                // Dropping `task` concludes the remaining letters.
+                task.conclude(delivery.attempt, broken(*progress.lock(), ConnectionEnd::Closed.after()));
                 return;
             }
         };
@@ -218,61 +226,62 @@ pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Locati
             }
             _ => None,
         };
-        round.conclude(errand.attempt, conclusion);
+        task.conclude(delivery.attempt, conclusion);
         if let Some(error) = unreachable {
-            // They need not all find out by themselves.
-            for errand in round.endpoint.legacy.couriers.drain(&round.to) {
+            // The other waiting letters fail with the same error, without an attempt each.
+            for delivery in task.endpoint.legacy.senders.drain(&task.to) {
                 let conclusion = Conclusion::NotSent(error.clone());
-                round.sink.concluded(errand.attempt, conclusion);
+                task.sink.concluded(delivery.attempt, conclusion);
             }
         }
     }
-    round.done = true;
+    task.done = true;
 }
 
-/// A task that delivers: whatever happens to it, every letter gets its conclusion.
-struct Round {
-    endpoint: Arc<Endpoint>,
+/// The task of a queue. Dropping it concludes every remaining letter.
+struct QueueTask {
+    endpoint: Arc<TcpEndpoint>,
     sink: Arc<dyn Sink>,
     to: Location,
-    /// Whether the queue has been found empty, and is no more.
+    /// Whether the queue was empty and has been removed.
     done: bool,
 }
 
-impl Round {
+impl QueueTask {
     fn conclude(&self, attempt: AttemptId, conclusion: Conclusion) {
-        if self.endpoint.legacy.couriers.ended(&self.to) {
+        if self.endpoint.legacy.senders.ended(&self.to) {
             self.sink.concluded(attempt, conclusion);
         }
     }
 }
 
-impl Drop for Round {
+impl Drop for QueueTask {
     fn drop(&mut self) {
         if self.done {
             return;
         }
-        let Some(queue) = self.endpoint.legacy.couriers.forget(&self.to) else {
+        let Some(queue) = self.endpoint.legacy.senders.forget(&self.to) else {
             return;
         };
         if let Some(attempt) = queue.current {
-            let conclusion = Conclusion::Unconfirmed(End::Closed.after());
+            let conclusion = Conclusion::Unconfirmed(ConnectionEnd::Closed.after());
             self.sink.concluded(attempt, conclusion);
         }
-        for errand in queue.waiting {
-            let conclusion = Conclusion::NotSent(End::Closed.after());
-            self.sink.concluded(errand.attempt, conclusion);
+        for delivery in queue.waiting {
+            let conclusion = Conclusion::NotSent(ConnectionEnd::Closed.after());
+            self.sink.concluded(delivery.attempt, conclusion);
         }
     }
 }
 
-async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclusion {
-    let (endpoint, to) = (&round.endpoint, &round.to);
+async fn deliver(task: &QueueTask, delivery: &LegacyDelivery, begun: &Mutex<bool>) -> Conclusion {
+    let (endpoint, to) = (&task.endpoint, &task.to);
     let in_dialect = |here: Option<&str>| {
-        translate(&errand.letter, &errand.receiver, to.signature(), here)
+        translate(&delivery.letter, &delivery.receiver, to.signature(), here)
             .map_err(|error| Conclusion::NotSent(WayError::new(error.fault(), error)))
     };
-    // Before anything is opened: a connection without a letter costs fipa_services a descriptor.
+    // Translated before a connection is opened: a connection without a letter leaks a descriptor in
+    // fipa_services.
     let mut letter = match in_dialect(None) {
         Ok(letter) => letter,
         Err(not_sent) => return not_sent,
@@ -287,7 +296,9 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
             }
         };
     if !endpoint.config.gives_old_peers_at(peer.ip()) {
-        let detail = format!("{peer} cannot prove who it is, and is no exception");
+        let detail = format!(
+            "{peer} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
+        );
         return Conclusion::NotSent(WayError::new(WayFault::Refused, detail));
     }
     if to.signature() == Signature::JadeProxy
@@ -302,7 +313,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
     if let Err(error) = prepare(&stream, endpoint.limits()) {
         return Conclusion::NotSent(WayError::new(WayFault::Broken, error));
     }
-    if !endpoint.legacy.couriers.begin(to) {
+    if !endpoint.legacy.senders.begin(to) {
         let detail = "the letter was abandoned";
         return Conclusion::NotSent(WayError::new(WayFault::TimedOut, detail));
     }
@@ -312,7 +323,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
             return broken(*begun.lock(), error);
         }
     }
-    match farewell(&mut stream).await {
+    match finish(&mut stream).await {
         Ok(()) => {
             count(&endpoint.tally().unframed_out);
             Conclusion::Handed
@@ -342,7 +353,7 @@ async fn write(
             Ok(Ok(())) => {}
             Ok(Err(error)) => return Err(WayError::new(WayFault::Broken, error)),
             Err(_) => {
-                let detail = "the peer stopped reading";
+                let detail = "the peer stopped reading (stall_timeout)";
                 return Err(WayError::new(WayFault::TimedOut, detail));
             }
         }
@@ -350,18 +361,19 @@ async fn write(
     Ok(())
 }
 
-/// Ends the letter, and gives the peer a moment to hang up.
-async fn farewell(stream: &mut TcpStream) -> std::io::Result<()> {
+/// Ends the letter, and waits a moment for the peer to close the connection.
+async fn finish(stream: &mut TcpStream) -> std::io::Result<()> {
     stream.shutdown().await?;
     let mut ignored = [0; 256];
     let hangup = async {
         while stream.read(&mut ignored).await? > 0 {}
         Ok(())
     };
-    timeout(FAREWELL, hangup).await.unwrap_or(Ok(()))
+    timeout(CLOSE_TIMEOUT, hangup).await.unwrap_or(Ok(()))
 }
 
-/// Where a socket with this address can be reached, when the endpoint listens there.
+/// Returns the listening address with the IP address `local` as a URL, if the endpoint listens
+/// there.
 fn listening_at(listening: &[String], local: SocketAddr) -> Option<String> {
     listening
         .iter()

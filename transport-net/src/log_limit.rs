@@ -1,10 +1,10 @@
-//! Warnings about what others do to us.
+//! Rate-limited warnings about events that peers cause.
 
 use parking_lot::Mutex;
 
-/// Warns the first time, the second, the fourth, the eighth …: what others do to us must not fill
-/// our log.
-pub(crate) fn warn_seldom(times_before: u64, what: std::fmt::Arguments<'_>) {
+/// Logs a warning at the first, second, fourth, eighth, … occurrence, and a debug message
+/// otherwise, so that peers cannot fill the log.
+pub(crate) fn warn_limited(times_before: u64, what: std::fmt::Arguments<'_>) {
     let times = times_before.saturating_add(1);
     if times.is_power_of_two() {
         tracing::warn!(times, "{what}");
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_series_is_logged_when_it_begins_and_then_by_number() {
+    fn a_series_is_logged_at_its_start_and_then_by_count() {
         let events = PerSecond::default();
         assert!(events.count());
         assert!(!events.count());

@@ -1,7 +1,8 @@
-//! How much each peer may send, however many connections it has: letters and bytes a second.
+//! Rate limits of the peers: letters and bytes per second, over all connections of a peer.
 //!
-//! Whoever sends more is not refused but read from later, so that its own side holds it back. A
-//! peer is an address here: it is what costs something to have many of. Sans-I/O but for the lock.
+//! Bytes beyond the limit are not refused but read later, so that backpressure slows the sender. A
+//! peer is identified by its address here, because additional addresses are costly to obtain. The
+//! module does no I/O; it only locks.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr};
@@ -11,23 +12,23 @@ use std::time::{Duration, Instant};
 use fipa_transport::Allowance;
 use parking_lot::Mutex;
 
-/// Addresses that are told apart. All beyond share what one of them has.
+/// Maximum number of addresses with a limit of their own. All further addresses share one limit.
 const MAX_ADDRESSES: usize = 4096;
 
-/// What a peer may send in a second; 0: any number.
+/// The limits of a peer per second; 0: unlimited.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rates {
     pub(crate) letters: u64,
     pub(crate) bytes: u64,
 }
 
-/// What is remembered of all peers.
+/// The rate limits of all peers.
 #[derive(Debug, Default)]
-pub(crate) struct Rations(Mutex<HashMap<IpAddr, Arc<Ration>>>);
+pub(crate) struct PeerRateLimits(Mutex<HashMap<IpAddr, Arc<PeerRateLimit>>>);
 
-/// What one peer may still send.
+/// The rate limit of one peer.
 #[derive(Debug)]
-pub(crate) struct Ration {
+pub(crate) struct PeerRateLimit {
     letters_per_second: f64,
     bytes_per_second: f64,
     left: Mutex<Left>,
@@ -39,31 +40,33 @@ struct Left {
     bytes: Allowance,
 }
 
-impl Rations {
-    /// The one of whoever is at this address; none when peers may send as much as they like.
-    pub(crate) fn of(&self, ip: IpAddr, rates: Rates, now: Instant) -> Option<Arc<Ration>> {
+impl PeerRateLimits {
+    /// Returns the rate limit of the peer at this address; `None` when peers are unlimited.
+    pub(crate) fn of(&self, ip: IpAddr, rates: Rates, now: Instant) -> Option<Arc<PeerRateLimit>> {
         if rates.letters == 0 && rates.bytes == 0 {
             return None;
         }
-        let ip = whose(ip);
+        let ip = quota_address(ip);
         let mut all = self.0.lock();
-        if let Some(ration) = all.get(&ip) {
-            return Some(ration.clone());
+        if let Some(rate_limit) = all.get(&ip) {
+            return Some(rate_limit.clone());
         }
         if all.len() >= MAX_ADDRESSES {
-            // Whoever has been silent for a second has all of it again.
-            all.retain(|_, ration| Arc::strong_count(ration) > 1 || !ration.is_full(now));
+            // A peer that has been silent for long enough has its full limit again.
+            all.retain(|_, rate_limit| {
+                Arc::strong_count(rate_limit) > 1 || !rate_limit.is_full(now)
+            });
             if all.len() >= MAX_ADDRESSES {
                 return all.values().next().cloned();
             }
         }
-        let ration = Arc::new(Ration::new(rates, now));
-        all.insert(ip, ration.clone());
-        Some(ration)
+        let rate_limit = Arc::new(PeerRateLimit::new(rates, now));
+        all.insert(ip, rate_limit.clone());
+        Some(rate_limit)
     }
 }
 
-impl Ration {
+impl PeerRateLimit {
     fn new(rates: Rates, now: Instant) -> Self {
         let rate = |limit: u64| match limit {
             0 => f64::INFINITY,
@@ -80,8 +83,8 @@ impl Ration {
         }
     }
 
-    /// Counts what has come. Until when nothing more is to be read, if not at once: a second from
-    /// now at the latest, so that signs of life are seen in time.
+    /// Charges received letters and bytes. Returns the time until which nothing more is to be read,
+    /// if any: at most a second from now, so that pings are read in time.
     pub(crate) fn spend(&self, letters: u64, bytes: usize, now: Instant) -> Option<Instant> {
         let mut left = self.left.lock();
         let spent = [
@@ -94,7 +97,7 @@ impl Ration {
         } = &mut *left;
         let pauses = [few, small].into_iter().zip(spent);
         let pauses = pauses.filter_map(|(allowance, (amount, rate))| {
-            // Of what is not limited nothing is ever missing.
+            // An unlimited rate never causes a pause.
             rate.is_finite()
                 .then(|| allowance.spend(amount, rate, now))?
         });
@@ -108,15 +111,15 @@ impl Ration {
     }
 }
 
-/// Whether an address is that of one peer: the processes of this host are many at one address.
+/// Whether an address belongs to one peer. A loopback address belongs to many processes.
 #[cfg(feature = "ip")]
 pub(crate) fn is_one_peer(ip: IpAddr) -> bool {
     !ip.to_canonical().is_loopback()
 }
 
-/// The address that stands for a source: of IPv6, where every host has many addresses, the network of
-/// 64 bits; of loopback, where every user of this host has all addresses, one of them.
-pub(crate) fn whose(ip: IpAddr) -> IpAddr {
+/// Returns the address that represents a source: the network of 64 bits for IPv6, where every host
+/// has many addresses; 127.0.0.1 for loopback, where every user of this host has all addresses.
+pub(crate) fn quota_address(ip: IpAddr) -> IpAddr {
     match ip.to_canonical() {
         ip if ip.is_loopback() => IpAddr::V4(Ipv4Addr::LOCALHOST),
         IpAddr::V6(v6) if !v6.is_unicast_link_local() => {
@@ -136,11 +139,11 @@ mod tests {
     }
 
     #[test]
-    fn all_connections_of_a_peer_share_what_it_may_send() {
-        let (rations, now) = (Rations::default(), Instant::now());
+    fn all_connections_of_a_peer_share_its_rate_limit() {
+        let (rate_limits, now) = (PeerRateLimits::default(), Instant::now());
         let of = |ip: &str| {
             let ip = ip.parse().unwrap();
-            rations.of(ip, rates(10, 1000), now).unwrap()
+            rate_limits.of(ip, rates(10, 1000), now).unwrap()
         };
         assert_eq!(of("10.0.0.1").spend(6, 0, now), None);
         let later = of("::ffff:10.0.0.1").spend(5, 0, now);
@@ -153,44 +156,50 @@ mod tests {
     }
 
     #[test]
-    fn a_host_of_ipv6_is_one_peer_whatever_address_it_takes() {
-        let whose = |ip: &str| whose(ip.parse().unwrap());
-        assert_eq!(whose("2001:db8::1"), whose("2001:db8::ffff:2"));
-        assert_ne!(whose("2001:db8::1"), whose("2001:db8:0:1::1"));
-        assert_ne!(whose("fe80::1"), whose("fe80::2"));
+    fn all_addresses_of_an_ipv6_network_are_one_peer() {
+        let quota_address = |ip: &str| quota_address(ip.parse().unwrap());
+        assert_eq!(
+            quota_address("2001:db8::1"),
+            quota_address("2001:db8::ffff:2")
+        );
+        assert_ne!(
+            quota_address("2001:db8::1"),
+            quota_address("2001:db8:0:1::1")
+        );
+        assert_ne!(quota_address("fe80::1"), quota_address("fe80::2"));
     }
 
     #[test]
     fn all_loopback_addresses_are_one_source() {
-        let whose = |ip: &str| whose(ip.parse().unwrap());
+        let quota_address = |ip: &str| quota_address(ip.parse().unwrap());
         for other in ["127.0.0.2", "127.255.255.254", "::1", "::ffff:127.0.0.3"] {
-            assert_eq!(whose(other), whose("127.0.0.1"), "{other}");
+            assert_eq!(quota_address(other), quota_address("127.0.0.1"), "{other}");
         }
-        assert_ne!(whose("127.0.0.1"), whose("10.0.0.1"));
+        assert_ne!(quota_address("127.0.0.1"), quota_address("10.0.0.1"));
     }
 
     #[test]
-    fn addresses_that_are_remembered_are_bounded() {
-        let (rations, now) = (Rations::default(), Instant::now());
+    fn the_number_of_rate_limits_is_bounded() {
+        let (rate_limits, now) = (PeerRateLimits::default(), Instant::now());
         let address = |number: u32| IpAddr::from(number.to_be_bytes());
         for number in 0..2 * MAX_ADDRESSES as u32 {
-            let ration = rations.of(address(number), rates(1, 1), now).unwrap();
-            ration.spend(1, 1, now);
+            let rate_limit = rate_limits.of(address(number), rates(1, 1), now).unwrap();
+            rate_limit.spend(1, 1, now);
         }
-        assert_eq!(rations.0.lock().len(), MAX_ADDRESSES);
+        assert_eq!(rate_limits.0.lock().len(), MAX_ADDRESSES);
         let later = now + Duration::from_secs(2);
-        rations.of(address(u32::MAX), rates(1, 1), later);
-        assert_eq!(rations.0.lock().len(), 1);
+        rate_limits.of(address(u32::MAX), rates(1, 1), later);
+        assert_eq!(rate_limits.0.lock().len(), 1);
     }
 
     #[test]
-    fn what_is_not_limited_is_not_counted() {
-        let (rations, now) = (Rations::default(), Instant::now());
+    fn an_unlimited_rate_is_not_counted() {
+        let (rate_limits, now) = (PeerRateLimits::default(), Instant::now());
         let ip = address();
-        assert!(rations.of(ip, rates(0, 0), now).is_none());
-        let ration = rations.of(ip, rates(0, 10), now).unwrap();
-        assert_eq!(ration.spend(u64::MAX, 10, now), None);
-        assert!(ration.spend(0, 1, now).is_some());
+        assert!(rate_limits.of(ip, rates(0, 0), now).is_none());
+        let rate_limit = rate_limits.of(ip, rates(0, 10), now).unwrap();
+        assert_eq!(rate_limit.spend(u64::MAX, 10, now), None);
+        assert!(rate_limit.spend(0, 1, now).is_some());
     }
 
     fn address() -> IpAddr {
