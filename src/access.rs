@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use fipa_mts::Source;
 use fipa_sds::Matcher;
-use fipa_transport::Allowance;
+use fipa_transport::TokenBucket;
 
 /// A line of `access.allow` or `access.deny`: the sender and its receivers.
 pub(crate) type Line<'a> = (&'a str, &'a [String]);
@@ -92,7 +92,7 @@ struct Rule {
 /// What a sender may still send.
 #[derive(Debug)]
 struct Sender {
-    allowance: Allowance,
+    allowance: TokenBucket,
     /// When it was last told that it sent too much.
     told: Option<Instant>,
 }
@@ -159,7 +159,7 @@ impl Senders {
         }
         let known = self.sources.entry(source).or_default();
         let fresh = || Sender {
-            allowance: Allowance::new(rate, now),
+            allowance: TokenBucket::new(rate, now),
             told: None,
         };
         known.senders.entry(sender.into()).or_insert_with(fresh)

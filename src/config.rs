@@ -222,7 +222,7 @@ pub struct Security {
     pub loopback: bool,
     /// `legacy_peers`: addresses of legacy peers, which cannot prove their identity. The gateway exchanges
     /// letters in their dialects with them despite its keys. At most 64.
-    pub old_peers: Vec<IpAddr>,
+    pub legacy_peers: Vec<IpAddr>,
     /// `peer_connections`: maximum number of connections of each transport from the peers with one
     /// certificate or, without keys, from one address. This and the next two limits apply to other
     /// hosts, and to loopback addresses if those must prove their identity.
@@ -381,7 +381,7 @@ impl Config {
                 keys: String::new(),
                 insecure: false,
                 loopback: false,
-                old_peers: Vec::new(),
+                legacy_peers: Vec::new(),
                 peer_connections: 64,
                 peer_letters: 20_000,
                 peer_bytes: 256 << 20,

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
-use fipa_mts::{Gate, Link};
+use fipa_mts::{AccessGate, Link};
 use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
 use parking_lot::Mutex;
 
@@ -123,7 +123,7 @@ enum Refused {
     Other(String),
 }
 
-impl Gate for Door {
+impl AccessGate for Door {
     fn admits(
         &self,
         now: Instant,

@@ -18,7 +18,7 @@ use fipa_sds::{
     ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
     Role as EntryRole, StaticDirectory,
 };
-use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, WayFault};
+use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind};
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
@@ -77,7 +77,7 @@ impl Gateway {
                     let network = network(config, mts)?;
                     let told = exchange.directory() as Arc<dyn Directory>;
                     let there = network.clone().map(Network::directory);
-                    let old = Arc::new(old_peers(config)?) as Arc<dyn Directory>;
+                    let old = Arc::new(legacy_peers(config)?) as Arc<dyn Directory>;
                     let known = there.into_iter().chain([told, old]).collect();
                     let known = Arc::new(MergedDirectory::new(known));
                     let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
@@ -230,7 +230,7 @@ impl Gateway {
     }
 
     /// Uses another configuration from now on, without losing a letter: orders of transports,
-    /// exceptions, the deadline of old peers' letters, static peers. Returns the keys that differ
+    /// exceptions, the deadline of legacy peers' letters, static peers. Returns the keys that differ
     /// and are used only after the gateway was started again.
     ///
     /// # Errors
@@ -372,14 +372,14 @@ fn speaks_on_loopback_only(config: &Config) -> bool {
     !interfaces.is_empty() && interfaces.iter().all(is_loopback)
 }
 
-/// Whether a line of `discovery.static` names an agent of an old peer, not a gateway.
+/// Whether a line of `discovery.static` names an agent of a legacy peer, not a gateway.
 fn is_old(peer: &crate::config::Peer) -> bool {
     let mut locations = peer.locations.iter();
     locations.all(|location| location.signature() != Signature::Frames)
 }
 
-/// The agents of old peers that the configuration names.
-fn old_peers(config: &Config) -> Result<StaticDirectory, OpenError> {
+/// The agents of legacy peers that the configuration names.
+fn legacy_peers(config: &Config) -> Result<StaticDirectory, OpenError> {
     let peers = config.discovery.peers.iter().filter(|peer| is_old(peer));
     let agents = peers.map(|peer| (peer.name.as_str(), peer.locations.clone()));
     StaticDirectory::new(agents).map_err(|error| OpenError::Discovery(error.to_string()))
@@ -484,7 +484,7 @@ impl Contacts for Acquaintances {
         }
     }
 
-    fn doubtful(&self, location: &Location, fault: WayFault) {
+    fn doubtful(&self, location: &Location, fault: TransportErrorKind) {
         self.neighbours.doubt(location, fault);
         if let Some(network) = &*self.network.lock() {
             network.doubt(location.incarnation());

@@ -96,7 +96,7 @@ pub use fipa_sds::{
 };
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, Kind, ListenError, Location, Outcome, Signature,
-    WayError, WayFault,
+    TransportError, TransportErrorKind,
 };
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{AgentId, Performative, escape};
-pub use fipa_mts::core::{Route, Standing, Way, WayState};
+pub use fipa_mts::core::{Route, RouteCandidate, RouteState, Standing};
 use fipa_sds::{Directory, Entry, Query, Role};
 use fipa_transport::{Incarnation, Location};
 use serde::{Deserialize, Serialize};
@@ -34,7 +34,7 @@ pub struct Report {
     /// The route to each agent.
     pub routes: Vec<Route>,
     /// The state of each route.
-    pub ways: Vec<WayState>,
+    pub ways: Vec<RouteState>,
     /// The static peers; empty unless the service is a gateway.
     pub peers: Vec<StaticPeer>,
     /// The gateways with an open connection; empty unless the service is a gateway.

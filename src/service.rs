@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
-use fipa_mts::{Contacts, Gate, Mts, RuntimeConfig, Started};
+use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory, Entry, HostDirectory, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
@@ -189,7 +189,7 @@ fn gate(
     config: &Config,
     role: &Role<'_>,
     host: &Arc<HostDirectory>,
-) -> Result<Option<Arc<dyn Gate>>, OpenError> {
+) -> Result<Option<Arc<dyn AccessGate>>, OpenError> {
     let of = match role.gateway {
         true => Of::Gateway(Arc::clone(&role.name)),
         false => Of::Process(Arc::clone(host)),
@@ -199,7 +199,7 @@ fn gate(
         .access
         .rules()
         .map_err(|error| OpenError::Access(error.to_string()))?;
-    Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn Gate>))
+    Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn AccessGate>))
 }
 
 /// Joins the reasons why no transport can be used.

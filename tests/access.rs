@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa::config::Sources;
 use fipa::{
     Agent, AgentId, Config, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome,
-    Performative, WayFault,
+    Performative, TransportErrorKind,
 };
 use fipa_mts::letter_for;
 use fipa_transport::{
@@ -58,7 +58,7 @@ fn refused(outcome: &Outcome) -> Option<String> {
             attempts,
         } => {
             let attempt = attempts.last().unwrap();
-            assert_eq!(attempt.error.fault, WayFault::Refused);
+            assert_eq!(attempt.error.fault, TransportErrorKind::Refused);
             Some(attempt.error.to_string())
         }
         _ => None,

@@ -11,7 +11,7 @@ use fipa::config::Sources;
 use fipa::routes::{self, Standing};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Message, OpenError,
-    Outcome, Performative, Query, WayFault,
+    Outcome, Performative, Query, TransportErrorKind,
 };
 
 /// A simulated host with a domain and names that no other test uses.
@@ -130,7 +130,7 @@ async fn small_letters_use_udp_and_letters_too_large_for_it_use_tcp() {
                 Kind::Tcp => {
                     assert_eq!(attempts.len(), 1, "{sent}");
                     assert_eq!(attempts[0].via, Kind::Udp);
-                    assert_eq!(attempts[0].error.fault, WayFault::TooLarge);
+                    assert_eq!(attempts[0].error.fault, TransportErrorKind::TooLarge);
                 }
                 _ => assert!(attempts.is_empty(), "{sent}"),
             }

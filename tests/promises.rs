@@ -20,7 +20,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fastrand::Rng;
 use fipa::{AgentId, FailureReason, Kind, Letter, Message, Outcome, Performative};
 use fipa_mts::core::Submission;
-use fipa_mts::{Gate, Sending, letter_for};
+use fipa_mts::{AccessGate, Sending, letter_for};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
     Transport, Verdict,
@@ -96,7 +96,7 @@ impl Draft {
 /// The access rule of the far gateway: it refuses `cancel`.
 struct NoCancel;
 
-impl Gate for NoCancel {
+impl AccessGate for NoCancel {
     fn admits(
         &self,
         _: Instant,

@@ -42,7 +42,7 @@ enum Attack {
     /// Frames over TCP.
     Frames,
     /// A letter of a legacy peer.
-    OldPeer,
+    LegacyPeer,
     /// Datagrams that may begin a UDP connection.
     Datagrams,
     /// A UDP connection.
@@ -60,10 +60,10 @@ enum Attack {
 }
 
 use Attack::*;
-const CLEAR: [Attack; 4] = [Frames, OldPeer, Datagrams, Udp];
+const CLEAR: [Attack; 4] = [Frames, LegacyPeer, Datagrams, Udp];
 const SECURED: [Attack; 7] = [
     Frames,
-    OldPeer,
+    LegacyPeer,
     Handshake,
     Tls,
     QuicDatagrams,
@@ -204,8 +204,8 @@ impl Target {
                 let script = writer.frames();
                 Some(stream::plain(self.tcp, script).await)
             }
-            OldPeer => {
-                let script = writer.old_peer();
+            LegacyPeer => {
+                let script = writer.legacy_peer();
                 Some(stream::plain(self.tcp, script).await)
             }
             Datagrams | QuicDatagrams => {

@@ -23,7 +23,7 @@ use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
     Introduction, Kind, LegacySource, Location, Mandate, Outcome, Parcel, Principal, Report,
-    Signature, Stream, Ticket, Verdict, WayError, WayFault,
+    Signature, Stream, Ticket, TransportError, TransportErrorKind, Verdict,
 };
 
 use crate::input::Input;
@@ -589,7 +589,7 @@ impl World {
                     } else if [LIAR, MOLE].contains(&to) {
                         self.held.push((at, attempt, parcel));
                     } else {
-                        let error = WayError::new(WayFault::Unreachable, "");
+                        let error = TransportError::new(TransportErrorKind::Unreachable, "");
                         let conclusion = Coming::Conclusion(attempt, Conclusion::NotSent(error));
                         self.coming.push_back((self.now + DELAY, at, conclusion));
                     }
@@ -798,18 +798,18 @@ fn reason(input: &mut Input<'_>) -> FailureReason {
     ])
 }
 
-fn way_error(input: &mut Input<'_>) -> WayError {
+fn way_error(input: &mut Input<'_>) -> TransportError {
     let fault = input.one_of(&[
-        WayFault::Unreachable,
-        WayFault::Congested,
-        WayFault::Broken,
-        WayFault::TooLarge,
-        WayFault::WrongIncarnation,
-        WayFault::Refused,
-        WayFault::TimedOut,
-        WayFault::Inexpressible,
+        TransportErrorKind::Unreachable,
+        TransportErrorKind::Congested,
+        TransportErrorKind::Broken,
+        TransportErrorKind::TooLarge,
+        TransportErrorKind::WrongIncarnation,
+        TransportErrorKind::Refused,
+        TransportErrorKind::TimedOut,
+        TransportErrorKind::Inexpressible,
     ]);
-    WayError::new(fault, String::from_utf8_lossy(input.bytes(20)))
+    TransportError::new(fault, String::from_utf8_lossy(input.bytes(20)))
 }
 
 fn lying_outcome(input: &mut Input<'_>) -> Outcome {

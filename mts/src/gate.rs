@@ -68,7 +68,7 @@ fn network_of(address: IpAddr) -> IpAddr {
 }
 
 /// Decides which letters are accepted, for an agent of this service or into a gateway's custody.
-pub trait Gate: Send + Sync {
+pub trait AccessGate: Send + Sync {
     /// Decides whether a letter for this receiver that arrived on this link is accepted. Called
     /// once per letter when there is space for it: not for copies of an accepted letter, and not
     /// for one that must wait. Must not block or call the service back.

@@ -18,6 +18,6 @@ pub mod watch;
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
 pub use failure::DeliveryFailure;
-pub use gate::{Gate, Link, Source};
+pub use gate::{AccessGate, Link, Source};
 pub use post::{PostError, letter_around, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};

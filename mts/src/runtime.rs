@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use fipa_sds::{Change, Directory, Entry, Pattern};
 use fipa_transport::{
     Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
-    OwnerProcess, Transport, WayError, WayFault,
+    OwnerProcess, Transport, TransportError, TransportErrorKind,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
@@ -26,11 +26,11 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 
 use self::receiving::TransportSink;
-use crate::Gate;
+use crate::AccessGate;
 use crate::Map;
 use crate::core::{
-    Action, Core, CoreConfig, Notice, Now, Peer, PeerState, Received, Route, SendId, Submission,
-    WayState,
+    Action, Core, CoreConfig, Notice, Now, Peer, PeerState, Received, Route, RouteState, SendId,
+    Submission,
 };
 
 /// Configuration of the runtime, in addition to that of the core.
@@ -46,7 +46,7 @@ pub struct RuntimeConfig {
     /// Observer of the letters that pass while the service is [watched](Mts::watch).
     pub tap: Option<Arc<dyn Tap>>,
     /// Decides which letters are accepted; without one, all are. Called with the service locked.
-    pub gate: Option<Arc<dyn Gate>>,
+    pub gate: Option<Arc<dyn AccessGate>>,
 }
 
 /// Receives news about other hosts: services with an open connection, and agents that are in no
@@ -56,7 +56,7 @@ pub trait Contacts: Send + Sync {
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
 
     /// A service may be gone; see [`Action::Doubtful`].
-    fn doubtful(&self, location: &Location, fault: WayFault);
+    fn doubtful(&self, location: &Location, fault: TransportErrorKind);
 
     /// A service has introduced itself on a connection; see
     /// [`Sink::introduced`](fipa_transport::Sink::introduced).
@@ -377,7 +377,7 @@ impl Mts {
 
     /// Returns the health and counters of each route; see [`Core::ways`].
     #[must_use]
-    pub fn ways(&self) -> Vec<WayState> {
+    pub fn ways(&self) -> Vec<RouteState> {
         self.shared.state.lock().core.ways(Now::read())
     }
 
@@ -648,9 +648,9 @@ impl State {
     }
 }
 
-fn no_such_transport(kind: Kind) -> WayError {
+fn no_such_transport(kind: Kind) -> TransportError {
     let text = format!("this process has no transport of kind {kind}");
-    WayError::new(WayFault::Closed, text)
+    TransportError::new(TransportErrorKind::Closed, text)
 }
 
 /// A future with the outcomes of one letter.

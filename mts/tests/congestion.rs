@@ -9,7 +9,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, Incarnation, Kind, Outcome, WayError, WayFault,
+    Answer, AttemptId, Conclusion, Incarnation, Kind, Outcome, TransportError, TransportErrorKind,
 };
 
 const RECEIVERS: usize = 40;
@@ -60,7 +60,10 @@ fn only_an_attempt_that_ended_frees_room() {
                     if under_way.len() < WINDOW {
                         under_way.push_back(attempt);
                     } else {
-                        let full = WayError::new(WayFault::Congested, "the window is full");
+                        let full = TransportError::new(
+                            TransportErrorKind::Congested,
+                            "the window is full",
+                        );
                         core.handle_conclusion(now, attempt, Conclusion::NotSent(full));
                     }
                 }

@@ -12,7 +12,8 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict, WayError, WayFault,
+    Outcome, Parcel, Principal, Report, Stream, Ticket, TransportError, TransportErrorKind,
+    Verdict,
 };
 
 const OWN: Incarnation = Incarnation::from_u64(1);
@@ -212,7 +213,7 @@ fn a_custodian_that_has_the_letter_keeps_it_and_is_asked_again() {
         let (later, ask, question) = sender.wait_for_dispatch(ms, ms + 10_000).unwrap();
         assert_eq!(question.body, Body::Predecessor);
         let conclusion = match ms {
-            1 => Conclusion::Unconfirmed(WayError::new(WayFault::TimedOut, "")),
+            1 => Conclusion::Unconfirmed(TransportError::new(TransportErrorKind::TimedOut, "")),
             _ => Conclusion::Answered(Answer::Accepted),
         };
         sender.conclude(later, ask, conclusion);

@@ -221,7 +221,8 @@ fn over_shared_memory_custody_is_answered_at_once() {
         other => panic!("{other:?}"),
     }
     // A lost report is sent again.
-    let broken = fipa_transport::WayError::new(fipa_transport::WayFault::Broken, "");
+    let broken =
+        fipa_transport::TransportError::new(fipa_transport::TransportErrorKind::Broken, "");
     let now = gateway.at(2);
     gateway
         .core
@@ -401,7 +402,7 @@ fn a_failed_route_is_avoided_during_its_backoff() {
     let accepted = || Conclusion::Answered(Answer::Accepted);
     let (attempt, first) = send(&mut core, 0);
     assert_eq!(first, Kind::Shm);
-    let error = fipa_transport::WayError::new(fipa_transport::WayFault::Broken, "");
+    let error = fipa_transport::TransportError::new(fipa_transport::TransportErrorKind::Broken, "");
     core.handle_conclusion(at(1), attempt, Conclusion::NotSent(error));
     let Some(Action::Dispatch {
         attempt, location, ..

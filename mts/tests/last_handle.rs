@@ -10,7 +10,7 @@ use fipa_mts::{Contacts, Mts, RuntimeConfig};
 use fipa_sds::MemoryDirectory;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Hop, Incarnation, Introduction, Kind, ListenError, Location,
-    Mandate, Parcel, Principal, Sink, Ticket, Transport, WayError, WayFault,
+    Mandate, Parcel, Principal, Sink, Ticket, Transport, TransportError, TransportErrorKind,
 };
 use parking_lot::Mutex;
 
@@ -52,8 +52,8 @@ impl Transport for Locked {
         Ok(Vec::new())
     }
 
-    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), WayError> {
-        Err(WayError::new(WayFault::Unreachable, ""))
+    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
+        Err(TransportError::new(TransportErrorKind::Unreachable, ""))
     }
 
     fn abandon(&self, _: AttemptId) -> Abandoned {
@@ -77,7 +77,7 @@ struct Halting {
 impl Contacts for Halting {
     fn heard(&self, _: &str, _: Incarnation, _: Location) {}
 
-    fn doubtful(&self, _: &Location, _: WayFault) {}
+    fn doubtful(&self, _: &Location, _: TransportErrorKind) {}
 
     fn introduced(&self, _: &Introduction) {
         let _ = self.called.lock().send(());

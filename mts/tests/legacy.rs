@@ -11,7 +11,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, StaticDirectory};
 use fipa_transport::{
-    AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, WayError, WayFault,
+    AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, TransportError,
+    TransportErrorKind,
 };
 
 const ROVER: Incarnation = Incarnation::from_u64(0xb);
@@ -85,8 +86,8 @@ impl Bench {
         }
     }
 
-    fn not_sent(&mut self, ms: u64, attempt: AttemptId, fault: WayFault) {
-        let conclusion = Conclusion::NotSent(WayError::new(fault, "for a test"));
+    fn not_sent(&mut self, ms: u64, attempt: AttemptId, fault: TransportErrorKind) {
+        let conclusion = Conclusion::NotSent(TransportError::new(fault, "for a test"));
         self.core
             .handle_conclusion(self.at(ms), attempt, conclusion);
     }
@@ -111,7 +112,7 @@ fn a_letter_that_the_dialect_cannot_express_fails_at_once() {
     let mut bench = Bench::new(&["tcp://10.0.0.3:6789;fipa-services"]);
     bench.send(0);
     let (attempt, _) = bench.dispatched();
-    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    bench.not_sent(1, attempt, TransportErrorKind::Inexpressible);
     let outcome = bench.outcome().unwrap();
     assert_eq!(reason(&outcome), FailureReason::Inexpressible);
     assert_eq!(outcome.attempts().len(), 1);
@@ -130,7 +131,7 @@ fn a_letter_that_one_dialect_cannot_express_goes_by_another() {
     ]);
     bench.send(0);
     let (attempt, _) = bench.dispatched();
-    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    bench.not_sent(1, attempt, TransportErrorKind::Inexpressible);
     let (attempt, location) = bench.dispatched();
     assert_eq!(location, "tcp://10.0.0.3:6790;jade");
     bench
@@ -148,9 +149,9 @@ fn a_letter_that_another_location_may_carry_later_is_repeated() {
     ]);
     bench.send(0);
     let (attempt, _) = bench.dispatched();
-    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    bench.not_sent(1, attempt, TransportErrorKind::Inexpressible);
     let (attempt, _) = bench.dispatched();
-    bench.not_sent(2, attempt, WayFault::Unreachable);
+    bench.not_sent(2, attempt, TransportErrorKind::Unreachable);
     assert_eq!(bench.outcome(), None);
     bench.core.handle_timeout(bench.at(5001));
     let outcome = bench.outcome().unwrap();
@@ -190,7 +191,7 @@ fn letters_that_waited_for_a_dead_peer_report_the_attempts() {
         bench.send(0);
     }
     let (attempt, _) = bench.dispatched();
-    bench.not_sent(1, attempt, WayFault::Unreachable);
+    bench.not_sent(1, attempt, TransportErrorKind::Unreachable);
     bench.core.handle_timeout(bench.at(5001));
     let outcomes = outcomes(&mut bench);
     assert_eq!(outcomes.len(), 3);
@@ -199,7 +200,7 @@ fn letters_that_waited_for_a_dead_peer_report_the_attempts() {
         let tried = outcome.attempts();
         assert_eq!(tried.len(), 1, "{outcome}");
         assert_eq!(tried[0].location.to_string(), LEGACY);
-        assert_eq!(tried[0].error.fault, WayFault::Unreachable);
+        assert_eq!(tried[0].error.fault, TransportErrorKind::Unreachable);
     }
     // Each failure message contains it, too.
     for _ in 0..3 {
@@ -246,8 +247,8 @@ fn the_last_error_of_each_location_is_reported() {
             bench.core.handle_timeout(Now { instant: now, utc });
         };
         let fault = match number {
-            28.. => WayFault::Refused,
-            _ => WayFault::Unreachable,
+            28.. => TransportErrorKind::Refused,
+            _ => TransportErrorKind::Unreachable,
         };
         let ms = now.duration_since(bench.start).as_millis();
         bench.not_sent(u64::try_from(ms).unwrap(), attempt, fault);
@@ -257,6 +258,10 @@ fn the_last_error_of_each_location_is_reported() {
     for location in [LEGACY, "tcp://10.0.0.3:6790;jade"] {
         let mut tried = outcome.attempts().iter().rev();
         let last = tried.find(|attempt| attempt.location.to_string() == location);
-        assert_eq!(last.unwrap().error.fault, WayFault::Refused, "{outcome}");
+        assert_eq!(
+            last.unwrap().error.fault,
+            TransportErrorKind::Refused,
+            "{outcome}"
+        );
     }
 }

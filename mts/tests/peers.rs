@@ -11,7 +11,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location, Mandate,
-    Principal, WayError, WayFault,
+    Principal, TransportError, TransportErrorKind,
 };
 
 struct Bench {
@@ -49,7 +49,7 @@ impl Bench {
     }
 
     fn fails(&mut self, attempt: AttemptId) {
-        let error = WayError::new(WayFault::Unreachable, "no host");
+        let error = TransportError::new(TransportErrorKind::Unreachable, "no host");
         let conclusion = Conclusion::NotSent(error);
         self.core.handle_conclusion(self.now, attempt, conclusion);
     }
@@ -175,7 +175,7 @@ fn silence_counts_as_a_failure() {
         Some(Action::Abandon { .. })
     ));
     let state = &bench.core.peers(bench.now)[0];
-    assert_eq!(state.failures[0].1.fault, WayFault::TimedOut);
+    assert_eq!(state.failures[0].1.fault, TransportErrorKind::TimedOut);
 }
 
 #[test]

@@ -11,8 +11,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, WayError,
-    WayFault,
+    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome,
+    TransportError, TransportErrorKind,
 };
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
@@ -82,7 +82,7 @@ impl Bench {
     }
 
     fn is_too_large(&mut self, ms: u64, attempt: AttemptId) {
-        let error = WayError::new(WayFault::TooLarge, "");
+        let error = TransportError::new(TransportErrorKind::TooLarge, "");
         let conclusion = Conclusion::NotSent(error);
         self.core
             .handle_conclusion(self.at(ms), attempt, conclusion);

@@ -9,7 +9,7 @@ use fipa_mts::{Mts, RuntimeConfig};
 use fipa_sds::MemoryDirectory;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Incarnation, Kind, ListenError, Location, Parcel, Sink, Ticket,
-    Transport, WayError, WayFault,
+    Transport, TransportError, TransportErrorKind,
 };
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
@@ -38,8 +38,11 @@ impl Transport for Slow {
         Ok(Vec::new())
     }
 
-    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), WayError> {
-        Err(WayError::new(WayFault::Unreachable, "no process is there"))
+    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
+        Err(TransportError::new(
+            TransportErrorKind::Unreachable,
+            "no process is there",
+        ))
     }
 
     fn abandon(&self, _: AttemptId) -> Abandoned {

@@ -42,8 +42,8 @@ const MAX_INTERFACES: usize = 64;
 /// Maximum number of static peers.
 const MAX_PEERS: usize = 1024;
 
-/// Maximum number of addresses in `security.old_peers`.
-const MAX_OLD_PEERS: usize = 64;
+/// Maximum number of addresses in `security.legacy_peers`.
+const MAX_LEGACY_PEERS: usize = 64;
 
 /// Lower bound of `security.peer_bytes`, in bytes per second: idle connections need some to stay open.
 const MIN_PEER_BYTES: u64 = 64 << 10;
@@ -134,9 +134,9 @@ impl Findings {
                 "write the full path, for example /home/robot/.config/fipa/keys",
             );
         }
-        if security.old_peers.len() > MAX_OLD_PEERS {
+        if security.legacy_peers.len() > MAX_LEGACY_PEERS {
             let path = ["security", "legacy_peers"];
-            self.too_many(&path, security.old_peers.len(), MAX_OLD_PEERS);
+            self.too_many(&path, security.legacy_peers.len(), MAX_LEGACY_PEERS);
         }
         if security.peer_connections == 0 {
             self.add(

@@ -202,8 +202,8 @@ pub(super) const KEYS: &[Key] = &[
         path: &["security", "legacy_peers"],
         shape: Shape::List,
         expected: r#"a list of addresses such as ["10.0.0.9"]"#,
-        write: |config, value| items(value, ip).map(|all| config.security.old_peers = all),
-        read: |config| Value::list(&config.security.old_peers),
+        write: |config, value| items(value, ip).map(|all| config.security.legacy_peers = all),
+        read: |config| Value::list(&config.security.legacy_peers),
     },
     Key {
         path: &["security", "peer_connections"],

@@ -41,7 +41,7 @@ fn the_former_name_of_a_key_is_read_as_the_present_one() {
         ("", &["security.legacy_peers=10.0.0.9"][..]),
     ] {
         let config = config(text, set);
-        assert_eq!(config.security.old_peers, addresses, "{text:?} {set:?}");
+        assert_eq!(config.security.legacy_peers, addresses, "{text:?} {set:?}");
     }
 }
 
@@ -162,7 +162,7 @@ fn every_key_is_read() {
     assert_eq!(config.security.keys, "/etc/fipa/keys");
     assert!(config.security.loopback && !config.security.insecure);
     let old: [std::net::IpAddr; 2] = ["10.0.0.9", "::1"].map(|text| text.parse().unwrap());
-    assert_eq!(config.security.old_peers, old);
+    assert_eq!(config.security.legacy_peers, old);
     let security = &config.security;
     assert_eq!((security.peer_connections, security.peer_letters), (8, 0));
     assert_eq!(security.peer_bytes, 1 << 20);

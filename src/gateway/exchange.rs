@@ -13,7 +13,7 @@ use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
     Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Present,
 };
-use fipa_transport::{Incarnation, Location, WayFault};
+use fipa_transport::{Incarnation, Location, TransportErrorKind};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
@@ -152,7 +152,7 @@ impl Exchanging {
                 if let Some(network) = &means.network {
                     network.ended(location.incarnation());
                 }
-            } else if fault == WayFault::WrongIncarnation {
+            } else if fault == TransportErrorKind::WrongIncarnation {
                 // The service that is there introduces itself.
                 let at = location.with_incarnation(Incarnation::UNKNOWN);
                 means.service.mts.greet(vec![(at.address().into(), at)]);

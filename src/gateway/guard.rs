@@ -55,7 +55,7 @@ impl Guard {
         tell_of_ends(&credentials);
         let rules = Rules {
             loopback: config.loopback,
-            old_peers: config.old_peers.clone(),
+            legacy_peers: config.legacy_peers.clone(),
         };
         let security = Security::new(credentials, rules);
         let security = security.map_err(|error| OpenError::Keys(error.to_string()))?;

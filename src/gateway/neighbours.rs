@@ -15,7 +15,7 @@ use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
     Role, Source, Subscriber, Watch,
 };
-use fipa_transport::{Incarnation, Introduction, Location, Mandate, Principal, WayFault};
+use fipa_transport::{Incarnation, Introduction, Location, Mandate, Principal, TransportErrorKind};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
@@ -33,7 +33,7 @@ struct State {
     present: HashMap<Incarnation, Neighbour>,
     peers: Vec<Peer>,
     /// Locations at which an attempt failed, and why it did.
-    doubted: HashMap<Location, WayFault>,
+    doubted: HashMap<Location, TransportErrorKind>,
     /// Those whose last connection has ended, and when, the latest last.
     parted: VecDeque<(Instant, Arc<Entry>)>,
 }
@@ -101,7 +101,7 @@ impl Neighbours {
     }
 
     /// An attempt at this location failed: the gateway may not be there any more.
-    pub(super) fn doubt(&self, location: &Location, fault: WayFault) {
+    pub(super) fn doubt(&self, location: &Location, fault: TransportErrorKind) {
         let mut state = self.state.lock();
         if state.doubted.len() < MAX_DOUBTED {
             state.doubted.insert(location.clone(), fault);
@@ -110,7 +110,7 @@ impl Neighbours {
     }
 
     /// The locations at which attempts failed since the last call.
-    pub(super) fn take_doubted(&self) -> HashMap<Location, WayFault> {
+    pub(super) fn take_doubted(&self) -> HashMap<Location, TransportErrorKind> {
         std::mem::take(&mut self.state.lock().doubted)
     }
 

@@ -45,7 +45,7 @@ pub use avahi::Avahi;
 pub use network::{Host, Network};
 pub use packet_repeater::PacketRepeater;
 #[cfg(feature = "tls")]
-pub use peer::Anybody;
+pub use peer::AnyPeer;
 pub use peer::{frame, frame_header};
 
 /// Environment variable with the directory of the test, for the process in the namespaces.

@@ -30,10 +30,10 @@ pub fn frame_header(kind: u8, id: u64, body_len: u64) -> [u8; 24] {
 /// Accepts every server certificate without verification.
 #[cfg(feature = "tls")]
 #[derive(Debug)]
-pub struct Anybody;
+pub struct AnyPeer;
 
 #[cfg(feature = "tls")]
-impl ServerCertVerifier for Anybody {
+impl ServerCertVerifier for AnyPeer {
     fn verify_server_cert(
         &self,
         _: &CertificateDer<'_>,

@@ -10,7 +10,7 @@ use std::time::{Duration, SystemTime};
 
 use fipa::{AgentId, Kind, Letter, Message, Performative};
 use fipa_mts::core::CoreConfig;
-use fipa_mts::{Gate, Mts, RuntimeConfig, Started, letter_for};
+use fipa_mts::{AccessGate, Mts, RuntimeConfig, Started, letter_for};
 use fipa_sds::{Directory as _, MemoryDirectory, Registration};
 use fipa_transport::{Incarnation, Location, Transport};
 #[cfg(feature = "secure")]
@@ -70,7 +70,7 @@ pub(crate) struct TestService {
 struct Bounds {
     /// Maximum number of processes that can have its mailbox open.
     clients: Option<usize>,
-    gate: Option<Arc<dyn Gate>>,
+    gate: Option<Arc<dyn AccessGate>>,
 }
 
 impl TestService {
@@ -96,7 +96,7 @@ impl TestService {
         name: &str,
         order: &[Kind],
         security: Security,
-        gate: Arc<dyn Gate>,
+        gate: Arc<dyn AccessGate>,
     ) -> Self {
         let bounds = Bounds {
             gate: Some(gate),

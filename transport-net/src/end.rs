@@ -1,12 +1,12 @@
 //! The reasons for which a connection ends, and their consequences for parcels.
 
-use fipa_transport::{Incarnation, Location, WayError, WayFault};
+use fipa_transport::{Incarnation, Location, TransportError, TransportErrorKind};
 
 /// The reason for which a connection ends.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum ConnectionEnd {
     /// The connection could not be opened.
-    NotOpened(WayError),
+    NotOpened(TransportError),
     /// The peer has another incarnation than expected.
     WrongIncarnation {
         expected: Incarnation,
@@ -48,7 +48,7 @@ impl ConnectionEnd {
     /// Creates the end of a connection that could not be opened to a location.
     pub(crate) fn unreachable(to: &Location, what: &dyn std::fmt::Display) -> Self {
         let detail = format!("{}: {what}", to.address());
-        Self::NotOpened(WayError::new(WayFault::Unreachable, detail))
+        Self::NotOpened(TransportError::new(TransportErrorKind::Unreachable, detail))
     }
 
     /// Whether this side ends the connection with a goodbye.
@@ -71,21 +71,23 @@ impl ConnectionEnd {
 
     /// Returns the error of parcels that the peer cannot have received. `greeted` is whether the
     /// peer's hello had arrived.
-    pub(crate) fn before(&self, greeted: bool) -> WayError {
+    pub(crate) fn before(&self, greeted: bool) -> TransportError {
         match self {
             Self::NotOpened(error) => error.clone(),
-            Self::WrongIncarnation { expected, found } => WayError::new(
-                WayFault::WrongIncarnation,
+            Self::WrongIncarnation { expected, found } => TransportError::new(
+                TransportErrorKind::WrongIncarnation,
                 format_args!("the service at this address has incarnation {found}, not {expected}"),
             ),
-            Self::ProtocolViolation(what) => WayError::new(WayFault::Incompatible, what),
-            Self::Goodbye { .. } if !greeted => WayError::new(
-                WayFault::Refused,
+            Self::ProtocolViolation(what) => {
+                TransportError::new(TransportErrorKind::Incompatible, what)
+            }
+            Self::Goodbye { .. } if !greeted => TransportError::new(
+                TransportErrorKind::Refused,
                 "the peer refused the connection: its max_connections is reached, \
                  or it is connected with another service of this incarnation",
             ),
-            Self::Hangup if !greeted => WayError::new(
-                WayFault::Incompatible,
+            Self::Hangup if !greeted => TransportError::new(
+                TransportErrorKind::Incompatible,
                 "the peer closed the connection before its hello; \
                  is a fipa endpoint listening there?",
             ),
@@ -94,39 +96,48 @@ impl ConnectionEnd {
     }
 
     /// Returns the error of parcels that the peer may have received.
-    pub(crate) fn after(&self) -> WayError {
+    pub(crate) fn after(&self) -> TransportError {
         let (fault, detail) = match self {
             Self::NotOpened(error) => return error.clone(),
-            Self::WrongIncarnation { .. } => (WayFault::Broken, "the peer has another incarnation"),
-            Self::NotSought => (WayFault::Broken, "the peer dialled another service"),
-            Self::ProtocolViolation(what) => (WayFault::Broken, what.as_str()),
-            Self::TooSlow(what) => (WayFault::TimedOut, *what),
+            Self::WrongIncarnation { .. } => (
+                TransportErrorKind::Broken,
+                "the peer has another incarnation",
+            ),
+            Self::NotSought => (
+                TransportErrorKind::Broken,
+                "the peer dialled another service",
+            ),
+            Self::ProtocolViolation(what) => (TransportErrorKind::Broken, what.as_str()),
+            Self::TooSlow(what) => (TransportErrorKind::TimedOut, *what),
             Self::Silent => (
-                WayFault::TimedOut,
+                TransportErrorKind::TimedOut,
                 "the peer did not respond in time (keep_alive)",
             ),
-            Self::Broken(what) => (WayFault::Broken, what.as_str()),
-            Self::Hangup => (WayFault::Broken, "the peer closed the connection"),
-            Self::Goodbye { .. } => (WayFault::Broken, "the peer ended the connection"),
+            Self::Broken(what) => (TransportErrorKind::Broken, what.as_str()),
+            Self::Hangup => (TransportErrorKind::Broken, "the peer closed the connection"),
+            Self::Goodbye { .. } => (TransportErrorKind::Broken, "the peer ended the connection"),
             Self::Idle => (
-                WayFault::Broken,
+                TransportErrorKind::Broken,
                 "the connection reached its idle timeout (idle_close)",
             ),
             Self::TooManyConnections => (
-                WayFault::Congested,
+                TransportErrorKind::Congested,
                 "too many connections (max_connections)",
             ),
             #[cfg(feature = "secure")]
-            Self::Distrusted => (WayFault::Refused, "the peer is no longer trusted"),
+            Self::Distrusted => (TransportErrorKind::Refused, "the peer is no longer trusted"),
             #[cfg(feature = "secure")]
             Self::Expired => (
-                WayFault::Refused,
+                TransportErrorKind::Refused,
                 "the peer's certificate has expired; run `fipa keys renew` on the peer's host",
             ),
-            Self::IdentityConflict(why) => (WayFault::Refused, *why),
-            Self::Superseded => (WayFault::Broken, "the peer opened another connection"),
-            Self::Closed => (WayFault::Closed, "this endpoint has been closed"),
+            Self::IdentityConflict(why) => (TransportErrorKind::Refused, *why),
+            Self::Superseded => (
+                TransportErrorKind::Broken,
+                "the peer opened another connection",
+            ),
+            Self::Closed => (TransportErrorKind::Closed, "this endpoint has been closed"),
         };
-        WayError::new(fault, detail)
+        TransportError::new(fault, detail)
     }
 }

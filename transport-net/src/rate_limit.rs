@@ -9,7 +9,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_transport::Allowance;
+use fipa_transport::TokenBucket;
 use parking_lot::Mutex;
 
 /// Maximum number of addresses with a limit of their own. All further addresses share one limit.
@@ -36,8 +36,8 @@ pub(crate) struct PeerRateLimit {
 
 #[derive(Debug)]
 struct Left {
-    letters: Allowance,
-    bytes: Allowance,
+    letters: TokenBucket,
+    bytes: TokenBucket,
 }
 
 impl PeerRateLimits {
@@ -77,8 +77,8 @@ impl PeerRateLimit {
             letters_per_second: letters,
             bytes_per_second: bytes,
             left: Mutex::new(Left {
-                letters: Allowance::new(letters, now),
-                bytes: Allowance::new(bytes, now),
+                letters: TokenBucket::new(letters, now),
+                bytes: TokenBucket::new(bytes, now),
             }),
         }
     }

@@ -18,7 +18,7 @@ use common::intruder::{
 };
 use common::{NAME, Party, Recorder, config, hello_of, parcel, quic_config, until};
 use fipa_testbed::frame;
-use fipa_transport::{Conclusion, Kind, Location, Transport, WayFault};
+use fipa_transport::{Conclusion, Kind, Location, Transport, TransportErrorKind};
 use fipa_transport_net::{QuicTransport, TcpTransport};
 use rustls::version::TLS12;
 
@@ -72,7 +72,7 @@ fn assert_not_sent<T: Transport>(from: &Party<T>, kind: Kind, at: &str) -> Strin
     let Conclusion::NotSent(error) = from.conclusion(1) else {
         panic!("{:?}", from.conclusion(1));
     };
-    assert_eq!(error.fault, WayFault::Unreachable, "{error}");
+    assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}");
     error.to_string()
 }
 

@@ -14,7 +14,9 @@ use std::time::Duration;
 use common::{Party, accepted, config, parcel, rogue_hello, until, written};
 use fipa_acl::Envelope;
 use fipa_testbed::frame_header;
-use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, Verdict, WayFault};
+use fipa_transport::{
+    Conclusion, Kind, Location, Parcel, Transport as _, TransportErrorKind, Verdict,
+};
 use fipa_transport_net::{Counters, Limits};
 use socket2::{Domain, Socket, Type};
 
@@ -71,7 +73,7 @@ fn frame(id: u64, parcel: &Parcel) -> Vec<u8> {
 }
 
 #[test]
-fn recorded_letters_of_old_peers_arrive_in_the_standard_dialect() {
+fn recorded_letters_of_legacy_peers_arrive_in_the_standard_dialect() {
     arrives_in_the_standard_dialect(TCP_LETTER);
     arrives_in_the_standard_dialect(TCP_LETTER_JADE);
 }
@@ -175,7 +177,7 @@ fn announcing_gigabytes_is_refused_at_once() {
 }
 
 #[test]
-fn a_letter_of_an_old_peer_is_bounded() {
+fn a_letter_of_a_legacy_peer_is_bounded() {
     let mut small = config(&["127.0.0.1:0"]);
     small.limits.max_letter = 100_000;
     let party = Party::with(small);
@@ -218,7 +220,9 @@ fn introduced_peers_beyond_the_limit_are_refused_with_a_reason() {
     peers[1].assert_reaches(1, &party);
     peers[2].send(1, party.location(), parcel(1, "x")).unwrap();
     match peers[2].conclusion(1) {
-        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Refused, "{error}"),
+        Conclusion::NotSent(error) => {
+            assert_eq!(error.fault, TransportErrorKind::Refused, "{error}")
+        }
         other => panic!("{other:?}"),
     }
     // The other slots are for connections that this side opens, and for other hosts.
@@ -227,7 +231,7 @@ fn introduced_peers_beyond_the_limit_are_refused_with_a_reason() {
     let error = party
         .send(3, peers[4].location(), parcel(1, "x"))
         .unwrap_err();
-    assert_eq!(error.fault, WayFault::Congested, "{error}");
+    assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
     peers[0].assert_reaches(2, &party);
 }
 
@@ -250,7 +254,7 @@ fn a_server_of_another_protocol_is_incompatible() {
         party.send(attempt as u64, &to, parcel(1, "x")).unwrap();
         match party.conclusion(attempt as u64) {
             Conclusion::NotSent(error) => {
-                assert_eq!(error.fault, WayFault::Incompatible, "{error}")
+                assert_eq!(error.fault, TransportErrorKind::Incompatible, "{error}")
             }
             other => panic!("{other:?}"),
         }
@@ -278,11 +282,15 @@ fn a_peer_that_stops_reading_is_given_up() {
             .unwrap();
     }
     match party.conclusion(0) {
-        Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
+        Conclusion::Unconfirmed(error) => {
+            assert_eq!(error.fault, TransportErrorKind::TimedOut, "{error}")
+        }
         other => panic!("{other:?}"),
     }
     match party.conclusion(2) {
-        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
+        Conclusion::NotSent(error) => {
+            assert_eq!(error.fault, TransportErrorKind::TimedOut, "{error}")
+        }
         other => panic!("{other:?}"),
     }
     drop(server.join().unwrap());
@@ -306,7 +314,9 @@ fn a_peer_that_resets_during_the_goodbye_blocks_nothing() {
     let peer = server.join().unwrap();
     party.transport.close();
     match party.conclusion(1) {
-        Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::Closed, "{error}"),
+        Conclusion::Unconfirmed(error) => {
+            assert_eq!(error.fault, TransportErrorKind::Closed, "{error}")
+        }
         other => panic!("{other:?}"),
     }
     // Closing with unread bytes sends a reset.

@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use common::certificates::Host;
 use common::{NAME, Party, Recorder, accepted, parcel, quic_config, until};
-use fipa_transport::{Conclusion, Kind, Location, WayFault};
+use fipa_transport::{Conclusion, Kind, Location, TransportErrorKind};
 use fipa_transport_net::{QuicConfig, QuicTransport};
 
 fn party(config: QuicConfig) -> Party<QuicTransport> {
@@ -138,7 +138,7 @@ fn many_large_letters_arrive_in_order() {
         let content = vec![attempt as u8; 700_000];
         from.send(attempt, to.location(), parcel(attempt, content))
             .or_else(|error| match error.fault {
-                WayFault::Congested => {
+                TransportErrorKind::Congested => {
                     assert_eq!(from.conclusion(attempt - 40), accepted());
                     let content = vec![attempt as u8; 700_000];
                     from.send(attempt, to.location(), parcel(attempt, content))
@@ -219,5 +219,5 @@ fn a_peer_without_quic_is_reported_in_time() {
     let Conclusion::NotSent(error) = from.conclusion(1) else {
         panic!("{:?}", from.conclusion(1));
     };
-    assert_eq!(error.fault, WayFault::Unreachable);
+    assert_eq!(error.fault, TransportErrorKind::Unreachable);
 }

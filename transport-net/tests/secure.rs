@@ -17,7 +17,7 @@ use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
-use fipa_transport::{Answer, Conclusion, FailureReason, Mandate, Transport, WayFault};
+use fipa_transport::{Answer, Conclusion, FailureReason, Mandate, Transport, TransportErrorKind};
 use fipa_transport_net::secure::{Rules, Security};
 use fipa_transport_net::{Counters, Limits, TcpTransport};
 
@@ -267,14 +267,14 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
     let mut stray = letter_parcel(4, letter_from("rover"));
     stray.receiver = "sherpa".into();
     let refused = from.send(4, to.location(), stray.clone()).unwrap_err();
-    assert_eq!(refused.fault, WayFault::Refused);
+    assert_eq!(refused.fault, TransportErrorKind::Refused);
     // Also when the connection is only opened for such a letter.
     let later = T::party(rover.security(&[&crex]));
     later.send(1, to.location(), stray).unwrap();
     let Conclusion::NotSent(refused) = later.conclusion(1) else {
         panic!("{:?}", later.conclusion(1));
     };
-    assert_eq!(refused.fault, WayFault::Refused);
+    assert_eq!(refused.fault, TransportErrorKind::Refused);
 }
 
 /// Gateways forward letters of processes of their own host.
@@ -378,7 +378,7 @@ fn with_an_exception() -> Security {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let rules = Rules {
         loopback: true,
-        old_peers: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
+        legacy_peers: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
     };
     Security::new(crex.credentials(&[&rover]), rules).unwrap()
 }
@@ -393,7 +393,7 @@ fn throw(to: &Party) {
 }
 
 #[test]
-fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
+fn a_legacy_peer_may_be_an_exception_and_is_nothing_more() {
     let to = party(with_an_exception());
     throw(&to);
     until("its letter", || {
@@ -403,7 +403,7 @@ fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
 }
 
 #[test]
-fn an_old_peer_beyond_its_rate_limit_is_read_later() {
+fn a_legacy_peer_beyond_its_rate_limit_is_read_later() {
     let to = TcpTransport::limited(with_an_exception(), |limits| limits.peer_letters = 2);
     let begun = Instant::now();
     for _ in 0..6 {

@@ -13,8 +13,8 @@ use bytes::Bytes;
 use common::{Party, accepted, config, letter_parcel, parcel, until};
 use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport, Verdict,
-    WayFault,
+    Answer, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport,
+    TransportErrorKind, Verdict,
 };
 use fipa_transport_net::TcpTransport;
 
@@ -128,7 +128,9 @@ fn a_restarted_peer_has_another_incarnation_and_is_reachable_again() {
         let attempt = ATTEMPT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         a.send(attempt, &old, parcel(1, "to the old one")).ok()?;
         match a.conclusion(attempt) {
-            Conclusion::NotSent(error) if error.fault == WayFault::WrongIncarnation => Some(error),
+            Conclusion::NotSent(error) if error.fault == TransportErrorKind::WrongIncarnation => {
+                Some(error)
+            }
             Conclusion::NotSent(_) | Conclusion::Unconfirmed(_) => None,
             other => panic!("{other:?}"),
         }
@@ -219,7 +221,7 @@ fn an_unreachable_peer_is_reported_with_its_address() {
         a.send(attempt, &to, parcel(1, "x")).unwrap();
         match a.conclusion(attempt) {
             Conclusion::NotSent(error) => {
-                assert_eq!(error.fault, WayFault::Unreachable);
+                assert_eq!(error.fault, TransportErrorKind::Unreachable);
                 assert!(error.detail.contains(text), "{error}");
             }
             other => panic!("{other:?}"),
@@ -281,7 +283,7 @@ fn a_runtime_that_was_shut_down_is_reported() {
     let error = orphan
         .dispatch(fipa_transport::AttemptId(1), b.location(), parcel(1, "x"))
         .unwrap_err();
-    assert_eq!(error.fault, WayFault::Closed, "{error}");
+    assert_eq!(error.fault, TransportErrorKind::Closed, "{error}");
 }
 
 /// An address at which the system ignores connections while the returned sockets are kept.

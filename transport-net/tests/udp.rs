@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use common::{Recorder, accepted, parcel, rogue_hello, runtime, udp_config, until, written};
-use fipa_transport::{AttemptId, Conclusion, Kind, Location, Sink, Transport, WayFault};
+use fipa_transport::{AttemptId, Conclusion, Kind, Location, Sink, Transport, TransportErrorKind};
 use fipa_transport_net::{UdpConfig, UdpTransport};
 
 struct Party {
@@ -86,7 +86,9 @@ fn a_name_resolves_to_the_address_that_answers() {
         .dispatch(AttemptId(2), &unknown, parcel(1, "x"))
         .unwrap();
     match near.conclusion(2) {
-        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+        Conclusion::NotSent(error) => {
+            assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}")
+        }
         other => panic!("{other:?}"),
     }
 }
@@ -231,7 +233,9 @@ fn a_peer_that_stops_answering_is_given_up() {
     }
     for attempt in 0..3 {
         match near.conclusion(attempt) {
-            Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}")
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -254,9 +258,13 @@ fn an_unreachable_peer_is_detected_by_an_error_of_the_system() {
         .dispatch(AttemptId(2), &gone, parcel(2, "x"))
         .map(|()| near.conclusion(2));
     match sent {
-        Ok(Conclusion::NotSent(error)) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+        Ok(Conclusion::NotSent(error)) => {
+            assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}")
+        }
         // The letter was sent before the goodbye arrived.
-        Ok(Conclusion::Unconfirmed(error)) => assert_eq!(error.fault, WayFault::Broken, "{error}"),
+        Ok(Conclusion::Unconfirmed(error)) => {
+            assert_eq!(error.fault, TransportErrorKind::Broken, "{error}")
+        }
         other => panic!("{other:?}"),
     }
 }

@@ -15,7 +15,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use common::{Party, Recorder, accepted, parcel, unix_config, until};
-use fipa_transport::{Conclusion, Incarnation, Kind, ListenError, Location, Transport, WayFault};
+use fipa_transport::{
+    Conclusion, Incarnation, Kind, ListenError, Location, Transport, TransportErrorKind,
+};
 use fipa_transport_net::UnixTransport;
 
 type Unix = Party<UnixTransport>;
@@ -191,7 +193,7 @@ fn no_path_is_an_address() {
         let Conclusion::NotSent(error) = concluded else {
             panic!("{concluded:?}")
         };
-        assert_eq!(error.fault, WayFault::Unreachable);
+        assert_eq!(error.fault, TransportErrorKind::Unreachable);
     }
     assert_eq!(b.arrivals(), 0);
 }

@@ -8,7 +8,8 @@ use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use fipa_transport::{
-    Abandoned, AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, WayError, WayFault,
+    Abandoned, AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, TransportError,
+    TransportErrorKind,
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
@@ -334,7 +335,7 @@ impl Endpoint {
         attempt: AttemptId,
         to: &Location,
         parcel: &Parcel,
-    ) -> Result<(), WayError> {
+    ) -> Result<(), TransportError> {
         self.check_owner()?;
         if self.sink.get().is_none() {
             return Err(closed());
@@ -369,29 +370,30 @@ impl Endpoint {
         head_room: usize,
         len: usize,
         tail_room: usize,
-    ) -> Result<ShmLoan, WayError> {
+    ) -> Result<ShmLoan, TransportError> {
         self.check_owner()?;
         let peer = self.peer_at(to)?;
         self.outbox(&peer)?.loan(head_room, len, tail_room)
     }
 
-    fn check_owner(&self) -> Result<(), WayError> {
+    fn check_owner(&self) -> Result<(), TransportError> {
         match self.owner.is_this() {
             true => Ok(()),
-            false => Err(WayError::new(
-                WayFault::Closed,
+            false => Err(TransportError::new(
+                TransportErrorKind::Closed,
                 "this process was forked from the one that opened shared memory",
             )),
         }
     }
 
     /// Returns the outbox to a peer; opens its mailbox if necessary.
-    fn outbox(&self, peer: &Peer) -> Result<Arc<Outbox>, WayError> {
+    fn outbox(&self, peer: &Peer) -> Result<Arc<Outbox>, TransportError> {
         peer.outbox(|| {
             let node = self.node.lock();
             let name = mailbox_name(peer.incarnation());
-            let service = ServiceName::new(&name)
-                .map_err(|e| WayError::new(WayFault::Unreachable, format_args!("{e:?}")))?;
+            let service = ServiceName::new(&name).map_err(|e| {
+                TransportError::new(TransportErrorKind::Unreachable, format_args!("{e:?}"))
+            })?;
             Outbox::open(Opening {
                 node: node.as_ref().ok_or_else(closed)?,
                 service: &service,
@@ -406,16 +408,16 @@ impl Endpoint {
         })
     }
 
-    fn peer_at(self: &Arc<Self>, to: &Location) -> Result<Arc<Peer>, WayError> {
+    fn peer_at(self: &Arc<Self>, to: &Location) -> Result<Arc<Peer>, TransportError> {
         let incarnation: Incarnation = to.address().parse().map_err(|e| {
-            WayError::new(
-                WayFault::Unreachable,
+            TransportError::new(
+                TransportErrorKind::Unreachable,
                 format_args!("not the address of a mailbox: {e}"),
             )
         })?;
         if to.incarnation().is_known() && to.incarnation() != incarnation {
-            return Err(WayError::new(
-                WayFault::WrongIncarnation,
+            return Err(TransportError::new(
+                TransportErrorKind::WrongIncarnation,
                 format_args!("the mailbox belongs to incarnation {incarnation}"),
             ));
         }
@@ -423,7 +425,7 @@ impl Endpoint {
     }
 
     /// Returns a peer; opens its files if necessary.
-    fn peer(self: &Arc<Self>, incarnation: Incarnation) -> Result<Arc<Peer>, WayError> {
+    fn peer(self: &Arc<Self>, incarnation: Incarnation) -> Result<Arc<Peer>, TransportError> {
         let now = self.uses.fetch_add(1, Ordering::Relaxed);
         if let Some(peer) = self.peers.read().get(&incarnation) {
             peer.mark_used(now);
@@ -440,8 +442,8 @@ impl Endpoint {
             let idle = peers.values().filter(|peer| peer.is_idle());
             let oldest = idle.min_by_key(|peer| peer.last_used());
             let oldest = oldest.map(|peer| peer.incarnation()).ok_or_else(|| {
-                WayError::new(
-                    WayFault::Congested,
+                TransportError::new(
+                    TransportErrorKind::Congested,
                     format_args!(
                         "letters to {} processes are unanswered; raise max_peers",
                         self.config.max_peers
@@ -454,15 +456,15 @@ impl Endpoint {
         }
         let paths = self.domain.paths();
         let process = PeerProcess::open(paths, incarnation).map_err(|e| match e.kind() {
-            ErrorKind::NotFound => WayError::new(
-                WayFault::Unreachable,
+            ErrorKind::NotFound => TransportError::new(
+                TransportErrorKind::Unreachable,
                 format_args!(
                     "no process {incarnation} in {}",
                     paths.directory().display()
                 ),
             ),
-            _ => WayError::new(
-                WayFault::Congested,
+            _ => TransportError::new(
+                TransportErrorKind::Congested,
                 format_args!("cannot open the files of process {incarnation}: {e}"),
             ),
         })?;
@@ -474,8 +476,8 @@ impl Endpoint {
             }
         };
         peer.watch(&self.runtime, ended).map_err(|e| {
-            WayError::new(
-                WayFault::Congested,
+            TransportError::new(
+                TransportErrorKind::Congested,
                 format_args!("cannot watch process {incarnation}: {e}"),
             )
         })?;
@@ -590,6 +592,6 @@ fn report_conclusions(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) 
     }
 }
 
-fn closed() -> WayError {
-    WayError::new(WayFault::Closed, "")
+fn closed() -> TransportError {
+    TransportError::new(TransportErrorKind::Closed, "")
 }

@@ -1,7 +1,7 @@
 //! Mapping of iceoryx2 errors to transport errors.
 
 use fipa_transport::wire::WireError;
-use fipa_transport::{WayError, WayFault};
+use fipa_transport::{TransportError, TransportErrorKind};
 use iceoryx2::port::LoanError;
 use iceoryx2::port::client::RequestSendError;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
@@ -10,74 +10,83 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 const MAILBOX_TAKEN: &str =
     ": too many processes have it open; raise max_clients of the other process";
 
-pub(crate) fn too_large() -> WayError {
-    WayError::new(WayFault::TooLarge, "")
+pub(crate) fn too_large() -> TransportError {
+    TransportError::new(TransportErrorKind::TooLarge, "")
 }
 
-pub(crate) fn retired() -> WayError {
-    WayError::new(WayFault::Congested, "the connection is being renewed")
+pub(crate) fn retired() -> TransportError {
+    TransportError::new(
+        TransportErrorKind::Congested,
+        "the connection is being renewed",
+    )
 }
 
-pub(crate) fn window_full(window: usize) -> WayError {
-    WayError::new(
-        WayFault::Congested,
+pub(crate) fn window_full(window: usize) -> TransportError {
+    TransportError::new(
+        TransportErrorKind::Congested,
         format_args!("{window} letters to this process are unanswered"),
     )
 }
 
-pub(crate) fn wire_error(error: WireError) -> WayError {
+pub(crate) fn wire_error(error: WireError) -> TransportError {
     let fault = match error {
-        WireError::BodyLength { .. } => WayFault::TooLarge,
-        _ => WayFault::Refused,
+        WireError::BodyLength { .. } => TransportErrorKind::TooLarge,
+        _ => TransportErrorKind::Refused,
     };
-    WayError::new(fault, error)
+    TransportError::new(fault, error)
 }
 
-pub(crate) fn open_error(error: RequestResponseOpenError) -> WayError {
+pub(crate) fn open_error(error: RequestResponseOpenError) -> TransportError {
     use RequestResponseOpenError as E;
     let fault = match error {
-        E::DoesNotExist | E::IsMarkedForDestruction => WayFault::Unreachable,
-        E::ExceedsMaxNumberOfNodes => WayFault::Congested,
+        E::DoesNotExist | E::IsMarkedForDestruction => TransportErrorKind::Unreachable,
+        E::ExceedsMaxNumberOfNodes => TransportErrorKind::Congested,
         E::IncompatibleRequestOrResponseType
         | E::IncompatibleAttributes
-        | E::IncompatibleMessagingPattern => WayFault::Incompatible,
-        _ => WayFault::Unreachable,
+        | E::IncompatibleMessagingPattern => TransportErrorKind::Incompatible,
+        _ => TransportErrorKind::Unreachable,
     };
     let hint = match error {
         E::ExceedsMaxNumberOfNodes => MAILBOX_TAKEN,
         _ => "",
     };
-    WayError::new(
+    TransportError::new(
         fault,
         format_args!("cannot open the mailbox ({error:?}){hint}"),
     )
 }
 
-pub(crate) fn create_error(error: ClientCreateError) -> WayError {
+pub(crate) fn create_error(error: ClientCreateError) -> TransportError {
     let hint = match error {
         ClientCreateError::ExceedsMaxSupportedClients => MAILBOX_TAKEN,
         _ => ": the limit of open files may be too low, or shared memory full",
     };
-    WayError::new(
-        WayFault::Congested,
+    TransportError::new(
+        TransportErrorKind::Congested,
         format_args!("cannot connect to the mailbox ({error:?}){hint}"),
     )
 }
 
-pub(crate) fn loan_error(error: LoanError) -> WayError {
+pub(crate) fn loan_error(error: LoanError) -> TransportError {
     let hint = match error {
         LoanError::ExceedsMaxLoans => "too many letters to this process are unanswered",
         _ => "cannot allocate shared memory: enlarge /dev/shm, or raise the limit of open files",
     };
-    WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
+    TransportError::new(
+        TransportErrorKind::Congested,
+        format_args!("{hint} ({error:?})"),
+    )
 }
 
-pub(crate) fn send_error(error: RequestSendError) -> WayError {
+pub(crate) fn send_error(error: RequestSendError) -> TransportError {
     let hint = match error {
         RequestSendError::ExceedsMaxActiveRequests => {
             "too many letters to this process are unanswered"
         }
         _ => "the mailbox does not accept the letter",
     };
-    WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
+    TransportError::new(
+        TransportErrorKind::Congested,
+        format_args!("{hint} ({error:?})"),
+    )
 }

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::time::{Duration, Instant};
 
-use fipa_transport::{WayError, WayFault};
+use fipa_transport::{TransportError, TransportErrorKind};
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
 use rustix::io::Errno;
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
@@ -84,10 +84,10 @@ impl Budget {
     /// until the result is dropped. The pages must be allocated before that ([`populate`]).
     ///
     /// A holder of the domain's lock may take this lock, but not the other way round.
-    pub(crate) fn reserve(&self, need: u64) -> Result<OwnedFd, WayError> {
+    pub(crate) fn reserve(&self, need: u64) -> Result<OwnedFd, TransportError> {
         let lock_directory = self.lock_directory().map_err(|e| {
-            WayError::new(
-                WayFault::Congested,
+            TransportError::new(
+                TransportErrorKind::Congested,
                 format_args!(
                     "cannot lock {} to allocate memory: {e}",
                     self.directory.display()
@@ -108,10 +108,10 @@ impl Budget {
     }
 
     /// Checks that `need` more bytes can be allocated now.
-    pub(crate) fn check(&self, need: u64) -> Result<(), WayError> {
+    pub(crate) fn check(&self, need: u64) -> Result<(), TransportError> {
         if need > self.capacity {
-            return Err(WayError::new(
-                WayFault::TooLarge,
+            return Err(TransportError::new(
+                TransportErrorKind::TooLarge,
                 format_args!(
                     "{need} bytes of shared memory are needed, and the capacity of this domain is {}; \
                      raise transport.shm.capacity",
@@ -121,8 +121,8 @@ impl Budget {
         }
         let used = self.used();
         if used.saturating_add(need) > self.capacity {
-            return Err(WayError::new(
-                WayFault::Congested,
+            return Err(TransportError::new(
+                TransportErrorKind::Congested,
                 format_args!(
                     "{need} more bytes of shared memory are needed, and {used} of this domain's {} \
                      are in use; raise transport.shm.capacity",
@@ -213,15 +213,15 @@ pub(crate) fn open_owned(
     Ok((file, found))
 }
 
-pub(crate) fn no_room_error(need: u64, what: &str) -> WayError {
-    WayError::new(
-        WayFault::Congested,
+pub(crate) fn no_room_error(need: u64, what: &str) -> TransportError {
+    TransportError::new(
+        TransportErrorKind::Congested,
         format_args!("{need} more bytes of shared memory are needed, and {SHM} {what}; enlarge it"),
     )
 }
 
 /// The transport error for pages that could not be allocated.
-pub(crate) fn shortage_error(shortage: Shortage) -> WayError {
+pub(crate) fn shortage_error(shortage: Shortage) -> TransportError {
     no_room_error(shortage.needed, &format!("is full ({})", shortage.error))
 }
 
@@ -234,7 +234,7 @@ fn free_bytes() -> std::io::Result<u64> {
 ///
 /// `start` must be in memory that is mapped for writing and stays mapped during the call; any other
 /// range gives an error.
-pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
+pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), TransportError> {
     // Aligned to the kernel's pages: it refuses other ranges with `INVAL`, which is also the error
     // of a kernel without this advice.
     let page = page_size();

@@ -8,7 +8,9 @@ use std::sync::{Arc, Weak};
 
 use bytes::Bytes;
 use fipa_transport::wire::{ParcelHeader, Pieces};
-use fipa_transport::{AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault};
+use fipa_transport::{
+    AttemptId, Body, Conclusion, Incarnation, Parcel, TransportError, TransportErrorKind,
+};
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::DegradationAction;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
@@ -136,12 +138,12 @@ pub(crate) struct Opening<'a> {
 }
 
 impl Outbox {
-    pub(crate) fn open(opening: Opening<'_>) -> Result<Self, WayError> {
+    pub(crate) fn open(opening: Opening<'_>) -> Result<Self, TransportError> {
         opening.budget.check(OPENING)?;
         let _lock = opening
             .domain
             .lock_shared()
-            .map_err(|e| WayError::new(WayFault::Congested, e))?;
+            .map_err(|e| TransportError::new(TransportErrorKind::Congested, e))?;
         let service = opening
             .node
             .service_builder(opening.service)
@@ -167,8 +169,8 @@ impl Outbox {
         }
         let client = client.map_err(create_error)?;
         let start = getrandom::u64().map_err(|e| {
-            WayError::new(
-                WayFault::Closed,
+            TransportError::new(
+                TransportErrorKind::Closed,
                 format_args!("cannot get random numbers: {e}"),
             )
         })?;
@@ -222,7 +224,11 @@ impl Outbox {
     }
 
     /// Puts a parcel into the mailbox.
-    pub(crate) fn post(&self, attempt: AttemptId, parcel: &Parcel) -> Result<Posted, WayError> {
+    pub(crate) fn post(
+        &self,
+        attempt: AttemptId,
+        parcel: &Parcel,
+    ) -> Result<Posted, TransportError> {
         let (header, pieces) = ParcelHeader::borrowing(parcel).map_err(wire_error)?;
         let (content, tail) = match &parcel.body {
             Body::Letter(letter) => (&letter.payload().content, letter.payload().tail.len()),
@@ -321,15 +327,15 @@ impl Outbox {
         unanswered.keep();
     }
 
-    fn not_delivered(&self, pending: &Pending) -> WayError {
+    fn not_delivered(&self, pending: &Pending) -> TransportError {
         if pending.is_connected() {
-            WayError::new(
-                WayFault::Congested,
+            TransportError::new(
+                TransportErrorKind::Congested,
                 "the mailbox of the other process is full",
             )
         } else {
-            WayError::new(
-                WayFault::Unreachable,
+            TransportError::new(
+                TransportErrorKind::Unreachable,
                 "the other process has closed its mailbox",
             )
         }
@@ -345,7 +351,11 @@ impl Outbox {
     }
 
     /// Takes the request out of a loan if iceoryx2 will accept it now.
-    fn ready_loan(&self, state: &State, loan: &Loan) -> Result<Option<UninitRequest>, WayError> {
+    fn ready_loan(
+        &self,
+        state: &State,
+        loan: &Loan,
+    ) -> Result<Option<UninitRequest>, TransportError> {
         let kept = |loan: &Weak<Loan>| {
             loan.upgrade()
                 .is_some_and(|loan| loan.is_kept_after_sending())
@@ -370,7 +380,7 @@ impl Outbox {
         start: usize,
         pieces: &Pieces<'_>,
         content: &Bytes,
-    ) -> Result<bool, WayError> {
+    ) -> Result<bool, TransportError> {
         *request.user_header_mut() = header;
         let room = start..loan.payload_len();
         // SAFETY: `room` ends where the payload does, which the request just taken owns. Other
@@ -405,15 +415,15 @@ impl Outbox {
         head_room: usize,
         len: usize,
         tail_room: usize,
-    ) -> Result<ShmLoan, WayError> {
+    ) -> Result<ShmLoan, TransportError> {
         let offsets = PieceOffsets::for_lengths(head_room, len, tail_room).ok_or_else(too_large)?;
         let mut state = self.state.lock();
         if self.is_retired() {
             return Err(retired());
         }
         if self.loans.load(Ordering::Acquire) >= self.max_loans {
-            return Err(WayError::new(
-                WayFault::Congested,
+            return Err(TransportError::new(
+                TransportErrorKind::Congested,
                 format_args!(
                     "{} loans to this process are already out; send or drop one, or raise max_loans",
                     self.max_loans
@@ -448,7 +458,7 @@ impl Outbox {
     }
 
     /// Takes a request with a payload of this length, all of whose pages are allocated.
-    fn take(&self, state: &mut State, len: usize) -> Result<UninitRequest, WayError> {
+    fn take(&self, state: &mut State, len: usize) -> Result<UninitRequest, TransportError> {
         let segment = &mut state.segment;
         let grows = len > segment.room;
         // Keeps other processes from allocating until the pages are allocated here.
@@ -603,8 +613,8 @@ impl Sent {
 
     fn conclusion_of(&self, pending: &Pending, ended: bool) -> Option<Conclusion> {
         let broken = |detail: String| {
-            Some(Conclusion::Unconfirmed(WayError::new(
-                WayFault::Broken,
+            Some(Conclusion::Unconfirmed(TransportError::new(
+                TransportErrorKind::Broken,
                 detail,
             )))
         };
@@ -617,8 +627,8 @@ impl Sent {
         match answer {
             Ok(Some(ack)) => Some(match ack.answer(self.token) {
                 Some(answer) => Conclusion::Answered(answer),
-                None => Conclusion::Unconfirmed(WayError::new(
-                    WayFault::Incompatible,
+                None => Conclusion::Unconfirmed(TransportError::new(
+                    TransportErrorKind::Incompatible,
                     "the answer is malformed",
                 )),
             }),
@@ -688,6 +698,6 @@ fn header_len() -> usize {
     (size_of::<RequestHeader>() + size_of::<Header>()).next_multiple_of(ALIGNMENT)
 }
 
-fn offset(start: usize) -> Result<u32, WayError> {
+fn offset(start: usize) -> Result<u32, TransportError> {
     u32::try_from(start).map_err(|_| too_large())
 }

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
-use fipa_transport::{AttemptId, Conclusion, Incarnation, WayError, WayFault};
+use fipa_transport::{AttemptId, Conclusion, Incarnation, TransportError, TransportErrorKind};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
@@ -86,8 +86,8 @@ impl Peer {
     /// Returns the outbox, opened with `open` if necessary.
     pub(crate) fn outbox(
         &self,
-        open: impl FnOnce() -> Result<Outbox, WayError>,
-    ) -> Result<Arc<Outbox>, WayError> {
+        open: impl FnOnce() -> Result<Outbox, TransportError>,
+    ) -> Result<Arc<Outbox>, TransportError> {
         let mut slot = self.outbox.lock();
         if self.ended.load(Ordering::SeqCst) {
             return Err(self.gone());
@@ -98,9 +98,9 @@ impl Peer {
         }
     }
 
-    fn gone(&self) -> WayError {
-        WayError::new(
-            WayFault::Unreachable,
+    fn gone(&self) -> TransportError {
+        TransportError::new(
+            TransportErrorKind::Unreachable,
             format_args!("process {} has ended", self.incarnation),
         )
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 
 use bytes::Bytes;
-use fipa_transport::{Incarnation, LoanedContent, WayError, WayFault};
+use fipa_transport::{Incarnation, LoanedContent, TransportError, TransportErrorKind};
 use parking_lot::Mutex;
 
 use crate::domain_files::DomainFiles;
@@ -86,13 +86,13 @@ impl Pool {
     pub(crate) fn loan(
         self: &Arc<Self>,
         len: usize,
-    ) -> Result<Option<SharedContentLoan>, WayError> {
+    ) -> Result<Option<SharedContentLoan>, TransportError> {
         if len < self.share_from {
             return Ok(None);
         }
         let mut state = self.state.lock();
         if state.closed {
-            return Err(WayError::new(WayFault::Closed, ""));
+            return Err(TransportError::new(TransportErrorKind::Closed, ""));
         }
         let (segment, generation) = match state.begin_idle(len) {
             Some(begun) => begun,
@@ -107,10 +107,10 @@ impl Pool {
     }
 
     /// Creates a segment. Replaces idle ones if there are too many or memory is short.
-    fn create(&self, state: &mut State, len: usize) -> Result<(Arc<Segment>, u64), WayError> {
+    fn create(&self, state: &mut State, len: usize) -> Result<(Arc<Segment>, u64), TransportError> {
         if state.slots.len() >= MAX_SEGMENTS && !self.drop_idle(state) {
-            return Err(WayError::new(
-                WayFault::Congested,
+            return Err(TransportError::new(
+                TransportErrorKind::Congested,
                 format_args!(
                     "{MAX_SEGMENTS} contents for several receivers are already held or being read"
                 ),
@@ -122,7 +122,7 @@ impl Pool {
             match self.budget.reserve(need) {
                 Ok(lock) => break lock,
                 Err(error) => {
-                    if error.fault == WayFault::TooLarge || !self.drop_idle(state) {
+                    if error.fault == TransportErrorKind::TooLarge || !self.drop_idle(state) {
                         return Err(error);
                     }
                 }
@@ -143,13 +143,13 @@ impl Pool {
         Ok((segment, generation))
     }
 
-    fn make_file(&self, number: u64, room: usize) -> Result<(SegmentFile, u64), WayError> {
+    fn make_file(&self, number: u64, room: usize) -> Result<(SegmentFile, u64), TransportError> {
         let path = self.domain.paths().segment(self.own, number);
         let cannot = |e: std::io::Error| match e.kind() {
             ErrorKind::StorageFull => no_room_error(room as u64, "is full"),
             _ => {
                 let text = format_args!("cannot create {}: {e}", path.display());
-                WayError::new(WayFault::Exhausted, text)
+                TransportError::new(TransportErrorKind::Exhausted, text)
             }
         };
         let file = SegmentFile::create(&path, room).map_err(cannot)?;

@@ -8,7 +8,7 @@ use arc_swap::ArcSwap;
 use bytes::Bytes;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Body, Kind, ListenError, LoanedContent, Location, Parcel, Sink,
-    Ticket, Transport, WayError, WayFault,
+    Ticket, Transport, TransportError, TransportErrorKind,
 };
 use parking_lot::Mutex;
 use tokio::io::unix::AsyncFd;
@@ -120,12 +120,14 @@ impl ShmTransport {
     }
 
     /// Replaces the error of a closed endpoint by a retriable one while the domain is joined again.
-    fn retriable_while_rejoining(&self, error: WayError) -> WayError {
+    fn retriable_while_rejoining(&self, error: TransportError) -> TransportError {
         match error.fault {
-            WayFault::Closed if !self.closed.load(Ordering::SeqCst) => WayError::new(
-                WayFault::Congested,
-                "joining the domain again after its files were removed",
-            ),
+            TransportErrorKind::Closed if !self.closed.load(Ordering::SeqCst) => {
+                TransportError::new(
+                    TransportErrorKind::Congested,
+                    "joining the domain again after its files were removed",
+                )
+            }
             _ => error,
         }
     }
@@ -180,7 +182,12 @@ impl Transport for ShmTransport {
         Ok(vec![self.location()])
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         if let Body::Letter(letter) = &parcel.body {
             self.check_len(letter.len())?;
         }
@@ -206,14 +213,14 @@ impl Transport for ShmTransport {
         head_room: usize,
         len: usize,
         tail_room: usize,
-    ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+    ) -> Result<Option<Box<dyn LoanedContent>>, TransportError> {
         self.check_len(len)?;
         let loan = self.endpoint.load().loan(to, head_room, len, tail_room);
         let loan = loan.map_err(|error| self.retriable_while_rejoining(error))?;
         Ok(Some(Box::new(loan)))
     }
 
-    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, TransportError> {
         self.check_len(len)?;
         let loan = self.endpoint.load().pool().loan(len)?;
         Ok(loan.map(|loan| Box::new(loan) as Box<dyn LoanedContent>))
@@ -237,13 +244,13 @@ impl Transport for ShmTransport {
 }
 
 impl ShmTransport {
-    fn check_len(&self, len: usize) -> Result<(), WayError> {
+    fn check_len(&self, len: usize) -> Result<(), TransportError> {
         let most = self.max_letter();
         if len <= most {
             return Ok(());
         }
-        Err(WayError::new(
-            WayFault::TooLarge,
+        Err(TransportError::new(
+            TransportErrorKind::TooLarge,
             format_args!("the letter has {len} bytes, and transport.shm.max_letter is {most}"),
         ))
     }

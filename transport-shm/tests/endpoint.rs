@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use common::{RecordingSink, TestDomain, attempt, parcel, wait_for};
-use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
+use fipa_transport::{Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 
 #[test]
@@ -41,7 +41,7 @@ fn domains_are_isolated() {
     let refused = one
         .dispatch(attempt(), &other.location(), parcel(Bytes::new()))
         .unwrap_err();
-    assert_eq!(refused.fault, WayFault::Unreachable);
+    assert_eq!(refused.fault, TransportErrorKind::Unreachable);
 }
 
 #[test]
@@ -88,7 +88,7 @@ fn a_full_window_is_an_error() {
             .unwrap();
     }
     let refused = sender.dispatch(attempt(), &receiver.location(), parcel(Bytes::new()));
-    assert_eq!(refused.unwrap_err().fault, WayFault::Congested);
+    assert_eq!(refused.unwrap_err().fault, TransportErrorKind::Congested);
 }
 
 #[test]
@@ -181,7 +181,7 @@ fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
     let watchdog = Duration::from_secs(60);
     finished.recv_timeout(watchdog).unwrap();
     let refused = refused.join().unwrap().unwrap_err();
-    assert_eq!(refused.fault, WayFault::Congested);
+    assert_eq!(refused.fault, TransportErrorKind::Congested);
     assert!(refused.detail.contains("stopped"), "{refused}");
     assert_eq!(sink.conclusions(), 0);
     // After the release, the next process removes what was left.

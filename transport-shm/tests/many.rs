@@ -8,7 +8,7 @@ use std::sync::{Arc, Barrier};
 
 use bytes::Bytes;
 use common::{FRONT, RecordingSink, TestDomain, attempt, parcel, wait_for};
-use fipa_transport::{Answer, Conclusion, Transport, WayFault};
+use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
 use fipa_transport_shm::ShmTransport;
 
 /// Content for several receivers, with every byte set to `with`.
@@ -82,7 +82,7 @@ fn new_content_does_not_wait_for_readers_and_reuses_unread_segments() {
         .loan_for_many(100_000)
         .err()
         .expect("the limit is reached");
-    assert_eq!(refused.fault, WayFault::Congested, "{refused}");
+    assert_eq!(refused.fault, TransportErrorKind::Congested, "{refused}");
     // Content outside of a segment is copied.
     let copied = Bytes::from(vec![8; 100_000]);
     assert!(sender.copies_for_each(&copied));
@@ -133,10 +133,10 @@ fn exceeding_the_capacity_with_shared_content_is_an_error() {
     let (sender, sink) = domain.listening_with(config);
     let (receiver, got) = domain.listening();
     let refused = |len| sender.loan_for_many(len).err().expect("memory is short");
-    assert_eq!(refused(9 << 20).fault, WayFault::TooLarge);
+    assert_eq!(refused(9 << 20).fault, TransportErrorKind::TooLarge);
     let held = content(&sender, 5 << 20, 1);
     let error = refused(4 << 20);
-    assert_eq!(error.fault, WayFault::Congested);
+    assert_eq!(error.fault, TransportErrorKind::Congested);
     assert!(error.detail.contains("capacity"), "{error}");
     // An idle segment is released to make room.
     drop(held);

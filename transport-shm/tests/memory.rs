@@ -6,7 +6,7 @@ mod common;
 
 use bytes::Bytes;
 use common::{FRONT, TestDomain, attempt, mapping_of, parcel, wait_for};
-use fipa_transport::{Answer, Conclusion, Transport, WayFault};
+use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
 
 fn pattern(len: usize) -> Bytes {
     (0..len)
@@ -146,7 +146,7 @@ fn loans_are_bounded_and_leave_room_for_letters() {
         .loan(&to, FRONT, 100, 1)
         .err()
         .expect("the limit is reached");
-    assert_eq!(refused.fault, WayFault::Congested);
+    assert_eq!(refused.fault, TransportErrorKind::Congested);
     sender
         .dispatch(attempt(), &to, parcel(Bytes::new()))
         .unwrap();
@@ -236,7 +236,7 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
     let refused = sender
         .dispatch(attempt(), &to, parcel(pattern(9 << 20)))
         .unwrap_err();
-    assert_eq!(refused.fault, WayFault::TooLarge);
+    assert_eq!(refused.fault, TransportErrorKind::TooLarge);
     // The receiver keeps every letter, so each one takes new memory.
     let mut taken = 0;
     let refused = loop {
@@ -248,7 +248,7 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
         assert!(taken < 10);
     };
     assert!(taken > 2, "{taken}");
-    assert_eq!(refused.fault, WayFault::Congested);
+    assert_eq!(refused.fault, TransportErrorKind::Congested);
     assert!(refused.detail.contains("capacity"), "{refused}");
     sender
         .dispatch(attempt(), &to, parcel(pattern(500)))

@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use common::{TestDomain, attempt, location_of, mapping_of, parcel, wait_for};
-use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
+use fipa_transport::{Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
@@ -241,14 +241,14 @@ fn attempts_to_a_killed_receiver_are_concluded() {
     wait_for("conclusions", || sent.conclusions() == 6);
     for one in &attempts {
         match sent.conclusion_of(*one) {
-            Some(Conclusion::Unconfirmed(e)) => assert_eq!(e.fault, WayFault::Broken),
+            Some(Conclusion::Unconfirmed(e)) => assert_eq!(e.fault, TransportErrorKind::Broken),
             other => panic!("{other:?}"),
         }
     }
     let refused = sender
         .dispatch(attempt(), &to, parcel(Bytes::new()))
         .unwrap_err();
-    assert_eq!(refused.fault, WayFault::Unreachable);
+    assert_eq!(refused.fault, TransportErrorKind::Unreachable);
     assert_eq!(sender.counters().peers_gone, 1);
     // The survivor removes the files of the dead process while it runs.
     let dead = receiver.incarnation.to_string();

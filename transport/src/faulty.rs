@@ -11,7 +11,8 @@ use parking_lot::Mutex;
 use crate::transport::LoanedContent;
 use crate::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, LegacySource,
-    ListenError, Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    ListenError, Location, Parcel, Sink, Ticket, Transport, TransportError, TransportErrorKind,
+    Verdict,
 };
 
 /// A kind of fault.
@@ -103,7 +104,10 @@ impl Faulty {
 }
 
 fn lost() -> Conclusion {
-    Conclusion::Unconfirmed(WayError::new(WayFault::Broken, "injected fault"))
+    Conclusion::Unconfirmed(TransportError::new(
+        TransportErrorKind::Broken,
+        "injected fault",
+    ))
 }
 
 impl Transport for Faulty {
@@ -127,13 +131,21 @@ impl Transport for Faulty {
         }))
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         let fault = self.draw();
         if fault.is_some() {
             self.shared.injected.fetch_add(1, Ordering::Relaxed);
         }
         match fault {
-            Some(Fault::Unreachable) => Err(WayError::new(WayFault::Unreachable, "injected fault")),
+            Some(Fault::Unreachable) => Err(TransportError::new(
+                TransportErrorKind::Unreachable,
+                "injected fault",
+            )),
             Some(Fault::Lost) => {
                 self.shared.substituted.lock().push((attempt, lost()));
                 Ok(())
@@ -186,11 +198,11 @@ impl Transport for Faulty {
         head_room: usize,
         len: usize,
         tail_room: usize,
-    ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+    ) -> Result<Option<Box<dyn LoanedContent>>, TransportError> {
         self.inner.loan(to, head_room, len, tail_room)
     }
 
-    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, TransportError> {
         self.inner.loan_for_many(len)
     }
 

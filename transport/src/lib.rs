@@ -5,14 +5,13 @@
 //! * [`Outcome`] is the final result of a letter, one per receiver.
 //! * [`wire`] is the fixed layout of a parcel in mailboxes and network frames.
 //! * [`OwnerProcess`] tells a process from a forked child.
-//! * [`Allowance`] limits the rate of a peer or a sender.
+//! * [`TokenBucket`] limits the rate of a peer or a sender.
 //! * `conformance` (feature of that name) is the suite that every implementation passes.
 //!   [`Faulty`] wraps a transport and injects faults.
 //!
 //! Sockets, shared memory, routes and retries belong to other crates. A transport tries once and
 //! reports; retries, other routes and order belong to the delivery core.
 
-mod allowance;
 #[cfg(feature = "conformance")]
 pub mod conformance;
 mod faulty;
@@ -21,18 +20,19 @@ mod location;
 mod outcome;
 mod owner;
 mod parcel;
+mod token_bucket;
 mod transport;
 pub mod wire;
 
-pub use allowance::Allowance;
 pub use faulty::{Fault, Faulty};
 pub use incarnation::Incarnation;
 pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
+pub use token_bucket::TokenBucket;
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,
-    ListenError, LoanedContent, Mandate, Principal, Sink, Ticket, Transport, Verdict, WayError,
-    WayFault,
+    ListenError, LoanedContent, Mandate, Principal, Sink, Ticket, Transport, TransportError,
+    TransportErrorKind, Verdict,
 };

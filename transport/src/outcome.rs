@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use crate::{Kind, Location, WayError};
+use crate::{Kind, Location, TransportError};
 
 /// A failed attempt to send a letter.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -14,7 +14,7 @@ pub struct Attempt {
     /// The location that the letter was sent to.
     pub location: Location,
     /// The cause of the failure.
-    pub error: WayError,
+    pub error: TransportError,
 }
 
 impl fmt::Display for Attempt {

@@ -38,7 +38,7 @@ pub trait Transport: Send + Sync + 'static {
     /// The kind of this transport. Locations of this kind are dispatched to it.
     fn kind(&self) -> Kind;
 
-    /// Maximum length of a letter in bytes. A longer one fails with [`WayFault::TooLarge`].
+    /// Maximum length of a letter in bytes. A longer one fails with [`TransportErrorKind::TooLarge`].
     fn max_letter(&self) -> usize;
 
     /// Whether the sink must answer arrivals at once. A delivery core that does not have the
@@ -57,7 +57,12 @@ pub trait Transport: Send + Sync + 'static {
     ///
     /// # Errors
     /// Returns an error if the parcel cannot be sent. No conclusion follows then.
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError>;
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError>;
 
     /// Ends an attempt and concludes it at once: its resources are released, and
     /// [`Sink::concluded`] is not called for it. Returns [`Abandoned::Unconfirmed`] for an unknown
@@ -87,7 +92,7 @@ pub trait Transport: Send + Sync + 'static {
         head_room: usize,
         len: usize,
         tail_room: usize,
-    ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+    ) -> Result<Option<Box<dyn LoanedContent>>, TransportError> {
         let _ = (to, head_room, len, tail_room);
         Ok(None)
     }
@@ -98,7 +103,7 @@ pub trait Transport: Send + Sync + 'static {
     ///
     /// # Errors
     /// Returns an error if there is no room or the content is too large.
-    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, TransportError> {
         let _ = len;
         Ok(None)
     }
@@ -367,7 +372,7 @@ pub enum Abandoned {
 impl Abandoned {
     /// The conclusion of the attempt, with this error.
     #[must_use]
-    pub fn conclusion(self, error: WayError) -> Conclusion {
+    pub fn conclusion(self, error: TransportError) -> Conclusion {
         match self {
             Self::NotSent => Conclusion::NotSent(error),
             Self::Unconfirmed => Conclusion::Unconfirmed(error),
@@ -384,25 +389,25 @@ pub enum Conclusion {
     /// Handed to a peer that cannot answer.
     Handed,
     /// The other side has not received the parcel, and will not.
-    NotSent(WayError),
+    NotSent(TransportError),
     /// The other side may have received the parcel.
-    Unconfirmed(WayError),
+    Unconfirmed(TransportError),
 }
 
 /// The error of an attempt.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error, Serialize)]
 #[error("{}{}{}", fault.description(), if detail.is_empty() { "" } else { ": " }, escape(detail))]
-pub struct WayError {
+pub struct TransportError {
     /// The kind of fault.
-    pub fault: WayFault,
+    pub fault: TransportErrorKind,
     /// Details for people: the error of the operating system, and a remedy. May contain text of a
     /// peer; `Display` [escapes](fipa_acl::escape) it.
     pub detail: String,
 }
 
-impl WayError {
+impl TransportError {
     /// Creates an error with a detail for people.
-    pub fn new(fault: WayFault, detail: impl fmt::Display) -> Self {
+    pub fn new(fault: TransportErrorKind, detail: impl fmt::Display) -> Self {
         Self {
             fault,
             detail: detail.to_string(),
@@ -414,7 +419,7 @@ impl WayError {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
-pub enum WayFault {
+pub enum TransportErrorKind {
     /// No service at the location, or no network path to it.
     Unreachable,
     /// A service of another incarnation than expected is at the location.
@@ -442,7 +447,7 @@ pub enum WayFault {
     Unsupported,
 }
 
-impl WayFault {
+impl TransportErrorKind {
     /// All faults. The position is the code on the wire, so new ones go last.
     pub(crate) const CODES: [Self; 12] = [
         Self::Unreachable,

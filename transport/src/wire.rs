@@ -18,7 +18,7 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::{
     Arriving, Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report,
-    Stream, WayError, WayFault,
+    Stream, TransportError, TransportErrorKind,
 };
 
 /// The header of a parcel: [`HEADER_LEN`] bytes, little-endian.
@@ -369,7 +369,7 @@ pub fn write_outcome(outcome: &Outcome) -> Bytes {
     } in included
     {
         out.put_u8(kind_code(*via));
-        out.put_u8(position(&WayFault::CODES, &error.fault));
+        out.put_u8(position(&TransportErrorKind::CODES, &error.fault));
         for text in [
             location.to_string().as_str(),
             truncated(&error.detail, 1024),
@@ -394,11 +394,11 @@ pub fn read_outcome(bytes: &[u8]) -> Option<Outcome> {
         rest = after;
         let location: Location = text(&mut rest)?.parse().ok()?;
         let detail = text(&mut rest)?.to_owned();
-        let fault = *WayFault::CODES.get(usize::from(fault))?;
+        let fault = *TransportErrorKind::CODES.get(usize::from(fault))?;
         attempts.push(Attempt {
             via: kind_of_code(kind)?,
             location,
-            error: WayError { fault, detail },
+            error: TransportError { fault, detail },
         });
     }
     if !rest.is_empty() {
@@ -482,7 +482,7 @@ mod tests {
         let attempts = vec![Attempt {
             via: Kind::Shm,
             location: "shm://1#0000000000000001".parse().unwrap(),
-            error: WayError::new(WayFault::Broken, "gone"),
+            error: TransportError::new(TransportErrorKind::Broken, "gone"),
         }];
         Outcome::Failed {
             reason: FailureReason::Loop,

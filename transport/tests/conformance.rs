@@ -8,7 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use fipa_transport::conformance::Fixture;
 use fipa_transport::{
     Abandoned, Answer, Arrival, AttemptId, Conclusion, Faulty, Hop, Incarnation, Kind, ListenError,
-    Location, Parcel, Principal, Sink, Ticket, Transport, Verdict, WayError, WayFault, wire,
+    Location, Parcel, Principal, Sink, Ticket, Transport, TransportError, TransportErrorKind,
+    Verdict, wire,
 };
 use parking_lot::Mutex;
 
@@ -78,19 +79,24 @@ impl Transport for TableTransport {
         Ok(vec![endpoint.location.clone()])
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
-        let refused = |fault| Err(WayError::new(fault, ""));
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
+        let refused = |fault| Err(TransportError::new(fault, ""));
         if self.0.state.lock().closed {
-            return refused(WayFault::Closed);
+            return refused(TransportErrorKind::Closed);
         }
         if matches!(&parcel.body, fipa_transport::Body::Letter(l) if l.len() > MAX_LETTER) {
-            return refused(WayFault::TooLarge);
+            return refused(TransportErrorKind::TooLarge);
         }
         let Some(peer) = self.0.table.0.lock().get(to).cloned() else {
-            return refused(WayFault::Unreachable);
+            return refused(TransportErrorKind::Unreachable);
         };
         if peer.state.lock().inbox.len() >= WINDOW {
-            return refused(WayFault::Congested);
+            return refused(TransportErrorKind::Congested);
         }
         self.0.state.lock().open.insert(attempt);
         peer.state
@@ -153,7 +159,7 @@ impl Transport for TableTransport {
     fn close(&self) {
         let endpoint = &self.0;
         endpoint.table.0.lock().remove(&endpoint.location);
-        let broken = || WayError::new(WayFault::Broken, "closed");
+        let broken = || TransportError::new(TransportErrorKind::Broken, "closed");
         let mut state = endpoint.state.lock();
         state.closed = true;
         let refused: Vec<_> = state.inbox.drain(..).collect();
@@ -276,7 +282,7 @@ mod faults {
         };
         assert_eq!(
             attempt(1, Fault::Unreachable).unwrap_err().fault,
-            WayFault::Unreachable
+            TransportErrorKind::Unreachable
         );
         attempt(2, Fault::Lost).unwrap();
         attempt(3, Fault::Silence).unwrap();

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use comfy_table::{Table, presets};
-use fipa::routes::{self, AskError, Report, Route, Standing, WayState};
+use fipa::routes::{self, AskError, Report, Route, RouteState, Standing};
 use fipa::{Domain, Incarnation, Matcher, Query, Reach, RegisterOptions, Role};
 use fipa_acl::escape;
 use serde_json::json;
@@ -262,7 +262,7 @@ fn standing(standing: &Standing) -> String {
     }
 }
 
-fn last_error(way: &WayState) -> String {
+fn last_error(way: &RouteState) -> String {
     match (&way.last_error, way.last_error_seconds) {
         (Some(error), Some(seconds)) => {
             let ago = humantime::format_duration(Duration::from_secs(seconds));

@@ -17,8 +17,8 @@ use fipa_testbed::frame;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{Body, FailureReason, Incarnation, Outcome, Parcel, Report, Stream};
 
-/// Letters that old peers sent: a fipa_services peer in its own dialect, and in JADE's.
-const OLD_PEERS: [&[u8]; 2] = [
+/// Letters that legacy peers sent: a fipa_services peer in its own dialect, and in JADE's.
+const LEGACY_PEERS: [&[u8]; 2] = [
     include_bytes!("../../../transport-net/tests/data/tcp_letter.bin"),
     include_bytes!("../../../transport-net/tests/data/tcp_letter_jade.bin"),
 ];
@@ -95,9 +95,9 @@ impl Writer<'_> {
         self.script(pieces)
     }
 
-    /// A letter of an old peer, with mistakes.
-    pub(crate) fn old_peer(&mut self) -> Script {
-        let letter = OLD_PEERS[self.random.usize(..OLD_PEERS.len())];
+    /// A letter of a legacy peer, with mistakes.
+    pub(crate) fn legacy_peer(&mut self) -> Script {
+        let letter = LEGACY_PEERS[self.random.usize(..LEGACY_PEERS.len())];
         let pieces = letter.chunks(self.random.usize(16..600));
         let pieces = pieces.map(<[u8]>::to_vec).collect();
         self.script(pieces)

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use fipa::keys::Keys;
-use fipa_testbed::Anybody;
+use fipa_testbed::AnyPeer;
 use quinn::crypto::rustls::QuicClientConfig;
 use rustls::ClientConfig;
 use rustls::crypto::ring;
@@ -17,7 +17,7 @@ pub(crate) fn client(keys: &Keys, name: &str) -> Arc<ClientConfig> {
         .with_protocol_versions(&[&TLS13])
         .unwrap()
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(Anybody))
+        .with_custom_certificate_verifier(Arc::new(AnyPeer))
         .with_client_auth_cert(vec![credentials.own.der().clone()], credentials.key)
         .unwrap();
     Arc::new(config)

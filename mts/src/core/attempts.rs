@@ -8,7 +8,7 @@ use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry};
 use fipa_transport::{
     Answer, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location, Outcome,
-    Parcel, Report, Stream, Ticket, WayError, WayFault,
+    Parcel, Report, Stream, Ticket, TransportError, TransportErrorKind,
 };
 use smallvec::SmallVec;
 
@@ -39,7 +39,7 @@ pub enum Action {
         /// The attempt.
         attempt: AttemptId,
         /// The error of the conclusion.
-        error: WayError,
+        error: TransportError,
     },
     /// Pass the transport the answer to an arrival that was deferred.
     Answer {
@@ -76,7 +76,7 @@ pub enum Action {
         /// The location.
         location: Location,
         /// Kind of the failure.
-        fault: WayFault,
+        fault: TransportErrorKind,
     },
     /// A letter was added to this agent's queue.
     Deliverable {
@@ -262,7 +262,7 @@ impl AttemptTable {
     }
 
     /// Makes the transport end an attempt, whose conclusion follows at once.
-    pub(crate) fn abandon(&mut self, kind: Kind, attempt: AttemptId, error: WayError) {
+    pub(crate) fn abandon(&mut self, kind: Kind, attempt: AttemptId, error: TransportError) {
         self.actions.push_back(Action::Abandon {
             kind,
             attempt,
@@ -273,7 +273,7 @@ impl AttemptTable {
     /// Makes the transport end an attempt whose conclusion is ignored.
     pub(crate) fn drop_attempt(&mut self, kind: Kind, attempt: AttemptId) {
         if self.attempts.remove(&attempt).is_some() {
-            let error = WayError::new(WayFault::TimedOut, "");
+            let error = TransportError::new(TransportErrorKind::TimedOut, "");
             self.abandon(kind, attempt, error);
         }
     }
@@ -554,7 +554,12 @@ impl AttemptTable {
         self.health.retain(|location, _| !which(location));
     }
 
-    pub(crate) fn route_failed(&mut self, now: Instant, location: &Location, fault: WayFault) {
+    pub(crate) fn route_failed(
+        &mut self,
+        now: Instant,
+        location: &Location,
+        fault: TransportErrorKind,
+    ) {
         if self.config.forwards && location.incarnation().is_known() {
             self.actions.push_back(Action::Doubtful {
                 location: location.clone(),

@@ -10,7 +10,7 @@ use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Pa
 
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE, work};
-use crate::Gate;
+use crate::AccessGate;
 use crate::gate::{Link, Source};
 
 /// A letter taken from an agent's queue.
@@ -92,7 +92,7 @@ impl Inbox {
         parcel: &Parcel,
         letter: Letter,
         (via, from): (Kind, &Hop),
-        gate: Option<&dyn Gate>,
+        gate: Option<&dyn AccessGate>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
         if stream.sender.is_known() {

@@ -7,7 +7,7 @@
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
-use fipa_transport::Allowance;
+use fipa_transport::TokenBucket;
 
 use crate::Map;
 
@@ -42,9 +42,9 @@ pub(super) struct SenderLimit {
     per_sender: f64,
     per_address: f64,
     in_all: f64,
-    all: Option<Allowance>,
-    addresses: Map<IpAddr, Allowance>,
-    senders: Map<Sender, Allowance>,
+    all: Option<TokenBucket>,
+    addresses: Map<IpAddr, TokenBucket>,
+    senders: Map<Sender, TokenBucket>,
 }
 
 impl SenderLimit {
@@ -67,7 +67,7 @@ impl SenderLimit {
     /// Takes a token; returns whether the action is allowed.
     pub(super) fn take(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
         if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
-            let is_recent = |it: &Allowance| now.saturating_duration_since(it.asked()) < MEMORY;
+            let is_recent = |it: &TokenBucket| now.saturating_duration_since(it.asked()) < MEMORY;
             self.senders.retain(|_, allowance| is_recent(allowance));
             self.addresses.retain(|_, allowance| is_recent(allowance));
             if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
@@ -89,7 +89,9 @@ impl SenderLimit {
             return false;
         }
         let in_all = self.in_all;
-        let all = self.all.get_or_insert_with(|| Allowance::new(in_all, now));
+        let all = self
+            .all
+            .get_or_insert_with(|| TokenBucket::new(in_all, now));
         if !all.take(1.0, in_all, now) {
             return false;
         }
@@ -238,8 +240,8 @@ fn host(address: IpAddr) -> IpAddr {
 }
 
 /// A full token bucket from which one token was taken.
-fn less_one(per_second: f64, now: Instant) -> Allowance {
-    let mut allowance = Allowance::new(per_second, now);
+fn less_one(per_second: f64, now: Instant) -> TokenBucket {
+    let mut allowance = TokenBucket::new(per_second, now);
     allowance.take(1.0, per_second, now);
     allowance
 }

@@ -47,7 +47,7 @@ use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
+    Kind, Location, Outcome, Parcel, Report, Stream, TransportError, TransportErrorKind, Verdict,
 };
 
 pub use attempts::Action;
@@ -60,11 +60,11 @@ use lane::{Delivery, Lane, LaneId, LaneKey};
 use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
 
-use crate::{Gate, Map};
+use crate::{AccessGate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
 use principals::{PrincipalError, Principals};
-pub use routes::{Route, Standing, Way, WayState};
+pub use routes::{Route, RouteCandidate, RouteState, Standing};
 
 /// The current time by two clocks.
 #[derive(Debug, Clone, Copy)]
@@ -118,7 +118,7 @@ pub struct Core {
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
     principals: Principals,
-    gate: Option<Arc<dyn Gate>>,
+    gate: Option<Arc<dyn AccessGate>>,
     failure_limit: FailureLimit,
     /// Limits the rate at which agents of legacy peers become known by their letters.
     contact_limit: SenderLimit,
@@ -197,7 +197,7 @@ impl Core {
 
     /// Sets the gate that decides which letters are accepted.
     #[must_use]
-    pub fn gated(self, gate: Arc<dyn Gate>) -> Self {
+    pub fn gated(self, gate: Arc<dyn AccessGate>) -> Self {
         Self {
             gate: Some(gate),
             ..self
@@ -611,7 +611,7 @@ impl Core {
                 // here would make it retry and fail, until the route counts as broken.
                 let made_room = !matches!(
                     &conclusion,
-                    Conclusion::NotSent(error) if error.fault == WayFault::Congested
+                    Conclusion::NotSent(error) if error.fault == TransportErrorKind::Congested
                 );
                 self.with_lane(now, id, |lane, table| {
                     route = lane.route_of(sequence).filter(|_| made_room).cloned();
@@ -678,7 +678,7 @@ impl Core {
             Late::Check(attempt) => {
                 if let Some(Purpose::Note(note)) = self.table.attempts.remove(&attempt) {
                     let kind = note.location.kind();
-                    let error = WayError::new(WayFault::TimedOut, "");
+                    let error = TransportError::new(TransportErrorKind::TimedOut, "");
                     self.table.abandon(kind, attempt, error.clone());
                     self.note_concluded(now, *note, Conclusion::Unconfirmed(error));
                 }
@@ -893,7 +893,7 @@ impl Core {
 fn is_denied(conclusion: &Conclusion) -> bool {
     match conclusion {
         Conclusion::Answered(Answer::Returned { .. }) => true,
-        Conclusion::NotSent(error) => error.fault == WayFault::WrongIncarnation,
+        Conclusion::NotSent(error) => error.fault == TransportErrorKind::WrongIncarnation,
         _ => false,
     }
 }

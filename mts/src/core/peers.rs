@@ -12,7 +12,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    AttemptId, Body, Conclusion, Incarnation, Location, Signature, Stream, WayError, WayFault,
+    AttemptId, Body, Conclusion, Incarnation, Location, Signature, Stream, TransportError,
+    TransportErrorKind,
 };
 
 use super::attempts::{AttemptTable, Purpose, note_parcel};
@@ -34,7 +35,7 @@ pub struct PeerState {
     /// The location that answered last, if it still does.
     pub answers: Option<Location>,
     /// The error of each location since a location last answered.
-    pub failures: Vec<(Location, WayError)>,
+    pub failures: Vec<(Location, TransportError)>,
     /// Number of consecutive rounds in which no location answered.
     pub rounds: u32,
     /// Time until the next check; `None` while an answer is awaited.
@@ -76,7 +77,7 @@ struct PeerLocation {
     /// Number of consecutive failures.
     failures: u32,
     /// Its latest error since a location of the peer last answered.
-    error: Option<WayError>,
+    error: Option<TransportError>,
     last_asked: Option<Instant>,
 }
 
@@ -166,7 +167,11 @@ impl Peers {
                     && until <= now
                 {
                     table.drop_attempt(candidate.location.kind(), attempt);
-                    static_peer.failed(now, index, WayError::new(WayFault::TimedOut, ""));
+                    static_peer.failed(
+                        now,
+                        index,
+                        TransportError::new(TransportErrorKind::TimedOut, ""),
+                    );
                 }
             }
         }
@@ -299,7 +304,7 @@ impl StaticPeer {
         }
     }
 
-    fn failed(&mut self, now: Instant, index: usize, error: WayError) {
+    fn failed(&mut self, now: Instant, index: usize, error: TransportError) {
         let Some(candidate) = self.candidates.get_mut(index) else {
             return;
         };

@@ -68,6 +68,10 @@ impl Principals {
         }
         let principal = peer.hop.principal;
         if let Some(known) = self.services.get_mut(&incarnation) {
+            if known.principal != principal {
+                // Connections of the former principal do not count for this one.
+                known.connections = 0;
+            }
             known.principal = principal;
             known.connections += 1;
             return;
@@ -91,7 +95,9 @@ impl Principals {
         let principal = peer.hop.principal;
         if let Some(known) = self.services.get(&incarnation) {
             let renewed = known.connections == 0 && known.name == peer.name;
-            return renewed || known.principal == principal;
+            // A claim without proof gives way to a certificate.
+            let is_claim = known.principal == Principal::Unproved;
+            return renewed || is_claim || known.principal == principal;
         }
         // The registration of an agent of another principal, which has written before.
         let of_others = |owner: &Option<Principal>| *owner != Some(principal);

@@ -26,12 +26,12 @@ pub struct Route {
     /// The pattern of `[routes]` that applies, or `None` for the order of `mts.transports`.
     pub exception: Option<String>,
     /// Its locations, in the order in which they would be tried. Unused ones come last.
-    pub ways: Vec<Way>,
+    pub ways: Vec<RouteCandidate>,
 }
 
 /// A location of an agent, as seen from one service.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Way {
+pub struct RouteCandidate {
     /// The location.
     pub location: Location,
     /// State of the location.
@@ -63,7 +63,7 @@ pub enum Standing {
 /// Counters of one location since the service started, or since the location was last dropped.
 /// Beyond 4096 locations, those without letters in flight are dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct WayState {
+pub struct RouteState {
     /// The location.
     pub location: Location,
     /// Its current state.
@@ -147,11 +147,11 @@ impl AttemptTable {
         while let Some(location) = self.choose(now, entry, &tried) {
             let standing = self.standing(now, &location);
             tried.push(location.clone());
-            ways.push(Way { location, standing });
+            ways.push(RouteCandidate { location, standing });
         }
         let rest = entry.locations.iter().filter(|it| !tried.contains(it));
         debug_assert!(rest.clone().all(|it| !order.contains(&it.kind())));
-        ways.extend(rest.map(|location| Way {
+        ways.extend(rest.map(|location| RouteCandidate {
             location: location.clone(),
             standing: match location.kind().is_supported() {
                 true => Standing::NotInOrder,
@@ -187,14 +187,14 @@ impl AttemptTable {
     }
 
     /// The counters of each location, sorted by location.
-    pub(super) fn way_states(&self, now: Instant) -> Vec<WayState> {
+    pub(super) fn way_states(&self, now: Instant) -> Vec<RouteState> {
         let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let tallies = self.tallies.0.iter();
-        let mut states: Vec<WayState> = tallies
+        let mut states: Vec<RouteState> = tallies
             .map(|(location, tally)| {
                 let last_error = tally.last_error.lock().clone();
                 let ago = |at: Instant| now.saturating_duration_since(at);
-                WayState {
+                RouteState {
                     location: location.clone(),
                     standing: self.standing(now, location),
                     in_flight: tally.in_flight(),
@@ -221,7 +221,7 @@ impl Core {
 
     /// Returns the counters of each location, sorted by location.
     #[must_use]
-    pub fn ways(&self, now: Now) -> Vec<WayState> {
+    pub fn ways(&self, now: Now) -> Vec<RouteState> {
         self.table.way_states(now.instant)
     }
 

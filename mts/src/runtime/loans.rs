@@ -2,7 +2,9 @@
 
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
-use fipa_transport::{Arriving, Incarnation, Kind, LoanedContent, Location, Transport, WayError};
+use fipa_transport::{
+    Arriving, Incarnation, Kind, LoanedContent, Location, Transport, TransportError,
+};
 
 use super::{Mts, Shared};
 use crate::core::{Now, Submission};
@@ -101,7 +103,7 @@ impl Shared {
     fn loan_from(
         &self,
         kind: Kind,
-        loan: impl FnOnce(&dyn Transport) -> Result<Option<Box<dyn LoanedContent>>, WayError>,
+        loan: impl FnOnce(&dyn Transport) -> Result<Option<Box<dyn LoanedContent>>, TransportError>,
     ) -> Option<Box<dyn LoanedContent>> {
         match loan(&**self.transport(kind)?) {
             Ok(loaned) => loaned,

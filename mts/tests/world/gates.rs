@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_mts::{Gate, Link};
-use fipa_transport::Allowance;
+use fipa_mts::{AccessGate, Link};
+use fipa_transport::TokenBucket;
 use parking_lot::Mutex;
 
 use super::Set;
@@ -25,7 +25,7 @@ pub(super) struct Rules {
     /// Whether letters without a number, which are those of hostile members, are accepted. Not
     /// where agents read slowly: queues full of them would count as a failure of the core.
     pub(super) strangers: bool,
-    pub(super) taken: Mutex<Option<Allowance>>,
+    pub(super) taken: Mutex<Option<TokenBucket>>,
     pub(super) refused: Refused,
 }
 
@@ -49,13 +49,13 @@ impl Rules {
         }
         let (rate, until) = self.rate?;
         let mut taken = self.taken.lock();
-        let taken = taken.get_or_insert_with(|| Allowance::new(rate, now));
+        let taken = taken.get_or_insert_with(|| TokenBucket::new(rate, now));
         let refused = now < until && !taken.take(1.0, rate, now);
         refused.then_some("too many letters")
     }
 }
 
-impl Gate for Rules {
+impl AccessGate for Rules {
     fn admits(&self, now: Instant, receiver: &str, letter: &Letter, _: Link) -> Result<(), String> {
         let Some(number) = number_of(letter) else {
             return match self.strangers {

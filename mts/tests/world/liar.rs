@@ -16,7 +16,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, Role};
 use fipa_transport::{
     Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Mandate, Outcome, Parcel, Principal, Report, Stream, WayError, WayFault,
+    Kind, Mandate, Outcome, Parcel, Principal, Report, Stream, TransportError, TransportErrorKind,
 };
 
 use super::links::Flown;
@@ -299,7 +299,7 @@ impl World {
             .map(|_| Attempt {
                 via,
                 location: way(via, self.processes[target].incarnation, 0),
-                error: WayError::new(WayFault::TimedOut, "a lie"),
+                error: TransportError::new(TransportErrorKind::TimedOut, "a lie"),
             })
             .collect();
         match self.random.u32(..4) {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel,
-    Principal, Ticket, Verdict, WayError, WayFault,
+    Principal, Ticket, TransportError, TransportErrorKind, Verdict,
 };
 
 #[cfg(debug_assertions)]
@@ -86,8 +86,8 @@ impl Flown {
     }
 }
 
-fn error(fault: WayFault) -> WayError {
-    WayError::new(fault, "simulated")
+fn error(fault: TransportErrorKind) -> TransportError {
+    TransportError::new(fault, "simulated")
 }
 
 impl World {
@@ -119,13 +119,13 @@ impl World {
         let remote = target.is_some_and(|p| self.processes[p].host != host);
         let size = size_of(&parcel);
         if kind == Kind::Udp && size > MAX_DATAGRAM {
-            let conclusion = Conclusion::NotSent(error(WayFault::TooLarge));
+            let conclusion = Conclusion::NotSent(error(TransportErrorKind::TooLarge));
             self.conclude_within(0, at, attempt, conclusion);
             return;
         }
         let down = self.down.contains(&(host, kind))
             || target.is_some_and(|p| self.down.contains(&(self.processes[p].host, kind)));
-        let unreachable = || Conclusion::NotSent(error(WayFault::Unreachable));
+        let unreachable = || Conclusion::NotSent(error(TransportErrorKind::Unreachable));
         let Some(to) = target.filter(|_| !down) else {
             return self.conclude_within(3, at, attempt, unreachable());
         };
@@ -149,7 +149,7 @@ impl World {
         if lost || silent || self.is_cut(at, to) {
             self.fly(at, attempt, Some(self.now), None);
             if lost {
-                let conclusion = Conclusion::Unconfirmed(error(WayFault::Broken));
+                let conclusion = Conclusion::Unconfirmed(error(TransportErrorKind::Broken));
                 self.conclude_within(50, at, attempt, conclusion);
             }
             return;
@@ -258,7 +258,7 @@ impl World {
     }
 
     /// The core abandons an attempt, and gets its conclusion at once.
-    pub(super) fn abandon(&mut self, at: usize, attempt: AttemptId, error: WayError) {
+    pub(super) fn abandon(&mut self, at: usize, attempt: AttemptId, error: TransportError) {
         let conclusion = match self.take_back(at, attempt) {
             true => Conclusion::NotSent(error),
             false => Conclusion::Unconfirmed(error),
@@ -308,7 +308,7 @@ impl World {
                 .map(|(attempt, _)| *attempt)
                 .collect();
             for attempt in broken_off {
-                let error = WayError::new(WayFault::Broken, "the process died");
+                let error = TransportError::new(TransportErrorKind::Broken, "the process died");
                 self.conclude_within(20, at, attempt, Conclusion::Unconfirmed(error));
             }
         }
@@ -347,7 +347,7 @@ impl World {
             copy,
             named,
         } = flown;
-        let broken = || Conclusion::Unconfirmed(error(WayFault::Broken));
+        let broken = || Conclusion::Unconfirmed(error(TransportErrorKind::Broken));
         let is_letter = matches!(parcel.body, Body::Letter(_));
         if is_letter {
             self.check_no_relay(from, to, &parcel);

@@ -24,7 +24,7 @@ use std::sync::Arc;
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, Parcel, Sink, Ticket, Transport,
-    WayError,
+    TransportError,
 };
 use tokio::runtime::Handle;
 
@@ -116,7 +116,12 @@ impl Transport for QuicTransport {
         })
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         self.endpoint.check(to, &parcel)?;
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
             let (endpoint, sockets) = (self.endpoint.clone(), self.sockets.clone());

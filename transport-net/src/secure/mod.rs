@@ -69,7 +69,7 @@ pub struct Rules {
     pub loopback: bool,
     /// Addresses of legacy peers, which cannot prove their identity. Only letters in their dialects
     /// are exchanged with them.
-    pub old_peers: Vec<IpAddr>,
+    pub legacy_peers: Vec<IpAddr>,
 }
 
 /// Credentials in the form that TLS needs.
@@ -124,7 +124,7 @@ impl Security {
 
     /// Whether this is the address of a legacy peer.
     pub(crate) fn excepts(&self, ip: IpAddr) -> bool {
-        self.rules.old_peers.contains(&ip.to_canonical())
+        self.rules.legacy_peers.contains(&ip.to_canonical())
     }
 
     /// Returns a receiver that is notified when the credentials have been replaced.

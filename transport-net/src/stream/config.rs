@@ -100,7 +100,7 @@ impl StreamConfig {
     /// Whether letters may be sent to a legacy peer at this address, which cannot prove its
     /// identity.
     #[cfg(feature = "ip")]
-    pub(crate) fn gives_old_peers_at(&self, ip: std::net::IpAddr) -> bool {
+    pub(crate) fn gives_legacy_peers_at(&self, ip: std::net::IpAddr) -> bool {
         #[cfg(feature = "secure")]
         if let Some(security) = &self.security {
             return !security.covers(ip) || security.excepts(ip);

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Mandate, Parcel, Principal,
-    WayError, WayFault,
+    TransportError, TransportErrorKind,
 };
 
 use super::config::Limits;
@@ -60,7 +60,7 @@ pub(crate) enum SendError {
     /// The connection has ended; another one is needed.
     Ended,
     /// The parcel cannot be sent to this peer.
-    Transport(WayError),
+    Transport(TransportError),
 }
 
 #[derive(Debug)]
@@ -236,7 +236,7 @@ impl Connection {
     /// When the parcel cannot be sent. The connection is unchanged then.
     pub(crate) fn send(&mut self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
         let refuse =
-            |fault, detail: String| Err(SendError::Transport(WayError::new(fault, detail)));
+            |fault, detail: String| Err(SendError::Transport(TransportError::new(fault, detail)));
         if self.ended || self.retiring {
             return Err(SendError::Ended);
         }
@@ -259,18 +259,18 @@ impl Connection {
             let detail = format!(
                 "{max_in_flight} parcels of this connection wait for their answer; the limit is max_in_flight"
             );
-            return refuse(WayFault::Congested, detail);
+            return refuse(TransportErrorKind::Congested, detail);
         }
         let id = self.last_sent + 1;
         if id >= MAX_ID {
             return refuse(
-                WayFault::Congested,
+                TransportErrorKind::Congested,
                 "parcel numbers of this connection are exhausted".into(),
             );
         }
         let pieces = match frame::parcel(id, parcel) {
             Ok(pieces) => pieces,
-            Err(error) => return refuse(WayFault::TooLarge, error.to_string()),
+            Err(error) => return refuse(TransportErrorKind::TooLarge, error.to_string()),
         };
         let queued = self.outbox.parcel_bytes();
         let len: usize = pieces.iter().map(bytes::Bytes::len).sum();
@@ -278,7 +278,7 @@ impl Connection {
             let detail = format!(
                 "{queued} bytes of this connection wait to be sent; the limit is {max_queued_bytes} (max_queued_bytes)"
             );
-            return refuse(WayFault::Congested, detail);
+            return refuse(TransportErrorKind::Congested, detail);
         }
         self.last_sent = id;
         self.outbox.push_parcel(id, pieces);
@@ -660,7 +660,7 @@ impl Connection {
 
     /// Returns the error of a parcel that was queued before the hello and that this peer cannot
     /// receive.
-    fn unfit(&self, sent: &Sent, peer: &Hello) -> Option<WayError> {
+    fn unfit(&self, sent: &Sent, peer: &Hello) -> Option<TransportError> {
         if sent.letter_len > peer.max_letter {
             return Some(too_large_for_peer(sent.letter_len, peer.max_letter));
         }
@@ -691,7 +691,7 @@ impl Connection {
         self.clock.busy = now;
         self.events.push_back(Event::Greeted);
         // These parcels were queued before the peer's identity and limits were known.
-        let unfit: Vec<(u64, WayError)> = self
+        let unfit: Vec<(u64, TransportError)> = self
             .sent
             .iter()
             .filter_map(|(id, sent)| Some((*id, self.unfit(sent, &hello)?)))
@@ -766,14 +766,14 @@ pub(crate) fn letter_len(parcel: &Parcel) -> u64 {
     }
 }
 
-fn not_its_agent(receiver: &str) -> WayError {
+fn not_its_agent(receiver: &str) -> TransportError {
     let detail = format!("the certificate of the peer does not cover the agent {receiver}");
-    WayError::new(WayFault::Refused, detail)
+    TransportError::new(TransportErrorKind::Refused, detail)
 }
 
-fn too_large_for_peer(len: u64, max: u64) -> WayError {
-    WayError::new(
-        WayFault::TooLarge,
+fn too_large_for_peer(len: u64, max: u64) -> TransportError {
+    TransportError::new(
+        TransportErrorKind::TooLarge,
         format_args!("the letter has {len} bytes; the peer accepts at most {max}"),
     )
 }

@@ -186,7 +186,9 @@ fn step() -> impl Strategy<Value = (bool, Step)> {
 fn perform(step: &Step, this: &mut Side, other: &mut Side, now: Instant) {
     match step {
         Step::Dispatch(len) => match this.dispatch(*len) {
-            Err(SendError::Transport(error)) => assert_eq!(error.fault, WayFault::Congested),
+            Err(SendError::Transport(error)) => {
+                assert_eq!(error.fault, TransportErrorKind::Congested)
+            }
             Err(SendError::Ended) => assert!(this.end.is_some()),
             Ok(()) => {}
         },
@@ -311,7 +313,9 @@ fn another_incarnation_ends_the_connection_before_a_parcel_is_sent() {
         Some(ConnectionEnd::WrongIncarnation { expected, found })
     );
     match &a.concluded[&AttemptId(0)][..] {
-        [Conclusion::NotSent(error)] => assert_eq!(error.fault, WayFault::WrongIncarnation),
+        [Conclusion::NotSent(error)] => {
+            assert_eq!(error.fault, TransportErrorKind::WrongIncarnation)
+        }
         other => panic!("{other:?}"),
     }
     assert!(b.arrived.is_empty(), "{:?}", b.arrived);
@@ -326,12 +330,12 @@ fn a_letter_that_the_peer_does_not_accept_is_not_sent() {
     a.dispatch(10).unwrap();
     settle(&mut a, &mut b, now);
     match &a.concluded[&AttemptId(0)][..] {
-        [Conclusion::NotSent(error)] => assert_eq!(error.fault, WayFault::TooLarge),
+        [Conclusion::NotSent(error)] => assert_eq!(error.fault, TransportErrorKind::TooLarge),
         other => panic!("{other:?}"),
     }
     assert_eq!(b.arrived, [1]);
     assert!(matches!(a.dispatch(101), Err(SendError::Transport(error))
-        if error.fault == WayFault::TooLarge));
+        if error.fault == TransportErrorKind::TooLarge));
 }
 
 #[test]
@@ -344,7 +348,7 @@ fn the_window_of_the_peer_is_respected_and_congestion_reported() {
         a.dispatch(10).unwrap();
     }
     assert!(matches!(a.dispatch(10), Err(SendError::Transport(error))
-        if error.fault == WayFault::Congested));
+        if error.fault == TransportErrorKind::Congested));
     a.transmit(usize::MAX, &mut b.coming, now);
     a.transmit(usize::MAX, &mut b.coming, now);
     assert!(a.connection.is_flushed());
@@ -359,7 +363,7 @@ fn queued_bytes_are_bounded_and_one_letter_always_fits() {
     a.connection.limits.max_queued_bytes = 100;
     a.dispatch(4000).unwrap();
     assert!(matches!(a.dispatch(1), Err(SendError::Transport(error))
-        if error.fault == WayFault::Congested));
+        if error.fault == TransportErrorKind::Congested));
     a.connection.abandon(AttemptId(0), now);
     a.dispatch(1).unwrap();
 }

@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Principal,
-    Sink, Ticket, WayError, WayFault,
+    Sink, Ticket, TransportError, TransportErrorKind,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -479,19 +479,19 @@ impl Endpoint {
     }
 
     /// Checks a parcel against the kind of the location, the receiver's name and `max_letter`.
-    pub(crate) fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
+    pub(crate) fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), TransportError> {
         if to.kind() != self.kind {
             let detail = format!("{to} is not a {} location", self.kind);
-            return Err(WayError::new(WayFault::Unreachable, detail));
+            return Err(TransportError::new(TransportErrorKind::Unreachable, detail));
         }
         if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
             let detail = "the receiver's name is empty or too long";
-            return Err(WayError::new(WayFault::Refused, detail));
+            return Err(TransportError::new(TransportErrorKind::Refused, detail));
         }
         let (len, max) = (letter_len(parcel), self.limits().max_letter);
         if len > max as u64 {
             let detail = format!("the letter has {len} bytes; the limit is {max} (max_letter)");
-            return Err(WayError::new(WayFault::TooLarge, detail));
+            return Err(TransportError::new(TransportErrorKind::TooLarge, detail));
         }
         Ok(())
     }
@@ -504,7 +504,7 @@ impl Endpoint {
         to: &Location,
         parcel: &Parcel,
         dial: impl Fn(Arc<Link>, Arc<dyn Sink>) -> JoinHandle<()>,
-    ) -> Result<(), WayError> {
+    ) -> Result<(), TransportError> {
         loop {
             let (link, fresh) = match self.route_to(to)? {
                 Route::Open(link) => (link, None),
@@ -516,7 +516,7 @@ impl Endpoint {
                 if task.is_finished() && !link.has_begun() {
                     self.forget(&link);
                     let detail = "the runtime of this endpoint has been shut down";
-                    return Err(WayError::new(WayFault::Closed, detail));
+                    return Err(TransportError::new(TransportErrorKind::Closed, detail));
                 }
                 return sent.map_err(|error| match error {
                     SendError::Transport(error) => error,
@@ -533,13 +533,13 @@ impl Endpoint {
     }
 
     /// Returns a connection to a location; creates a link when there is none.
-    fn route_to(&self, to: &Location) -> Result<Route, WayError> {
+    fn route_to(&self, to: &Location) -> Result<Route, TransportError> {
         let mut registry = self.registry.lock();
         let sink = match (registry.phase, &registry.sink) {
             (Phase::Open, Some(sink)) => sink.clone(),
             (Phase::New, _) => {
-                return Err(WayError::new(
-                    WayFault::Closed,
+                return Err(TransportError::new(
+                    TransportErrorKind::Closed,
                     "`listen` has not been called",
                 ));
             }

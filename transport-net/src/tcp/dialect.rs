@@ -9,7 +9,7 @@ use fipa_acl::{
     AclRepresentation, AgentId, DecodeError, Dialect, EncodeError, Envelope, EnvelopeParams,
     Letter, Message, Representation,
 };
-use fipa_transport::{Signature, WayFault};
+use fipa_transport::{Signature, TransportErrorKind};
 
 /// The reason for which a letter cannot be translated for a legacy peer.
 #[derive(Debug, thiserror::Error)]
@@ -27,10 +27,10 @@ pub(crate) enum TranslateError {
 
 impl TranslateError {
     /// Returns the fault of an attempt that ends with this error.
-    pub(crate) fn fault(&self) -> WayFault {
+    pub(crate) fn fault(&self) -> TransportErrorKind {
         match self {
-            Self::Read(_) | Self::Write(_) | Self::Receiver(_) => WayFault::Inexpressible,
-            Self::NoDialect(_) => WayFault::Incompatible,
+            Self::Read(_) | Self::Write(_) | Self::Receiver(_) => TransportErrorKind::Inexpressible,
+            Self::NoDialect(_) => TransportErrorKind::Incompatible,
         }
     }
 }

@@ -12,7 +12,8 @@ use std::time::Duration;
 use bytes::Bytes;
 use fipa_acl::Letter;
 use fipa_transport::{
-    Abandoned, AttemptId, Body, Conclusion, Location, Parcel, Signature, Sink, WayError, WayFault,
+    Abandoned, AttemptId, Body, Conclusion, Location, Parcel, Signature, Sink, TransportError,
+    TransportErrorKind,
 };
 use parking_lot::Mutex;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -80,11 +81,14 @@ impl LegacySenders {
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
-    ) -> Result<bool, WayError> {
+    ) -> Result<bool, TransportError> {
         let limits = endpoint.limits();
         let Body::Letter(letter) = parcel.body else {
             let detail = "a legacy peer accepts letters only";
-            return Err(WayError::new(WayFault::Incompatible, detail));
+            return Err(TransportError::new(
+                TransportErrorKind::Incompatible,
+                detail,
+            ));
         };
         if *self.closed.borrow() {
             return Err(ConnectionEnd::Closed.after());
@@ -103,7 +107,7 @@ impl LegacySenders {
             let detail = format!(
                 "{count} letters of {bytes} bytes wait for this legacy peer (max_in_flight, max_queued_bytes)"
             );
-            return Err(WayError::new(WayFault::Congested, detail));
+            return Err(TransportError::new(TransportErrorKind::Congested, detail));
         }
         queue.bytes += len;
         queue.waiting.push_back(LegacyDelivery {
@@ -221,7 +225,7 @@ pub(crate) async fn run(endpoint: Arc<TcpEndpoint>, sink: Arc<dyn Sink>, to: Loc
             }
         };
         let unreachable = match &conclusion {
-            Conclusion::NotSent(error) if error.fault == WayFault::Unreachable => {
+            Conclusion::NotSent(error) if error.fault == TransportErrorKind::Unreachable => {
                 Some(error.clone())
             }
             _ => None,
@@ -278,7 +282,7 @@ async fn deliver(task: &QueueTask, delivery: &LegacyDelivery, begun: &Mutex<bool
     let (endpoint, to) = (&task.endpoint, &task.to);
     let in_dialect = |here: Option<&str>| {
         translate(&delivery.letter, &delivery.receiver, to.signature(), here)
-            .map_err(|error| Conclusion::NotSent(WayError::new(error.fault(), error)))
+            .map_err(|error| Conclusion::NotSent(TransportError::new(error.fault(), error)))
     };
     // Translated before a connection is opened: a connection without a letter leaks a descriptor in
     // fipa_services.
@@ -292,14 +296,17 @@ async fn deliver(task: &QueueTask, delivery: &LegacyDelivery, begun: &Mutex<bool
             Err(Unreachable(what)) => {
                 count(&endpoint.tally().dial_failures);
                 let detail = format!("{}: {what}", to.address());
-                return Conclusion::NotSent(WayError::new(WayFault::Unreachable, detail));
+                return Conclusion::NotSent(TransportError::new(
+                    TransportErrorKind::Unreachable,
+                    detail,
+                ));
             }
         };
-    if !endpoint.config.gives_old_peers_at(peer.ip()) {
+    if !endpoint.config.gives_legacy_peers_at(peer.ip()) {
         let detail = format!(
             "{peer} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
         );
-        return Conclusion::NotSent(WayError::new(WayFault::Refused, detail));
+        return Conclusion::NotSent(TransportError::new(TransportErrorKind::Refused, detail));
     }
     if to.signature() == Signature::JadeProxy
         && let Some(here) = stream.local_addr().ok()
@@ -311,11 +318,11 @@ async fn deliver(task: &QueueTask, delivery: &LegacyDelivery, begun: &Mutex<bool
         };
     }
     if let Err(error) = prepare(&stream, endpoint.limits()) {
-        return Conclusion::NotSent(WayError::new(WayFault::Broken, error));
+        return Conclusion::NotSent(TransportError::new(TransportErrorKind::Broken, error));
     }
     if !endpoint.legacy.senders.begin(to) {
         let detail = "the letter was abandoned";
-        return Conclusion::NotSent(WayError::new(WayFault::TimedOut, detail));
+        return Conclusion::NotSent(TransportError::new(TransportErrorKind::TimedOut, detail));
     }
     for piece in letter {
         let patience = endpoint.limits().stall_timeout;
@@ -328,11 +335,11 @@ async fn deliver(task: &QueueTask, delivery: &LegacyDelivery, begun: &Mutex<bool
             count(&endpoint.tally().unframed_out);
             Conclusion::Handed
         }
-        Err(error) => broken(true, WayError::new(WayFault::Broken, error)),
+        Err(error) => broken(true, TransportError::new(TransportErrorKind::Broken, error)),
     }
 }
 
-fn broken(begun: bool, error: WayError) -> Conclusion {
+fn broken(begun: bool, error: TransportError) -> Conclusion {
     if begun {
         Conclusion::Unconfirmed(error)
     } else {
@@ -345,16 +352,16 @@ async fn write(
     mut piece: Bytes,
     patience: Duration,
     begun: &Mutex<bool>,
-) -> Result<(), WayError> {
+) -> Result<(), TransportError> {
     while !piece.is_empty() {
         let mut step = piece.split_to(piece.len().min(STEP));
         *begun.lock() = true;
         match timeout(patience, stream.write_all_buf(&mut step)).await {
             Ok(Ok(())) => {}
-            Ok(Err(error)) => return Err(WayError::new(WayFault::Broken, error)),
+            Ok(Err(error)) => return Err(TransportError::new(TransportErrorKind::Broken, error)),
             Err(_) => {
                 let detail = "the peer stopped reading (stall_timeout)";
-                return Err(WayError::new(WayFault::TimedOut, detail));
+                return Err(TransportError::new(TransportErrorKind::TimedOut, detail));
             }
         }
     }

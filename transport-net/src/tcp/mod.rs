@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, Parcel, Signature, Sink, Ticket,
-    Transport, WayError, WayFault,
+    Transport, TransportError, TransportErrorKind,
 };
 use tokio::runtime::Handle;
 
@@ -93,7 +93,7 @@ impl TcpTransport {
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
-    ) -> Result<(), WayError> {
+    ) -> Result<(), TransportError> {
         let Some(sink) = self.endpoint.sink() else {
             return Err(ConnectionEnd::Closed.after());
         };
@@ -103,7 +103,7 @@ impl TcpTransport {
             let task = self.endpoint.runtime.spawn(run);
             if task.is_finished() && senders.take_back(attempt, to) {
                 let detail = "the runtime of this endpoint has been shut down";
-                return Err(WayError::new(WayFault::Closed, detail));
+                return Err(TransportError::new(TransportErrorKind::Closed, detail));
             }
         }
         Ok(())
@@ -131,7 +131,12 @@ impl Transport for TcpTransport {
             })
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         self.endpoint.check(to, &parcel)?;
         if to.signature() != Signature::Frames {
             return self.dispatch_legacy(attempt, to, parcel);

@@ -16,7 +16,8 @@ use std::time::{Duration, Instant};
 use bytes::{Bytes, BytesMut};
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Conclusion, Incarnation, Location, Parcel, WayError, WayFault,
+    Abandoned, Answer, AttemptId, Conclusion, Incarnation, Location, Parcel, TransportError,
+    TransportErrorKind,
 };
 
 use super::config::UdpLimits;
@@ -250,10 +251,14 @@ impl Connection {
     ///
     /// # Errors
     /// When the parcel cannot be sent. The connection is unchanged then.
-    pub(crate) fn send(&mut self, attempt: AttemptId, parcel: &Parcel) -> Result<(), WayError> {
+    pub(crate) fn send(
+        &mut self,
+        attempt: AttemptId,
+        parcel: &Parcel,
+    ) -> Result<(), TransportError> {
         let Ok((header, pieces)) = ParcelHeader::of(parcel) else {
             let detail = "the receiver's name is empty or too long";
-            return Err(WayError::new(WayFault::Refused, detail));
+            return Err(TransportError::new(TransportErrorKind::Refused, detail));
         };
         let body: usize = pieces.iter().map(Bytes::len).sum();
         let size = body.saturating_add(PARCEL_OVERHEAD);
@@ -274,18 +279,18 @@ impl Connection {
             let detail = format!(
                 "{max_in_flight} parcels of this connection wait for their answer; the limit is max_in_flight"
             );
-            return Err(WayError::new(WayFault::Congested, detail));
+            return Err(TransportError::new(TransportErrorKind::Congested, detail));
         }
         let queued = self.waiting_bytes;
         if queued > 0 && queued.saturating_add(size) > max_queued_bytes {
             let detail = format!(
                 "{queued} bytes of this connection wait to be sent; the limit is {max_queued_bytes} (max_queued_bytes)"
             );
-            return Err(WayError::new(WayFault::Congested, detail));
+            return Err(TransportError::new(TransportErrorKind::Congested, detail));
         }
         if self.last_sent.saturating_add(self.waiting.len() as u64) + 1 >= MAX_ID {
             let detail = "parcel numbers of this connection are exhausted";
-            return Err(WayError::new(WayFault::Congested, detail));
+            return Err(TransportError::new(TransportErrorKind::Congested, detail));
         }
         self.waiting_bytes += size;
         self.waiting.push_back(Outgoing {
@@ -635,8 +640,8 @@ impl Connection {
     }
 }
 
-fn too_large(size: usize, carried: usize) -> WayError {
+fn too_large(size: usize, carried: usize) -> TransportError {
     let detail =
         format!("the parcel needs a datagram of {size} bytes; the path carries at most {carried}");
-    WayError::new(WayFault::TooLarge, detail)
+    TransportError::new(TransportErrorKind::TooLarge, detail)
 }

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Mandate,
-    Parcel, Ticket, WayError, WayFault,
+    Parcel, Ticket, TransportError, TransportErrorKind,
 };
 
 use super::config::UdpLimits;
@@ -186,7 +186,7 @@ impl Core {
         attempt: AttemptId,
         to: &Location,
         parcel: &Parcel,
-    ) -> Result<Option<u32>, WayError> {
+    ) -> Result<Option<u32>, TransportError> {
         let dialled = self.dialled.get(to).copied();
         let known = self.known.get(&to.incarnation());
         let there = dialled.or_else(|| known.and_then(|numbers| numbers.first().copied()));
@@ -195,7 +195,10 @@ impl Core {
             None => (self.create(now, to)?, true),
         };
         let Some(entry) = self.connections.get_mut(&number) else {
-            return Err(WayError::new(WayFault::Broken, "the connection has ended"));
+            return Err(TransportError::new(
+                TransportErrorKind::Broken,
+                "the connection has ended",
+            ));
         };
         if dialled.is_none() && !fresh {
             entry.connection.is_used_for(now, to);
@@ -250,7 +253,7 @@ impl Core {
     }
 
     /// Ends a new connection that cannot be opened.
-    pub(crate) fn cannot_begin(&mut self, number: u32, error: WayError) {
+    pub(crate) fn cannot_begin(&mut self, number: u32, error: TransportError) {
         self.end(number, &ConnectionEnd::NotOpened(error));
     }
 
@@ -309,7 +312,7 @@ impl Core {
                 self.of_dialling(to, path, |_, _| {
                     let detail = "the peer refused the connection: its max_connections is reached, or it is connected \
                                   with this service already";
-                    Err(ConnectionEnd::NotOpened(WayError::new(WayFault::Refused, detail)))
+                    Err(ConnectionEnd::NotOpened(TransportError::new(TransportErrorKind::Refused, detail)))
                 });
             }
             Datagram::Unknown { number } => self.is_unknown(path, number),
@@ -440,7 +443,7 @@ impl Core {
     }
 
     /// Creates a connection for a location.
-    fn create(&mut self, now: Instant, to: &Location) -> Result<u32, WayError> {
+    fn create(&mut self, now: Instant, to: &Location) -> Result<u32, TransportError> {
         if self.connections.len() >= self.limits.max_connections {
             return Err(ConnectionEnd::TooManyConnections.after());
         }

@@ -5,7 +5,7 @@
 
 use std::time::{Duration, Instant};
 
-use fipa_transport::{WayError, WayFault};
+use fipa_transport::{TransportError, TransportErrorKind};
 
 use super::connection::Path;
 use super::packet::{self, Cookie, NO_COOKIE};
@@ -96,7 +96,7 @@ impl Dialling {
             Some(next) => *next = now.min(*next),
             None => {
                 let detail = format!("{}: {what}", path.remote);
-                let error = WayError::new(WayFault::Unreachable, detail);
+                let error = TransportError::new(TransportErrorKind::Unreachable, detail);
                 return Err(ConnectionEnd::NotOpened(error));
             }
         }
@@ -117,8 +117,8 @@ impl Dialling {
             return Ok(());
         }
         let detail = format!("no answer within {patience:?} (connect_timeout)");
-        Err(ConnectionEnd::NotOpened(WayError::new(
-            WayFault::Unreachable,
+        Err(ConnectionEnd::NotOpened(TransportError::new(
+            TransportErrorKind::Unreachable,
             detail,
         )))
     }

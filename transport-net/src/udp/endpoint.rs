@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, Arrival, AttemptId, Kind, ListenError, Location, Parcel, Sink, Ticket,
-    Verdict, WayError, WayFault,
+    TransportError, TransportErrorKind, Verdict,
 };
 use parking_lot::Mutex;
 use tokio::net::lookup_host;
@@ -182,14 +182,14 @@ impl Endpoint {
         attempt: AttemptId,
         to: &Location,
         parcel: &Parcel,
-    ) -> Result<(), WayError> {
+    ) -> Result<(), TransportError> {
         let mut state = self.state.lock();
         let now = Instant::now();
         let core = match (state.phase, state.core.as_mut()) {
             (Phase::Open, Some(core)) => core,
             (Phase::New, _) => {
-                return Err(WayError::new(
-                    WayFault::Closed,
+                return Err(TransportError::new(
+                    TransportErrorKind::Closed,
                     "`listen` has not been called",
                 ));
             }
@@ -256,7 +256,7 @@ impl Endpoint {
                 }
                 None => ConnectionEnd::Closed.after(),
             },
-            Err(error) => WayError::new(WayFault::Unreachable, error),
+            Err(error) => TransportError::new(TransportErrorKind::Unreachable, error),
         };
         if let Some(core) = state.core.as_mut() {
             core.cannot_begin(connection, error);
@@ -290,7 +290,10 @@ impl Endpoint {
             return;
         };
         if paths.is_empty() {
-            core.cannot_begin(connection, WayError::new(WayFault::Unreachable, fault));
+            core.cannot_begin(
+                connection,
+                TransportError::new(TransportErrorKind::Unreachable, fault),
+            );
         } else {
             core.begin(Instant::now(), connection, paths);
         }
@@ -421,7 +424,8 @@ async fn look_up(endpoint: Arc<Endpoint>, connection: u32, name: String, port: u
     match found {
         Ok(addresses) => endpoint.begin(&mut state, connection, &addresses),
         Err(error) => {
-            let error = WayError::new(WayFault::Unreachable, format!("{name}: {error}"));
+            let error =
+                TransportError::new(TransportErrorKind::Unreachable, format!("{name}: {error}"));
             if let Some(core) = state.core.as_mut() {
                 core.cannot_begin(connection, error);
             }

@@ -26,7 +26,7 @@ use std::sync::Arc;
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Body, Incarnation, Kind, ListenError, Location, Parcel,
-    Signature, Sink, Ticket, Transport, WayError, WayFault,
+    Signature, Sink, Ticket, Transport, TransportError, TransportErrorKind,
 };
 use tokio::runtime::Handle;
 
@@ -44,7 +44,7 @@ const NAME: usize = 255;
 /// other receives datagrams at its address, before either stores any state about the other. Lost
 /// packets are retransmitted based on the measured round-trip time; parcels arrive once and in
 /// order. A letter that does not fit an unfragmented datagram on the path is [too
-/// large](WayFault::TooLarge).
+/// large](TransportErrorKind::TooLarge).
 ///
 /// An address is a numeric `address:port`, with a scope where one is needed
 /// (`[fe80::1%eth0]:7788`), or `name:port`.
@@ -71,10 +71,10 @@ impl UdpTransport {
         self.endpoint.counters()
     }
 
-    fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
+    fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), TransportError> {
         if to.kind() != Kind::Udp || to.signature() != Signature::Frames {
             let detail = format!("{to} is not a UDP location");
-            return Err(WayError::new(WayFault::Unreachable, detail));
+            return Err(TransportError::new(TransportErrorKind::Unreachable, detail));
         }
         if let Body::Letter(letter) = &parcel.body
             && letter.len() > self.max_letter()
@@ -82,7 +82,7 @@ impl UdpTransport {
             let (len, max) = (letter.len(), self.max_letter());
             let detail =
                 format!("the letter has {len} bytes; at most {max} fit a datagram (max_datagram)");
-            return Err(WayError::new(WayFault::TooLarge, detail));
+            return Err(TransportError::new(TransportErrorKind::TooLarge, detail));
         }
         Ok(())
     }
@@ -114,7 +114,12 @@ impl Transport for UdpTransport {
         self.endpoint.open(sink, random)
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         self.check(to, &parcel)?;
         self.endpoint.dispatch(attempt, to, &parcel)
     }

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Stream, Ticket,
-    WayFault,
+    TransportErrorKind,
 };
 
 use super::config::UdpLimits;
@@ -93,7 +93,7 @@ impl Simulation {
         }
     }
 
-    fn send(&mut self, from: usize, attempt: u64, len: usize) -> Result<(), WayFault> {
+    fn send(&mut self, from: usize, attempt: u64, len: usize) -> Result<(), TransportErrorKind> {
         let to = Location::new(Kind::Udp, &address(1 - from).to_string()).unwrap();
         let parcel = parcel(attempt, len);
         let fresh = self.cores[from]
@@ -306,7 +306,7 @@ fn run(seed: u64, conditions: LinkConditions, late: f64) -> (usize, usize) {
             Ok(()) => {
                 attempts[from].insert(number);
             }
-            Err(fault) => assert_eq!(fault, WayFault::TooLarge, "seed {seed}"),
+            Err(fault) => assert_eq!(fault, TransportErrorKind::TooLarge, "seed {seed}"),
         }
         for _ in 0..simulation.random.u8(0..4) {
             simulation.step();
@@ -409,7 +409,7 @@ fn a_vanished_peer_is_detected_and_no_letter_counts_as_accepted() {
         }
         assert!(matches!(
             &simulation.concluded[A][&AttemptId(100)][0],
-            Conclusion::NotSent(error) if error.fault == WayFault::Unreachable
+            Conclusion::NotSent(error) if error.fault == TransportErrorKind::Unreachable
         ));
         simulation.cut = false;
         simulation.send(A, 101, 1).unwrap();
@@ -433,7 +433,7 @@ fn a_restarted_peer_reports_the_unknown_connection() {
     simulation.until_concluded(A, &BTreeSet::from([1, 2]));
     assert!(matches!(
         &simulation.concluded[A][&AttemptId(2)][0],
-        Conclusion::Unconfirmed(error) if error.fault == WayFault::Broken
+        Conclusion::Unconfirmed(error) if error.fault == TransportErrorKind::Broken
     ));
     assert!(simulation.now < restarted + Duration::from_millis(50));
     simulation.send(A, 3, 10).unwrap();
@@ -616,7 +616,7 @@ fn an_interface_below_the_minimum_mtu_ends_the_connection() {
     let [Conclusion::Unconfirmed(error)] = &simulation.concluded[A][&AttemptId(3)][..] else {
         panic!("{:?}", simulation.concluded[A]);
     };
-    assert_eq!(error.fault, WayFault::Broken);
+    assert_eq!(error.fault, TransportErrorKind::Broken);
     assert!(error.detail.contains("1200"), "{error}");
 }
 

@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, OwnerProcess, Parcel, Sink, Ticket,
-    Transport, WayError,
+    Transport, TransportError,
 };
 use parking_lot::Mutex;
 use tokio::net::UnixListener;
@@ -227,7 +227,12 @@ impl Transport for UnixTransport {
         })
     }
 
-    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         self.endpoint.check(to, &parcel)?;
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
             let bound = self.bound.lock();

@@ -5,7 +5,7 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_testbed::{Anybody, frame};
+use fipa_testbed::{AnyPeer, frame};
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
 use rustls::client::ResolvesClientCert;
 use rustls::crypto::ring;
@@ -45,7 +45,7 @@ pub(crate) fn client(own: Option<&Host>, versions: Versions) -> ClientConfig {
         .with_protocol_versions(versions)
         .unwrap()
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(Anybody))
+        .with_custom_certificate_verifier(Arc::new(AnyPeer))
         .with_client_cert_resolver(Arc::new(Own(own.map(Arc::new))))
 }
 

@@ -19,8 +19,8 @@ use fipa_acl::{Letter, Payload};
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind,
-    LegacySource, LoanedContent, Location, Parcel, Sink, Stream, Ticket, Transport, Verdict,
-    WayError,
+    LegacySource, LoanedContent, Location, Parcel, Sink, Stream, Ticket, Transport, TransportError,
+    Verdict,
 };
 use fipa_transport_net::{
     Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
@@ -297,7 +297,12 @@ impl<T: Transport> Party<T> {
         &self.locations[0]
     }
 
-    pub(crate) fn send(&self, attempt: u64, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+    pub(crate) fn send(
+        &self,
+        attempt: u64,
+        to: &Location,
+        parcel: Parcel,
+    ) -> Result<(), TransportError> {
         self.transport.dispatch(AttemptId(attempt), to, parcel)
     }
 

@@ -12,7 +12,8 @@ use super::endpoint::{
     TestEndpoint, accepted, assert_same, concluded, letter, parcel, pattern, until,
 };
 use crate::{
-    Abandoned, Answer, Arrival, AttemptId, Body, Conclusion, Location, Transport, Verdict, WayFault,
+    Abandoned, Answer, Arrival, AttemptId, Body, Conclusion, Location, Transport,
+    TransportErrorKind, Verdict,
 };
 
 /// An abandoned attempt is concluded once and at once, and other attempts go on.
@@ -149,7 +150,7 @@ pub fn a_closed_transport_refuses_parcels(fixture: &dyn Fixture) {
         .transport
         .dispatch(AttemptId(1), &a.location, parcel(1, letter("x")))
         .expect_err("the transport is closed");
-    assert_eq!(error.fault, WayFault::Closed, "{error}");
+    assert_eq!(error.fault, TransportErrorKind::Closed, "{error}");
     let not_sent = match a
         .transport
         .dispatch(AttemptId(1), &b.location, parcel(1, letter("x")))
@@ -223,7 +224,7 @@ pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
             Ok(None) if round == 0 => return,
             // Held contents use all the room, and letters are sent without a loan.
             Err(error) if round > 0 => {
-                assert_eq!(error.fault, WayFault::Congested, "{error}");
+                assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
                 filled(round)
             }
             other => panic!("round {round}: {:?}", other.map(|loan| loan.is_some())),
@@ -275,7 +276,7 @@ pub fn a_flood_is_bounded_and_every_attempt_concluded(fixture: &dyn Fixture) {
             parcel(attempt, letter("x")),
         ) {
             Ok(()) => taken.push(attempt),
-            Err(error) => assert_eq!(error.fault, WayFault::Congested, "{error}"),
+            Err(error) => assert_eq!(error.fault, TransportErrorKind::Congested, "{error}"),
         }
     }
     assert!(!taken.is_empty());

@@ -11,7 +11,7 @@ use super::endpoint::{
 };
 use crate::{
     Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Outcome,
-    Parcel, Report, Stream, Verdict, WayError, WayFault,
+    Parcel, Report, Stream, TransportError, TransportErrorKind, Verdict,
 };
 
 /// Letters, reports and credits arrive with all fields unchanged.
@@ -22,7 +22,7 @@ pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
         location: "tcp://192.0.2.1:7#00000000000000aa"
             .parse()
             .expect("a location"),
-        error: WayError::new(WayFault::TimedOut, "no answer in 250 ms"),
+        error: TransportError::new(TransportErrorKind::TimedOut, "no answer in 250 ms"),
     }];
     let outcome = Outcome::Failed {
         reason: FailureReason::Unreachable,
@@ -156,7 +156,7 @@ pub fn order_is_kept(fixture: &dyn Fixture) {
                 parcel(sequence, letter(content.clone())),
             ) {
                 Ok(()) => Some(()),
-                Err(error) if error.fault == WayFault::Congested => None,
+                Err(error) if error.fault == TransportErrorKind::Congested => None,
                 Err(error) => panic!("{error}"),
             }
         });
@@ -248,7 +248,7 @@ pub fn a_letter_above_the_limit_is_not_sent(fixture: &dyn Fixture) {
             parcel(1, letter(vec![0; limit + 1])),
         )
         .expect_err("the letter is too large");
-    assert_eq!(error.fault, WayFault::TooLarge, "{error}");
+    assert_eq!(error.fault, TransportErrorKind::TooLarge, "{error}");
     a.send(2, &b, parcel(2, letter("small")));
     assert_eq!(concluded(&[&a, &b], &a, 2), accepted());
     assert_eq!(b.arrivals(), 1);
@@ -261,9 +261,11 @@ pub fn a_location_without_an_endpoint_is_unreachable(fixture: &dyn Fixture) {
         .transport
         .dispatch(AttemptId(1), &fixture.nowhere(), parcel(1, letter("x")))
     {
-        Err(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+        Err(error) => assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}"),
         Ok(()) => match concluded(&[&a], &a, 1) {
-            Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}")
+            }
             other => panic!("{other:?}"),
         },
     }
@@ -287,7 +289,10 @@ pub fn a_letter_for_another_incarnation_is_not_delivered(fixture: &dyn Fixture) 
         },
     };
     assert!(
-        matches!(fault, WayFault::WrongIncarnation | WayFault::Unreachable),
+        matches!(
+            fault,
+            TransportErrorKind::WrongIncarnation | TransportErrorKind::Unreachable
+        ),
         "{fault:?}"
     );
     assert_eq!(b.arrivals(), 0);

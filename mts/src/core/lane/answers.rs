@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use fipa_sds::Entry;
 use fipa_transport::{
     Answer, AttemptId, Conclusion, FailureReason, Hop, Incarnation, Kind, Location, Outcome,
-    Report, Signature, WayError, WayFault,
+    Report, Signature, TransportError, TransportErrorKind,
 };
 
 use super::super::attempts::{AttemptTable, Settlement};
@@ -77,7 +77,7 @@ impl Lane {
             other => {
                 let text = format!("unknown conclusion of the attempt: {other:?}");
                 self.letters[index].ended(AttemptEnd::Unknown);
-                let error = WayError::new(WayFault::Incompatible, text);
+                let error = TransportError::new(TransportErrorKind::Incompatible, text);
                 self.came_back(now, index, &location, error, table);
             }
         }
@@ -222,8 +222,8 @@ impl Lane {
         (reason, detail): (FailureReason, String),
         table: &mut AttemptTable,
     ) {
-        let fault = WayFault::Refused;
-        self.letters[index].failed_at(location, WayError { fault, detail });
+        let fault = TransportErrorKind::Refused;
+        self.letters[index].failed_at(location, TransportError { fault, detail });
         self.fail(now, index, reason, table);
     }
 
@@ -233,14 +233,14 @@ impl Lane {
         now: Instant,
         index: usize,
         location: &Location,
-        error: WayError,
+        error: TransportError,
         table: &mut AttemptTable,
     ) {
         self.recovering = true;
         if let Some(tally) = self.tally() {
             tally.fail(now, &error);
         }
-        if error.fault == WayFault::Congested && self.congested < CONGESTED_TRIES {
+        if error.fault == TransportErrorKind::Congested && self.congested < CONGESTED_TRIES {
             // The end of another attempt, in this lane or another, makes room.
             self.congested += 1;
             self.letters[index]
@@ -251,7 +251,10 @@ impl Lane {
             self.pause_until(now + CONGESTED_PAUSE);
             return;
         }
-        if !matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
+        if !matches!(
+            error.fault,
+            TransportErrorKind::TooLarge | TransportErrorKind::Inexpressible
+        ) {
             table.route_failed(now, location, error.fault);
         }
         self.route_failed(location, &error);
@@ -471,7 +474,7 @@ impl Lane {
             } => {
                 if !std::mem::replace(abandoned, true) {
                     let text = "the service at this location was replaced";
-                    let error = WayError::new(WayFault::Broken, text);
+                    let error = TransportError::new(TransportErrorKind::Broken, text);
                     table.abandon(location.kind(), *attempt, error);
                 }
             }

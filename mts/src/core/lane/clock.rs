@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use fipa_transport::{FailureReason, WayError, WayFault};
+use fipa_transport::{FailureReason, TransportError, TransportErrorKind};
 
 use super::super::attempts::AttemptTable;
 use super::super::work;
@@ -39,10 +39,11 @@ impl Lane {
                     let ends = expired || abandoned || *times_out <= now;
                     if ends && !std::mem::replace(asked, true) {
                         let error = match expired {
-                            true => {
-                                WayError::new(WayFault::TimedOut, "the letter's deadline passed")
-                            }
-                            false => WayError::new(WayFault::TimedOut, ""),
+                            true => TransportError::new(
+                                TransportErrorKind::TimedOut,
+                                "the letter's deadline passed",
+                            ),
+                            false => TransportError::new(TransportErrorKind::TimedOut, ""),
                         };
                         table.abandon(location.kind(), *attempt, error);
                     }
@@ -50,7 +51,10 @@ impl Lane {
                 State::Custody { location, .. } if expired || abandoned => {
                     let location = location.clone();
                     let text = "the gateway that has the letter in custody has not reported";
-                    delivery.failed_at(&location, WayError::new(WayFault::TimedOut, text));
+                    delivery.failed_at(
+                        &location,
+                        TransportError::new(TransportErrorKind::TimedOut, text),
+                    );
                     self.fail(now, index, FailureReason::Unconfirmed, table);
                     continue;
                 }

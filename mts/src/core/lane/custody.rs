@@ -7,7 +7,7 @@
 
 use std::time::{Duration, Instant};
 
-use fipa_transport::{Incarnation, WayError, WayFault};
+use fipa_transport::{Incarnation, TransportError, TransportErrorKind};
 
 use super::super::attempts::{AttemptTable, Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, HoldDecision};
@@ -164,7 +164,7 @@ impl Lane {
         let before = std::mem::replace(&mut delivery.progress.state, State::Waiting);
         if let State::Custody { location, .. } = before {
             delivery.ended(AttemptEnd::CustodianLost);
-            let error = WayError::new(WayFault::Broken, text);
+            let error = TransportError::new(TransportErrorKind::Broken, text);
             self.came_back(now, index, &location, error, table);
         }
     }

@@ -4,7 +4,8 @@ use std::time::Instant;
 
 use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, Attempt, AttemptId, FailureReason, Hop, Incarnation, Location, WayError, WayFault,
+    Answer, Attempt, AttemptId, FailureReason, Hop, Incarnation, Location, TransportError,
+    TransportErrorKind,
 };
 use smallvec::SmallVec;
 
@@ -148,7 +149,7 @@ impl Delivery {
 
     /// Records a failed attempt. Of many, the first ones and the last one at each location are
     /// kept.
-    pub(super) fn failed_at(&mut self, location: &Location, error: WayError) {
+    pub(super) fn failed_at(&mut self, location: &Location, error: TransportError) {
         let attempts = &mut self.progress.attempts;
         if attempts.len() >= MAX_ATTEMPTS {
             let mut known = attempts.iter().rev();
@@ -188,8 +189,8 @@ impl Delivery {
         let mut reason = None;
         for attempt in &self.progress.attempts {
             match attempt.error.fault {
-                WayFault::Inexpressible => reason = Some(FailureReason::Inexpressible),
-                WayFault::TooLarge => {
+                TransportErrorKind::Inexpressible => reason = Some(FailureReason::Inexpressible),
+                TransportErrorKind::TooLarge => {
                     reason = reason.or(Some(FailureReason::TooLarge));
                 }
                 _ => return None,

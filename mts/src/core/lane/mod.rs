@@ -26,8 +26,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, WayError,
-    WayFault,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, TransportError,
+    TransportErrorKind,
 };
 
 pub(crate) use self::delivery::Delivery;
@@ -444,7 +444,8 @@ impl Lane {
             let reason = match entry.is_unsupported() {
                 true => {
                     for location in &entry.locations {
-                        let error = WayError::new(WayFault::Unsupported, location.kind());
+                        let error =
+                            TransportError::new(TransportErrorKind::Unsupported, location.kind());
                         delivery.failed_at(location, error);
                     }
                     FailureReason::Unsupported
@@ -563,7 +564,8 @@ impl Lane {
                     ..
                 } => {
                     if !std::mem::replace(abandoned, true) {
-                        let error = WayError::new(WayFault::Closed, "the sender went away");
+                        let error =
+                            TransportError::new(TransportErrorKind::Closed, "the sender went away");
                         table.abandon(location.kind(), *attempt, error);
                     }
                     index += 1;

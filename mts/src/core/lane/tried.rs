@@ -2,14 +2,17 @@
 //! letters before them.
 
 use fipa_sds::Entry;
-use fipa_transport::{Attempt, FailureReason, Location, WayError, WayFault};
+use fipa_transport::{Attempt, FailureReason, Location, TransportError, TransportErrorKind};
 
 use super::Lane;
 
 impl Lane {
     /// Records an error of a route, unless it concerns one letter only.
-    pub(super) fn route_failed(&mut self, location: &Location, error: &WayError) {
-        if matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
+    pub(super) fn route_failed(&mut self, location: &Location, error: &TransportError) {
+        if matches!(
+            error.fault,
+            TransportErrorKind::TooLarge | TransportErrorKind::Inexpressible
+        ) {
             return;
         }
         self.route_worked(location);
@@ -55,7 +58,7 @@ impl Lane {
         Some(Attempt {
             via: location.kind(),
             location: location.clone(),
-            error: WayError::new(WayFault::TimedOut, detail),
+            error: TransportError::new(TransportErrorKind::TimedOut, detail),
         })
     }
 }

@@ -1,5 +1,5 @@
 use fipa_acl::{AgentId, Performative};
-use fipa_transport::{Attempt, FailureReason, WayError, WayFault};
+use fipa_transport::{Attempt, FailureReason, TransportError, TransportErrorKind};
 
 use super::*;
 use crate::core::SendId;
@@ -40,7 +40,7 @@ fn all() -> Vec<News> {
         attempts: vec![Attempt {
             via: Kind::Shm,
             location: "shm://1#0000000000000001".parse().unwrap(),
-            error: WayError::new(WayFault::Broken, "gone"),
+            error: TransportError::new(TransportErrorKind::Broken, "gone"),
         }],
     };
     vec![

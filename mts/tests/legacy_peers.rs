@@ -10,15 +10,15 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
-use fipa_mts::{Gate, Link, letter_for};
+use fipa_mts::{AccessGate, Link, letter_for};
 use fipa_sds::{
     ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
     StaticDirectory,
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
-    LegacySource, Location, Outcome, Parcel, Principal, Signature, Ticket, Verdict, WayError,
-    WayFault,
+    LegacySource, Location, Outcome, Parcel, Principal, Signature, Ticket, TransportError,
+    TransportErrorKind, Verdict,
 };
 
 /// A recorded letter from a fipa_services agent, `cpp-sender`, to an agent `echo`.
@@ -141,7 +141,7 @@ fn the_sender_of_an_undeliverable_recorded_letter_gets_a_failure_message_in_its_
     written.unwrap();
 
     // A failure message that cannot be delivered causes no other.
-    let error = WayError::new(WayFault::Unreachable, "gone");
+    let error = TransportError::new(TransportErrorKind::Unreachable, "gone");
     let later = Now {
         instant: now().instant + Duration::from_secs(60),
         ..now()
@@ -202,7 +202,7 @@ fn a_location_on_another_host_than_the_source_gets_no_failure_message() {
 /// A gate that refuses all letters to agents whose names begin with this prefix.
 struct Refusing(&'static str);
 
-impl Gate for Refusing {
+impl AccessGate for Refusing {
     fn admits(&self, _: Instant, receiver: &str, _: &Letter, _: Link) -> Result<(), String> {
         match receiver.starts_with(self.0) {
             true => Err("a rule denies it".to_owned()),
@@ -649,7 +649,7 @@ fn letters_to_an_unreachable_legacy_peer_fail_like_others() {
         },
     );
     let (attempt, _, _) = dispatched(&mut core).unwrap();
-    let error = WayError::new(WayFault::Unreachable, "connection refused");
+    let error = TransportError::new(TransportErrorKind::Unreachable, "connection refused");
     core.handle_conclusion(start, attempt, Conclusion::NotSent(error));
     let over = Now {
         instant: start.instant + Duration::from_secs(1),

@@ -19,16 +19,16 @@ use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
 use fipa_transport::{
-    AttemptId, Conclusion, Kind, Location, Parcel, Signature, Transport, WayFault,
+    AttemptId, Conclusion, Kind, Location, Parcel, Signature, Transport, TransportErrorKind,
 };
 
 /// A legacy peer that accepts connections one after the other, and reads each to its end.
-struct OldPeer {
+struct LegacyPeer {
     location: Location,
     letters: Receiver<Vec<u8>>,
 }
 
-impl OldPeer {
+impl LegacyPeer {
     fn new(signature: Signature) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let location = location(&listener, signature);
@@ -88,7 +88,7 @@ fn parcel(sequence: u64, content: &str) -> Parcel {
 
 #[test]
 fn fipa_services_gets_one_letter_per_connection_in_order() {
-    let (party, peer) = (Party::new(), OldPeer::new(Signature::FipaServices));
+    let (party, peer) = (Party::new(), LegacyPeer::new(Signature::FipaServices));
     for number in 0..20 {
         party
             .send(number, &peer.location, parcel(number, &number.to_string()))
@@ -109,7 +109,7 @@ fn fipa_services_gets_one_letter_per_connection_in_order() {
 
 #[test]
 fn jade_gets_xml_and_a_string_message_and_can_answer() {
-    let (party, peer) = (Party::new(), OldPeer::new(Signature::JadeProxy));
+    let (party, peer) = (Party::new(), LegacyPeer::new(Signature::JadeProxy));
     party.send(1, &peer.location, parcel(1, "hello")).unwrap();
     assert_eq!(party.conclusion(1), Conclusion::Handed);
     let (envelope, message, bytes) = peer.letter();
@@ -137,7 +137,9 @@ fn an_unreachable_peer_is_reported_for_all_waiting_letters() {
     }
     for attempt in 0..10 {
         match party.conclusion(attempt) {
-            Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}")
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -149,7 +151,7 @@ fn a_peer_that_does_not_read_is_given_up_and_others_are_served() {
     impatient.limits.stall_timeout = Duration::from_millis(300);
     let (party, good) = (
         Party::with(impatient),
-        OldPeer::new(Signature::FipaServices),
+        LegacyPeer::new(Signature::FipaServices),
     );
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let deaf = location(&listener, Signature::FipaServices);
@@ -160,7 +162,9 @@ fn a_peer_that_does_not_read_is_given_up_and_others_are_served() {
     party.send(3, &good.location, parcel(3, "y")).unwrap();
     assert_eq!(party.conclusion(3), Conclusion::Handed);
     match party.conclusion(1) {
-        Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
+        Conclusion::Unconfirmed(error) => {
+            assert_eq!(error.fault, TransportErrorKind::TimedOut, "{error}")
+        }
         other => panic!("{other:?}"),
     }
     // The system accepts a small letter for a peer that does not read.
@@ -184,7 +188,7 @@ fn waiting_letters_are_bounded_and_concluded_once() {
         party.send(attempt, &slow, parcel(attempt, "x")).unwrap();
     }
     let full = party.send(4, &slow, parcel(4, "x")).unwrap_err();
-    assert_eq!(full.fault, WayFault::Congested, "{full}");
+    assert_eq!(full.fault, TransportErrorKind::Congested, "{full}");
     party.transport.abandon(AttemptId(2));
     party.transport.close();
     assert!(matches!(party.conclusion(0), Conclusion::Unconfirmed(_)));
@@ -193,18 +197,20 @@ fn waiting_letters_are_bounded_and_concluded_once() {
     }
     assert_eq!(party.sink.record.lock().concluded.len(), 3);
     let closed = party.send(5, &slow, parcel(5, "x")).unwrap_err();
-    assert_eq!(closed.fault, WayFault::Closed, "{closed}");
+    assert_eq!(closed.fault, TransportErrorKind::Closed, "{closed}");
     drop(stream);
 }
 
 #[test]
 fn a_letter_that_the_peer_cannot_read_is_not_sent() {
-    let (party, peer) = (Party::new(), OldPeer::new(Signature::FipaServices));
+    let (party, peer) = (Party::new(), LegacyPeer::new(Signature::FipaServices));
     party
         .send(1, &peer.location, common::parcel(1, "not even an envelope"))
         .unwrap();
     match party.conclusion(1) {
-        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Inexpressible, "{error}"),
+        Conclusion::NotSent(error) => {
+            assert_eq!(error.fault, TransportErrorKind::Inexpressible, "{error}")
+        }
         other => panic!("{other:?}"),
     }
 }

@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 ///
 /// Sans-I/O: the caller passes `now`, which must not decrease.
 #[derive(Debug, Clone)]
-pub struct Allowance {
+pub struct TokenBucket {
     /// Tokens. Negative after more was [spent](Self::spend) than there was.
     left: f64,
     at: Instant,
 }
 
-impl Allowance {
+impl TokenBucket {
     /// A full bucket.
     #[must_use]
     pub fn new(per_second: f64, now: Instant) -> Self {
@@ -63,7 +63,7 @@ mod tests {
     #[test]
     fn a_burst_of_one_second_is_allowed_and_then_the_rate() {
         let now = Instant::now();
-        let mut allowance = Allowance::new(2.0, now);
+        let mut allowance = TokenBucket::new(2.0, now);
         assert!(allowance.take(1.0, 2.0, now) && allowance.take(1.0, 2.0, now));
         assert!(!allowance.take(1.0, 2.0, now));
         assert!(allowance.take(1.0, 2.0, now + SECOND / 2));
@@ -73,7 +73,7 @@ mod tests {
     #[test]
     fn an_overdraft_lasts_at_most_one_second() {
         let now = Instant::now();
-        let mut allowance = Allowance::new(10.0, now);
+        let mut allowance = TokenBucket::new(10.0, now);
         assert_eq!(allowance.spend(10.0, 10.0, now), None);
         assert_eq!(allowance.spend(5.0, 10.0, now), Some(SECOND / 2));
         assert_eq!(allowance.spend(1e12, 10.0, now), Some(SECOND));
@@ -87,7 +87,7 @@ mod tests {
             let rate = f64::from(random.u32(1..50));
             let begun = Instant::now();
             let (mut now, mut taken) = (begun, 0.0);
-            let mut allowance = Allowance::new(rate, begun);
+            let mut allowance = TokenBucket::new(rate, begun);
             for _ in 0..random.usize(1..200) {
                 now += Duration::from_millis(random.u64(0..200));
                 taken += f64::from(u8::from(allowance.take(1.0, rate, now)));
