@@ -73,7 +73,7 @@ impl World {
         // compiling them takes longer than everything else.
         let receiver = match self.random.u32(..100) {
             0 => format!("h{host}_.*"),
-            1..=10 => "absent".to_owned(),
+            1..=10 => "nobody".to_owned(),
             _ => format!("h{host}_p{}_{}", self.random.usize(..PROCESSES), 0),
         };
         let mut receiver: Arc<str> = receiver.as_str().into();
