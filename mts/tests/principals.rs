@@ -207,6 +207,30 @@ fn a_connected_service_is_accepted_with_its_own_certificate_only() {
 }
 
 #[test]
+fn a_certificate_replaces_a_claim_without_proof() {
+    let mut bench = Bench::new();
+    let service = Incarnation::from_u64(77);
+    let introduction = |name: &str, principal| Introduction {
+        name: name.into(),
+        hop: Hop {
+            principal,
+            ..link(service, HONEST)
+        },
+        dialled: None,
+        mandate: Mandate::Unproved,
+    };
+    let claim = introduction("other", Principal::Unproved);
+    bench.core.handle_introduced(bench.now, &claim);
+    let proved = introduction("mts", link(service, HONEST).principal);
+    assert!(bench.core.accepts(&proved));
+    bench.core.handle_introduced(bench.now, &proved);
+    assert!(!bench.core.accepts(&claim));
+    // The end of the claimant's connection changes nothing.
+    bench.core.handle_parted(bench.now, &claim);
+    assert!(!bench.core.accepts(&claim));
+}
+
+#[test]
 fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
     let mut bench = Bench::new();
     bench

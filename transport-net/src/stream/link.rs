@@ -656,7 +656,9 @@ impl LinkTask {
                         mandate,
                     };
                     if !self.sink.accepts(&introduction) {
-                        return Err(ConnectionEnd::IdentityConflict("another certificate belongs to this service"));
+                        return Err(ConnectionEnd::IdentityConflict(
+                            "another certificate belongs to this service",
+                        ));
                     }
                     self.peer = Some(introduction);
                 }
