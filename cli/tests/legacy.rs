@@ -154,7 +154,7 @@ fn a_name_that_legacy_peers_cannot_read_causes_one_warning() {
     for arguments in [&["echo", "a b"][..], &["coalition", "a b", "arm"]] {
         let (code, output) = host.start(arguments).signal("-INT");
         assert_eq!(code, Some(0));
-        let warned = "can neither get letters from \"a b\" nor name it";
+        let warned = "can neither receive letters from \"a b\" nor address it";
         assert_eq!(output.matches(warned).count(), 1, "{output}");
     }
 }
