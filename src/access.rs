@@ -1,9 +1,11 @@
-//! Who may send what to whom: the rules of `[access]`, and how often.
+//! The rules of `[access]`, which decide about letters by their sender, receiver, performative and
+//! protocol, and the rate limit of senders.
 //!
-//! A rule that denies comes before all that allow; when there are rules that allow, what none of
-//! them names is refused. Sans-I/O: what a letter claims and `now` go in, a judgement comes out.
+//! A deny rule takes precedence over all allow rules. If there are allow rules, a letter that
+//! matches none of them is refused. This module does no I/O: it takes the facts of a letter and
+//! `now`, and returns a decision.
 //!
-//! What must not live here: whether a sender is who it says (`fipa_transport_net::secure`).
+//! Not in this module: the proof of a sender's identity (`fipa_transport_net::secure`).
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
@@ -13,93 +15,95 @@ use fipa_mts::Source;
 use fipa_sds::Matcher;
 use fipa_transport::TokenBucket;
 
-/// A line of `access.allow` or `access.deny`: the sender and its receivers.
+/// An entry of `access.allow` or `access.deny`: the sender and its receivers.
 pub(crate) type Line<'a> = (&'a str, &'a [String]);
 
-/// Senders whose rate is remembered, of all sources. When there are more, the source with the most
-/// senders loses the one that it brought first: a source that invents names makes this process forget
-/// its own senders only.
+/// Maximum number of senders whose rate is stored, over all sources. Beyond it, silent senders are
+/// removed. If there are none, the oldest sender of the source with the most senders is evicted, so
+/// a source that invents names evicts its own senders only.
 const MAX_SENDERS: usize = 8192;
 
-/// What a letter says of itself.
+/// The properties of a letter that the rules check. They are claims of the sender.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Claim<'a> {
+pub(crate) struct LetterFacts<'a> {
     pub(crate) sender: &'a str,
     pub(crate) receiver: &'a str,
     pub(crate) performative: &'a str,
     pub(crate) protocol: Option<&'a str>,
 }
 
-/// Why a letter does not pass.
+/// The reason why a letter is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Refusal {
     #[error("a rule denies it (access.deny)")]
     Denied,
     #[error("no rule allows it (access.allow)")]
     NotAllowed,
-    #[error("its sender sends more letters a second than it may (access.rate)")]
+    #[error("its sender exceeds the limit of letters per second (access.rate)")]
     TooMany {
-        /// Whether it is worth a line of the audit: one a second for each sender.
+        /// Whether to log the refusal: true at most once per second and sender.
         told: bool,
     },
 }
 
-/// A rule that cannot be understood; the text says what to write.
+/// The error of a rule that cannot be parsed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct RuleError(String);
 
-/// The rules, and what senders have sent lately.
+/// The rules, and the current rates of senders.
 #[derive(Debug)]
 pub(crate) struct Access {
     deny: Vec<Rule>,
     allow: Vec<Rule>,
-    /// Letters a second; none: any number.
+    /// Maximum number of letters per second and sender; `None` means unlimited.
     rate: Option<f64>,
     senders: Senders,
 }
 
-/// The senders of each source, bounded.
+/// The senders of all sources, at most [`MAX_SENDERS`].
 #[derive(Debug, Default)]
 struct Senders {
-    sources: HashMap<Source, OfSource>,
-    /// The number of senders of each source.
+    sources: HashMap<Source, SourceSenders>,
+    /// Each source with its number of senders, ordered by that number.
     sizes: BTreeSet<(usize, Source)>,
-    /// All senders.
+    /// Number of senders of all sources.
     len: usize,
-    /// When silent senders were last looked for.
+    /// Time of the last removal of silent senders.
     swept: Option<Instant>,
 }
 
 /// The senders of one source.
 #[derive(Debug, Default)]
-struct OfSource {
+struct SourceSenders {
     senders: HashMap<Arc<str>, Sender>,
-    /// In the order in which they were first heard.
+    /// The senders in the order of their first letters.
     order: VecDeque<Arc<str>>,
 }
 
-/// One receiver of one line.
+/// The rule for one receiver of an entry.
 #[derive(Debug, Clone)]
 struct Rule {
     sender: Matcher,
     receiver: Matcher,
-    /// Any, when there are none.
+    /// The performatives to which the rule applies; if empty, all.
     performatives: Vec<String>,
+    /// The protocols to which the rule applies; if empty, all.
     protocols: Vec<String>,
 }
 
-/// What a sender may still send.
+/// The rate of one sender.
 #[derive(Debug)]
 struct Sender {
-    allowance: TokenBucket,
-    /// When it was last told that it sent too much.
+    bucket: TokenBucket,
+    /// Time of the last refusal that was logged.
     told: Option<Instant>,
 }
 
 impl Access {
-    /// The rules of these lines, each a sender and its receivers, and the letters per second of one
-    /// sender (0: unlimited). `None` if there is nothing to check.
+    /// Parses these entries, each a sender and its receivers. `rate` is the maximum number of
+    /// letters per second and sender; 0 means unlimited. Returns `None` if there is nothing to
+    /// check.
     pub(crate) fn new<'a>(
         deny: impl IntoIterator<Item = Line<'a>>,
         allow: impl IntoIterator<Item = Line<'a>>,
@@ -117,18 +121,18 @@ impl Access {
         }))
     }
 
-    /// What the rules say of a letter.
-    pub(crate) fn judge(&self, claim: &Claim<'_>) -> Result<(), Refusal> {
-        if self.deny.iter().any(|rule| rule.names(claim)) {
+    /// Checks a letter against the rules.
+    pub(crate) fn judge(&self, facts: &LetterFacts<'_>) -> Result<(), Refusal> {
+        if self.deny.iter().any(|rule| rule.names(facts)) {
             return Err(Refusal::Denied);
         }
-        if !self.allow.is_empty() && !self.allow.iter().any(|rule| rule.names(claim)) {
+        if !self.allow.is_empty() && !self.allow.iter().any(|rule| rule.names(facts)) {
             return Err(Refusal::NotAllowed);
         }
         Ok(())
     }
 
-    /// Counts a letter that may pass by the rules, if its sender may send one more by this source.
+    /// Counts a letter that the rules allow. Fails when the sender exceeds its rate by this source.
     pub(crate) fn count(
         &mut self,
         source: Source,
@@ -143,7 +147,7 @@ impl Access {
 }
 
 impl Senders {
-    /// What this sender may still send by this source.
+    /// Returns the rate of this sender by this source, and creates it if necessary.
     fn of(&mut self, source: Source, sender: &str, rate: f64, now: Instant) -> &mut Sender {
         let known = self.sources.get(&source);
         if !known.is_some_and(|known| known.senders.contains_key(sender)) {
@@ -159,14 +163,15 @@ impl Senders {
         }
         let known = self.sources.entry(source).or_default();
         let fresh = || Sender {
-            allowance: TokenBucket::new(rate, now),
+            bucket: TokenBucket::new(rate, now),
             told: None,
         };
         known.senders.entry(sender.into()).or_insert_with(fresh)
     }
 
-    /// Forgets the senders that were silent for a second, which may send as much as new ones. If there
-    /// are none, the first sender of the source with the most is forgotten.
+    /// Removes the senders without a letter in the last second, at most once per second. The bucket
+    /// of such a sender is as full as that of a new one. If this makes no room, evicts the oldest
+    /// sender of the source with the most senders.
     fn make_room(&mut self, now: Instant) {
         if self.swept.is_none_or(|swept| is_over(swept, now)) {
             self.swept = Some(now);
@@ -191,11 +196,12 @@ impl Senders {
         }
     }
 
+    /// Removes the senders without a letter in the last second.
     fn sweep(&mut self, now: Instant) {
         self.sources.retain(|_, known| {
-            let is_recent = |it: &Sender| !is_over(it.allowance.asked(), now);
+            let is_recent = |it: &Sender| !is_over(it.bucket.asked(), now);
             known.senders.retain(|_, it| is_recent(it));
-            let OfSource { senders, order } = known;
+            let SourceSenders { senders, order } = known;
             order.retain(|sender| senders.contains_key(sender));
             !order.is_empty()
         });
@@ -208,8 +214,9 @@ impl Senders {
 }
 
 impl Sender {
+    /// Takes a token for one letter.
     fn take(&mut self, rate: f64, now: Instant) -> Result<(), Refusal> {
-        if self.allowance.take(1.0, rate, now) {
+        if self.bucket.take(1.0, rate, now) {
             return Ok(());
         }
         let told = self.told.is_none_or(|before| is_over(before, now));
@@ -220,19 +227,21 @@ impl Sender {
     }
 }
 
-/// Whether a second has gone by since.
+/// Whether at least one second has passed since then.
 fn is_over(since: Instant, now: Instant) -> bool {
     now.saturating_duration_since(since) >= Duration::from_secs(1)
 }
 
 impl Rule {
-    /// Reads `RECEIVER [performative=NAME,…] [protocol=NAME,…]`.
+    /// Parses `RECEIVER [performative=NAME,…] [protocol=NAME,…]`.
     fn parse(sender: &str, receiver: &str) -> Result<Self, RuleError> {
         let matcher = |text: &str| {
             Matcher::parse(text).map_err(|error| {
                 let error = error.to_string();
                 let last = error.lines().last().unwrap_or_default().trim();
-                RuleError(format!("{text:?} cannot be matched: {last}"))
+                RuleError(format!(
+                    "has {text:?}, which is not a valid pattern: {last}"
+                ))
             })
         };
         let mut words = receiver.split_whitespace();
@@ -260,20 +269,20 @@ impl Rule {
         Ok(rule)
     }
 
-    /// Whether the rule is about such a letter.
-    fn names(&self, claim: &Claim<'_>) -> bool {
+    /// Whether the rule applies to this letter.
+    fn names(&self, facts: &LetterFacts<'_>) -> bool {
         let among = |names: &[String], name: Option<&str>| {
             names.is_empty()
                 || name.is_some_and(|name| names.iter().any(|it| it.eq_ignore_ascii_case(name)))
         };
-        self.sender.matches(claim.sender)
-            && self.receiver.matches(claim.receiver)
-            && among(&self.performatives, Some(claim.performative))
-            && among(&self.protocols, claim.protocol)
+        self.sender.matches(facts.sender)
+            && self.receiver.matches(facts.receiver)
+            && among(&self.performatives, Some(facts.performative))
+            && among(&self.protocols, facts.protocol)
     }
 }
 
-/// What is wrong with a line of rules, if anything is.
+/// Returns the first error of an entry, if it has one.
 pub(crate) fn fault((sender, receivers): Line<'_>) -> Option<RuleError> {
     if receivers.is_empty() {
         return Some(RuleError("has no receivers".to_owned()));
@@ -315,8 +324,8 @@ mod tests {
             .unwrap()
     }
 
-    fn claim<'a>(sender: &'a str, receiver: &'a str) -> Claim<'a> {
-        Claim {
+    fn facts<'a>(sender: &'a str, receiver: &'a str) -> LetterFacts<'a> {
+        LetterFacts {
             sender,
             receiver,
             performative: "inform",
@@ -327,11 +336,11 @@ mod tests {
     #[test]
     fn what_is_denied_does_not_pass_whatever_is_allowed() {
         let access = access(&[("rover_2", &["arm"])], &[("rover_.*", &["arm"])], 0);
-        assert_eq!(access.judge(&claim("rover_1", "arm")), Ok(()));
-        let denied = access.judge(&claim("rover_2", "arm"));
+        assert_eq!(access.judge(&facts("rover_1", "arm")), Ok(()));
+        let denied = access.judge(&facts("rover_2", "arm"));
         assert_eq!(denied, Err(Refusal::Denied));
         for (sender, receiver) in [("rover_1", "arm_2"), ("crex", "arm")] {
-            let refused = access.judge(&claim(sender, receiver));
+            let refused = access.judge(&facts(sender, receiver));
             assert_eq!(refused, Err(Refusal::NotAllowed));
         }
     }
@@ -347,12 +356,12 @@ mod tests {
             ("request", Some("fipa-query"), false),
             ("request", None, false),
         ] {
-            let claim = Claim {
+            let facts = LetterFacts {
                 performative,
                 protocol,
-                ..claim("rover", "arm")
+                ..facts("rover", "arm")
             };
-            assert_eq!(access.judge(&claim).is_ok(), passes, "{claim:?}");
+            assert_eq!(access.judge(&facts).is_ok(), passes, "{facts:?}");
         }
     }
 
@@ -372,10 +381,10 @@ mod tests {
             assert_eq!(access.count(CREX, &name, now), Ok(()));
         }
         assert_eq!(access.senders.len, MAX_SENDERS);
-        // It is still remembered, and others of its host are served.
+        // The rate of the first sender is still stored, and other senders of its source may send.
         assert_eq!(access.count(ROVER, "rover", now), TOLD);
         assert_eq!(access.count(ROVER, "arm", now), Ok(()));
-        // Many sources with one name each are one more than the source with two.
+        // Many sources with one sender each evict the senders of a source with two or more.
         for number in 0..MAX_SENDERS as u64 {
             let source = Source::Process(fipa_transport::Incarnation::from_u64(number + 1));
             assert_eq!(access.count(source, "agent", now), Ok(()));
@@ -431,7 +440,7 @@ mod tests {
         fn a_denied_pair_never_passes(sender in "[a-c]{1,2}", receiver in "[a-c]{1,2}") {
             let access = access(&[("a.*", &["b.*"])], &[(".*", &[".*"])], 0);
             let denied = sender.starts_with('a') && receiver.starts_with('b');
-            let judged = access.judge(&claim(&sender, &receiver));
+            let judged = access.judge(&facts(&sender, &receiver));
             prop_assert_eq!(judged.is_err(), denied);
         }
     }

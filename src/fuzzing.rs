@@ -1,16 +1,16 @@
-//! Parts that the fuzz targets reach; `fuzz/` has the targets.
+//! Private parts of this crate that the fuzz targets in `fuzz/` call.
 
 use std::time::Instant;
 
 use fipa_transport::Incarnation;
 
-use crate::access::{self, Claim};
+use crate::access::{self, LetterFacts};
 use crate::config::{AccessRule, Config, ConfigError, Effective, Sources};
 
-/// Reads and checks a text as if it stood in `fipa.toml`, with these overrides (`key=value`).
+/// Parses and checks a text as the content of `fipa.toml`, with these overrides (`key=value`).
 ///
 /// # Errors
-/// With all mistakes.
+/// Returns all mistakes.
 pub fn config(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
     let sources = Sources {
         set: set.iter().map(|one| (*one).to_owned()).collect(),
@@ -20,15 +20,16 @@ pub fn config(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
     Effective::of_text(&sources, text.to_owned())
 }
 
-/// Rules of access.
+/// The access rules, and the rates of senders.
 #[derive(Debug)]
 pub struct Access(access::Access);
 
-/// Lines of rules: a sender, and its receivers.
+/// Entries of rules, each a sender and its receivers.
 pub type Lines<'a> = &'a [(&'a str, Vec<&'a str>)];
 
 impl Access {
-    /// Rules with these lines; none when a line cannot be understood, or there is nothing to check.
+    /// Creates rules from these entries. Returns `None` if an entry cannot be parsed or there is
+    /// nothing to check.
     #[must_use]
     pub fn new(deny: Lines<'_>, allow: Lines<'_>, rate: usize) -> Option<Self> {
         let lines = |lines: Lines<'_>| -> Vec<AccessRule> {
@@ -43,7 +44,7 @@ impl Access {
         config.rules().ok().flatten().map(Self)
     }
 
-    /// Whether the rules let such a letter pass.
+    /// Whether the rules allow this letter.
     #[must_use]
     pub fn passes(
         &self,
@@ -51,13 +52,13 @@ impl Access {
         performative: &str,
         protocol: Option<&str>,
     ) -> bool {
-        let claim = Claim {
+        let facts = LetterFacts {
             sender,
             receiver,
             performative,
             protocol,
         };
-        self.0.judge(&claim).is_ok()
+        self.0.judge(&facts).is_ok()
     }
 
     /// Whether the sender may send one more letter from the process with this number.

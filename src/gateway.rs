@@ -1,9 +1,12 @@
-//! The gateway of a domain on one host: the same service as in every robot process, with leave to
-//! forward, listening on the network, and the go-between of two directories: what lives on this
-//! host is announced to the network, what is announced there is told to the processes here.
+//! The gateway of a domain on one host.
+//!
+//! The gateway runs the same message transport service as every robot process. In addition, it
+//! forwards letters and listens on the network. It connects two directories: it announces the
+//! agents of this host to other hosts, and publishes the agents of other hosts to the processes of
+//! this host.
 
-mod clerk;
 mod exchange;
+mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
 mod neighbours;
@@ -22,20 +25,20 @@ use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, Trans
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
-use self::clerk::Clerk;
 use self::exchange::{Exchanging, Means};
+use self::gateway_agent::GatewayAgent;
 #[cfg(feature = "secure")]
 use self::guard::Guard;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
-use self::publisher::{Keeper, Publisher};
+use self::publisher::{PublishTask, Publisher};
 use crate::config::ConfigError;
 use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::service::{Role, Service};
 use crate::{AgentId, Config};
 
-/// A running gateway. Ends when [`close`](Self::close) is called or it is dropped.
+/// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
 pub struct Gateway {
     config: Config,
     service: Arc<Service>,
@@ -49,11 +52,11 @@ pub struct Gateway {
 
 impl Gateway {
     /// Starts the gateway of the domain that the configuration names. Must be called within a
-    /// tokio runtime, which then does the work in the background.
+    /// tokio runtime, which runs the background tasks of the gateway.
     ///
     /// # Errors
-    /// When the configuration, the domain's directory or a configured address cannot be used, or
-    /// the domain has a gateway already.
+    /// Fails when the configuration, the domain's directory or a configured address cannot be used,
+    /// or when the domain already has a gateway.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
         #[cfg(feature = "secure")]
         let guard = Guard::open(&config.security, &config.mts.name)?;
@@ -62,7 +65,7 @@ impl Gateway {
             let without = "this program was built without the feature `secure`";
             return Err(OpenError::Keys(without.to_owned()));
         }
-        let contacts = Arc::new(Acquaintances::default());
+        let contacts = Arc::new(KnownPeers::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
         let made = Mutex::new(None);
         let service = Service::start(
@@ -75,15 +78,15 @@ impl Gateway {
                 security: guard.as_ref().map(Guard::security),
                 view: &|host, mts| {
                     let network = network(config, mts)?;
-                    let told = exchange.directory() as Arc<dyn Directory>;
-                    let there = network.clone().map(Network::directory);
-                    let old = Arc::new(legacy_peers(config)?) as Arc<dyn Directory>;
-                    let known = there.into_iter().chain([told, old]).collect();
+                    let exchanged = exchange.directory() as Arc<dyn Directory>;
+                    let announced = network.clone().map(Network::directory);
+                    let legacy = Arc::new(legacy_peers(config)?) as Arc<dyn Directory>;
+                    let known = announced.into_iter().chain([exchanged, legacy]).collect();
                     let known = Arc::new(MergedDirectory::new(known));
-                    let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
-                    let beyond = Arc::clone(&known) as Arc<dyn Directory>;
+                    let contacted = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
+                    let remote = Arc::clone(&known) as Arc<dyn Directory>;
                     let view: Arc<dyn Directory> = Arc::new(View {
-                        all: MergedDirectory::new(vec![host, beyond, heard]),
+                        all: MergedDirectory::new(vec![host, remote, contacted]),
                         neighbours: Arc::clone(&contacts.neighbours),
                     });
                     *made.lock() = Some((network, known, Arc::clone(&view)));
@@ -104,7 +107,7 @@ impl Gateway {
             exchange,
             tasks: Vec::new(),
         };
-        // The queue first: once the name is known, letters come.
+        // The queue is created first, because letters arrive as soon as the name is registered.
         let own = &gateway.service.own;
         let mts = &gateway.service.mts;
         mts.register(Arc::clone(&own.name), own.incarnation);
@@ -119,13 +122,14 @@ impl Gateway {
             contacts: Arc::clone(&contacts.directory),
             service: Arc::clone(&gateway.service),
             has_keys: !config.security.keys.is_empty(),
-            only_loopback: speaks_on_loopback_only(config),
+            only_loopback: announces_on_loopback_only(config),
         });
-        // From now on, who writes becomes known on this host before its letter arrives there.
+        // From here on, the sender of a letter from another host is published on this host before
+        // the letter is delivered.
         *contacts.publisher.lock() = Some(Arc::clone(&publisher));
         contacts.network.lock().clone_from(&gateway.network);
-        let keeper = Keeper::new(publisher, gateway.network.clone());
-        gateway.tasks.push(tokio::spawn(keeper.run()));
+        let publish_task = PublishTask::new(publisher, gateway.network.clone());
+        gateway.tasks.push(tokio::spawn(publish_task.run()));
         let follow = follow_locations(
             Arc::clone(&gateway.service),
             Arc::clone(&gateway.neighbours),
@@ -139,15 +143,15 @@ impl Gateway {
         Ok(gateway)
     }
 
-    /// From now on the gateway answers letters, exchanges its directory with neighbours and keeps
-    /// in touch with its static peers.
+    /// Starts to answer letters, to exchange directories with neighbors, and to keep in touch with
+    /// the static peers.
     fn open_for_letters(
         &mut self,
         config: &Config,
         known: Arc<MergedDirectory>,
     ) -> Result<(), OpenError> {
         let means = self.means()?;
-        let clerk = Clerk {
+        let gateway_agent = GatewayAgent {
             service: Arc::clone(&self.service),
             id: means.id.clone(),
             neighbours: Arc::clone(&self.neighbours),
@@ -155,7 +159,7 @@ impl Gateway {
             exchange: Arc::clone(&self.exchange),
             notices: Mutex::default(),
         };
-        self.tasks.push(tokio::spawn(clerk.run()));
+        self.tasks.push(tokio::spawn(gateway_agent.run()));
         let exchange = Arc::clone(&self.exchange);
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);
@@ -176,7 +180,7 @@ impl Gateway {
         })
     }
 
-    /// Registers the gateway itself, so that the processes of this host find it.
+    /// Registers the gateway in the directory of this host, in which the processes find it.
     fn enter(&self) -> Result<(), OpenError> {
         let service = &self.service;
         let own = register(service);
@@ -186,7 +190,8 @@ impl Gateway {
             }
             other => other.into(),
         })?;
-        // Looked for only now: of two that start at the same moment, at most one finds nobody.
+        // Other gateways are searched for after the registration. If two gateways start at the
+        // same moment, at most one of them finds no other.
         service.host.refresh();
         let entries = service.host.entries();
         let mut gateways = entries
@@ -198,50 +203,54 @@ impl Gateway {
         }
     }
 
-    /// The name of the gateway.
+    /// Returns the name of the gateway.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.service.own.name
     }
 
-    /// This life of it.
+    /// Returns the incarnation of the gateway.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
         self.service.own.incarnation
     }
 
-    /// Where it can be reached at present.
+    /// Returns the current locations of the gateway.
     #[must_use]
     pub fn locations(&self) -> Vec<Location> {
         self.service.locations()
     }
 
-    /// Who is there, on this host and on others.
+    /// Returns the directory of this host and of other hosts.
     #[must_use]
     pub fn directory(&self) -> &dyn Directory {
         &*self.view
     }
 
-    /// The gateways of other hosts that a connection is open with at the moment, whoever opened
-    /// it.
+    /// Returns the gateways of other hosts with which a connection is open now, whether this
+    /// gateway or the other one opened it.
     #[must_use]
     pub fn neighbours(&self) -> Vec<Neighbour> {
         self.neighbours.all()
     }
 
-    /// Uses another configuration from now on, without losing a letter: orders of transports,
-    /// exceptions, the deadline of legacy peers' letters, static peers. Returns the keys that differ
-    /// and are used only after the gateway was started again.
+    /// Applies another configuration without losing a letter. The orders of transports, the
+    /// exceptions from them, the deadline of letters from legacy peers, and the static peers take
+    /// effect at once. Returns the keys that differ and take effect only after a restart of the
+    /// gateway.
     ///
     /// # Errors
-    /// When the configuration has mistakes. Nothing has been changed then.
+    /// Fails when the configuration has mistakes; nothing has changed then.
     pub fn reload(&mut self, config: &Config) -> Result<Vec<String>, ConfigError> {
         config.check()?;
         let mut later = self.config.differences(config);
         let open: Vec<Kind> = self.service.mts.kinds().collect();
         let agents = |config: &Config| {
             let peers = config.discovery.peers.iter();
-            peers.filter(|it| is_old(it)).cloned().collect::<Vec<_>>()
+            peers
+                .filter(|it| is_legacy(it))
+                .cloned()
+                .collect::<Vec<_>>()
         };
         let same_agents = agents(&self.config) == agents(config);
         later.retain(|key| match key.as_str() {
@@ -275,13 +284,13 @@ impl Gateway {
         Ok(later)
     }
 
-    /// What goes wrong with finding other hosts, if anything does.
+    /// Returns the current problem of the discovery of other hosts, if there is one.
     #[must_use]
     pub fn discovery_problem(&self) -> Option<String> {
         self.network.as_ref().and_then(|network| network.problem())
     }
 
-    /// Ends the gateway: says goodbye to the network and gives letters under way a moment to
+    /// Ends the gateway. Announces the end to other hosts, and gives letters in transit a moment to
     /// arrive.
     pub async fn close(mut self) {
         if !self.owner.is_this() {
@@ -294,10 +303,10 @@ impl Gateway {
             self.exchange.goodbye(&means).await;
         }
         if let Some(network) = self.network.take() {
-            // Blocks for as long as it takes to say goodbye.
+            // Closing blocks until the goodbye has been sent.
             let goodbye = tokio::task::spawn_blocking(move || network.close()).await;
             if let Err(error) = goodbye {
-                tracing::warn!(%error, "did not say goodbye to the network");
+                tracing::warn!(%error, "the directory of the network was not closed properly");
             }
         }
         self.service.close().await;
@@ -305,7 +314,7 @@ impl Gateway {
 
     fn abort(&mut self) {
         if !self.owner.is_this() {
-            // In a forked child: saying goodbye to the network would be in the parent's name.
+            // In a forked child, a goodbye would end the announcements of the parent.
             std::mem::forget(self.network.take());
             return;
         }
@@ -325,7 +334,7 @@ impl Drop for Gateway {
     }
 }
 
-/// Registers the gateway with its present locations.
+/// Registers the gateway with its current locations.
 fn register(service: &Service) -> Result<Arc<Entry>, RegisterError> {
     service.host.register(Registration {
         role: EntryRole::Gateway,
@@ -339,8 +348,9 @@ fn register(service: &Service) -> Result<Arc<Entry>, RegisterError> {
     })
 }
 
-/// Keeps the gateway's own entry right, and says hello to its neighbours from where it is now: they
-/// cannot all be told by the directory of the network. The rest is up to [`Keeper`].
+/// Updates the gateway's own entry and greets its neighbors when its locations change. The
+/// greetings are needed because the directory of the network does not reach all neighbors.
+/// [`PublishTask`] updates the announcements of the agents.
 async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
     let mut locations = service.follow_locations();
     while locations.changed().await.is_ok() {
@@ -351,18 +361,18 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
             .collect();
         tracing::info!(
             locations = now.join(" "),
-            "this gateway is reached elsewhere now"
+            "the locations of this gateway have changed"
         );
         if let Err(error) = register(&service) {
-            tracing::warn!(%error, "the processes of this host are not told where the gateway is");
+            tracing::warn!(%error, "cannot update the gateway in the directory of this host");
         }
         service.mts.greet(neighbours.to_greet(Instant::now()));
     }
 }
 
-/// Whether the directory of the network is announced on loopback only. An interface by name counts
-/// when it is the one called `lo`.
-fn speaks_on_loopback_only(config: &Config) -> bool {
+/// Whether the gateway announces its agents on loopback interfaces only. An interface that is given
+/// by name is a loopback interface if its name is `lo`.
+fn announces_on_loopback_only(config: &Config) -> bool {
     let interfaces = &config.discovery.interfaces;
     let is_loopback = |interface: &crate::config::Interface| {
         let text = interface.to_string();
@@ -372,22 +382,26 @@ fn speaks_on_loopback_only(config: &Config) -> bool {
     !interfaces.is_empty() && interfaces.iter().all(is_loopback)
 }
 
-/// Whether a line of `discovery.static` names an agent of a legacy peer, not a gateway.
-fn is_old(peer: &crate::config::Peer) -> bool {
+/// Whether an entry of `discovery.static` names an agent of a legacy peer instead of a gateway.
+fn is_legacy(peer: &crate::config::Peer) -> bool {
     let mut locations = peer.locations.iter();
     locations.all(|location| location.signature() != Signature::Frames)
 }
 
-/// The agents of legacy peers that the configuration names.
+/// Returns the agents of legacy peers that the configuration names.
 fn legacy_peers(config: &Config) -> Result<StaticDirectory, OpenError> {
-    let peers = config.discovery.peers.iter().filter(|peer| is_old(peer));
+    let peers = config.discovery.peers.iter().filter(|peer| is_legacy(peer));
     let agents = peers.map(|peer| (peer.name.as_str(), peer.locations.clone()));
     StaticDirectory::new(agents).map_err(|error| OpenError::Discovery(error.to_string()))
 }
 
-/// The gateways that the configuration names.
+/// Returns the gateways that the configuration names.
 fn peers(config: &Config) -> Vec<Peer> {
-    let peers = config.discovery.peers.iter().filter(|peer| !is_old(peer));
+    let peers = config
+        .discovery
+        .peers
+        .iter()
+        .filter(|peer| !is_legacy(peer));
     peers
         .map(|peer| Peer {
             name: peer.name.as_str().into(),
@@ -396,16 +410,18 @@ fn peers(config: &Config) -> Vec<Peer> {
         .collect()
 }
 
-/// A directory of other hosts, in which this one's agents are announced.
+/// A directory that is shared with other hosts and announces the agents of this host to them.
 trait Network: Send + Sync {
     fn directory(self: Arc<Self>) -> Arc<dyn Directory>;
+    /// Returns the last error, if there is one.
     fn problem(&self) -> Option<String>;
-    /// Finds out whether this gateway is still there.
+    /// Checks whether this gateway of another host still runs.
     fn doubt(&self, gateway: Incarnation);
-    /// This gateway is not there any more: another one has its place.
+    /// Removes the entries of this gateway of another host, because another one has replaced it.
     fn ended(&self, gateway: Incarnation);
-    /// The interfaces of this host have changed: others are spoken to on the new ones at once.
+    /// Uses the changed interfaces of this host at once.
     fn interfaces_changed(&self);
+    /// Withdraws the announcements of this host and closes the directory. Blocks meanwhile.
     fn close(&self);
 }
 
@@ -461,17 +477,17 @@ fn network(_: &Config, _: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, Op
     Ok(None)
 }
 
-/// Gateways of other hosts that are connected, and agents there that have written before anybody
-/// told of them.
+/// The connected gateways of other hosts, and the agents of other hosts that sent a letter before a
+/// directory listed them.
 #[derive(Default)]
-struct Acquaintances {
+struct KnownPeers {
     neighbours: Arc<Neighbours>,
     directory: Arc<ContactDirectory>,
     publisher: Mutex<Option<Arc<Publisher>>>,
     network: Mutex<Option<Arc<dyn Network>>>,
 }
 
-impl Contacts for Acquaintances {
+impl Contacts for KnownPeers {
     fn heard(&self, name: &str, agent: Incarnation, location: Location) {
         match self.directory.heard(Instant::now(), name, agent, location) {
             Ok(true) => {
@@ -480,7 +496,7 @@ impl Contacts for Acquaintances {
                 }
             }
             Ok(false) => {}
-            Err(error) => tracing::info!(%error, "who has written cannot be answered"),
+            Err(error) => tracing::info!(%error, "cannot record the sender of a letter"),
         }
     }
 

@@ -36,6 +36,7 @@
 //! Not in this crate: delivery (`fipa-mts`), the transports, and terminal output (`fipa-cli`).
 
 mod access;
+mod access_gate;
 mod agent;
 pub mod blocking;
 #[cfg(feature = "monitor")]
@@ -60,7 +61,6 @@ mod error;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
-mod gate;
 #[cfg(feature = "net")]
 mod gateway;
 mod host_directory;

@@ -13,10 +13,10 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::Config;
+use crate::access_gate::{Of, RulesGate};
 use crate::dir_maintenance::DirMaintenance;
 use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
-use crate::gate::{Door, Of};
 use crate::host_directory;
 use crate::routes::Report;
 use crate::watch::Watchers;
@@ -199,7 +199,7 @@ fn gate(
         .access
         .rules()
         .map_err(|error| OpenError::Access(error.to_string()))?;
-    Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn AccessGate>))
+    Ok(access.map(|access| Arc::new(RulesGate::new(access, of)) as Arc<dyn AccessGate>))
 }
 
 /// Joins the reasons why no transport can be used.

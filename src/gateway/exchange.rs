@@ -1,7 +1,8 @@
-//! The exchange of directories with neighbours: the shell around [`fipa_sds::Exchange`].
+//! The exchange of directories with neighbors: the I/O around [`fipa_sds::Exchange`].
 //!
-//! Its letters are those of the gateway itself, to the neighbour itself, so they go by whatever
-//! transport leads there, in order and acknowledged. The clerk hands over what comes in.
+//! A letter of the exchange goes from this gateway to a neighbor, over any transport that leads
+//! there. The letters arrive in order and are acknowledged. The gateway agent passes the letters of
+//! neighbors to [`Exchanging::received`].
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -23,24 +24,24 @@ use super::neighbours::{Neighbour, Neighbours};
 use super::publisher::{Contested, own_agents};
 use crate::service::Service;
 
-/// How long a letter of the exchange may be under way. A neighbour that a link was cut to for
-/// longer is told everything again.
+/// Deadline for the delivery of a letter of the exchange. After a longer interruption of the link,
+/// a neighbor receives all agents again.
 const DEADLINE: Duration = Duration::from_secs(5);
-/// How long goodbyes may take.
+/// Deadline for the delivery of goodbyes.
 const GOODBYE_DEADLINE: Duration = Duration::from_millis(500);
 
 /// The ontology of messages about registrations (FIPA00023).
 pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
-/// What neighbours have told, and what they are told.
+/// The directory exchange of this gateway with its neighbors.
 pub(super) struct Exchanging {
     core: Mutex<Exchange>,
     directory: Arc<ExchangeDirectory>,
-    /// Tells the task that there may be something to do.
+    /// Wakes the task after a letter has changed the state.
     wake: Notify,
 }
 
-/// What the task needs of the gateway.
+/// The parts of the gateway that the exchange uses.
 pub(super) struct Means {
     pub(super) service: Arc<Service>,
     pub(super) id: AgentId,
@@ -51,7 +52,8 @@ pub(super) struct Means {
 }
 
 impl Exchanging {
-    /// Nobody is there yet. The seed decides when what is said; that of two gateways differs.
+    /// Creates an exchange without neighbors. The seed randomizes the times of the letters; two
+    /// gateways use different seeds.
     pub(super) fn new(seed: u64) -> Self {
         let core = Exchange::new(seed);
         Self {
@@ -61,12 +63,12 @@ impl Exchanging {
         }
     }
 
-    /// What neighbours have told.
+    /// Returns the directory of the agents that neighbors have sent.
     pub(super) fn directory(&self) -> Arc<ExchangeDirectory> {
         Arc::clone(&self.directory)
     }
 
-    /// A letter with [`EXCHANGE_ONTOLOGY`] has come.
+    /// Handles the content of a letter with [`EXCHANGE_ONTOLOGY`] from this gateway.
     pub(super) fn received(&self, from: Incarnation, content: &[u8]) {
         let taken = self
             .core
@@ -74,25 +76,29 @@ impl Exchanging {
             .handle_letter(Instant::now(), from, content);
         match taken {
             Ok(()) => self.wake.notify_one(),
-            Err(error) => tracing::info!(%error, "what a gateway has told was not used"),
+            Err(error) => tracing::info!(%error, "rejected an exchange letter of a gateway"),
         }
     }
 
-    /// Tells and is told, until the service ends.
+    /// Runs the exchange until the service ends.
     pub(super) async fn run(self: Arc<Self>, means: Means, known: Arc<MergedDirectory>) {
         let (mut host, mut there) = (means.service.host.watch(), known.watch());
-        let (mut contests, mut disputes) = (Contests::default(), Disputes::default());
+        let (mut conflicts, mut disputes) = (NameConflicts::default(), Disputes::default());
         let mut sent: JoinSet<(Incarnation, bool)> = JoinSet::new();
         let mut own_changed = true;
         loop {
-            let told_now = contests.due().is_some_and(|due| due <= Instant::now());
-            if std::mem::take(&mut own_changed) || told_now {
+            let conflict_due = conflicts.due().is_some_and(|due| due <= Instant::now());
+            if std::mem::take(&mut own_changed) || conflict_due {
                 let (own, contested) = own_agents(&means.service.host, &*known, means.has_keys);
                 self.core.lock().handle_own(Instant::now(), &own);
-                contests.tell(&means, &contested);
+                conflicts.report(&means, &contested);
             }
-            disputes.tell(&means, Instant::now(), &self.directory.contested());
-            let due = [self.work(&means, &mut sent), contests.due(), disputes.due()];
+            disputes.report(&means, Instant::now(), &self.directory.contested());
+            let due = [
+                self.work(&means, &mut sent),
+                conflicts.due(),
+                disputes.due(),
+            ];
             let until = due
                 .into_iter()
                 .flatten()
@@ -121,14 +127,14 @@ impl Exchanging {
                 () = tokio::time::sleep_until(until.unwrap_or_else(tokio::time::Instant::now)),
                     if until.is_some() => {}
             }
-            // Many changes that came together are one.
+            // Several pending changes are handled together.
             while host.try_next().is_some() || there.try_next().is_some() {
                 own_changed = true;
             }
         }
     }
 
-    /// Brings the core up to date, sends what is to be sent, and says when there is more.
+    /// Updates the core and sends the letters that are due. Returns the time of the next call.
     fn work(&self, means: &Means, sent: &mut JoinSet<(Incarnation, bool)>) -> Option<Instant> {
         let now = Instant::now();
         let neighbours = means.neighbours.all();
@@ -153,7 +159,7 @@ impl Exchanging {
                     network.ended(location.incarnation());
                 }
             } else if fault == TransportErrorKind::WrongIncarnation {
-                // The service that is there introduces itself.
+                // The greeting makes the service that runs there now introduce itself.
                 let at = location.with_incarnation(Incarnation::UNKNOWN);
                 means.service.mts.greet(vec![(at.address().into(), at)]);
             }
@@ -180,7 +186,8 @@ impl Exchanging {
         core.poll_timeout()
     }
 
-    /// Takes leave of all neighbours, and waits a moment for them to hear it.
+    /// Sends a goodbye to the neighbors and waits until it is delivered, at most
+    /// [`GOODBYE_DEADLINE`].
     pub(super) async fn goodbye(&self, means: &Means) {
         let (to, content) = self.core.lock().goodbye();
         let mut sent = JoinSet::new();
@@ -192,12 +199,13 @@ impl Exchanging {
                 sent.spawn(sending.outcomes());
             }
         }
-        // Whoever has not heard it notices that the connection ends.
+        // A neighbor that does not receive the goodbye detects the end of the connection.
         while sent.join_next().await.is_some() {}
     }
 }
 
-/// An entry that each neighbour announces, with the locations of the neighbour.
+/// Returns, for each neighbor, one entry that it announces. The locations of the entry are those of
+/// the neighbor.
 fn announced_by(
     neighbours: &[Neighbour],
     announced: Option<&dyn Directory>,
@@ -212,7 +220,7 @@ fn announced_by(
         .collect()
 }
 
-/// These locations, and others of kinds that are not among them.
+/// Returns the known locations, and those of the others whose kind the known ones lack.
 fn with_others<'a>(
     known: &'a [Location],
     others: impl Iterator<Item = &'a Location>,
@@ -222,53 +230,54 @@ fn with_others<'a>(
     all.take(Entry::MAX_LOCATIONS).cloned().collect()
 }
 
-/// How long somebody else has to have a name before its later owner is told: news of an agent that
-/// moves may overtake each other.
+/// Time for which a conflict about a name has to last before it is reported. The updates about an
+/// agent that moves may arrive in the wrong order.
 const CONTESTED: Duration = Duration::from_secs(1);
 
-/// The agents of this host whose name somebody else has: since when, and whether they were told.
+/// The agents of this host whose name an agent of another host has: the start of each conflict, and
+/// whether the agent was informed.
 #[derive(Default)]
-struct Contests(HashMap<Incarnation, (Instant, bool)>);
+struct NameConflicts(HashMap<Incarnation, (Instant, bool)>);
 
-impl Contests {
-    /// When somebody is to be told next.
+impl NameConflicts {
+    /// Returns the time at which the next agent is to be informed.
     fn due(&self) -> Option<Instant> {
         let untold = self.0.values().filter(|(_, told)| !told);
         untold.map(|(since, _)| *since + CONTESTED).min()
     }
 
-    /// Tells agents of this host, once, that others reach somebody else by their name.
-    fn tell(&mut self, means: &Means, contested: &[Contested]) {
+    /// Informs each of these agents once that an agent of another host has its name.
+    fn report(&mut self, means: &Means, contested: &[Contested]) {
         let now = Instant::now();
         self.0
             .retain(|agent, _| contested.iter().any(|one| one.entry.incarnation == *agent));
         for one in contested {
-            let contest = self.0.entry(one.entry.incarnation);
-            let (since, told) = contest.or_insert((now, false));
+            let conflict = self.0.entry(one.entry.incarnation);
+            let (since, told) = conflict.or_insert((now, false));
             if !*told && now >= *since + CONTESTED {
                 *told = true;
-                one.tell(means);
+                one.report(means);
             }
         }
     }
 }
 
-/// The names that agents of two other hosts claim, both proved: since when, and whether the gateways
-/// there were told.
+/// The names that agents of two other hosts claim, both with proof: the start of each dispute, and
+/// whether it was reported to the gateways of the agents.
 #[derive(Default)]
 struct Disputes {
     all: HashMap<(Arc<str>, Incarnation), (Instant, bool)>,
-    /// The gateways of the agents that do not have the names.
+    /// The gateways of the agents that claim the names but do not hold them.
     by: HashMap<(Arc<str>, Incarnation), Incarnation>,
-    /// When a gateway was last told.
+    /// Time of the last report about a claim of each gateway.
     told: HashMap<Incarnation, Instant>,
 }
 
 impl Disputes {
-    /// How often the claims of one gateway are told.
+    /// Minimum time between two reports about claims of one gateway.
     const PAUSE: Duration = Duration::from_secs(1);
 
-    /// When a gateway is to be told next.
+    /// Returns the time of the next report.
     fn due(&self) -> Option<Instant> {
         let untold = self.all.iter().filter(|(_, (_, told))| !told);
         untold
@@ -280,13 +289,13 @@ impl Disputes {
             .min()
     }
 
-    /// Tells the gateways of both agents, once, that both claim one name. Of the claims that one gateway
-    /// makes to names of others, one a second is told.
-    fn tell(&mut self, means: &Means, now: Instant, contested: &[(Arc<Entry>, Arc<Entry>)]) {
+    /// Reports each dispute once, to the gateways of both agents. Of the claims of one gateway to
+    /// names of other agents, at most one per second is reported.
+    fn report(&mut self, means: &Means, now: Instant, contested: &[(Arc<Entry>, Arc<Entry>)]) {
         for (holder, other) in self.next(now, contested) {
             let (name, at, by) = (&other.name, &holder.mts.name, &other.mts.name);
             let (shown, by_shown) = (escape(at), escape(by));
-            tracing::warn!(%name, holder = %shown, other = %by_shown, "agents of two hosts have one name");
+            tracing::warn!(%name, holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
             let content = format!(
                 "the name {name:?} is registered at {at:?} and at {by:?}: this host reaches the agent \
                  at {at:?}; deregister one of them"
@@ -300,7 +309,7 @@ impl Disputes {
         }
     }
 
-    /// The disputes that are to be told now.
+    /// Returns the disputes that are to be reported now.
     fn next(
         &mut self,
         now: Instant,
@@ -331,14 +340,15 @@ impl Disputes {
 }
 
 impl Contested {
-    fn tell(&self, means: &Means) {
+    /// Logs the conflict and informs the agent of this host.
+    fn report(&self, means: &Means) {
         let Self { entry, holder, .. } = self;
         let (name, mts) = (&entry.name, escape(&holder.mts.name));
         let content = if self.is_announced {
             tracing::warn!(%name, holder = %mts, "an agent of another host has the same name");
             format!(
-                "the name {name:?} is registered at {mts:?} as well: each other host reaches the agent \
-                 that it was told of first; deregister one of them"
+                "the name {name:?} is also registered at {mts:?}: each other host reaches the agent \
+                 that was announced to it first; deregister one of them"
             )
         } else {
             tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
@@ -354,7 +364,7 @@ impl Contested {
                 .ontology(MANAGEMENT_ONTOLOGY)
                 .content(content)
                 .build();
-            // The letter is on its way, whether somebody waits for its outcome or not.
+            // The letter is sent although its outcome is not awaited.
             drop(
                 message
                     .ok()
@@ -365,7 +375,7 @@ impl Contested {
 }
 
 impl Means {
-    /// Sends a letter of the exchange. None when there is no such letter.
+    /// Sends a letter of the exchange. Returns `None` if the letter cannot be built.
     fn send(&self, to: &Entry, content: Vec<u8>, deadline: Duration) -> Option<Sending> {
         let receiver = AgentId::new(&*to.name).ok()?;
         let message = Message::builder(Performative::Inform)
@@ -377,7 +387,7 @@ impl Means {
         self.post(&message.ok()?, to, deadline)
     }
 
-    /// Tells the operator of another gateway something about a name.
+    /// Sends a notice about a name to another gateway, which logs it for its operator.
     fn notify(&self, to: &Entry, content: &str) -> Option<Sending> {
         let message = Message::builder(Performative::Failure)
             .sender(self.id.clone())
@@ -392,7 +402,7 @@ impl Means {
         let letter = Some(message).and_then(|message| {
             let letter = letter_for(message, SystemTime::now());
             letter
-                .inspect_err(|error| tracing::warn!(%error, "could not be written to"))
+                .inspect_err(|error| tracing::warn!(%error, "cannot encode a letter"))
                 .ok()
         })?;
         let submission = Submission {
@@ -409,7 +419,7 @@ impl Means {
 mod tests {
     use super::*;
 
-    /// An agent with this name and number, at the gateway with that number.
+    /// Creates the entry of an agent with this name and number at the gateway with that number.
     fn agent(name: &str, number: u64, gateway: u64) -> Arc<Entry> {
         let gateway = Incarnation::from_u64(gateway);
         Arc::new(Entry {
@@ -439,7 +449,7 @@ mod tests {
             (names.collect::<Vec<_>>(), disputes.due())
         };
         let one = |name: &str, gateway| (name.to_owned(), Incarnation::from_u64(gateway));
-        // An agent that moves has two gateways for a moment.
+        // The directory may show an agent that moves at two gateways for a moment.
         assert_eq!(told(0, &all), (vec![], Some(at(1000))));
         assert_eq!(told(999, &all), (vec![], Some(at(1000))));
         let first = vec![one("a", 8), one("a", 9)];
@@ -448,7 +458,7 @@ mod tests {
         assert_eq!(told(2000, &all), (vec![one("b", 8)], Some(at(3000))));
         assert_eq!(told(3000, &all), (vec![one("c", 8)], None));
         assert_eq!(told(9000, &all), (vec![], None));
-        // It is told again when it ended meanwhile.
+        // A dispute that ended and began again is reported again.
         assert_eq!(told(9000, &[]), (vec![], None));
         assert_eq!(told(9000, &all[3..]), (vec![], Some(at(10_000))));
         assert_eq!(told(10_000, &all[3..]), (vec![one("a", 9)], None));

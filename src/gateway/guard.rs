@@ -1,4 +1,5 @@
-//! The gateway's keys: read when it opens, and again whenever their directory changes.
+//! The guard reads the gateway's keys when the gateway opens, and again when their directory
+//! changes.
 
 use std::time::Duration;
 
@@ -8,42 +9,42 @@ use crate::config;
 use crate::error::OpenError;
 use crate::keys::{Holding, Keys, Stamp};
 
-/// How often the directory is looked at. Looking is three calls to the system.
-const LOOK: Duration = Duration::from_secs(1);
+/// Interval between checks for changed keys. A check makes three system calls.
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Says which certificates do not hold, or not for long any more.
-fn tell_of_ends(credentials: &Credentials) {
+/// Logs the certificates that are not valid or expire soon.
+fn warn_about_expiry(credentials: &Credentials) {
     if let Some(what) = Holding::of(&credentials.own).told() {
         tracing::warn!(
-            "the certificate of this host {what}; without one that holds peers refuse it (`fipa keys \
-             renew`)"
+            "the certificate of this host {what}; peers refuse a host without a valid certificate \
+             (renew it with `fipa keys renew`)"
         );
     }
     for trusted in &credentials.trusted {
         if let Some(what) = Holding::of(trusted).told() {
             let peer = trusted.certified().mts();
             tracing::warn!(
-                "the certificate of {peer} {what}; its owner has to make a new one (`fipa keys renew` \
+                "the certificate of {peer} {what}; it has to be renewed on that host (`fipa keys renew` \
                  there)"
             );
         }
     }
 }
 
-/// Keeps the keys of a gateway as they are in their directory.
+/// Applies the changes in the directory of the keys to a running gateway.
 pub(super) struct Guard {
     keys: Keys,
     name: String,
     security: Security,
     seen: Stamp,
-    /// Whether what was seen then may have changed since without looking different.
+    /// Whether the keys may have changed after `seen` was read without changing it.
     fresh: bool,
-    /// Why what is there cannot be used, when it cannot.
+    /// The error of the last attempt to use the keys, if it failed.
     fault: Option<String>,
 }
 
 impl Guard {
-    /// Reads the keys that the configuration names, if it does.
+    /// Reads the keys that the configuration names. Returns `None` if it names none.
     pub(super) fn open(config: &config::Security, name: &str) -> Result<Option<Self>, OpenError> {
         if config.keys.is_empty() {
             return Ok(None);
@@ -52,7 +53,7 @@ impl Guard {
         let seen = keys.stamp();
         let credentials = keys.credentials_of(name);
         let credentials = credentials.map_err(|error| OpenError::Keys(error.to_string()))?;
-        tell_of_ends(&credentials);
+        warn_about_expiry(&credentials);
         let rules = Rules {
             loopback: config.loopback,
             legacy_peers: config.legacy_peers.clone(),
@@ -69,29 +70,29 @@ impl Guard {
         }))
     }
 
-    /// For the transports.
+    /// Returns the security of the transports, which follows changes of the keys.
     pub(super) fn security(&self) -> Security {
         self.security.clone()
     }
 
-    /// Looks after the directory for as long as it is polled.
+    /// Checks the keys at regular intervals, for as long as the future is polled.
     pub(super) async fn run(mut self) {
-        let mut look = tokio::time::interval(LOOK);
+        let mut interval = tokio::time::interval(CHECK_INTERVAL);
         loop {
-            look.tick().await;
-            self = match tokio::task::spawn_blocking(move || self.looked()).await {
+            interval.tick().await;
+            self = match tokio::task::spawn_blocking(move || self.checked()).await {
                 Ok(guard) => guard,
                 Err(error) => {
-                    tracing::error!(%error, "the keys are not looked after any more");
+                    tracing::error!(%error, "key changes are ignored; restart the gateway");
                     return;
                 }
             };
         }
     }
 
-    /// Uses what has changed. What cannot be read is looked at again every time: it may be mended by
-    /// a change that its directory does not show.
-    fn looked(mut self) -> Self {
+    /// Applies changes of the keys. After an error the keys are read again at every check, because
+    /// a repair may leave the change times of the directory as they are.
+    fn checked(mut self) -> Self {
         let now = self.keys.stamp();
         let changed = now != self.seen;
         if !changed && !self.fresh && self.fault.is_none() {
@@ -104,7 +105,7 @@ impl Guard {
             .and_then(|credentials| {
                 let count = credentials.trusted.len();
                 if changed {
-                    tell_of_ends(&credentials);
+                    warn_about_expiry(&credentials);
                 }
                 let replaced = self.security.replace(credentials);
                 replaced.map(|()| count).map_err(|error| error.to_string())
@@ -112,8 +113,8 @@ impl Guard {
         self.seen = now;
         match used {
             Ok(count) => {
-                let mended = self.fault.take().is_some();
-                if changed || mended {
+                let repaired = self.fault.take().is_some();
+                if changed || repaired {
                     tracing::info!(trusted = count, "the keys were read again");
                 }
             }
@@ -125,9 +126,9 @@ impl Guard {
         self
     }
 
-    /// Somebody has changed the keys, and it cannot be told all that was meant. It may have been to
-    /// revoke one, so only those stay trusted that can still be read there. The gateway's own key
-    /// stays, as without one nobody could be spoken with at all.
+    /// Restricts trust to the certificates that can still be read. The keys have changed but cannot
+    /// be used as a whole, and the change may revoke a certificate. The gateway's own key stays in
+    /// use, because without a key the gateway cannot reach any peer.
     fn keep_confirmed(&self, error: &str) {
         let (confirmed, _) = self.keys.confirmed();
         let count = confirmed.len();
@@ -138,10 +139,13 @@ impl Guard {
         match kept {
             Ok(()) => tracing::error!(
                 trusted = count,
-                "the keys have changed and cannot be read: {error}; only peers whose certificates can \
-                 still be read are trusted until that is mended (`fipa keys list`)"
+                "cannot use the changed keys: {error}; until this is repaired, only peers whose \
+                 certificates can be read are trusted (see `fipa keys list`)"
             ),
-            Err(kept) => tracing::error!("{error}; and those before cannot be used: {kept}"),
+            Err(kept) => tracing::error!(
+                "cannot use the changed keys: {error}; cannot restrict trust to the readable \
+                 certificates: {kept}"
+            ),
         }
     }
 }
@@ -153,7 +157,7 @@ mod tests {
     use super::*;
     use crate::keys::{Certificate, VALID};
 
-    /// Keys that trust two peers, and a guard of them.
+    /// Keys that trust two peers, and their guard.
     struct Scene {
         keys: Keys,
         guard: Option<Guard>,
@@ -186,7 +190,7 @@ mod tests {
         }
 
         fn trusts(&mut self) -> [bool; 2] {
-            let guard = self.guard.take().unwrap().looked();
+            let guard = self.guard.take().unwrap().checked();
             let security = guard.security();
             self.guard = Some(guard);
             [0, 1].map(|peer: usize| security.trusts(self.peers[peer].fingerprint()))
@@ -208,7 +212,7 @@ mod tests {
         fs::write(scene.file(0), "nothing").unwrap();
         assert_eq!(scene.trusts(), [false, true]);
         assert_eq!(scene.trusts(), [false, true], "and it stays so");
-        // Written in place: the directory does not change.
+        // The file is written in place, so the directory does not change.
         fs::write(scene.file(0), pem).unwrap();
         assert_eq!(scene.trusts(), [true, true]);
     }
@@ -219,7 +223,7 @@ mod tests {
         scene.keys.revoke("crex-mts").unwrap();
         fs::write(scene.keys.dir().join("trusted/other.pem"), "nothing").unwrap();
         assert_eq!(scene.trusts(), [false, true]);
-        // Nor does a copy of what was revoked count.
+        // A copy of a revoked certificate is not trusted.
         let name = scene.file(0).file_name().unwrap().to_owned();
         fs::copy(scene.keys.dir().join("revoked").join(name), scene.file(0)).unwrap();
         assert_eq!(scene.trusts(), [false, true]);

@@ -1,9 +1,9 @@
-//! Neighbours: gateways of other hosts that a connection is open with at the moment, whoever
-//! opened it.
+//! Neighbors: the gateways of other hosts with which a connection is open now, whether this gateway
+//! or the other one opened it.
 //!
-//! Static peers become neighbours as soon as they are reached, and others while letters pass
-//! between them. A neighbour can be written to, gateway to gateway, by its incarnation; by name it
-//! cannot, because two robots may give their gateways one name.
+//! A static peer becomes a neighbor as soon as it is reached. Another gateway is a neighbor while
+//! letters pass between the two. A gateway sends letters to a neighbor by its incarnation, not by
+//! its name, because the gateways of two robots may have the same name.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use tokio::sync::Notify;
 
 use crate::routes::Connected;
 
-/// Those that a connection is open with. Their number is bounded by that of connections.
+/// The gateways with an open connection. The number of connections bounds their number.
 #[derive(Debug, Default)]
 pub(crate) struct Neighbours {
     state: Mutex<State>,
@@ -32,41 +32,41 @@ pub(crate) struct Neighbours {
 struct State {
     present: HashMap<Incarnation, Neighbour>,
     peers: Vec<Peer>,
-    /// Locations at which an attempt failed, and why it did.
+    /// Locations at which an attempt failed, and the cause.
     doubted: HashMap<Location, TransportErrorKind>,
-    /// Those whose last connection has ended, and when, the latest last.
+    /// Neighbors whose last connection has ended, with the time of the end, the latest last.
     parted: VecDeque<(Instant, Arc<Entry>)>,
 }
 
-/// For how long a neighbour that has parted is greeted when this host moves: the connections may
-/// have ended because it lost its address, long before it gets another.
+/// Time for which a disconnected neighbor is still greeted when this host gets another address. The
+/// connections may have ended because this host lost its address, long before it gets another.
 const PARTED: Duration = Duration::from_secs(600);
 
-/// Most parted neighbours that are remembered.
+/// Maximum number of disconnected neighbors that are stored.
 const MAX_PARTED: usize = 64;
 
-/// Most locations in doubt that wait to be looked at.
+/// Maximum number of doubted locations that wait to be handled.
 const MAX_DOUBTED: usize = 64;
 
-/// A gateway of another host that a connection is open with.
+/// A gateway of another host with which a connection is open.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct Neighbour {
-    /// The gateway as the directory has it, registered when it was first connected. Its locations
-    /// are those of all its agents.
+    /// The directory entry of the gateway; its time of registration is that of the first
+    /// connection. Its locations are also those of the agents of the gateway.
     pub entry: Arc<Entry>,
-    /// The locations of the configuration, with its incarnation.
+    /// The locations in the configuration, with the incarnation of the gateway.
     configured: Vec<Location>,
-    /// Where it takes letters by what its open connections show, one location for each, the latest
+    /// The locations at which the gateway accepts letters, one for each open connection, the latest
     /// last.
     hops: Vec<Location>,
-    /// How many connections are open with it.
+    /// Number of open connections with the gateway.
     pub connections: usize,
-    /// What its links prove. Connections that prove something else are not its own.
+    /// The identity that the links prove. A connection that proves another one is ignored.
     principal: Principal,
-    /// The agents that its links prove it to speak for.
+    /// The agents for which the gateway may act, as far as its links prove it.
     pub(super) mandate: Mandate,
-    /// What `discovery.static` calls it, if it stands there.
+    /// The name in `discovery.static`, if the gateway is listed there.
     pub peer: Option<Arc<str>>,
 }
 
@@ -85,22 +85,22 @@ impl From<Neighbour> for Connected {
 }
 
 impl Neighbours {
-    /// The peers that the configuration names, with their locations.
+    /// Sets the peers that the configuration names, with their locations.
     pub(crate) fn name_peers(&self, peers: Vec<Peer>) {
         self.state.lock().peers = peers;
     }
 
-    /// All of them, in no particular order.
+    /// Returns all neighbors, in no particular order.
     pub(crate) fn all(&self) -> Vec<Neighbour> {
         self.state.lock().present.values().cloned().collect()
     }
 
-    /// Returns when there are others than before. For one task only.
+    /// Waits until a neighbor changes or a location is doubted. Only one task may wait.
     pub(super) async fn changed(&self) {
         self.changed.notified().await;
     }
 
-    /// An attempt at this location failed: the gateway may not be there any more.
+    /// Records that an attempt at this location failed: the gateway may have ended.
     pub(super) fn doubt(&self, location: &Location, fault: TransportErrorKind) {
         let mut state = self.state.lock();
         if state.doubted.len() < MAX_DOUBTED {
@@ -109,14 +109,15 @@ impl Neighbours {
         }
     }
 
-    /// The locations at which attempts failed since the last call.
+    /// Returns the locations at which attempts failed since the last call.
     pub(super) fn take_doubted(&self) -> HashMap<Location, TransportErrorKind> {
         std::mem::take(&mut self.state.lock().doubted)
     }
 
+    /// Adds a connection on which this peer has introduced itself.
     pub(super) fn introduced(&self, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
-        // Other processes of this host open connections, too.
+        // Processes of this host open connections as well.
         if !peer.hop.is_remote() || !incarnation.is_known() {
             return;
         }
@@ -124,12 +125,12 @@ impl Neighbours {
         let before = state.present.get(&incarnation);
         if before.is_some_and(|before| before.principal != peer.hop.principal) {
             let (name, at) = (escape(&peer.name), &peer.hop.location);
-            tracing::info!(%name, %at, "a connected gateway has another certificate");
+            tracing::info!(%name, %at, "ignored a connection with another certificate");
             return;
         }
         let neighbour = state.neighbour(peer, before);
         if let Err(error) = neighbour.entry.check() {
-            tracing::info!(%error, at = %peer.hop.location, "a gateway that cannot be written to");
+            tracing::info!(%error, at = %peer.hop.location, "ignored a gateway with an invalid entry");
             return;
         }
         let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));
@@ -145,6 +146,7 @@ impl Neighbours {
         }
     }
 
+    /// Removes a connection of this peer that has ended.
     pub(super) fn parted(&self, now: Instant, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         let mut state = self.state.lock();
@@ -157,7 +159,7 @@ impl Neighbours {
         }
         known.connections -= 1;
         if known.connections > 0 {
-            // A location that only this connection has shown is not known any more.
+            // A location that only this connection had is removed.
             if known.locate() {
                 self.changed.notify_one();
             }
@@ -173,15 +175,15 @@ impl Neighbours {
         tracing::info!(name = %peer.name, at = %peer.hop.location, "no longer connected");
     }
 
-    /// The gateways that are to be told where this one is now, by name and location: those that are
-    /// connected, and those that were a while ago.
+    /// Returns the gateways to greet from the current locations of this one, by name and location:
+    /// the connected ones, and those that were connected within the last [`PARTED`].
     pub(super) fn to_greet(&self, now: Instant) -> Vec<(Arc<str>, Location)> {
         let mut state = self.state.lock();
         state.parted.retain(|(since, _)| *since + PARTED > now);
         let present = state.present.values().map(|neighbour| &neighbour.entry);
         let parted = state.parted.iter().map(|(_, entry)| entry);
         let all = present.chain(parted).flat_map(|entry| {
-            // The transports race the locations of one kind.
+            // The transports race the locations of one kind, so one of each kind is enough.
             let mut kinds = Vec::new();
             let of_kind = entry.locations.iter().filter(move |location| {
                 let first = !kinds.contains(&location.kind());
@@ -195,7 +197,7 @@ impl Neighbours {
 }
 
 impl State {
-    /// What is known of a neighbour when a connection with it has been opened.
+    /// Returns the neighbor with this new connection, based on its state before.
     fn neighbour(&self, peer: &Introduction, before: Option<&Neighbour>) -> Neighbour {
         let incarnation = peer.hop.location.incarnation();
         let named = |listed: &&Peer| {
@@ -207,7 +209,7 @@ impl State {
             && *listed.name != *peer.name
         {
             let (name, says) = (&listed.name, &peer.name);
-            tracing::info!(%name, %says, "a static peer calls itself by another name");
+            tracing::info!(%name, %says, "a static peer has another name than in discovery.static");
         }
         let configured = listed.iter().flat_map(|listed| &listed.locations);
         let configured: Vec<Location> = configured
@@ -256,14 +258,14 @@ impl State {
 }
 
 impl Neighbour {
-    /// Brings the locations of the entry up to date: those of the open connections, the latest first,
-    /// then those of the configuration over transports that no connection is open by. Another location
-    /// of the configuration may be an address that the peer does not have at present, and each letter
-    /// that tries it waits for an answer. Says whether they have changed.
+    /// Updates the locations of the entry and returns whether they have changed. First come the
+    /// locations of the open connections, the latest first. Then come the configured locations over
+    /// transports without an open connection. The other configured locations are left out: the peer
+    /// may not have such an address now, and each letter to it would wait for an answer.
     fn locate(&mut self) -> bool {
         let hops: Vec<&Location> = self.hops.iter().rev().collect();
         let is_open = |kind| hops.iter().any(|hop| hop.kind() == kind);
-        // Those at an address that the peer has come first.
+        // Locations at an address of an open connection come first.
         let configured = self.configured.iter();
         let mut others: Vec<&Location> = configured.filter(|it| !is_open(it.kind())).collect();
         others.sort_by_key(|location| !hops.iter().any(|hop| host(hop) == host(location)));
@@ -281,13 +283,13 @@ impl Neighbour {
     }
 }
 
-/// The host of an address with a port.
+/// Returns the host of an address with a port.
 fn host(location: &Location) -> &str {
     let address = location.address();
     address.rsplit_once(':').map_or(address, |(host, _)| host)
 }
 
-/// The directory as the gateway looks up receivers in it: what everybody sees, and neighbours by
+/// The directory in which the gateway looks up receivers: all directories, and the neighbors by
 /// their incarnation.
 pub(crate) struct View {
     pub(crate) all: MergedDirectory,
@@ -349,7 +351,7 @@ mod tests {
         location.with_incarnation(GATEWAY)
     }
 
-    /// The gateway introduces itself on a connection from this address.
+    /// Creates the introduction of the gateway on a connection from this address.
     fn introduction(address: &str, dialled: Option<&str>) -> Introduction {
         Introduction {
             name: "crex-mts".into(),
@@ -401,7 +403,7 @@ mod tests {
         neighbours.introduced(&accepted);
         assert_eq!(neighbours.all()[0].peer, None);
         neighbours.introduced(&dialled);
-        // No letter tries another address while a connection shows the present one.
+        // Letters use no other address of this kind while a connection shows the current one.
         let udp: Location = "udp://crex.local:1".parse().unwrap();
         let known = [at("10.0.0.2:1"), udp.with_incarnation(GATEWAY)];
         assert_eq!(locations(&neighbours), known);

@@ -1,5 +1,5 @@
-//! Keeps the directories of a gateway in step: what lives on this host is announced to the
-//! network, and what is known of other hosts is told to the processes here.
+//! The publisher synchronizes the directories of a gateway. It announces the agents of this host to
+//! the network, and publishes the agents of other hosts to the processes of this host.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -14,25 +14,27 @@ use super::Network;
 use crate::config::is_on_loopback;
 use crate::service::Service;
 
-/// Tells the processes of this host who is on others, as reachable through this gateway.
+/// Publishes the agents of other hosts to the processes of this host, as reachable through this
+/// gateway.
 pub(super) struct Publisher {
     pub(super) host: Arc<HostDirectory>,
-    /// Where the agents of this host are announced, if anywhere.
+    /// The directory that announces the agents of this host, if there is one.
     pub(super) network: Option<Arc<dyn Directory>>,
-    /// Who is known of other hosts without having written.
+    /// The agents of other hosts, except those that are only known as senders of letters.
     pub(super) known: Arc<MergedDirectory>,
+    /// The agents of other hosts that have sent letters.
     pub(super) contacts: Arc<ContactDirectory>,
-    /// Takes letters for all that this gateway stands for.
+    /// The service that accepts letters for the published and announced agents.
     pub(super) service: Arc<Service>,
     /// Whether `security.keys` is set.
     pub(super) has_keys: bool,
-    /// Whether what is announced stays on this host.
+    /// Whether announcements stay on this host.
     pub(super) only_loopback: bool,
 }
 
 impl Publisher {
-    /// The locations that mean something on other hosts. Loopback addresses do not: there they lead
-    /// to the other host itself.
+    /// Returns the locations that other hosts can use. A loopback address is none of them, because
+    /// on another host it leads to that host.
     fn announced_locations(&self) -> Vec<Location> {
         let mut locations = self.service.locations();
         locations.retain(|location| {
@@ -42,15 +44,16 @@ impl Publisher {
         locations
     }
 
+    /// Publishes all agents of other hosts on this host.
     pub(super) fn publish(&self) {
         let locations = self.service.locations();
         let (heard, known) = (self.contacts.entries(), self.known.entries());
-        // The later of one name counts: what is known, before what was heard.
+        // Of two entries with one name the later is used: that of a directory, not of a contact.
         let all = heard.iter().chain(known.iter());
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
             .map(|entry| match entry.is_unsupported() {
-                // Its own locations say why no letter reaches it, by this gateway neither.
+                // Its own locations show the reason why letters cannot reach it.
                 true => Entry::clone(entry),
                 false => Entry {
                     locations: locations.clone(),
@@ -58,17 +61,17 @@ impl Publisher {
                 },
             });
         if let Err(error) = self.host.publish_remote(through_here.collect()) {
-            tracing::warn!(%error, "the processes of this host are not told of all other hosts");
+            tracing::warn!(%error, "cannot publish the agents of other hosts on this host");
         }
     }
 }
 
-/// The agents and coalitions of this host, as far as others are to know of them: first those that are, then those
-/// whose name belongs to an agent of another host, too, each with that holder.
+/// Returns the agents and coalitions of this host that are announced to other hosts, and those
+/// whose name an agent of another host also has, each with that agent.
 ///
-/// Without keys the earlier registration has the name on all hosts. With keys the times that other
-/// hosts state do not count: the agents of this host are announced, and claims that no link proves
-/// change nothing.
+/// Without keys, the earlier registration holds the name on all hosts. With keys, the registration
+/// times of other hosts have no effect: all agents of this host are announced, and a claim that no
+/// link proves is ignored.
 pub(super) fn own_agents(
     host: &HostDirectory,
     known: &dyn Directory,
@@ -101,26 +104,27 @@ pub(super) fn own_agents(
     (own, contested)
 }
 
-/// An agent of this host whose name an agent of another host has as well.
+/// An agent of this host whose name an agent of another host also has.
 pub(super) struct Contested {
     pub(super) entry: Arc<Entry>,
     pub(super) holder: Arc<Entry>,
-    /// Whether other hosts are told of the agent nevertheless.
+    /// Whether the agent of this host is announced to other hosts nevertheless.
     pub(super) is_announced: bool,
 }
 
-/// The task that does it.
-pub(super) struct Keeper {
+/// The task that keeps announcements and published entries up to date.
+pub(super) struct PublishTask {
     publisher: Arc<Publisher>,
     network: Option<Arc<dyn Network>>,
+    /// The announced agents, by name.
     announced: HashMap<Arc<str>, Arc<Entry>>,
-    /// The locations with which they are announced.
+    /// The locations with which the agents are announced.
     locations: Vec<Location>,
-    /// Those that could not be announced, which was said once.
+    /// The agents that could not be announced; this was logged once for each.
     refused: HashMap<Arc<str>, Incarnation>,
 }
 
-impl Keeper {
+impl PublishTask {
     pub(super) fn new(publisher: Arc<Publisher>, network: Option<Arc<dyn Network>>) -> Self {
         Self {
             publisher,
@@ -165,12 +169,12 @@ impl Keeper {
             if !goes_on {
                 return;
             }
-            // Many changes that came together are one.
+            // Several pending changes are handled together.
             while here.try_next().is_some() || there.try_next().is_some() {}
         }
     }
 
-    /// Announces what has joined on this host, and takes back what has left.
+    /// Announces the agents that joined on this host, and withdraws those that left.
     fn announce(&mut self, network: &dyn Directory) {
         let (agents, _) = own_agents(
             &self.publisher.host,
@@ -179,7 +183,7 @@ impl Keeper {
         );
         let mine: HashMap<&Arc<str>, &Arc<Entry>> =
             agents.iter().map(|entry| (&entry.name, entry)).collect();
-        // Who is the same agent changes in place, without having been away.
+        // An entry with an unchanged incarnation is updated in place, without being withdrawn.
         let mut leaving = Vec::new();
         self.announced.retain(|name, entry| {
             let now = mine.get(name);
@@ -192,8 +196,8 @@ impl Keeper {
         self.refused.retain(|name, _| mine.contains_key(name));
         let locations = self.publisher.announced_locations();
         let mut joining: Vec<(&Arc<str>, &Arc<Entry>)> = mine.into_iter().collect();
-        // Without any, what is announced stays as it is, because the host may be about to get an
-        // address; what is not has to wait for that.
+        // Without locations, announced agents stay announced, because the host may be about to get
+        // an address. Agents that are not announced yet wait for it.
         let relocated = self.locations != locations && !locations.is_empty();
         joining.retain(|(name, entry)| {
             let changed = relocated || self.announced.get(*name) != Some(*entry);
@@ -212,11 +216,11 @@ impl Keeper {
             role: entry.role.clone(),
             ..Registration::new(Arc::clone(name), entry.incarnation, locations.clone())
         });
-        // In one go, so that coalitions among them are seen to change together.
+        // One update for all, so that other hosts see the changes of a coalition together.
         let updated = network.update(&leaving, registrations.collect());
         for ((name, _), left) in leaving.iter().zip(updated.left) {
             if let Err(error) = left {
-                tracing::debug!(%name, %error, "was not announced any more");
+                tracing::debug!(%name, %error, "cannot withdraw an announcement");
             }
         }
         for ((name, entry), joined) in joining.into_iter().zip(updated.joined) {
@@ -226,16 +230,16 @@ impl Keeper {
                     self.refused.remove(name);
                 }
                 Err(error) => {
-                    // What was announced of it before is not true any more.
+                    // The previous announcement is outdated.
                     let was = self.announced.remove(name);
                     if let Some(was) = was
                         && let Err(error) = network.deregister(name, was.incarnation)
                     {
-                        tracing::debug!(%name, %error, "was not announced any more");
+                        tracing::debug!(%name, %error, "cannot withdraw an announcement");
                     }
                     let before = self.refused.insert(Arc::clone(name), entry.incarnation);
                     if before != Some(entry.incarnation) {
-                        tracing::warn!(%name, %error, "an agent is not announced to other hosts");
+                        tracing::warn!(%name, %error, "cannot announce an agent to other hosts");
                     }
                 }
             }
@@ -250,8 +254,8 @@ mod tests {
 
     use super::*;
 
-    /// The agents that are announced, and those that are contested, of a host with a rover while a
-    /// neighbour with this mandate tells of a rover that was registered long before.
+    /// Returns the number of announced and of contested agents of a host with the agent `rover`,
+    /// while a neighbor with this mandate has an agent `rover` that was registered long before.
     fn announced(mandate: Mandate, has_keys: bool) -> (usize, usize) {
         let place = tempfile::tempdir().unwrap();
         let host = HostDirectory::open(HostConfig {

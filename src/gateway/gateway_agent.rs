@@ -1,8 +1,8 @@
-//! The clerk: the agent that the gateway itself is. It has the gateway's name and incarnation, is
-//! written to by agents of this host and by other gateways, and answers.
+//! The gateway agent answers the letters that agents of this host and other gateways send to the
+//! gateway. It has the gateway's name and incarnation.
 //!
-//! Letters are told apart by their ontology. What nobody here understands is answered so, when an
-//! answer was asked for.
+//! The ontology of a letter selects its handler. A request with an unknown ontology is answered
+//! with `not-understood`.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -22,31 +22,31 @@ use super::neighbours::Neighbours;
 use crate::routes;
 use crate::service::Service;
 
-/// How long an answer may be under way.
+/// Deadline for the delivery of an answer.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 
-/// Longest text of a notice that is logged, in characters.
+/// Maximum length of the logged text of a notice, in characters.
 const MAX_NOTICE: usize = 1024;
 
-/// The agent that the gateway itself is.
-pub(crate) struct Clerk {
+/// The agent with the gateway's name and incarnation.
+pub(crate) struct GatewayAgent {
     pub(crate) service: Arc<Service>,
     pub(crate) id: AgentId,
     pub(crate) neighbours: Arc<Neighbours>,
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
-    /// When a notice of each gateway was last logged.
+    /// Time of the last logged notice of each gateway.
     pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
 }
 
-impl Clerk {
-    /// Reads and answers until the service ends.
+impl GatewayAgent {
+    /// Reads and answers letters until the service ends.
     pub(crate) async fn run(self) {
         let (mts, own) = (&self.service.mts, self.service.own.incarnation);
         while let Some(received) = mts.receive(own).await {
             match Message::decode(received.letter.payload()) {
                 Ok(message) => self.handle(&message, &received),
-                Err(error) => tracing::info!(%error, "a letter to the gateway makes no sense"),
+                Err(error) => tracing::info!(%error, "cannot decode a letter to the gateway"),
             }
         }
     }
@@ -56,10 +56,10 @@ impl Clerk {
         if message.ontology() == Some(EXCHANGE_ONTOLOGY)
             && *message.performative() == Performative::Inform
         {
-            // A gateway speaks for itself, on its own connections.
+            // A gateway sends its own agents only, on its own connections.
             if received.service != sender {
                 tracing::info!(
-                    "what a gateway tells was not used: it came over another's connection"
+                    "ignored agents of a gateway: sent on a connection of another service"
                 );
                 return;
             }
@@ -80,29 +80,30 @@ impl Clerk {
                 | Performative::Subscribe
         );
         if !asked {
-            tracing::debug!(performative = %message.performative(), "nothing to be done about it");
+            tracing::debug!(performative = %message.performative(), "ignored: no answer is required");
             return;
         }
         match message.ontology() {
-            // Routes name the incarnations of agents and gateways, and are for this host only.
+            // Routes contain the incarnations of agents and gateways, which must not leave this
+            // host.
             Some(routes::ONTOLOGY) if received.remote => {
                 self.answer(message, sender, Performative::Refuse, |answer| {
-                    answer.content("routes are told to agents of the gateway's host only")
+                    answer.content("routes are available to agents of the gateway's host only")
                 });
             }
-            Some(routes::ONTOLOGY) => self.tell_routes(message, sender),
+            Some(routes::ONTOLOGY) => self.answer_routes(message, sender),
             _ => self.answer(message, sender, Performative::NotUnderstood, |answer| {
-                answer.content("the gateway does not know this ontology")
+                answer.content("the gateway does not support this ontology")
             }),
         }
     }
 
-    /// Another gateway tells the operator of this one about a name. One notice a second of each gateway
-    /// is logged.
+    /// Logs a notice about a name that another gateway sent to the operator of this one. At most
+    /// one notice per second and gateway is logged.
     fn log_notice(&self, gateway: Incarnation, message: &Message) {
         let now = Instant::now();
         let mut notices = self.notices.lock();
-        notices.retain(|_, told| now.saturating_duration_since(*told) < Duration::from_secs(1));
+        notices.retain(|_, logged| now.saturating_duration_since(*logged) < Duration::from_secs(1));
         let all = self.neighbours.all();
         let neighbour = all.iter().find(|it| it.entry.incarnation == gateway);
         if let Some(neighbour) = neighbour
@@ -113,11 +114,11 @@ impl Clerk {
             let text = String::from_utf8_lossy(content.unwrap_or_default());
             let text: String = text.chars().take(MAX_NOTICE).collect();
             let (gateway, notice) = (escape(&neighbour.entry.name), escape(&text));
-            tracing::warn!(%gateway, %notice, "another gateway tells of a name");
+            tracing::warn!(%gateway, %notice, "another gateway reports a problem with a name");
         }
     }
 
-    fn tell_routes(&self, message: &Message, sender: Incarnation) {
+    fn answer_routes(&self, message: &Message, sender: Incarnation) {
         match self.report_for(message) {
             Ok(content) => self.answer(message, sender, Performative::Inform, |answer| {
                 answer.language("json").content(content)
@@ -144,7 +145,7 @@ impl Clerk {
         Ok(serde_json::to_vec(&report)?)
     }
 
-    /// Answers to the very life of an agent that asked.
+    /// Sends an answer to exactly the incarnation of the agent that asked.
     fn answer(
         &self,
         message: &Message,
@@ -153,17 +154,17 @@ impl Clerk {
         fill: impl FnOnce(fipa_acl::MessageBuilder) -> fipa_acl::MessageBuilder,
     ) {
         let Some(to) = self.view.by_incarnation(sender) else {
-            tracing::info!("who has asked the gateway is not known any more");
+            tracing::info!("dropping a reply: its requester is no longer registered");
             return;
         };
         let answer = message.reply(performative).sender(self.id.clone());
         match fill(answer).build() {
             Ok(answer) => self.send(&answer, &to),
-            Err(error) => tracing::warn!(%error, "the gateway could not answer"),
+            Err(error) => tracing::warn!(%error, "cannot build a reply of the gateway"),
         }
     }
 
-    /// Sends a message in the gateway's name.
+    /// Sends a message from the gateway.
     pub(crate) fn send(&self, message: &Message, to: &fipa_sds::Entry) {
         match letter_for(message, SystemTime::now()) {
             Ok(letter) => {
@@ -173,10 +174,10 @@ impl Clerk {
                     receivers: Vec::new(),
                     deadline: ANSWER_DEADLINE,
                 };
-                // It is on its way; when it fails, whoever waits for it asks again.
+                // The outcome is not awaited: a requester that gets no answer asks again.
                 drop(self.service.mts.send_to(submission, to));
             }
-            Err(error) => tracing::warn!(%error, "the gateway could not write"),
+            Err(error) => tracing::warn!(%error, "cannot encode a letter of the gateway"),
         }
     }
 }

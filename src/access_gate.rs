@@ -1,7 +1,7 @@
-//! The door of a process: what letters claim is held against the rules of `[access]`.
+//! The access gate of a process: checks arriving letters against the rules of `[access]`.
 //!
-//! The gateway has one for what comes from other hosts and goes there, every other process for what
-//! its own agents get: nobody can be trusted to keep rules for somebody else.
+//! The gateway checks the letters that come from other hosts or go there. Every other process
+//! checks the letters to its own agents, because it must not rely on the checks of other processes.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -11,27 +11,29 @@ use fipa_mts::{AccessGate, Link};
 use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
 use parking_lot::Mutex;
 
-use crate::access::{Access, Claim, Refusal};
+use crate::access::{Access, LetterFacts, Refusal};
 
-/// What lines about refused letters are told under.
+/// Log target of the lines about refused letters.
 const AUDIT: &str = "fipa::audit";
 
-/// Judges every letter that comes.
-pub(crate) struct Door {
+/// Checks every arriving letter against the rules.
+pub(crate) struct RulesGate {
     access: Mutex<Access>,
     of: Of,
 }
 
-/// Whose door it is.
+/// The owner of a gate.
 pub(crate) enum Of {
-    /// The gateway's, with its name. Everybody may write to it: so gateways and their clerks talk.
+    /// The gateway with this name. Every sender may send letters to the gateway itself, because
+    /// gateways and their agents communicate this way.
     Gateway(Arc<str>),
-    /// A process's on this host. The gateway there may write to everybody, as it answers only, and
-    /// has counted what it passes on. It is recognized by its link.
+    /// A process of this host, with its directory. The gateway of the host is identified by its
+    /// link. It may send its own letters to every agent, because they are answers only. The letters
+    /// that it forwards are not counted again, because it has counted them.
     Process(Arc<HostDirectory>),
 }
 
-impl Door {
+impl RulesGate {
     pub(crate) fn new(access: Access, of: Of) -> Self {
         Self {
             access: Mutex::new(access),
@@ -39,6 +41,7 @@ impl Door {
         }
     }
 
+    /// Checks a letter from this sender to this receiver.
     fn judge(
         &self,
         now: Instant,
@@ -50,17 +53,17 @@ impl Door {
     ) -> Result<(), Refused> {
         let message = MessageView::parse_payload(letter.payload());
         let message = message
-            .map_err(|error| Refused::Other(format!("its message cannot be read: {error}")))?;
+            .map_err(|error| Refused::Other(format!("its message cannot be decoded: {error}")))?;
         if let Some(signed) = message.sender().map(|it| it.name())
             && signed.as_str() != sender
         {
-            let what = format!("its envelope is from {sender}, and its message from {signed}");
+            let what = format!("its envelope names the sender {sender}, its message {signed}");
             return Err(Refused::Other(what));
         }
         let performative = message.performative_name();
         let protocol = message.protocol();
         let protocol = protocol.as_ref().map(|text| text.as_str());
-        let claim = Claim {
+        let facts = LetterFacts {
             sender,
             receiver,
             performative: &performative.as_str(),
@@ -68,30 +71,31 @@ impl Door {
         };
         let is_stamped = view.stamps().next().is_some();
         let judge = |gateway: Option<Arc<Entry>>| match gateway {
-            // The gateway has stamped what it has passed on, and counted it.
-            Some(_) if is_stamped => self.access.lock().judge(&claim),
+            // The gateway has forwarded this letter: it has stamped and counted it.
+            Some(_) if is_stamped => self.access.lock().judge(&facts),
             Some(gateway) if *gateway.name == *sender => Ok(()),
             _ => {
                 let mut access = self.access.lock();
                 access
-                    .judge(&claim)
+                    .judge(&facts)
                     .and_then(|()| access.count(link.source, sender, now))
             }
         };
         let gateway = self.gateway_on(link);
         let is_known = gateway.is_some();
         judge(gateway).or_else(|refusal| {
-            // The gateway may have registered a moment ago. Looking is for what is refused only.
-            match self.looked_for_gateway_on(link).filter(|_| !is_known) {
+            // The gateway may have registered a moment ago. The directory is refreshed only for
+            // letters that would be refused.
+            match self.refreshed_gateway_on(link).filter(|_| !is_known) {
                 Some(gateway) => Ok(judge(Some(gateway))?),
                 None => Err(refusal.into()),
             }
         })
     }
 
-    /// The entry of the gateway of this host, if it is at the other end of this link as far as is
-    /// known. The kernel proves that the other end is a process of this user only when the link is
-    /// within the host.
+    /// Returns the entry of the gateway of this host if the directory shows the gateway at the
+    /// other end of this link. The link must be within the host: only there does the kernel prove
+    /// that the other end is a process of this user.
     fn gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
         let Of::Process(host) = &self.of else {
             return None;
@@ -103,8 +107,8 @@ impl Door {
         (entry.role == EntryRole::Gateway).then_some(entry)
     }
 
-    /// The same, with what others have registered until now.
-    fn looked_for_gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
+    /// Like [`gateway_on`](Self::gateway_on), after a refresh of the directory.
+    fn refreshed_gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
         if let Of::Process(host) = &self.of
             && link.via.is_host_local()
         {
@@ -114,7 +118,7 @@ impl Door {
     }
 }
 
-/// Why a letter does not pass.
+/// The reason why a letter is refused.
 #[derive(Debug, thiserror::Error)]
 enum Refused {
     #[error(transparent)]
@@ -123,7 +127,7 @@ enum Refused {
     Other(String),
 }
 
-impl AccessGate for Door {
+impl AccessGate for RulesGate {
     fn admits(
         &self,
         now: Instant,
@@ -146,7 +150,7 @@ impl AccessGate for Door {
             _ => Err(Refused::Other("its envelope names no sender".to_owned())),
         };
         judged.map_err(|why| {
-            // Whoever sends too much would fill the log, too.
+            // A sender that exceeds its rate must not fill the log as well.
             if !matches!(why, Refused::ByRule(Refusal::TooMany { told: false })) {
                 let sender = sender.map(|name| name.to_string()).unwrap_or_default();
                 tracing::warn!(target: AUDIT, sender, receiver, "letter refused: {why}");
@@ -168,8 +172,8 @@ mod tests {
     use super::*;
     use crate::config;
 
-    /// A letter to the arm from this sender, around a message that names that one as its sender; with
-    /// the stamp of a gateway or without.
+    /// Creates a letter to `arm`. Its envelope names `sender` and its message names `signed` as the
+    /// sender. If `is_stamped`, it has the stamp of a gateway.
     fn letter(sender: &str, signed: &str, is_stamped: bool) -> Letter {
         let [arm, sender, signed] = ["arm", sender, signed].map(|name| AgentId::new(name).unwrap());
         let date: Time = "20261121T120000000Z".parse().unwrap();
@@ -191,9 +195,10 @@ mod tests {
         Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
     }
 
-    /// The door of a process of a host, which lets in a letter a second of each sender, but none of
-    /// those who are called so; the directory of the gateway there; and their place, for as long.
-    fn door(denied: &[&str]) -> (Door, HostDirectory, tempfile::TempDir) {
+    /// Returns the gate of a process, the directory of the gateway of its host, and the temporary
+    /// directory of both. The gate accepts one letter per second from each sender, and none from
+    /// the denied senders.
+    fn gate(denied: &[&str]) -> (RulesGate, HostDirectory, tempfile::TempDir) {
         let place = tempfile::tempdir().unwrap();
         let open = |gateway| {
             let directory = HostDirectory::open(HostConfig {
@@ -213,13 +218,13 @@ mod tests {
             ..config::Access::default()
         };
         let access = rules.rules().unwrap().unwrap();
-        let door = Door::new(access, Of::Process(Arc::new(open(false))));
-        (door, open(true), place)
+        let gate = RulesGate::new(access, Of::Process(Arc::new(open(false))));
+        (gate, open(true), place)
     }
 
     const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
 
-    /// The source of the letters of a service on this host.
+    /// Returns the source of the letters of a service on this host.
     fn source_by(via: Kind, service: Incarnation) -> Source {
         match via.is_host_local() {
             true => Source::Process(service),
@@ -227,7 +232,7 @@ mod tests {
         }
     }
 
-    /// A link with the gateway.
+    /// Creates a link with the gateway.
     fn gateway_by(via: Kind) -> Link {
         Link {
             via,
@@ -236,7 +241,7 @@ mod tests {
         }
     }
 
-    /// A link with a process that is not the gateway.
+    /// Creates a link with a process that is not the gateway.
     fn process_by(via: Kind) -> Link {
         let service = Incarnation::from_u64(0x9);
         Link {
@@ -246,30 +251,30 @@ mod tests {
         }
     }
 
-    /// The gateway registers itself, and the process of this door notices.
-    fn register(gateway: &HostDirectory, door: &Door) {
+    /// Registers the gateway, and refreshes the directory of the process with this gate.
+    fn register(gateway: &HostDirectory, gate: &RulesGate) {
         let at = "shm://0000000000006a7e#0000000000006a7e".parse().unwrap();
         let registration = Registration {
             role: EntryRole::Gateway,
             ..Registration::new("mts", GATEWAY, vec![at])
         };
         gateway.register(registration).unwrap();
-        if let Of::Process(host) = &door.of {
+        if let Of::Process(host) = &gate.of {
             host.refresh();
         }
     }
 
     #[tokio::test]
     async fn what_the_gateway_has_counted_is_not_counted_again() {
-        let (door, gateway, _place) = door(&[]);
-        register(&gateway, &door);
+        let (gate, gateway, _place) = gate(&[]);
+        register(&gateway, &gate);
         let now = Instant::now();
         let taken = |is_stamped, link| {
             let letter = letter("rover", "rover", is_stamped);
-            door.admits(now, "arm", &letter, link).is_ok()
+            gate.admits(now, "arm", &letter, link).is_ok()
         };
         let link = gateway_by(Kind::Unix);
-        // Held up on the way, they come closer together than they were sent.
+        // Delayed letters may arrive closer together than they were sent.
         assert!(taken(true, link) && taken(true, link) && taken(true, link));
         assert!(taken(false, link));
         assert!(!taken(false, link), "one a second");
@@ -280,34 +285,34 @@ mod tests {
         for link in [
             process_by(Kind::Shm),
             process_by(Kind::Unix),
-            // The incarnation is what the peer claims there.
+            // Over TCP the incarnation is only a claim of the peer.
             gateway_by(Kind::Tcp),
         ] {
-            let (door, gateway, _place) = door(&[]);
-            register(&gateway, &door);
+            let (gate, gateway, _place) = gate(&[]);
+            register(&gateway, &gate);
             let now = Instant::now();
             let stamped = letter("rover", "rover", true);
-            assert!(door.admits(now, "arm", &stamped, link).is_ok());
-            assert!(door.admits(now, "arm", &stamped, link).is_err(), "{link:?}");
+            assert!(gate.admits(now, "arm", &stamped, link).is_ok());
+            assert!(gate.admits(now, "arm", &stamped, link).is_err(), "{link:?}");
         }
     }
 
     #[tokio::test]
     async fn envelope_and_message_name_one_sender() {
-        let (door, _gateway, _place) = door(&[]);
+        let (gate, _gateway, _place) = gate(&[]);
         let letter = letter("rover", "crex", false);
-        let judged = door.admits(Instant::now(), "arm", &letter, process_by(Kind::Shm));
+        let judged = gate.admits(Instant::now(), "arm", &letter, process_by(Kind::Shm));
         let told = judged.unwrap_err();
         assert!(told.contains("rover") && told.contains("crex"), "{told}");
     }
 
     #[tokio::test]
     async fn the_gateway_of_the_host_is_taken_by_its_link_and_nothing_else_by_its_name() {
-        let (door, gateway, _place) = door(&["mts", "rover"]);
-        register(&gateway, &door);
+        let (gate, gateway, _place) = gate(&["mts", "rover"]);
+        register(&gateway, &gate);
         let taken = |sender, is_passed_on, link| {
             let letter = letter(sender, sender, is_passed_on);
-            door.admits(Instant::now(), "arm", &letter, link).is_ok()
+            gate.admits(Instant::now(), "arm", &letter, link).is_ok()
         };
         for local in [Kind::Shm, Kind::Unix] {
             assert!(taken("mts", false, gateway_by(local)));
