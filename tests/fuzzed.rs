@@ -1,7 +1,7 @@
-//! Runs the bodies of the fuzz targets with random inputs, on machines without libFuzzer.
+//! Runs the bodies of the fuzz targets with random inputs, for machines without libFuzzer.
 //!
-//! `FIPA_FUZZ_SECONDS` is the time per target; by default each runs a fixed number of inputs.
-//! `FIPA_FUZZ_SEED` repeats the inputs of an earlier run.
+//! `FIPA_FUZZ_SECONDS` is the time per target. By default, each target runs a fixed number of
+//! inputs. `FIPA_FUZZ_SEED` repeats the inputs of an earlier run.
 
 #![allow(
     dead_code,

@@ -1,5 +1,6 @@
-//! A protocol fuzzer for running gateways, over every transport on which they listen, while an honest
-//! pair of agents exchanges letters through each gateway: no crash, no stall, no leak.
+//! A protocol fuzzer for running gateways, over every transport on which they listen. Meanwhile, an
+//! honest pair of agents exchanges letters through each gateway. The gateways must not crash, stall
+//! or leak.
 //!
 //! There are two gateways, one without and one with keys. `FIPA_FUZZ_SECONDS` is the duration of the
 //! attack on each, in seconds (default: 3). `FIPA_FUZZ_SEED` repeats the random decisions of a run, but
@@ -30,10 +31,10 @@ const AT_ONCE: usize = 12;
 /// Allowed increase of open descriptors: connections that the gateway opens and closes by itself.
 const DESCRIPTORS: usize = 8;
 
-/// Allowed increase of memory in addition to a quarter of the memory before, in KiB: the allocator keeps
-/// memory of the largest conversations. A gateway has about 36 MiB and grows by 1 MiB in three seconds
-/// and by 5 MiB in ten minutes with 220,000 conversations. So a leak of 64 KiB per conversation is
-/// detected within a minute, and a leak of a few hundred bytes within ten minutes.
+/// Allowed increase of memory in addition to a quarter of the memory before, in KiB. The allocator
+/// keeps memory of the largest conversations. A gateway has about 36 MiB and grows by 1 MiB in
+/// three seconds and by 5 MiB in ten minutes with 220,000 conversations. So a leak of 64 KiB per
+/// conversation is detected within a minute, and a leak of a few hundred bytes within ten minutes.
 const RESIDENT: u64 = 12 << 10;
 
 /// Attacks on a gateway.
@@ -125,7 +126,8 @@ impl Setup {
             [stream::client_hello(tls), packet]
         };
         let known = pair.registrations();
-        // Without keys nothing separates strangers: one that claims to be the other host's is believed.
+        // A gateway without keys cannot disprove a claim to be the other host, so that claim is
+        // left out.
         let claimed = known
             .iter()
             .filter(|(name, _)| secured || name == "arm" || name == "target");
@@ -260,7 +262,7 @@ fn fuzz(secured: bool) {
     let at_first = setup.pair.gateway.usage();
     let calm = move |usage: &Usage| usage.descriptors <= at_first.descriptors + DESCRIPTORS;
 
-    // The gateway allocates in the warm-up what it keeps permanently.
+    // The gateway makes its permanent allocations during the warm-up.
     setup.attack(seconds.div_ceil(10), seed.rotate_left(32));
     let before = settled(&setup.pair.gateway, calm);
     let tallies = setup.attack(seconds, seed);

@@ -1,8 +1,8 @@
-//! Hosts whose addresses change: a gateway that listens on all addresses is reached where it is now,
-//! also by peers that have never been told the new address.
+//! Tests hosts whose addresses change. A gateway that listens on all addresses stays reachable at
+//! its current address, also for peers whose configuration has another address.
 //!
-//! The hosts are network namespaces of the test's own; see `fipa-testbed`. They speak IPv4 only, so
-//! that a host without an address cannot be heard at all.
+//! The hosts are network namespaces of the test; see `fipa-testbed`. IPv6 is off, so that a host
+//! without an IPv4 address cannot send at all.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 #![allow(
@@ -23,14 +23,14 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tokio::runtime::Runtime;
 
-/// The deadline of a letter that is sent at the moment a new address is usable: the longest that a
-/// gateway may be unreachable.
+/// Deadline of a letter that is sent as soon as a new address is usable. It is the maximum time for
+/// which a gateway may be unreachable.
 const BOUND: Duration = Duration::from_secs(3);
-/// Ends a test that hangs.
+/// Timeout that ends a hung test.
 const WATCHDOG: Duration = Duration::from_secs(60);
 const PORT: u16 = 7788;
 
-/// A test that the harness sees, and the one that it runs in namespaces of its own.
+/// Defines a test for the harness, and the ignored test that it runs in separate namespaces.
 macro_rules! on_a_network {
     ($(#[$doc:meta])* $name:ident, $inside:ident, $work:expr) => {
         $(#[$doc])*
@@ -50,7 +50,7 @@ macro_rules! on_a_network {
 }
 
 on_a_network!(
-    /// The host only receives: no letter of its own tells the others where it is.
+    /// The moving host only receives, so none of its letters reveals its new address.
     a_receiver_moves_five_times_by_tcp,
     inside_a_receiver_moves_five_times_by_tcp,
     || a_receiver_moves_five_times(&["tcp"])
@@ -77,7 +77,7 @@ fn a_receiver_moves_five_times(transports: &[&str]) {
 }
 
 on_a_network!(
-    /// The host that sends moves, and its letters and their answers go on.
+    /// The sending host moves. Letters in both directions still arrive.
     a_sender_moves_five_times,
     inside_a_sender_moves_five_times,
     || {
@@ -91,7 +91,8 @@ on_a_network!(
 );
 
 on_a_network!(
-    /// The host cannot say hello from its new address: only multicast tells where it is.
+    /// The moving host cannot connect from its new address, so only multicast announces that
+    /// address.
     a_receiver_that_cannot_dial_moves_five_times,
     inside_a_receiver_that_cannot_dial_moves_five_times,
     || {
@@ -112,7 +113,8 @@ on_a_network!(
 );
 
 on_a_network!(
-    /// A host has no address for so long that it is forgotten, and gets another one then.
+    /// A host has no address until the other host removes its agents, and then gets another
+    /// address.
     a_receiver_is_away_and_comes_back_elsewhere,
     inside_a_receiver_is_away_and_comes_back_elsewhere,
     || {
@@ -129,8 +131,8 @@ on_a_network!(
 );
 
 on_a_network!(
-    /// A gateway that starts on a host without an address announces nothing that leads elsewhere,
-    /// and everything once there is one.
+    /// A gateway that starts on a host without an address announces no loopback location. It
+    /// announces its location once the host has an address.
     a_gateway_starts_before_its_interface,
     inside_a_gateway_starts_before_its_interface,
     || {
@@ -143,8 +145,8 @@ on_a_network!(
             panic!("two robots")
         };
         let own = there.own_gateway();
-        assert!(own.contains("127.0.0.1"), "processes of the host use it: {own}");
-        // Its record would be heard on any interface that multicast passes.
+        assert!(own.contains("127.0.0.1"), "no loopback location for processes of the host: {own}");
+        // The announcement reaches every interface that passes multicast.
         host.ip("addr add 10.99.0.2/24 dev eth0");
         here.finds_after_announcement(there, "10.99.0.2");
         let routes = here.fipa(network.host(0), &["routes", "--json", &there.name]);
@@ -156,8 +158,8 @@ on_a_network!(
 );
 
 on_a_network!(
-    /// The peer of the configuration is somewhere else by now. It dials, and letters go back on that
-    /// connection, those as well that were sent while it was away.
+    /// The static peer has another address than the configured one. It connects, and letters return
+    /// on that connection, including letters that were sent while it was away.
     a_static_peer_moves_and_dials,
     inside_a_static_peer_moves_and_dials,
     || {
@@ -177,7 +179,8 @@ on_a_network!(
 );
 
 on_a_network!(
-    /// The host that moves has no static peers: it connects to the gateways that it was connected with.
+    /// The moving host has no static peers. It reconnects to the gateways of its former
+    /// connections.
     a_dialled_static_peer_moves,
     inside_a_dialled_static_peer_moves,
     || {
@@ -223,13 +226,13 @@ on_a_network!(
     }
 );
 
-/// How gateways find each other.
+/// Method by which gateways find each other.
 #[derive(Debug, PartialEq, Eq)]
 enum Discovery {
     Mdns,
-    /// Each is told the usual address of the other.
+    /// Each gateway has the other one's initial address as a static peer.
     Both,
-    /// The first is told the usual address of the second.
+    /// Only the first gateway has the other one's initial address as a static peer.
     FirstDials,
 }
 
@@ -243,10 +246,10 @@ struct Robot {
     _keys: Arc<TempDir>,
 }
 
-/// A letter that is under way.
+/// A letter without an outcome yet.
 type Waiting = tokio::task::JoinHandle<Deliveries>;
 
-/// Two hosts whose agents know each other.
+/// Starts two hosts and waits until their agents have exchanged letters.
 fn two_hosts(transports: &[&str], discovery: &Discovery) -> (Network, Vec<Robot>) {
     let network = Network::new(2);
     prepare(&network);
@@ -304,7 +307,7 @@ impl Robot {
     ) -> Self {
         let host = network.host(at);
         let mut settings = vec![
-            // A directory of its own, so that tests run side by side.
+            // A separate directory, so that tests can run concurrently.
             format!("domain=moving-{}", Incarnation::random()),
             format!("mts.name=gateway{at}"),
             format!("mts.transports=shm,{}", transports.join(",")),
@@ -370,13 +373,16 @@ impl Robot {
             if let Some(entry) = self.agent.domain().directory().lookup(name) {
                 return entry;
             }
-            assert!(started.elapsed() < WATCHDOG, "{name} is never found");
+            assert!(
+                started.elapsed() < WATCHDOG,
+                "timed out waiting until the directory has {name}"
+            );
             std::thread::sleep(Duration::from_millis(5));
         }
     }
 
-    /// The other agent, whose host has got this address a moment ago, is found because its gateway has
-    /// announced that: the directory of its own host has the gateway there first.
+    /// Waits until the gateway of the other agent has this new address in its own host's directory,
+    /// and then until the directory of this host has the other agent.
     fn finds_after_announcement(&self, other: &Self, address: &str) {
         let usable = Instant::now();
         other.gateway_has(address);
@@ -393,12 +399,15 @@ impl Robot {
     fn misses(&self, name: &str) {
         let started = Instant::now();
         while self.agent.domain().directory().lookup(name).is_some() {
-            assert!(started.elapsed() < WATCHDOG, "{name} is never missed");
+            assert!(
+                started.elapsed() < WATCHDOG,
+                "timed out waiting until the directory drops {name}"
+            );
             std::thread::sleep(Duration::from_millis(20));
         }
     }
 
-    /// The locations of this host's gateway, as the directory of the host has them.
+    /// Returns the locations of this host's gateway in the directory of the host.
     fn own_gateway(&self) -> String {
         let directory = self.agent.domain().directory();
         directory.refresh();
@@ -417,7 +426,10 @@ impl Robot {
             if places.contains(address) {
                 return places;
             }
-            assert!(started.elapsed() < WATCHDOG, "still at {places}");
+            assert!(
+                started.elapsed() < WATCHDOG,
+                "the gateway is still at {places}"
+            );
             std::thread::sleep(Duration::from_millis(5));
         }
     }
@@ -435,7 +447,7 @@ impl Robot {
             .spawn(async move { agent.send_within(message, deadline).await.unwrap() })
     }
 
-    /// A letter that is sent now arrives within the bound.
+    /// Sends a letter and checks that it arrives within [`BOUND`].
     fn reaches(&self, to: &Self) {
         let sent = Instant::now();
         let letter = self.sends(to, BOUND);
@@ -446,13 +458,13 @@ impl Robot {
     fn was_delivered(&self, letter: Waiting) {
         let deliveries = self.runtime.block_on(letter).unwrap();
         let [delivery] = &deliveries.0[..] else {
-            panic!("one receiver: {deliveries}")
+            panic!("expected one receiver: {deliveries}")
         };
         let delivered = matches!(delivery.outcome, Outcome::Delivered { .. });
         assert!(delivered, "{}", delivery.outcome);
     }
 
-    /// What a command says in JSON.
+    /// Runs a command and returns its JSON output.
     fn fipa(&self, host: &Host, args: &[&str]) -> Value {
         let mut command = host.command(env!("CARGO_BIN_EXE_fipa"));
         command.args(args);
@@ -470,12 +482,12 @@ fn places(entry: &Entry) -> String {
     places.join(" ")
 }
 
-/// The host has no address any more.
+/// Removes all addresses of the host.
 fn flush(host: &Host) {
     host.ip("addr flush dev eth0");
 }
 
-/// The host has another address, from one moment to the next.
+/// Replaces the address of the host at once.
 fn move_to(host: &Host, address: &str) {
     flush(host);
     host.ip(&format!("addr add {address}/24 dev eth0"));

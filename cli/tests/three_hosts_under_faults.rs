@@ -1,19 +1,24 @@
-//! The promises of delivery on three hosts with real gateways and processes, while processes and
-//! gateways are killed and stopped, links are cut, packets are filtered, addresses change, and
-//! agents move between hosts. Letters have deadlines from 10 ms to 60 s, some are large, and some are
-//! refused by gateways. Every process logs what it sends, each outcome, and what it takes.
+//! Tests the promises of delivery on three hosts with real gateways and processes. Meanwhile, the
+//! test kills and stops processes and gateways, cuts links, filters packets, changes addresses, and
+//! moves agents between hosts. Letters have deadlines from 10 ms to 60 s. Some letters are large,
+//! and gateways refuse some. Every process logs the letters that it sends, their outcomes, and the
+//! letters that it takes.
 //!
-//! Afterwards a checker reads all logs (`soak/checker.rs`): no letter is taken twice, whatever the
-//! registration; each registration takes the letters of a sender in order; no letter is *delivered*
-//! and not taken, unless its receiver was killed; no letter fails for certain and is taken; every
-//! letter has one outcome per receiver; no open letter is passed over; and after the last fault
-//! every stream delivers everything.
+//! Afterwards a checker (`soak/checker.rs`) reads all logs and checks these promises:
 //!
-//! `FIPA_SOAK_SECONDS` is the length of a run (15 by default) and `FIPA_SOAK_SEED` repeats the decisions
-//! of one, though not those of the machine. `FIPA_SOAK_FAULTS` lists the only faults that happen
-//! (`kill`, `restart`, `kill-gateway`, `stop`, `stop-gateway`, `cut`, `filter`, `address`, `move`). A run that fails, or
-//! recovers slowly, copies its logs to `FIPA_SOAK_LOGS`. The soak
-//! repeats runs of two minutes, each with transports and discovery of its own:
+//! * No letter is taken twice, by any registration.
+//! * Each registration takes the letters of a sender in order.
+//! * A *delivered* letter is taken, unless its receiver was killed.
+//! * A letter that failed for certain is not taken.
+//! * Every letter has one outcome per receiver, unless its sender was killed.
+//! * No open letter is passed over.
+//! * After the last fault, every stream delivers every letter.
+//!
+//! `FIPA_SOAK_SECONDS` is the length of a run (default: 15). `FIPA_SOAK_SEED` repeats the random
+//! decisions of a run, but not the timing. `FIPA_SOAK_FAULTS` limits the faults to a list (`kill`,
+//! `restart`, `kill-gateway`, `stop`, `stop-gateway`, `cut`, `filter`, `address`, `move`). A run
+//! that fails or recovers slowly copies its logs to the directory `FIPA_SOAK_LOGS`. The soak
+//! repeats runs of two minutes. Each run draws its own transports and discovery:
 //!
 //! ```console
 //! # FIPA_SOAK_SECONDS=1800 cargo test -p fipa-cli --test three_hosts_under_faults -- --ignored --nocapture soak
@@ -34,11 +39,11 @@ use soak::{actor, journal};
 
 /// Length of a run, in seconds.
 const SECONDS: u64 = 15;
-/// Longest run of a soak, in seconds.
+/// Maximum length of a run in a soak, in seconds.
 const EPISODE: u64 = 120;
-/// A recovery, in microseconds, that is worth a look at the logs.
+/// Recovery time above which the logs are kept, in microseconds.
 const SLOW: u64 = 2_000_000;
-/// Breaches that are printed.
+/// Maximum number of printed breaches.
 const SHOWN: usize = 20;
 
 #[test]
@@ -78,7 +83,7 @@ fn inside_a_run() {
     logs.keep = stage.quiet.iter().any(is_slow);
     let breaches = report.breaches.len();
     assert_eq!(breaches, 0, "promises were broken; see above");
-    assert!(report.taken > 0, "nothing was sent");
+    assert!(report.taken > 0, "no letter was taken");
 }
 
 #[test]
@@ -127,7 +132,7 @@ fn print(stage: &Stage, report: &Report) {
     );
 }
 
-/// Copies the logs of a run that failed, or that are to be kept.
+/// Copies the logs on drop if the run failed or `keep` is set.
 struct Logs {
     keep: bool,
 }

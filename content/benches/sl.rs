@@ -1,6 +1,6 @@
-//! SL beside JSON: the same values, written and read by this crate and by serde_json in one run.
+//! Compares SL and JSON: this crate and serde_json write and read the same values in one run.
 //!
-//! The ratio of both is what counts; absolute times depend on the machine.
+//! Only the ratio of both is meaningful. Absolute times depend on the machine.
 
 use std::collections::BTreeMap;
 use std::hint::black_box;

@@ -1,5 +1,5 @@
-//! The forms of requests and their answers: an action; the statement that it is done, or has a
-//! result; a refusal with a reason.
+//! The forms of requests and their answers: an action, the statement that it is done or has a
+//! result, and a refusal with a reason.
 
 use fipa_acl::AgentId;
 use serde::Serialize;
@@ -18,19 +18,20 @@ pub enum ReadError {
     /// Another expression.
     #[error("the content is not {0}")]
     Expression(&'static str),
-    /// The term for the agent is no agent identifier.
+    /// The term for the agent is not an agent identifier.
     #[error("the agent of the action is malformed")]
     Agent(#[from] AgentTermError),
     /// A term is not a value of the requested type.
     #[error(transparent)]
     Value(#[from] DeserializeError),
-    /// The answer is to another query.
+    /// The answer belongs to another query.
     #[error("the answer is to another query")]
     OtherQuery,
 }
 
 impl ActionExpression<'static> {
-    /// `(action agent act)`, the act written by serde: a struct, or a variant of an enum.
+    /// Returns `(action agent act)`. Serde writes the act, which is a struct or a variant of an
+    /// enum.
     ///
     /// # Errors
     /// When SL has no notation for a part of the act, or its `Serialize` fails.
@@ -43,11 +44,11 @@ impl ActionExpression<'static> {
 }
 
 impl ActionExpression<'_> {
-    /// The agent and the act of `(action agent act)`.
+    /// Returns the agent and the act of `(action agent act)`.
     ///
     /// # Errors
-    /// When it is another action expression, the agent is no agent identifier, or the act is not a
-    /// value of the type.
+    /// When it is another action expression, the agent is not an agent identifier, or the act is
+    /// not a value of the type.
     pub fn read<T: DeserializeOwned>(&self) -> Result<(AgentId, T), ReadError> {
         match self {
             Self::Action { agent, act } => Ok((AgentId::try_from(agent)?, act.read()?)),
@@ -57,7 +58,7 @@ impl ActionExpression<'_> {
 }
 
 impl<'a> Wff<'a> {
-    /// `(done action)`
+    /// Returns `(done action)`.
     #[must_use]
     pub fn done(action: ActionExpression<'a>) -> Self {
         Self::Done(Box::new(action), None)
@@ -65,7 +66,7 @@ impl<'a> Wff<'a> {
 }
 
 impl Wff<'static> {
-    /// `(result action value)`, the value written by serde.
+    /// Returns `(result action value)`. Serde writes the value.
     ///
     /// # Errors
     /// When SL has no notation for a part of the value, or its `Serialize` fails.
@@ -79,7 +80,7 @@ impl Wff<'static> {
 }
 
 impl<'a> Content<'a> {
-    /// The action that is all of the content, as in a `request`.
+    /// Returns the action that is the whole content, as in a `request`.
     ///
     /// # Errors
     /// When the content is anything else.
@@ -90,7 +91,7 @@ impl<'a> Content<'a> {
         }
     }
 
-    /// The formula that is all of the content, as in an `inform`.
+    /// Returns the formula that is the whole content, as in an `inform`.
     ///
     /// # Errors
     /// When the content is anything else.
@@ -101,7 +102,7 @@ impl<'a> Content<'a> {
         }
     }
 
-    /// The action that is said to be done.
+    /// Returns the action that the content states to be done.
     ///
     /// # Errors
     /// When the content is not `((done action))`.
@@ -112,7 +113,7 @@ impl<'a> Content<'a> {
         }
     }
 
-    /// The action and its result.
+    /// Returns the action and its result.
     ///
     /// # Errors
     /// When the content is not `((result action value))`, or the value is not of the type.
@@ -126,8 +127,8 @@ impl<'a> Content<'a> {
         }
     }
 
-    /// The action that is refused or has failed, and the reason, as in a `refuse`, a `failure` or a
-    /// `not-understood` (FIPA00037). [`Wff::read`] reads the reason as a value.
+    /// Returns the action that is refused or has failed, and the reason, as in a `refuse`, a
+    /// `failure` or a `not-understood` (FIPA00037). [`Wff::read`] reads the reason as a value.
     ///
     /// # Errors
     /// When the content is not `((action …) reason)`.
@@ -141,7 +142,7 @@ impl<'a> Content<'a> {
         }
     }
 
-    /// `((action …) reason)`: see [`refusal`](Self::refusal).
+    /// Returns `((action …) reason)`: see [`refusal`](Self::refusal).
     #[must_use]
     pub fn of_refusal(action: ActionExpression<'a>, reason: Wff<'a>) -> Self {
         let action = ContentExpression::from(action);

@@ -11,7 +11,7 @@ use crate::term::{Arguments, FunctionalTerm, Parameter, Term};
 /// The function symbol of agent identifiers.
 const SYMBOL: &str = "agent-identifier";
 
-/// A term that is no agent identifier.
+/// An error: a term is not an agent identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum AgentTermError {
@@ -29,13 +29,13 @@ pub enum AgentTermError {
         /// The type.
         expected: &'static str,
     },
-    /// A slot is there twice.
+    /// A slot occurs twice.
     #[error("the slot :{0} of the agent identifier is there twice")]
     DuplicateSlot(&'static str),
     /// A value that no agent identifier can have.
     #[error(transparent)]
     Value(#[from] AgentIdError),
-    /// A user-defined value that has no text.
+    /// A user-defined value without a text.
     #[error(transparent)]
     Print(#[from] PrintError),
 }
@@ -68,8 +68,8 @@ fn parameter(name: impl Into<Cow<'static, str>>, value: Term<'static>) -> Parame
     Parameter { name, value }
 }
 
-/// Reads an agent identifier. Slots that it does not have are ignored, unless their names begin
-/// with `X-`: those are user-defined. The case of the symbol and of the slots does not matter.
+/// Reads an agent identifier. Slots whose names start with `X-` are user-defined. Other unknown
+/// slots are ignored. The symbol and the slots are case-insensitive.
 impl TryFrom<&Term<'_>> for AgentId {
     type Error = AgentTermError;
 
@@ -120,7 +120,7 @@ fn slot<'t, 'a>(
     Ok(first.map(|parameter| &parameter.value))
 }
 
-/// The elements of a slot. JADE and older services write sets, too.
+/// Returns the elements of a slot. JADE and legacy services also write sets.
 fn sequence<'t, 'a>(
     term: &'t FunctionalTerm<'a>,
     name: &'static str,

@@ -51,7 +51,7 @@ pub(crate) fn is_white(byte: u8) -> bool {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shape {
     classes: u8,
-    /// Whether the first characters can begin a word.
+    /// Whether the first characters can start a word.
     begins: bool,
 }
 
@@ -89,9 +89,9 @@ impl Shape {
     }
 }
 
-/// Whether a token that begins so is a word.
+/// Whether a token with this start is a word.
 ///
-/// FIPA00008 `Word` allows `+` and `.` in front, which begin numbers, too: `+5`, `.5`.
+/// FIPA00008 `Word` allows `+` and `.` in front, which also start numbers: `+5`, `.5`.
 #[inline]
 pub(crate) fn begins_word(bytes: &[u8]) -> bool {
     match bytes.first() {
@@ -101,7 +101,7 @@ pub(crate) fn begins_word(bytes: &[u8]) -> bool {
     }
 }
 
-/// Whether a token that begins so is a number or a date-time.
+/// Whether a token with this start is a number or a date-time.
 #[inline]
 pub(crate) fn begins_number(bytes: &[u8]) -> bool {
     matches!(
@@ -112,7 +112,7 @@ pub(crate) fn begins_number(bytes: &[u8]) -> bool {
     )
 }
 
-/// Whether the word is a truth value, in any case, as JADE reads it.
+/// Returns the truth value of the word, in upper or lower case, as JADE reads it.
 #[inline]
 pub(crate) fn truth(word: &str) -> Option<bool> {
     match word.len() {
@@ -122,7 +122,7 @@ pub(crate) fn truth(word: &str) -> Option<bool> {
     }
 }
 
-/// Whether the word has a meaning of its own as the head of a term.
+/// Whether the word is reserved as the head of a term.
 pub(crate) fn is_term_keyword(word: &str) -> bool {
     matches!(
         word,

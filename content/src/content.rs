@@ -29,7 +29,7 @@ pub enum ContentExpression<'a> {
 }
 
 impl<'a> Content<'a> {
-    /// A content of these expressions.
+    /// Returns a content of these expressions.
     #[must_use]
     pub fn new(expressions: impl IntoIterator<Item = impl Into<ContentExpression<'a>>>) -> Self {
         Self {
@@ -57,7 +57,7 @@ impl<'a> Content<'a> {
         Parser::whole(dialect, bytes.as_ref(), Parser::content)
     }
 
-    /// The same content with all text in memory of its own.
+    /// Returns the same content with owned text.
     #[must_use]
     pub fn into_owned(self) -> Content<'static> {
         let expressions = self.expressions.into_iter();
@@ -68,7 +68,7 @@ impl<'a> Content<'a> {
 }
 
 impl ContentExpression<'_> {
-    /// The same expression with all text in memory of its own.
+    /// Returns the same expression with owned text.
     #[must_use]
     pub fn into_owned(self) -> ContentExpression<'static> {
         match self {
@@ -81,7 +81,7 @@ impl ContentExpression<'_> {
     }
 }
 
-/// The expression. A meta-symbol alone is [`Wff::Meta`], as it is when it is parsed.
+/// Converts the expression. A lone meta-symbol becomes [`Wff::Meta`], as in the parser.
 impl<'a> From<ActionExpression<'a>> for ContentExpression<'a> {
     fn from(action: ActionExpression<'a>) -> Self {
         match action {

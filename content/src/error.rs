@@ -23,26 +23,26 @@ impl ParseError {
         }))
     }
 
-    /// The same error in a text that begins so many bytes earlier.
+    /// Returns the same error for a text that starts `by` bytes earlier.
     #[cold]
     pub(crate) fn moved(mut self, by: usize) -> Self {
         self.0.offset += by;
         self
     }
 
-    /// Offset of the offending bytes, counted from the start of the parsed bytes.
+    /// Returns the offset of the offending bytes from the start of the parsed bytes.
     #[must_use]
     pub fn offset(&self) -> usize {
         self.0.offset
     }
 
-    /// The violated production of the standard, for example `FIPA00008 Wff`.
+    /// Returns the violated production of the standard, for example `FIPA00008 Wff`.
     #[must_use]
     pub fn clause(&self) -> &'static str {
         self.0.clause
     }
 
-    /// The problem.
+    /// Returns the problem.
     #[must_use]
     pub fn problem(&self) -> &Problem {
         &self.0.problem
@@ -64,13 +64,13 @@ pub enum Problem {
         /// The kind of token that should be there.
         expected: &'static str,
     },
-    /// A byte that begins no token.
+    /// A byte that starts no token.
     #[error("the byte {0:#04x} begins no token")]
     Byte(u8),
     /// Text that is not UTF-8.
     #[error("the {0} is not UTF-8")]
     NotUtf8(&'static str),
-    /// Digits that are no number.
+    /// Digits that are not a number.
     #[error("malformed number")]
     Number,
     /// A number out of the range of the requested type.

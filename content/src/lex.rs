@@ -65,11 +65,11 @@ impl Token<'_> {
     }
 }
 
-/// Goes over the bytes once, from front to back.
+/// Splits the bytes into tokens in one pass.
 #[derive(Debug, Clone)]
 pub(crate) struct Lexer<'a> {
     bytes: &'a [u8],
-    /// The bytes as text, if all of them are. Tokens then need no check of their own.
+    /// The bytes as text, if they are valid UTF-8. Tokens then need no separate check.
     text: Option<&'a str>,
     at: usize,
     dialect: Dialect,
@@ -89,22 +89,22 @@ impl<'a> Lexer<'a> {
         self.dialect
     }
 
-    /// Bytes read so far.
+    /// Returns the number of bytes read so far.
     pub(crate) fn offset(&self) -> usize {
         self.at
     }
 
-    /// Number of bytes that were not read yet.
+    /// Returns the number of unread bytes.
     pub(crate) fn remaining(&self) -> usize {
         self.bytes.len() - self.at
     }
 
-    /// The bytes since `start`, a former [`offset`](Self::offset).
+    /// Returns the bytes since `start`, an earlier [`offset`](Self::offset).
     pub(crate) fn since(&self, start: usize) -> &'a [u8] {
         self.bytes.get(start..self.at).unwrap_or_default()
     }
 
-    /// Skips white space and returns the byte that begins the next token.
+    /// Skips white space and returns the first byte of the next token.
     #[inline]
     pub(crate) fn peek(&mut self) -> Option<u8> {
         loop {
@@ -181,13 +181,13 @@ impl<'a> Lexer<'a> {
         Err(ParseError::new(start, NUMBER, Problem::Number))
     }
 
-    /// The bytes that were not read yet.
+    /// Returns the unread bytes.
     #[inline]
     pub(crate) fn rest(&self) -> &'a [u8] {
         self.bytes.get(self.at..).unwrap_or_default()
     }
 
-    /// Reads so many bytes, if a token ends behind them.
+    /// Reads this number of bytes, if a token ends after them.
     #[inline]
     pub(crate) fn take(&mut self, len: usize) -> Option<&'a [u8]> {
         let (taken, behind) = self.rest().split_at_checked(len)?;
@@ -198,7 +198,7 @@ impl<'a> Lexer<'a> {
         Some(taken)
     }
 
-    /// Reads a word that begins here, if there is one.
+    /// Reads a word that starts here, if there is one.
     #[inline]
     pub(crate) fn word(&mut self) -> Result<Option<&'a str>, ParseError> {
         let start = self.at;
@@ -210,7 +210,7 @@ impl<'a> Lexer<'a> {
         self.text_of(start, bytes, "word", WORD).map(Some)
     }
 
-    /// The bytes up to the next delimiter.
+    /// Returns the bytes up to the next delimiter.
     #[inline]
     pub(crate) fn run(&mut self) -> &'a [u8] {
         let rest = self.rest();
@@ -222,7 +222,7 @@ impl<'a> Lexer<'a> {
         rest.get(..len).unwrap_or(rest)
     }
 
-    /// The name of a parameter or variable: a string in any notation.
+    /// Reads the name of a parameter or variable: a string in any notation.
     pub(crate) fn name(&mut self, what: &'static str) -> Result<Cow<'a, str>, ParseError> {
         match self.bytes.get(self.at) {
             Some(b'"') => return self.quoted(),
@@ -313,14 +313,14 @@ impl<'a> Lexer<'a> {
                 Err(_) => Err(ParseError::new(first, "JADE String", Problem::Base64)),
             };
         }
-        // A count may end within a character, so the bytes are checked by themselves.
+        // A count may end within a character, so these bytes need a separate check.
         Ok(match std::str::from_utf8(taken) {
             Ok(text) => Token::Literal(Cow::Borrowed(text)),
             Err(_) => Token::Bytes(Cow::Borrowed(taken)),
         })
     }
 
-    /// The text of bytes that begin at `start`.
+    /// Returns the text of bytes that start at `start`.
     #[inline]
     pub(crate) fn text_of(
         &self,

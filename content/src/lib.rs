@@ -7,11 +7,12 @@
 //! * [`Content`], [`Wff`] and [`Term`] are parsed text. They borrow from the message, or own their
 //!   text after `into_owned()`. [`Printer`] writes them, on one line or indented, for readers of the
 //!   standard or of JADE ([`Dialect`]).
-//! * [`to_vec`] and [`from_slice`] convert Rust values to the text of a term and back, without a
-//!   tree in between.
+//! * [`to_vec`] and [`from_slice`] convert Rust values to the text of a term and back, without an
+//!   intermediate tree.
 //! * [`ActionExpression::new`], [`Wff::done`], [`Wff::result`], [`Content::of_refusal`] and
-//!   [`Query`] are what agents say to each other, each with its counterpart that reads.
-//! * [`Profile`] checks what `:language` promises: `fipa-sl0`, `fipa-sl1`, `fipa-sl2`, `fipa-sl`.
+//!   [`Query`] build the contents of conversations. Each has a counterpart that reads.
+//! * [`Profile`] checks the subset that `:language` names: `fipa-sl0`, `fipa-sl1`, `fipa-sl2`,
+//!   `fipa-sl`.
 //!
 //! ```
 //! use fipa_acl::AgentId;

@@ -3,10 +3,10 @@
 use std::borrow::Cow;
 use std::fmt;
 
-/// An integer or a floating point number, as written: decimal or hexadecimal digits, any number of
-/// them.
+/// An integer or a floating point number, as written, with any number of decimal or hexadecimal
+/// digits.
 ///
-/// Two numbers are equal when their texts are: `1`, `+1` and `0x1` differ.
+/// Two numbers are equal if their texts are equal: `1`, `+1` and `0x1` differ.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Number<'a>(Cow<'a, str>);
 
@@ -18,12 +18,12 @@ impl<'a> Number<'a> {
         is_number(text.as_bytes()).then_some(Self(text))
     }
 
-    /// A text that was checked.
+    /// Returns the number with this text, which the caller has checked.
     pub(crate) fn checked(text: &'a str) -> Self {
         Self(Cow::Borrowed(text))
     }
 
-    /// The text.
+    /// Returns the text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
@@ -35,19 +35,19 @@ impl<'a> Number<'a> {
         is_integer(self.0.as_bytes())
     }
 
-    /// The value of an integer that fits.
+    /// Returns the value of an integer that fits.
     #[must_use]
     pub fn as_i64(&self) -> Option<i64> {
         self.as_i128()?.try_into().ok()
     }
 
-    /// The value of an integer that fits.
+    /// Returns the value of an integer that fits.
     #[must_use]
     pub fn as_u64(&self) -> Option<u64> {
         self.as_i128()?.try_into().ok()
     }
 
-    /// The value of an integer that fits.
+    /// Returns the value of an integer that fits.
     #[must_use]
     pub fn as_i128(&self) -> Option<i128> {
         match integer(self.0.as_bytes())? {
@@ -56,7 +56,7 @@ impl<'a> Number<'a> {
         }
     }
 
-    /// The nearest floating point number. A text beyond the range of `f64` has none.
+    /// Returns the nearest floating point number. A text beyond the range of `f64` has none.
     #[must_use]
     pub fn as_f64(&self) -> Option<f64> {
         if self.is_hexadecimal() {
@@ -68,7 +68,7 @@ impl<'a> Number<'a> {
         self.0.parse().ok().filter(|value: &f64| value.is_finite())
     }
 
-    /// The same number with its text in memory of its own.
+    /// Returns the same number with an owned text.
     #[must_use]
     pub fn into_owned(self) -> Number<'static> {
         Number(Cow::Owned(self.0.into_owned()))
@@ -92,8 +92,8 @@ macro_rules! from_integers {
 from_integers!(i8, i16, i32, i64, i128, u8, u16, u32, u64, u128);
 
 impl Number<'_> {
-    /// The number with the fewest digits that reads as this value. NaN and the infinities have no
-    /// notation in SL.
+    /// Returns the number with the fewest digits that reads as this value. NaN and the infinities
+    /// have no notation in SL.
     #[must_use]
     pub fn from_f64(value: f64) -> Option<Self> {
         value.is_finite().then(|| {
@@ -143,7 +143,7 @@ pub(crate) fn is_hexadecimal(bytes: &[u8]) -> bool {
     matches!(unsigned(bytes), [b'0', b'x' | b'X', ..])
 }
 
-/// Sign and magnitude of an integer, if it has at most 128 bits.
+/// Returns the sign and the magnitude of an integer, if it has at most 128 bits.
 pub(crate) fn integer(bytes: &[u8]) -> Option<(bool, u128)> {
     let negative = bytes.first() == Some(&b'-');
     let digits = unsigned(bytes);
@@ -171,16 +171,16 @@ pub(crate) fn integer(bytes: &[u8]) -> Option<(bool, u128)> {
     Some((negative, magnitude))
 }
 
-/// A number in decimal digits, read in one pass.
+/// A number with decimal digits, read in one pass.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Decimal {
-    /// Bytes of the number.
+    /// Length of the number, in bytes.
     pub(crate) len: usize,
     pub(crate) negative: bool,
     pub(crate) is_integer: bool,
-    /// All digits without the point, if they are few enough.
+    /// All digits without the point, if they fit.
     mantissa: Option<u64>,
-    /// The power of ten that the mantissa is multiplied with.
+    /// The power of ten that scales the mantissa.
     exponent: i32,
 }
 
@@ -188,7 +188,7 @@ impl Decimal {
     /// Reads the number that the bytes begin with. Hexadecimal ones end after their zero.
     #[inline]
     pub(crate) fn scan(bytes: &[u8]) -> Option<Self> {
-        /// So many digits always fit 64 bits.
+        /// Number of digits that always fits 64 bits.
         const MAX_DIGITS: usize = 19;
         let negative = bytes.first() == Some(&b'-');
         let begin = bytes.len() - unsigned(bytes).len();
@@ -225,7 +225,7 @@ impl Decimal {
             if digits.is_empty() {
                 return None;
             }
-            // Beyond what fits, the digits are read in the other way.
+            // Longer digits need the slower conversion.
             let value = std::str::from_utf8(digits)
                 .ok()
                 .and_then(|text| text.parse().ok());
@@ -247,13 +247,14 @@ impl Decimal {
         })
     }
 
-    /// The magnitude of an integer, if it has few digits.
+    /// Returns the magnitude of an integer, if it has few digits.
     #[inline]
     pub(crate) fn magnitude(&self) -> Option<u64> {
         self.mantissa.filter(|_| self.is_integer)
     }
 
-    /// The value, if one multiplication or division of exact numbers gives it, which rounds once.
+    /// Returns the value, if one multiplication or division of exact numbers gives it, which rounds
+    /// once.
     #[inline]
     pub(crate) fn as_exact_f64(&self) -> Option<f64> {
         const POWERS: [f64; 23] = [
@@ -309,7 +310,7 @@ mod tests {
     }
 
     proptest! {
-        /// Against the numbers of the standard library.
+        /// Compares with the numbers of the standard library.
         #[test]
         fn decimals_are_read_exactly(
             text in "[+-]?([0-9]{1,22}(\\.[0-9]{0,22})?|\\.[0-9]{1,22})([eE][+-]?[0-9]{1,3})?"

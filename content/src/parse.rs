@@ -24,7 +24,7 @@ const VARIABLE: &str = "FIPA00008 Variable";
 /// Reads tokens and builds the tree.
 pub(crate) struct Parser<'a> {
     lexer: Lexer<'a>,
-    /// Offset of the token that was read last.
+    /// Offset of the last token that was read.
     start: usize,
     depth: usize,
     nodes: usize,
@@ -34,7 +34,7 @@ pub(crate) struct Parser<'a> {
 enum Head<'a> {
     /// An unquoted word, which can be a keyword.
     Word(&'a str),
-    /// A quoted symbol, which never is.
+    /// A quoted symbol, which is never a keyword.
     Symbol(Cow<'a, str>),
 }
 
@@ -55,7 +55,7 @@ impl<'a> Head<'a> {
 }
 
 impl<'a> Parser<'a> {
-    /// Reads with `read`, and nothing may be left.
+    /// Parses with `read` and checks that no bytes are left.
     pub(crate) fn whole<T>(
         dialect: Dialect,
         bytes: &'a [u8],
@@ -64,7 +64,7 @@ impl<'a> Parser<'a> {
         Self::whole_at(0, dialect, bytes, read)
     }
 
-    /// The same within as many parentheses.
+    /// Parses with `read` at this depth of parentheses and checks that no bytes are left.
     pub(crate) fn whole_at<T>(
         depth: usize,
         dialect: Dialect,
@@ -123,7 +123,7 @@ impl<'a> Parser<'a> {
         self.wff_of(head)
     }
 
-    /// A formula without parentheses.
+    /// Parses a formula without parentheses.
     fn atom(&mut self, token: Token<'a>, clause: &'static str) -> Result<Wff<'a>, ParseError> {
         self.count()?;
         Ok(match token {
@@ -136,7 +136,7 @@ impl<'a> Parser<'a> {
         })
     }
 
-    /// The rest of a formula in parentheses.
+    /// Parses the rest of a formula in parentheses.
     fn wff_of(&mut self, head: Head<'a>) -> Result<Wff<'a>, ParseError> {
         self.count()?;
         let keyword = head.keyword();
@@ -219,7 +219,7 @@ impl<'a> Parser<'a> {
         })
     }
 
-    /// The rest of a term in parentheses.
+    /// Parses the rest of a term in parentheses.
     fn compound(&mut self) -> Result<Term<'a>, ParseError> {
         let head = self.head(TERM)?;
         let keyword = head.keyword();
@@ -244,7 +244,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// Terms up to the closing parenthesis.
+    /// Parses terms up to the closing parenthesis.
     fn terms(&mut self) -> Result<Vec<Term<'a>>, ParseError> {
         let mut terms = Vec::new();
         while !self.closes(TERM)? {
@@ -253,7 +253,7 @@ impl<'a> Parser<'a> {
         Ok(terms)
     }
 
-    /// Parameters up to the closing parenthesis.
+    /// Parses parameters up to the closing parenthesis.
     fn parameters(&mut self) -> Result<Vec<Parameter<'a>>, ParseError> {
         let mut parameters = Vec::new();
         loop {
@@ -299,7 +299,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// The rest of an action expression.
+    /// Parses the rest of an action expression.
     fn action_of(&mut self, head: &Head<'a>) -> Result<ActionExpression<'a>, ParseError> {
         self.count()?;
         let action = match head.keyword() {
@@ -332,7 +332,7 @@ impl<'a> Parser<'a> {
         self.lexer.next()
     }
 
-    /// Whether the list ends here; its parenthesis is then read.
+    /// Whether the list ends here. If so, its closing parenthesis is read.
     #[inline]
     fn closes(&mut self, clause: &'static str) -> Result<bool, ParseError> {
         match self.lexer.peek() {
@@ -409,7 +409,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// The name of a production, without the standard's.
+/// Returns the name of a production without the name of the standard.
 fn within(clause: &'static str) -> &'static str {
     clause.rsplit(' ').next().unwrap_or(clause)
 }

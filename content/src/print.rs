@@ -43,7 +43,7 @@ enum Layout {
 }
 
 impl Printer {
-    /// A printer for the standard dialect, on one line.
+    /// Returns a printer for the standard dialect, on one line.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
@@ -55,7 +55,7 @@ impl Printer {
         Self { dialect, ..self }
     }
 
-    /// Writes lists of more than 80 bytes on several lines, for people. Strings keep their line
+    /// Writes lists of more than 80 bytes on several lines for readability. Strings keep their line
     /// breaks.
     #[must_use]
     pub fn indented(self) -> Self {
@@ -63,8 +63,9 @@ impl Printer {
         Self { layout, ..self }
     }
 
-    /// Writes as the AMS of JADE writes failures of its message transport: in JADE's dialect, with
-    /// the blanks of its string encoding inside agent identifiers and actions. They mean nothing.
+    /// Writes in the format in which the AMS of JADE reports failures of its message transport: in
+    /// JADE's dialect, with the insignificant blanks of its string encoding in agent identifiers
+    /// and actions.
     #[must_use]
     pub fn jade_failure(self) -> Self {
         Self {
@@ -93,13 +94,13 @@ impl Printer {
     }
 }
 
-/// Values that a [`Printer`] prints. No other crate implements it.
+/// Values that a [`Printer`] prints. Other crates cannot implement this trait.
 pub trait Expression: sealed::Print {}
 
 mod sealed {
     use crate::error::PrintError;
 
-    /// Keeps [`super::Expression`] to this crate.
+    /// Seals [`super::Expression`].
     pub trait Print {
         /// Appends the expression.
         #[doc(hidden)]
@@ -107,7 +108,7 @@ mod sealed {
     }
 }
 
-/// The text so far.
+/// The output buffer.
 #[derive(Debug)]
 pub struct Writer {
     printer: Printer,
@@ -134,7 +135,7 @@ impl Writer {
         self.out.push(b')');
     }
 
-    /// A list that begins with a keyword.
+    /// Appends a list that starts with a keyword.
     fn list<const N: usize>(
         &mut self,
         keyword: &str,
@@ -147,7 +148,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Each part after a blank.
+    /// Appends each part after a blank.
     fn each<'p>(
         &mut self,
         parts: impl IntoIterator<Item = &'p dyn sealed::Print>,
@@ -200,7 +201,7 @@ impl Writer {
         Ok(())
     }
 
-    /// An agent identifier as JADE's string encoding of messages writes it.
+    /// Appends an agent identifier in the form of JADE's string encoding of messages.
     fn jade_agent(&mut self, parameters: &[Parameter<'_>]) -> Result<(), PrintError> {
         self.open()?;
         self.put(" agent-identifier");
@@ -369,8 +370,8 @@ macro_rules! expressions {
     ($($name:ident),*) => {$(
         impl Expression for $name<'_> {}
 
-        /// One line in the standard dialect, [escaped](escape), for people. An expression that
-        /// cannot be printed gives the error's text in angle brackets.
+        /// Writes one line in the standard dialect, [escaped](escape). An expression that cannot be
+        /// printed gives the text of the error in angle brackets.
         impl fmt::Display for $name<'_> {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 match Printer::new().print(self) {

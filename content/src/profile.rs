@@ -6,7 +6,7 @@ use crate::content::{Content, ContentExpression};
 use crate::term::{ActionExpression, Arguments, IdentifyingExpression, Term};
 use crate::wff::{LogicalOperator, Quantifier, Wff};
 
-/// A subset of SL. Each has all that the one before has.
+/// A subset of SL. Each profile contains the previous one.
 ///
 /// `(= a b)` is in all of them, because the smaller ones read `=` as a predicate symbol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -24,7 +24,7 @@ pub enum Profile {
     Sl,
 }
 
-/// A part of a content that a profile does not have.
+/// An error: a content has an expression that is not in the profile.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{profile} has no {construct}{}", Remedy(.needs))]
 pub struct ProfileError {
@@ -34,13 +34,13 @@ pub struct ProfileError {
 }
 
 impl ProfileError {
-    /// The kind of expression.
+    /// Returns the kind of expression.
     #[must_use]
     pub fn construct(&self) -> &'static str {
         self.construct
     }
 
-    /// The smallest profile that has it. The standard has no meta-symbols in any.
+    /// Returns the smallest profile that has the expression. No profile has meta-symbols.
     #[must_use]
     pub fn needs(&self) -> Option<Profile> {
         self.needs
@@ -62,7 +62,7 @@ impl Profile {
     /// All profiles, the smallest one first.
     pub const ALL: [Self; 4] = [Self::Sl0, Self::Sl1, Self::Sl2, Self::Sl];
 
-    /// The value of `:language`.
+    /// Returns the value of `:language`.
     #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
@@ -73,24 +73,24 @@ impl Profile {
         }
     }
 
-    /// The profile that a value of `:language` names, in whatever case.
+    /// Returns the profile that a value of `:language` names. Case is ignored.
     #[must_use]
     pub fn of_language(language: &str) -> Option<Self> {
         let mut all = Self::ALL.into_iter();
         all.find(|profile| profile.as_str().eq_ignore_ascii_case(language))
     }
 
-    /// The smallest profile that has the content. A content with meta-symbols has none.
+    /// Returns the smallest profile that has the content. A content with meta-symbols has none.
     #[must_use]
     pub fn of(content: &Content<'_>) -> Option<Self> {
         let mut all = Self::ALL.into_iter();
         all.find(|profile| profile.check(content).is_ok())
     }
 
-    /// Checks that the profile has all that is in the content.
+    /// Checks that the profile has every expression of the content.
     ///
     /// # Errors
-    /// Names the first expression that it does not have.
+    /// The first expression that the profile does not have.
     pub fn check(self, content: &Content<'_>) -> Result<(), ProfileError> {
         content
             .expressions
@@ -121,7 +121,7 @@ impl Profile {
         })
     }
 
-    /// A formula with quantifiers in front (`PrenexExpression`).
+    /// Checks a formula with quantifiers in front (`PrenexExpression`).
     fn prenex(self, wff: &Wff<'_>) -> Result<(), ProfileError> {
         match wff {
             Wff::Quantified {
@@ -136,7 +136,7 @@ impl Profile {
         }
     }
 
-    /// A formula with existential quantifiers in front (`ExistQuantExpression`).
+    /// Checks a formula with existential quantifiers in front (`ExistQuantExpression`).
     fn existential(self, wff: &Wff<'_>) -> Result<(), ProfileError> {
         match wff {
             Wff::Quantified {

@@ -39,19 +39,19 @@ use crate::wff::Wff;
 pub struct Query(IdentifyingExpression<'static>);
 
 impl Query {
-    /// A query for the only object, or combination of objects, that the formula holds for.
+    /// Returns a query for the only object, or combination of objects, that the formula holds for.
     #[must_use]
     pub fn iota<'v>(variables: impl IntoIterator<Item = &'v str>, wff: Wff<'_>) -> Self {
         Self::new(ReferentialOperator::Iota, variables, wff)
     }
 
-    /// A query for any one of them.
+    /// Returns a query for any one of the objects.
     #[must_use]
     pub fn any<'v>(variables: impl IntoIterator<Item = &'v str>, wff: Wff<'_>) -> Self {
         Self::new(ReferentialOperator::Any, variables, wff)
     }
 
-    /// A query for all of them.
+    /// Returns a query for all of the objects.
     #[must_use]
     pub fn all<'v>(variables: impl IntoIterator<Item = &'v str>, wff: Wff<'_>) -> Self {
         Self::new(ReferentialOperator::All, variables, wff)
@@ -78,7 +78,7 @@ impl Query {
         })
     }
 
-    /// The query that is all of a content.
+    /// Returns the query that is the whole content.
     ///
     /// # Errors
     /// When the content is anything else.
@@ -91,20 +91,20 @@ impl Query {
         }
     }
 
-    /// The content of the message that asks.
+    /// Returns the content of the message with the query.
     #[must_use]
     pub fn content(&self) -> Content<'static> {
         self.0.clone().into()
     }
 
-    /// The identifying expression.
+    /// Returns the identifying expression.
     #[must_use]
     pub fn expression(&self) -> &IdentifyingExpression<'static> {
         &self.0
     }
 
-    /// The names of the variables, in the order of the answers' values. Terms that are no variables
-    /// are left out.
+    /// Returns the names of the variables, in the order of the values of an answer. Terms that are
+    /// not variables are left out.
     pub fn variables(&self) -> impl Iterator<Item = &str> {
         let terms = match &self.0.term {
             Term::Sequence(terms) => &terms[..],
@@ -116,7 +116,7 @@ impl Query {
         })
     }
 
-    /// The content of an answer to a query for one object: `((= (iota …) value))`.
+    /// Returns the content of an answer to a query for one object: `((= (iota …) value))`.
     ///
     /// # Errors
     /// When SL has no notation for a part of the value, or its `Serialize` fails.
@@ -127,7 +127,7 @@ impl Query {
         Term::from_value(value).map(|value| self.answer(value))
     }
 
-    /// The content of an answer to a query for all objects: `((= (all …) (set value…)))`.
+    /// Returns the content of an answer to a query for all objects: `((= (all …) (set value…)))`.
     ///
     /// # Errors
     /// When SL has no notation for a part of a value, or its `Serialize` fails.
@@ -142,8 +142,8 @@ impl Query {
     /// Reads the answer to a query for one object.
     ///
     /// # Errors
-    /// When the content is no answer, is the answer to another query, or its value is not of the
-    /// type.
+    /// When the content is not an answer, is the answer to another query, or its value is not of
+    /// the type.
     pub fn read_one<T: DeserializeOwned>(&self, answer: &Content<'_>) -> Result<T, ReadError> {
         Ok(self.value(answer)?.read()?)
     }
@@ -151,8 +151,8 @@ impl Query {
     /// Reads the answer to a query for all objects.
     ///
     /// # Errors
-    /// When the content is no answer, is the answer to another query, or its value is no set or
-    /// sequence of values of the type.
+    /// When the content is not an answer, is the answer to another query, or its value is not a set
+    /// or sequence of values of the type.
     pub fn read_all<T: DeserializeOwned>(&self, answer: &Content<'_>) -> Result<Vec<T>, ReadError> {
         self.read_one(answer)
     }
@@ -161,7 +161,7 @@ impl Query {
         Wff::Equal(Box::new(self.0.clone().into()), Box::new(value)).into()
     }
 
-    /// The value that the answer says is equal to the query's expression.
+    /// Returns the value that the answer equates with the expression of the query.
     fn value<'t, 'a>(&self, answer: &'t Content<'a>) -> Result<&'t Term<'a>, ReadError> {
         let Wff::Equal(left, right) = answer.wff()? else {
             return Err(ReadError::Expression("((= (iota …) value))"));

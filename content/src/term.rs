@@ -23,13 +23,13 @@ pub enum Term<'a> {
     Meta(Cow<'a, str>),
     /// A numerical constant.
     Number(Number<'a>),
-    /// A string constant, in whatever notation.
+    /// A string constant in any notation.
     String(Cow<'a, str>),
     /// A byte-length encoded string that is not text; from JADE, any byte-length encoded string.
     Bytes(Cow<'a, [u8]>),
-    /// The unquoted word `true` or `false`. The standard has them as formulas, and as terms they
-    /// are strings; JADE takes them for truth values and writes the strings in quotation marks, and
-    /// so does this crate.
+    /// The unquoted word `true` or `false`. In the standard, these words are formulas, and strings
+    /// as terms. JADE and this crate read them as truth values, and write the strings in quotation
+    /// marks.
     Boolean(bool),
     /// A date-time constant.
     DateTime(Time),
@@ -54,7 +54,7 @@ pub struct FunctionalTerm<'a> {
     pub arguments: Arguments<'a>,
 }
 
-/// The arguments of a functional term. One without arguments has no [`Terms`](Self::Terms).
+/// The arguments of a functional term. A term without arguments has empty [`Terms`](Self::Terms).
 #[derive(Debug, Clone, PartialEq)]
 #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
 pub enum Arguments<'a> {
@@ -105,7 +105,7 @@ pub enum ReferentialOperator {
 }
 
 impl ReferentialOperator {
-    /// The keyword.
+    /// Returns the keyword.
     #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
@@ -116,7 +116,8 @@ impl ReferentialOperator {
     }
 }
 
-/// An identifying expression, `(iota ?x (p ?x))`: what the term stands for where the formula holds.
+/// An identifying expression, `(iota ?x (p ?x))`: the objects of the term for which the formula
+/// holds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IdentifyingExpression<'a> {
     /// The operator.
@@ -148,7 +149,7 @@ impl<'a> Term<'a> {
         Parser::whole(dialect, bytes.as_ref(), Parser::term)
     }
 
-    /// The same term with all text in memory of its own.
+    /// Returns the same term with owned text.
     #[must_use]
     pub fn into_owned(self) -> Term<'static> {
         match self {
@@ -167,7 +168,7 @@ impl<'a> Term<'a> {
         }
     }
 
-    /// A functional term with arguments by position.
+    /// Returns a functional term with arguments by position.
     #[must_use]
     pub fn functional(
         symbol: impl Into<Cow<'a, str>>,
@@ -179,7 +180,7 @@ impl<'a> Term<'a> {
         })
     }
 
-    /// The functional term that this is, if it is one.
+    /// Returns the functional term, if the term is one.
     #[must_use]
     pub fn as_functional(&self) -> Option<&FunctionalTerm<'a>> {
         match self {
@@ -188,7 +189,7 @@ impl<'a> Term<'a> {
         }
     }
 
-    /// The string that this is, if it is one.
+    /// Returns the string, if the term is one.
     #[must_use]
     pub fn as_str(&self) -> Option<&str> {
         match self {
@@ -197,7 +198,7 @@ impl<'a> Term<'a> {
         }
     }
 
-    /// The elements of the sequence or set that this is, if it is one.
+    /// Returns the elements, if the term is a sequence or set.
     #[must_use]
     pub fn elements(&self) -> Option<&[Term<'a>]> {
         match self {
@@ -208,14 +209,14 @@ impl<'a> Term<'a> {
 }
 
 impl<'a> FunctionalTerm<'a> {
-    /// The value of the first parameter of this name.
+    /// Returns the value of the first parameter of this name.
     #[must_use]
     pub fn parameter(&self, name: &str) -> Option<&Term<'a>> {
         let found = self.parameters().iter().find(|found| found.name == name);
         found.map(|found| &found.value)
     }
 
-    /// The arguments by name; none if there are arguments by position.
+    /// Returns the arguments by name. The slice is empty if there are arguments by position.
     #[must_use]
     pub fn parameters(&self) -> &[Parameter<'a>] {
         match &self.arguments {
@@ -224,7 +225,7 @@ impl<'a> FunctionalTerm<'a> {
         }
     }
 
-    /// The arguments by position; none if there are arguments by name.
+    /// Returns the arguments by position. The slice is empty if there are arguments by name.
     #[must_use]
     pub fn terms(&self) -> &[Term<'a>] {
         match &self.arguments {
@@ -233,7 +234,7 @@ impl<'a> FunctionalTerm<'a> {
         }
     }
 
-    /// The same term with all text in memory of its own.
+    /// Returns the same term with owned text.
     #[must_use]
     pub fn into_owned(self) -> FunctionalTerm<'static> {
         FunctionalTerm {
@@ -253,7 +254,7 @@ impl<'a> FunctionalTerm<'a> {
 }
 
 impl ActionExpression<'_> {
-    /// The same expression with all text in memory of its own.
+    /// Returns the same expression with owned text.
     #[must_use]
     pub fn into_owned(self) -> ActionExpression<'static> {
         match self {
@@ -275,7 +276,7 @@ impl ActionExpression<'_> {
 }
 
 impl IdentifyingExpression<'_> {
-    /// The same expression with all text in memory of its own.
+    /// Returns the same expression with owned text.
     #[must_use]
     pub fn into_owned(self) -> IdentifyingExpression<'static> {
         IdentifyingExpression {
@@ -296,7 +297,7 @@ impl<'a> From<FunctionalTerm<'a>> for Term<'a> {
     }
 }
 
-/// The term. A meta-symbol alone is [`Term::Meta`], as it is when it is parsed.
+/// Converts the expression. A lone meta-symbol becomes [`Term::Meta`], as in the parser.
 impl<'a> From<ActionExpression<'a>> for Term<'a> {
     fn from(action: ActionExpression<'a>) -> Self {
         match action {

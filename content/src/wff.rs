@@ -73,7 +73,7 @@ macro_rules! keywords {
         }
 
         impl $name {
-            /// The keyword.
+            /// Returns the keyword.
             #[must_use]
             pub fn as_str(self) -> &'static str {
                 match self {
@@ -100,7 +100,7 @@ keywords! {
         Or = "or",
         /// The second holds if the first does.
         Implies = "implies",
-        /// Both hold, or none does.
+        /// Both hold, or neither does.
         Equiv = "equiv",
     }
 }
@@ -120,9 +120,9 @@ keywords! {
     ModalOperator {
         /// The agent believes it.
         Belief = "B",
-        /// The agent is uncertain of it, and takes it for more likely than its opposite.
+        /// The agent is uncertain of it, and considers it more likely than its opposite.
         Uncertainty = "U",
-        /// The agent has it for a persistent goal.
+        /// The formula is a persistent goal of the agent.
         PersistentGoal = "PG",
         /// The agent intends it.
         Intention = "I",
@@ -150,7 +150,7 @@ impl<'a> Wff<'a> {
         Parser::whole(dialect, bytes.as_ref(), Parser::wff)
     }
 
-    /// A predicate; without arguments, a proposition.
+    /// Returns a predicate, or a proposition if there are no arguments.
     #[must_use]
     pub fn predicate(
         symbol: impl Into<Cow<'a, str>>,
@@ -163,7 +163,7 @@ impl<'a> Wff<'a> {
         Self::Predicate { symbol, arguments }
     }
 
-    /// The same formula with all text in memory of its own.
+    /// Returns the same formula with owned text.
     #[must_use]
     pub fn into_owned(self) -> Wff<'static> {
         fn boxed(wff: Wff<'_>) -> Box<Wff<'static>> {

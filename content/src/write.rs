@@ -46,7 +46,7 @@ pub(crate) fn proposition(
     quoted(out, dialect, text, shape)
 }
 
-/// Appends a function symbol; `arithmetic` if it has two arguments by position.
+/// Appends a function symbol. `arithmetic` is set if it has two arguments by position.
 #[inline]
 pub(crate) fn function_symbol(
     out: &mut Vec<u8>,
@@ -126,8 +126,8 @@ fn is_word(shape: Shape, dialect: Dialect) -> bool {
     shape.is_word() && (dialect == Dialect::Standard || shape.is_ascii())
 }
 
-/// Appends the text in quotation marks, or as a byte-length encoded string where a reader could
-/// find another end of it.
+/// Appends the text in quotation marks, or as a byte-length encoded string if a reader could find
+/// another end of the text.
 fn quoted(out: &mut Vec<u8>, dialect: Dialect, text: &str, shape: Shape) -> Result<(), PrintError> {
     if shape.has_backslashes() {
         match dialect {
@@ -157,8 +157,8 @@ fn quoted(out: &mut Vec<u8>, dialect: Dialect, text: &str, shape: Shape) -> Resu
     Ok(())
 }
 
-/// Whether every reader finds the end of the text in quotation marks: no quotation mark behind a
-/// backslash, and no backslash at the end.
+/// Whether every reader finds the end of the text in quotation marks. The text must have no
+/// quotation mark after a backslash, and no backslash at the end.
 fn is_quotable(text: &str) -> bool {
     !text.ends_with('\\') && !text.contains("\\\"")
 }

@@ -1,4 +1,4 @@
-//! Contents that JADE wrote, or read.
+//! Contents that JADE wrote or read.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -54,7 +54,7 @@ fn a_search_is_read_and_written_as_jade_does() {
         let printer = Printer::new().dialect(Dialect::Jade);
         assert_eq!(printer.print(&content).unwrap(), bytes, "{name}");
         assert_eq!(Content::parse(bytes).as_ref(), Ok(&content));
-        // Nothing in it is written otherwise in the standard.
+        // The standard notation of this content is the same.
         assert_eq!(Printer::new().print(&content).unwrap(), bytes);
         let language = message.language().unwrap();
         let profile = Profile::of_language(language).unwrap();
@@ -100,7 +100,7 @@ fn a_failure_of_the_message_transport_is_read_and_written_as_jade_does() {
     let content = Content::parse_in(Dialect::Jade, bytes).unwrap();
     let printer = Printer::new().jade_failure();
     assert_eq!(printer.print(&content).unwrap(), bytes);
-    // Only blanks differ in what SLCodec would write.
+    // The output of SLCodec differs only in blanks.
     let line = Printer::new().dialect(Dialect::Jade).print(&content);
     assert_eq!(Content::parse(&line.unwrap()).as_ref(), Ok(&content));
 

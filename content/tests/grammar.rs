@@ -1,4 +1,4 @@
-//! The productions of FIPA00008, profiles, layouts, and what conversations say.
+//! The productions of FIPA00008, profiles, layouts, and the contents of conversations.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -9,7 +9,7 @@ use fipa_content::{
 };
 use serde::{Deserialize, Serialize};
 
-/// Contents with the least profile that has them.
+/// Contents, each with the smallest profile that has it.
 const CONTENTS: [(&str, Profile); 29] = [
     ("(p)", Profile::Sl0),
     ("(true false \"true\")", Profile::Sl0),
@@ -163,7 +163,7 @@ fn what_breaks_the_grammar_is_named_with_its_clause() {
 
 #[test]
 fn keywords_count_only_where_they_stand_for_something() {
-    // Quoted, or elsewhere than behind a parenthesis, they are symbols.
+    // Keywords that are quoted or not right after a parenthesis are symbols.
     let text = "((\"not\" action) (p (not a) (B a b) (\"sequence\" 1) set))";
     let content = Content::parse(text).unwrap();
     assert_eq!(content.to_string(), text);
@@ -271,9 +271,9 @@ fn an_action_is_refused_with_a_reason() {
         let (refused, why) = refusal.refusal().unwrap();
         assert_eq!((refused, why.read::<Reason>().unwrap()), (&action, reason));
     }
-    // What has parameters by name is no predicate.
+    // A term with parameters by name is not a predicate.
     assert_eq!(Wff::from_value(&act), Err(SerializeError::Predicate));
-    // A predicate symbol is never taken for an operator.
+    // A predicate symbol never reads as an operator.
     let not = Wff::from_value(&("not", 1)).unwrap_err();
     assert_eq!(not, SerializeError::Predicate);
     let not = Wff::from_value(&Operator::Not(1)).unwrap();

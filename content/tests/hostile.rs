@@ -1,4 +1,4 @@
-//! Text of any depth, size and bytes: typed errors, in bounded memory and time.
+//! Hostile text of any depth, size and bytes gives typed errors in bounded memory and time.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -29,7 +29,7 @@ impl Nested {
     }
 }
 
-/// The problem with the text, for which the value was refused.
+/// Returns the problem for which the text is refused as a value of the type.
 fn problem<T>(text: &str) -> Problem
 where
     T: for<'de> Deserialize<'de>,
@@ -45,7 +45,7 @@ where
 
 #[test]
 fn depth_is_bounded() {
-    // Of the stacks that programs give their threads, a small one.
+    // A small stack, compared to the usual thread stacks.
     let small = thread::Builder::new().stack_size(1 << 20);
     let run = small.spawn(|| {
         let allowed = nested(MAX_DEPTH);
@@ -97,7 +97,7 @@ fn formulas_nest_as_deep_as_terms() {
         .problem()
         .clone();
     assert_eq!(error, Problem::TooDeep);
-    // What was made by hand is not written deeper than it can be read.
+    // A constructed term is not written deeper than the parser accepts.
     let deeper = (0..=MAX_DEPTH).fold(Term::from("x"), |term, _| Term::functional("f", [term]));
     assert_eq!(Printer::new().print(&deeper), Err(PrintError::TooDeep));
 }
@@ -118,7 +118,7 @@ fn the_number_of_terms_is_bounded() {
     let more = many(MAX_NODES);
     let error = Term::parse(&more).unwrap_err();
     assert_eq!(error.problem(), &Problem::TooMany);
-    // A typed value has the size of its text, and no such bound.
+    // This bound does not apply to typed values, whose size follows from the text.
     let typed: Vec<&str> = from_slice(&more).unwrap();
     assert_eq!(typed.len(), MAX_NODES);
 }
@@ -139,8 +139,8 @@ fn announced_lengths_take_no_memory() {
     }
 }
 
-/// Each of these took quadratic time if something were looked for again and again. The test runner's
-/// watchdog would end it.
+/// Each of these texts takes quadratic time if a search repeats per token. The watchdog of the test
+/// runner then ends the test.
 #[test]
 fn large_text_is_read_once() {
     const SIZE: usize = 512 << 10;
@@ -152,7 +152,7 @@ fn large_text_is_read_once() {
         let _ = Content::parse_in(Dialect::Jade, &text);
         let _ = from_slice::<IgnoredAny>(&text);
         let _ = from_slice::<Nested>(&text);
-        // As the value of an unknown slot, too.
+        // Also as the value of an unknown slot.
         let _ = from_slice::<Nested>(&format!("(f :other \"{text}"));
     }
     let long = format!("\"{}\"", "a\\\"".repeat(SIZE / 3));
@@ -164,7 +164,7 @@ fn large_text_is_read_once() {
     assert_eq!(Term::parse(&indented).unwrap(), wide);
 }
 
-/// Every prefix and every changed byte of a content is read or refused.
+/// Every prefix and every changed byte of a content is accepted or refused.
 #[test]
 fn damaged_text_is_refused_where_it_is_damaged() {
     let text = "((action (agent-identifier :name crex) (dock :target (pose :x 1.5 :frame \"a b\")))\

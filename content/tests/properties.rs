@@ -1,4 +1,4 @@
-//! Properties of every content, and of any bytes at all.
+//! Properties of all contents, and of arbitrary bytes.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use arbitrary::{content, nested, text};
 use bytes::{DIALECTS, are_read_or_refused, survives};
 
-/// Bytes with a chance to be taken for something.
+/// Bytes with a fair probability to form tokens.
 fn nearly_sl() -> impl Strategy<Value = Vec<u8>> {
     let pieces = prop::sample::select(
         &[
@@ -62,7 +62,7 @@ fn nearly_sl() -> impl Strategy<Value = Vec<u8>> {
     vec(piece, 0..40).prop_map(|pieces| pieces.concat())
 }
 
-/// One of the contents in `tests/contents`, changed in a few places.
+/// Returns one of the contents in `tests/contents`, changed in a few places.
 fn damaged() -> impl Strategy<Value = Vec<u8>> {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/contents");
     let files = fs::read_dir(directory).unwrap();
@@ -148,7 +148,7 @@ struct Everything {
     unit: (),
 }
 
-/// An option in a slot of its own.
+/// A struct with an optional slot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Option1 {
     value: Option<i32>,

@@ -1,4 +1,4 @@
-//! Rust values as terms: the mapping of the crate's documentation, line by line, and its errors.
+//! Rust values as terms: each line of the mapping in the crate documentation, and the errors.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -17,7 +17,7 @@ fn text(value: &(impl Serialize + ?Sized)) -> String {
     String::from_utf8(to_vec(value).unwrap()).unwrap()
 }
 
-/// Writes the value, compares, and reads it again.
+/// Writes the value, compares the text, and reads it again.
 fn same<T: Serialize + DeserializeOwned + PartialEq + Debug>(value: T, expected: &str) {
     assert_eq!(text(&value), expected);
     assert_eq!(from_slice::<T>(expected).unwrap(), value, "{expected}");
@@ -109,7 +109,7 @@ fn enums_are_function_symbols() {
     same(Act::Plus(1, 2), "(plus 1 2)");
     same(Act::Dock { speed: Some(0.5) }, "(dock :speed 0.5)");
     same(Act::Dock { speed: None }, "(dock)");
-    // What has a meaning of its own is told apart by quotation marks.
+    // Quotation marks distinguish strings from reserved words.
     same(Act::Keyword(1), "(\"set\" 1)");
     assert_eq!(from_slice::<Act>("(brake)").unwrap(), Act::Brake);
     assert_eq!(
@@ -117,7 +117,7 @@ fn enums_are_function_symbols() {
         Act::Dock { speed: Some(0.5) }
     );
 
-    // An operator of SL is no function symbol.
+    // An operator of SL is not a function symbol.
     assert!(matches!(
         refused::<Act>("(action a b)").kind(),
         DeserializeErrorKind::Type { .. }
@@ -165,7 +165,7 @@ fn collections_are_sequences_sets_and_properties() {
     same((), "(sequence)");
     same(Set(BTreeSet::from([1, 2])), "(set 1 2)");
     same(Some(Set(vec![vec![1]])), "(set (sequence 1))");
-    // Only the collection itself is a set, nothing further inside.
+    // Only the outer collection is a set.
     assert_eq!(
         text(&Set(Lists { list: vec![1] })),
         "(Lists :list (sequence 1))"
@@ -217,7 +217,7 @@ fn strings_that_look_like_something_else_are_quoted() {
     same(true, "true");
     assert!(from_slice::<bool>("TRUE").unwrap());
     assert!(from_slice::<bool>("\"true\"").is_err());
-    // Readers of the standard do not quote them.
+    // In the standard dialect, the unquoted words are also strings.
     assert_eq!(from_slice::<String>("true").unwrap(), "true");
     let borrowed: &str = from_slice("\"a b\"").unwrap();
     assert_eq!(borrowed, "a b");
@@ -301,7 +301,7 @@ fn floats_are_finite() {
     ));
 }
 
-/// A value of bytes, as `serde_bytes` has it.
+/// A value of bytes, as in `serde_bytes`.
 #[derive(Debug, PartialEq)]
 struct Bytes(Vec<u8>);
 
@@ -376,7 +376,7 @@ fn times_agents_and_terms_are_parts_of_values() {
     assert!(error.to_string().contains(":name"), "{error}");
 
     same(Term::parse("(all ?x (p ?x))").unwrap(), "(all ?x (p ?x))");
-    // In other formats, the text.
+    // Other formats use the text.
     let json = serde_json::to_string(&(DateTime(time), Set([1]), Term::from("a b"))).unwrap();
     assert_eq!(json, r#"["20000508T042651481Z",[1],"\"a b\""]"#);
     let back: (DateTime, Set<[u8; 1]>, Term<'static>) = serde_json::from_str(&json).unwrap();
@@ -456,7 +456,7 @@ fn errors_name_the_slot_the_offset_and_the_type() {
         (syntax.offset(), syntax.clause()),
         (25, "FIPA00008 FunctionalTerm")
     );
-    // Text from outside is cut and escaped.
+    // Untrusted text is truncated and escaped.
     let error = refused::<u8>(&format!("\"\u{1b}{}\"", "x".repeat(1000)));
     let shown = error.to_string();
     assert!(shown.len() < 200 && !shown.contains('\u{1b}'), "{shown}");

@@ -1,5 +1,4 @@
-//! Any rules of access say what they say of a letter; see
-//! [`fipa_fuzz::access`].
+//! Any access rules are accepted or refused, and decide about letters; see [`fipa_fuzz::access`].
 
 #![no_main]
 

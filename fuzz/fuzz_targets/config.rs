@@ -1,5 +1,4 @@
-//! Any configuration is read or its mistakes are named; see
-//! [`fipa_fuzz::config`].
+//! Any configuration is accepted or refused with its mistakes; see [`fipa_fuzz::config`].
 
 #![no_main]
 

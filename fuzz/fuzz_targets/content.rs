@@ -1,4 +1,4 @@
-//! Any bytes are SL or an error, in every way of reading them; what was read survives being written.
+//! Any bytes are SL or an error, for every reader. A parsed content is the same after a round trip.
 
 #![no_main]
 

@@ -1,5 +1,5 @@
-//! Datagrams of any peers do no harm to a UDP endpoint, which tells strangers no more than they wrote; see
-//! [`fipa_fuzz::datagrams`].
+//! Datagrams of any peers do no harm to a UDP endpoint. An unverified address receives at most as
+//! many bytes as it sent; see [`fipa_fuzz::datagrams`].
 
 #![no_main]
 

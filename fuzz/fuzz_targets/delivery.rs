@@ -1,5 +1,5 @@
-//! Parcels, reports, answers and hellos of liars do not keep honest agents from being served; see
-//! [`fipa_fuzz::delivery`].
+//! Parcels, reports, answers and hellos of malicious services do not prevent delivery between
+//! honest agents; see [`fipa_fuzz::delivery`].
 
 #![no_main]
 

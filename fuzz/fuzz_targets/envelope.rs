@@ -1,5 +1,5 @@
-//! Any bytes begin with a bit-efficient envelope or are refused. A decoded envelope is the same after a
-//! round trip, and the view and the explanation agree with it.
+//! Any bytes start with a bit-efficient envelope or are refused. A decoded envelope is the same
+//! after a round trip. The view and the explanation agree with the decoder.
 
 #![no_main]
 
@@ -23,7 +23,8 @@ fuzz_target!(|bytes: &[u8]| {
         }
     };
     envelope_view_agrees(bytes, &envelope, len);
-    let letter = Letter::split(Bytes::copy_from_slice(bytes)).expect("an envelope is there");
+    let letter =
+        Letter::split(Bytes::copy_from_slice(bytes)).expect("the bytes start with an envelope");
     assert_eq!(letter.envelope_len(), len);
     envelope_survives(&envelope);
 });

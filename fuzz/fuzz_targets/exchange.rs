@@ -1,4 +1,4 @@
-//! Letters of the exchange of directories change nothing of other gateways; see
+//! Letters of the directory exchange do not change the entries of other gateways; see
 //! [`fipa_fuzz::exchange`].
 
 #![no_main]

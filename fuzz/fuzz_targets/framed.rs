@@ -1,4 +1,4 @@
-//! Bytes of a peer of a framed stream do no harm to the reader and the connection; see
+//! Bytes from the peer of a framed stream do no harm to the reader and the connection; see
 //! [`fipa_fuzz::framed`].
 
 #![no_main]

@@ -1,5 +1,4 @@
-//! Any bytes are a file of the host's directory or an error; see
-//! [`fipa_fuzz::host`].
+//! Any bytes are an entries file of the host's directory or an error; see [`fipa_fuzz::host`].
 
 #![no_main]
 

@@ -1,5 +1,4 @@
-//! Packets of multicast DNS do no harm to what is kept of other hosts; see
-//! [`fipa_fuzz::mdns`].
+//! Multicast DNS packets do no harm to the stored records of other hosts; see [`fipa_fuzz::mdns`].
 
 #![no_main]
 

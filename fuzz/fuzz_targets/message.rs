@@ -1,5 +1,5 @@
 //! Any bytes are a bit-efficient message or are refused. A decoded message is the same after a round
-//! trip, and the view and the explanation agree with it.
+//! trip. The view and the explanation agree with the decoder.
 
 #![no_main]
 

@@ -16,10 +16,10 @@ fuzz_target!(|bytes: &[u8]| {
     let Ok(parcel) = header.parcel(Bytes::copy_from_slice(body)) else {
         return;
     };
-    let (again, pieces) = ParcelHeader::of(&parcel).expect("what was read can be written");
+    let (again, pieces) = ParcelHeader::of(&parcel).expect("a decoded parcel can be encoded");
     let read = again
         .parcel(pieces.concat().into())
-        .expect("what was written can be read");
+        .expect("an encoded parcel can be decoded");
     match (&read.body, &parcel.body) {
         (Body::Letter(one), Body::Letter(other)) => assert_eq!(one.to_bytes(), other.to_bytes()),
         (one, other) => assert_eq!(one, other),

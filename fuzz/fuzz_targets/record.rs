@@ -1,5 +1,5 @@
 //! Any bytes from a process are a record or are refused. For any records, the watcher reports no letter
-//! twice and keeps its bounds. The records that this project writes are accepted.
+//! twice and stays within its limits. The records that this project writes are accepted.
 
 #![no_main]
 
@@ -21,7 +21,7 @@ const HEADER: usize = 96;
 fuzz_target!(|bytes: &[u8]| {
     let _ = Wish::parse(bytes);
     let whole = Bytes::copy_from_slice(bytes);
-    // Payloads that are no letter are recorded too.
+    // Payloads that are not a message are recorded, too.
     let envelope_len = Envelope::decode(&whole).map_or(bytes.len() / 2, |(_, len)| len);
     let (envelope, payload) = (whole.slice(..envelope_len), whole.slice(envelope_len..));
     written_records_are_accepted(&Letter::new(envelope, payload));
@@ -37,7 +37,7 @@ fuzz_target!(|bytes: &[u8]| {
         rest = after;
         number += 1;
         let source = Source(number % 3);
-        // Some inputs are tried as they are. The others get a valid header.
+        // A record of kind 0 stays unchanged. Other records get a valid header.
         let record = match kind {
             0 => record.to_vec(),
             kind => repaired(*kind, record),
@@ -73,8 +73,8 @@ fn note(event: &Event, reported: &mut HashSet<(Incarnation, u64)>) {
     }
 }
 
-/// Sets the magic number, the version, a kind and matching lengths, so that the parser reads the parts
-/// behind the header.
+/// Returns the record with a valid magic number, version and kind, and matching lengths, so that
+/// the parser reads the parts behind the header.
 fn repaired(kind: u8, record: &[u8]) -> Vec<u8> {
     let mut record = record.to_vec();
     record.resize(record.len().max(HEADER), 0);
@@ -110,9 +110,9 @@ fn written_records_are_accepted(letter: &Letter) {
         let at = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
         let written = of(&notice, Wish { content }, at);
         assert!(written.len() <= MAX_LEN);
-        let record = Record::parse(&written.into()).expect("what was written is read");
+        let record = Record::parse(&written.into()).expect("a written record can be read");
         let RecordBody::Letter { letter: seen, .. } = record.body else {
-            panic!("another kind");
+            panic!("a record of another kind");
         };
         assert_eq!(seen.size, letter.len() as u64);
         assert!(seen.content.len() as u64 <= u64::from(content));

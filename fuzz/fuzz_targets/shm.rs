@@ -1,4 +1,4 @@
-//! Descriptors in shared memory announce nothing outside of their payload; see
+//! Accepted descriptors in shared memory announce no range outside of their payload; see
 //! [`fipa_fuzz::shm`].
 
 #![no_main]

@@ -1,4 +1,4 @@
-//! Names in certificates, locations, names of agents and patterns are read or refused; see
+//! Certificates and their names, locations, agent names and patterns are accepted or refused; see
 //! [`fipa_fuzz::texts`].
 
 #![no_main]

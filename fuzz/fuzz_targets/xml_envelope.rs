@@ -1,5 +1,5 @@
-//! Any bytes begin with an XML envelope or are refused. A decoded envelope is the same after a round
-//! trip.
+//! Any bytes start with an XML envelope or are refused. A decoded envelope is the same after a
+//! round trip.
 
 #![no_main]
 
@@ -17,7 +17,8 @@ fuzz_target!(|bytes: &[u8]| {
         Err(error) => return assert!(error.offset() <= bytes.len()),
     };
     envelope_view_agrees(bytes, &envelope, len);
-    let letter = Letter::split(Bytes::copy_from_slice(bytes)).expect("an envelope is there");
+    let letter =
+        Letter::split(Bytes::copy_from_slice(bytes)).expect("the bytes start with an envelope");
     assert_eq!(letter.envelope_len(), len);
     envelope_survives(&envelope);
 });

@@ -1,5 +1,5 @@
-//! Rules of access: any rules are understood or refused, and what they say of a letter does not depend
-//! on anything but the rules that name it.
+//! Access rules. Any rules are accepted or refused. Only the rules that match a letter decide about
+//! it.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use fipa::fuzzing::Access;
 
 use crate::input::Input;
 
-/// Reads rules and letters from the bytes.
+/// Reads rules and letters from the bytes, and checks each decision.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let rate = input.below(4);
@@ -27,7 +27,7 @@ pub fn play(bytes: &[u8]) {
         let protocol = input.one_of(&[None, Some("fipa-request"), Some("")]);
         let between = (sender, receiver);
         let passes = access.passes(between, performative, protocol);
-        // As a rule that denies, a rule that allows says which letters it names.
+        // The allow rules are tried as deny rules, which shows the letters that they match.
         let named = |rules: &Option<Access>| {
             let rules = rules.as_ref();
             rules.is_some_and(|it| !it.passes(between, performative, protocol))
@@ -36,7 +36,7 @@ pub fn play(bytes: &[u8]) {
             !named(&denies) && (allow.iter().all(|it| it.1.is_empty()) || named(&allows));
         assert_eq!(passes, expected, "{sender:?} to {receiver:?}");
         sent += u32::from(access.may_send(1, "rover", now));
-        // Names that another source invents change nothing for this one.
+        // Names from another source must not change the rate limit of this one.
         access.may_send(2, sender, now);
         if rate > 0 {
             let seconds = now.duration_since(began).as_secs_f64();

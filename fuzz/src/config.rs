@@ -1,9 +1,9 @@
-//! Configuration files and overrides: any text gives a configuration or names its mistakes; what is
-//! shown of a configuration reads as the same one.
+//! Configuration files and overrides. Any text gives a configuration or an error that names the
+//! mistakes. The rendered configuration reads as the same configuration.
 
 use fipa::fuzzing;
 
-/// Reads the text before a zero byte as a file, and what follows as overrides.
+/// Reads the text before the first zero byte as a file, and the parts after it as overrides.
 pub fn play(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else {
         return;
@@ -16,7 +16,7 @@ pub fn play(bytes: &[u8]) {
             effective
                 .config()
                 .check()
-                .expect("what is loaded is checked");
+                .expect("a loaded configuration is valid");
             let shown = effective.render();
             let again = fuzzing::config(&shown, &[]);
             let again = again.unwrap_or_else(|error| panic!("{error} in {shown}"));

@@ -1,7 +1,8 @@
-//! The UDP transport: datagrams of several peers, before and after the handshake.
+//! Datagrams of several peers to the UDP transport, before and after the handshake.
 //!
-//! An address that has proved nothing is told no more bytes than it has written; what leaves is a
-//! datagram of the protocol; every attempt has exactly one conclusion.
+//! * An unverified address receives at most as many bytes as it sent.
+//! * Every sent datagram is one of the protocol.
+//! * Every attempt has exactly one conclusion.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +11,7 @@ use fipa_transport_net::fuzzing::{Datagrams, Written, parcel_body as written};
 use crate::framed::{answer, parcel};
 use crate::input::Input;
 
-/// Plays an endpoint as the bytes say.
+/// Runs an endpoint with the datagrams and calls that the bytes encode.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let mut now = Instant::now();
@@ -86,7 +87,8 @@ pub fn play(bytes: &[u8]) {
     end.close(now);
 }
 
-/// A frame of a packet: an acknowledgment, a parcel, an answer, or another kind, mostly well formed.
+/// Appends a frame of a packet, mostly well-formed: an acknowledgment, a parcel, an answer, or
+/// another kind.
 fn put_frame(frames: &mut Vec<u8>, input: &mut Input<'_>) {
     let kind = input.byte() % 8;
     frames.push(kind);

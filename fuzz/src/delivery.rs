@@ -1,15 +1,16 @@
-//! Delivery cores of two honest hosts, between which nothing is lost, and two liars: the gateway of
-//! another host, and a process of the first one. Liars fill every field of their parcels with what they
-//! like, at any time.
+//! Delivery cores of two honest hosts with lossless links between them, and two malicious services:
+//! the gateway of another host (`LIAR`), and a process of the first host (`MOLE`). Malicious
+//! services send parcels with any fields at any time.
 //!
-//! * No arrival makes a core panic or run on without end.
+//! * No arrival makes a core panic or loop endlessly.
 //! * Each letter of an honest agent has one outcome, by its deadline.
-//! * A letter that is *delivered* was taken by its receiver.
+//! * The receiver of a *delivered* letter has taken it.
 //! * Agents take the letters of honest agents once, and in order.
-//! * Letters between honest agents that read are delivered, when they have the time.
+//! * Letters to the honest agents `arm` and `rover` are delivered if their deadline is long enough
+//!   and no queue is full.
 //!
-//! A process of the same user may say that a letter is another agent's, so the lying process lies about
-//! the rest only.
+//! The cores accept the stream sender that a process of the same user names. So letters of the
+//! malicious process have no honest agent as the sender of their stream.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -29,15 +30,15 @@ use fipa_transport::{
 use crate::input::Input;
 
 const UNKNOWN: Incarnation = Incarnation::UNKNOWN;
-/// The gateways of both hosts, and the processes with their agents.
+/// Gateways of both honest hosts, and processes with honest agents.
 const GATEWAY: Incarnation = Incarnation::from_u64(1);
 const PROCESS: Incarnation = Incarnation::from_u64(2);
 const FAR_GATEWAY: Incarnation = Incarnation::from_u64(3);
 const FAR_PROCESS: Incarnation = Incarnation::from_u64(4);
-/// A gateway and a process that lie, each with an agent.
+/// A malicious gateway and a malicious process, each with an agent.
 const LIAR: Incarnation = Incarnation::from_u64(5);
 const MOLE: Incarnation = Incarnation::from_u64(6);
-/// Agents of the honest processes. The eye reads only now and then.
+/// Agents of the honest processes. The agent `eye` reads only on some inputs.
 const ARM: Incarnation = Incarnation::from_u64(11);
 const EYE: Incarnation = Incarnation::from_u64(12);
 const ROVER: Incarnation = Incarnation::from_u64(13);
@@ -46,7 +47,7 @@ const MOLE_AGENT: Incarnation = Incarnation::from_u64(15);
 const STRANGER: Incarnation = Incarnation::from_u64(99);
 
 const SERVICES: [Incarnation; 4] = [GATEWAY, PROCESS, FAR_GATEWAY, FAR_PROCESS];
-/// Incarnations that liars name.
+/// Incarnations that malicious services use.
 const NAMED: [Incarnation; 13] = [
     ARM,
     ROVER,
@@ -66,14 +67,14 @@ const NAMES: [&str; 9] = [
     "arm", "rover", "eye", "liar", "mole", "gw", "far-gw", "nobody", "",
 ];
 
-/// How long parcels and answers take.
+/// Transit time of parcels and answers.
 const DELAY: Duration = Duration::from_millis(1);
-/// A letter that has at least this long is delivered, whatever the liars do.
+/// Minimum deadline with which a letter is delivered despite the malicious services.
 const ENOUGH: Duration = Duration::from_secs(8);
-/// Most parcels that honest services exchange because of one input.
+/// Maximum number of events of the honest services for one input.
 const MOST_EVENTS: usize = 60_000;
 
-/// Who is where, as one service sees it.
+/// The directory of one service.
 struct View(Vec<Arc<Entry>>);
 
 impl Directory for View {
@@ -107,7 +108,7 @@ fn at(service: Incarnation, kind: Kind) -> Location {
     location.with_incarnation(service)
 }
 
-/// The directory of an honest service.
+/// Returns the directory of an honest service.
 fn view(of: Incarnation) -> View {
     let near = [GATEWAY, PROCESS].contains(&of);
     let is_gateway = [GATEWAY, FAR_GATEWAY].contains(&of);
@@ -151,11 +152,11 @@ struct Service {
     core: Core,
     /// Attempts without a conclusion.
     open: BTreeMap<AttemptId, Location>,
-    /// Arrivals that are answered later, and whose attempts they are.
+    /// Services and attempts of the arrivals whose answer is pending.
     tickets: BTreeMap<u64, (Incarnation, AttemptId)>,
 }
 
-/// What arrives at an honest service.
+/// An event for an honest service.
 enum Coming {
     Parcel {
         from: Incarnation,
@@ -170,7 +171,7 @@ struct Sent {
     sender: Incarnation,
     receiver: Incarnation,
     deadline: Instant,
-    /// It has to be delivered.
+    /// Whether the letter has to be delivered.
     must: bool,
     outcome: Option<Outcome>,
     taken: bool,
@@ -180,12 +181,12 @@ struct World {
     now: Instant,
     services: BTreeMap<Incarnation, Service>,
     coming: VecDeque<(Instant, Incarnation, Coming)>,
-    /// Attempts of honest services at liars, which they answer as they like.
+    /// Attempts of honest services at malicious ones. The input decides about the answers.
     held: Vec<(Incarnation, AttemptId, Parcel)>,
     sends: BTreeMap<(Incarnation, SendId), u64>,
     sent: Vec<Sent>,
     last_taken: BTreeMap<(Incarnation, Incarnation), u64>,
-    /// Introductions of the liar that it may take back.
+    /// Introductions of the malicious gateway that [`part`](Self::part) can revoke.
     introduced: Vec<(Incarnation, Introduction)>,
     next_ticket: u64,
     events: usize,
@@ -195,7 +196,7 @@ fn certificate(service: Incarnation) -> Principal {
     Principal::Certificate([service.as_u64() as u8; 32])
 }
 
-/// The link on which an honest service or the lying process is found.
+/// Returns the link of an honest service or of the malicious process.
 fn hop(from: Incarnation, kind: Kind) -> Hop {
     Hop {
         location: at(from, kind),
@@ -222,7 +223,7 @@ fn number_of(letter: &Letter) -> Option<u64> {
     Some(u64::from_le_bytes(content))
 }
 
-/// Plays what the bytes say, then waits until every deadline has passed.
+/// Runs the actions that the bytes encode, then lets every deadline pass.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let mut world = World::new();
@@ -332,7 +333,7 @@ impl World {
         }
     }
 
-    /// An honest agent writes.
+    /// Sends a letter from an honest agent.
     fn send(&mut self, input: &mut Input<'_>) {
         let (at, name, sender) = input.one_of(&[
             (PROCESS, "arm", ARM),
@@ -369,7 +370,7 @@ impl World {
         });
     }
 
-    /// A liar sends a parcel.
+    /// Sends a parcel from a malicious service.
     fn lie(&mut self, input: &mut Input<'_>) {
         let how = input.byte();
         let is_mole = how & 1 == 1;
@@ -431,7 +432,8 @@ impl World {
         self.carry_out(at);
     }
 
-    /// A link of the lying gateway: with its certificate or without, under its own name or another.
+    /// Returns a link of the malicious gateway: with or without its certificate, with its own or
+    /// another incarnation.
     fn lying_hop(&mut self, how: u8, input: &mut Input<'_>) -> Hop {
         let named = match how & 3 {
             0 => input.one_of(&NAMED),
@@ -451,7 +453,7 @@ impl World {
         }
     }
 
-    /// A liar answers a parcel of an honest service.
+    /// Answers a parcel of an honest service from a malicious one.
     fn answer_falsely(&mut self, input: &mut Input<'_>) {
         if self.held.is_empty() {
             return;
@@ -476,7 +478,7 @@ impl World {
             7 => Conclusion::NotSent(way_error(input)),
             8 => Conclusion::Unconfirmed(way_error(input)),
             _ => {
-                // It comes back to the gateway as if the liar passed it on.
+                // The malicious gateway forwards the parcel to an honest gateway.
                 self.held.push((at, attempt, parcel.clone()));
                 let arrival = Arrival {
                     parcel,
@@ -519,7 +521,7 @@ impl World {
         self.carry_out(at);
     }
 
-    /// A letter without a parcel arrives, from a legacy peer.
+    /// Delivers a letter without a parcel from a legacy peer.
     fn legacy(&mut self, input: &mut Input<'_>) {
         let at = input.one_of(&[GATEWAY, FAR_GATEWAY, PROCESS]);
         let signature = input.one_of(&[Signature::FipaServices, Signature::JadeProxy]);
@@ -551,7 +553,7 @@ impl World {
                     fipa_acl::Representation::BitEfficient,
                     fipa_acl::Dialect::Standard,
                 ) {
-                    Ok(envelope) => Letter::new(Bytes::from(envelope), inner.payload().clone()),
+                    Ok(envelope) => Letter::new(envelope, inner.payload().clone()),
                     Err(_) => inner,
                 }
             }
@@ -565,11 +567,14 @@ impl World {
         self.carry_out(at);
     }
 
-    /// Does what the core of a service wants done.
+    /// Carries out the actions of a service's core.
     fn carry_out(&mut self, at: Incarnation) {
         while let Some(action) = self.service(at).core.poll_action() {
             self.events += 1;
-            assert!(self.events < MOST_EVENTS, "one input keeps the cores busy");
+            assert!(
+                self.events < MOST_EVENTS,
+                "one input causes too many events"
+            );
             match action {
                 Action::Dispatch {
                     attempt,
@@ -651,7 +656,7 @@ impl World {
         self.carry_out(at);
     }
 
-    /// Lets everything happen that happens at this time or before.
+    /// Processes all events and timeouts that are due.
     fn settle(&mut self) {
         for at in SERVICES {
             self.carry_out(at);
@@ -669,7 +674,10 @@ impl World {
                 return;
             }
             self.events += 1;
-            assert!(self.events < MOST_EVENTS, "one input keeps the cores busy");
+            assert!(
+                self.events < MOST_EVENTS,
+                "one input causes too many events"
+            );
             for at in due {
                 self.service(at).core.handle_timeout(now);
                 self.carry_out(at);
@@ -756,7 +764,7 @@ impl World {
                 continue;
             }
             if matches!(outcome, Outcome::Delivered { .. }) {
-                assert!(sent.taken, "letter {number} is delivered to none");
+                assert!(sent.taken, "letter {number} is delivered but not taken");
             }
             let refused = matches!(
                 outcome,

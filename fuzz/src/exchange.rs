@@ -1,7 +1,7 @@
-//! Letters of the exchange of directories, from neighbours that say what they like, beside an honest one.
+//! Letters of the directory exchange from malicious neighbors and an honest one.
 //!
-//! A neighbour tells of its own agents only, within the bounds; what it says does not change what the
-//! honest neighbour has told, nor keep that from being told.
+//! * A neighbor adds only entries of its own agents, within the limits.
+//! * A malicious neighbor neither changes nor blocks the entries of the honest one.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -41,13 +41,14 @@ fn agent(name: &str, incarnation: u64, gateway: Incarnation) -> Arc<Entry> {
     })
 }
 
-/// Plays a gateway with its neighbours as the bytes say.
+/// Runs a gateway with the letters and events of its neighbors that the bytes encode.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let mut now = Instant::now();
     let mut here = Exchange::new(7);
     let mut there = Exchange::new(8);
-    // Liars claim to have the rover, and the earlier registration keeps a name; none has the lander.
+    // Malicious neighbors claim the rover, and the earlier registration keeps a name. None of them
+    // claims the lander.
     let rover = agent("rover", 100, HONEST);
     let lander = agent("lander", 102, HONEST);
     let arm = agent("arm", 101, OWN);
@@ -73,7 +74,7 @@ pub fn play(bytes: &[u8]) {
                 drop(here.handle_letter(now, liar, &content));
             }
             5 => {
-                // It comes and goes.
+                // The neighbor appears or disappears.
                 match present.iter().position(|it| *it == liar) {
                     Some(at) => drop(present.remove(at)),
                     None => present.push(liar),
@@ -81,7 +82,7 @@ pub fn play(bytes: &[u8]) {
                 here.handle_neighbours(now, &gateways(&present));
             }
             6 => {
-                // Another gateway is where it was.
+                // Another gateway has the location of the neighbor.
                 here.handle_silence(now, &location(liar));
             }
             _ => now += input.time().min(Duration::from_secs(60)),
@@ -91,7 +92,7 @@ pub fn play(bytes: &[u8]) {
         there.handle_timeout(now);
         check(&here);
     }
-    // Soon after, both honest gateways know each other's agents.
+    // Soon after, each honest gateway has the agents of the other one in its directory.
     for _ in 0..400 {
         now += Duration::from_millis(500);
         exchange((&mut here, &mut there), now, 0, &mut last);
@@ -101,11 +102,12 @@ pub fn play(bytes: &[u8]) {
         let honest = known
             .iter()
             .any(|it| &*it.name == name && it.mts.incarnation.as_u64() < 3);
-        assert!(honest, "{name} is not known any more");
+        assert!(honest, "{name} is missing from the directory");
     }
 }
 
-/// The letters that are due go out; those for liars arrive or do not.
+/// Delivers the due letters of both honest gateways. `how` decides if letters to malicious
+/// neighbors succeed.
 fn exchange(
     (here, there): (&mut Exchange, &mut Exchange),
     now: Instant,
@@ -134,7 +136,8 @@ fn exchange(
     }
 }
 
-/// A letter of a liar: JSON that is nearly right, what it was told itself, or any bytes.
+/// Returns a letter of a malicious neighbor: nearly valid JSON, the last letter to that neighbor,
+/// or any bytes.
 fn letter(
     input: &mut Input<'_>,
     last: &BTreeMap<Incarnation, Vec<u8>>,
@@ -181,17 +184,19 @@ fn told(input: &mut Input<'_>) -> serde_json::Value {
     agent
 }
 
-/// What neighbours have told is theirs, and within the bounds.
+/// Checks that every entry belongs to the gateway that sent it and is within the limits.
 fn check(here: &Exchange) {
     let known = here.directory().entries();
     assert!(known.len() <= Exchange::MAX_TOTAL);
     for entry in known.iter() {
-        entry.check().expect("what is taken in keeps to the limits");
+        entry
+            .check()
+            .expect("an accepted entry is within the limits");
         let gateway = entry.mts.incarnation;
-        assert!(gateway != OWN, "{} is said to be here", entry.name);
+        assert!(gateway != OWN, "{} is listed at this gateway", entry.name);
         assert_eq!(entry.source, Source::Exchange);
         let all = entry.locations.iter();
         let own = all.map(Location::incarnation).all(|it| it == gateway);
-        assert!(own, "{} is told at another gateway", entry.name);
+        assert!(own, "{} has a location of another gateway", entry.name);
     }
 }

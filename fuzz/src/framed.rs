@@ -1,8 +1,9 @@
-//! The framed stream and its connection, which TCP, TLS, the Unix socket and QUIC share: bytes of a
-//! peer, between what the honest end does.
+//! The framed stream and its connection, which TCP, TLS, the Unix socket and QUIC share. Bytes of a
+//! peer alternate with operations of the honest end.
 //!
-//! No bytes make the reader or the connection panic, take memory that they did not announce within the
-//! limits, or leave an attempt without exactly one conclusion.
+//! * No bytes make the reader or the connection panic.
+//! * Memory stays within the announced lengths and the limits.
+//! * Every attempt has exactly one conclusion.
 
 use std::time::{Duration, Instant};
 
@@ -13,7 +14,7 @@ use fipa_transport_net::fuzzing::{Framed, answer_body, frame, hello_body, parcel
 
 use crate::input::Input;
 
-/// Plays a connection as the bytes say.
+/// Runs a connection with the bytes and operations that the input encodes.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let how = input.byte();
@@ -43,7 +44,7 @@ pub fn play(bytes: &[u8]) {
                 next += 1;
             }
             4 => {
-                // Only the beginning of a parcel that is said to be long.
+                // The start of a parcel with another announced length.
                 let mut begun = frame(2, next, &written(&parcel(&mut input)));
                 let said = input.number();
                 begun[16..24].copy_from_slice(&said.to_le_bytes());
@@ -69,7 +70,7 @@ pub fn play(bytes: &[u8]) {
     end.close();
 }
 
-/// A parcel with any fields.
+/// Returns a parcel with any fields.
 pub fn parcel(input: &mut Input<'_>) -> Parcel {
     let body = match input.below(6) {
         0 => Body::Credit,
@@ -104,7 +105,7 @@ fn letter(envelope: &[u8], len: usize) -> Letter {
     Letter::new(Bytes::copy_from_slice(envelope), payload)
 }
 
-/// Any answer.
+/// Returns any answer.
 pub fn answer(input: &mut Input<'_>) -> Answer {
     match input.below(7) {
         0 => Answer::Accepted,

@@ -1,13 +1,13 @@
-//! Files of the host's directory: any bytes are an entries file or an error; what is read survives
-//! being written.
+//! Entries files of the host's directory. Any bytes are an entries file or an error. A valid file
+//! is still valid after it is written again.
 
 use fipa_sds::fuzzing::{file_name, read_and_written};
 
-/// Reads the bytes as an entries file, and as the name of one.
+/// Reads the bytes as an entries file, and as the name of an entries file.
 pub fn play(bytes: &[u8]) {
     match read_and_written(bytes) {
         Ok(written) => {
-            read_and_written(&written).expect("what was written is read");
+            read_and_written(&written).expect("a written file can be read");
         }
         Err(error) => assert!(!error.is_empty()),
     }

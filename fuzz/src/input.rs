@@ -1,8 +1,9 @@
-//! Choices drawn from the bytes of an input, in order. Where the bytes end, every choice is the first.
+//! Choices from the bytes of an input, in order. After the last byte, every choice is the first
+//! one.
 
 use std::time::Duration;
 
-/// The bytes of an input that are not used yet.
+/// The unused bytes of an input.
 #[derive(Debug, Clone, Copy)]
 pub struct Input<'a>(pub &'a [u8]);
 
@@ -13,7 +14,7 @@ impl<'a> Input<'a> {
         self.0.is_empty()
     }
 
-    /// The next byte.
+    /// Returns the next byte, or zero after the last one.
     pub fn byte(&mut self) -> u8 {
         let Some((first, rest)) = self.0.split_first() else {
             return 0;
@@ -22,22 +23,23 @@ impl<'a> Input<'a> {
         *first
     }
 
-    /// A number below `count`, which is at most 256.
+    /// Returns a number below `count`, which is at most 256.
     pub fn below(&mut self, count: usize) -> usize {
         usize::from(self.byte()) % count
     }
 
-    /// One of these.
+    /// Returns one of these values.
     pub fn one_of<T: Clone>(&mut self, all: &[T]) -> T {
         all[self.below(all.len())].clone()
     }
 
-    /// A number of eight bytes.
+    /// Returns a number from eight bytes.
     pub fn u64(&mut self) -> u64 {
         u64::from_le_bytes([(); 8].map(|()| self.byte()))
     }
 
-    /// A number as protocols count: mostly small, sometimes at an edge, sometimes any.
+    /// Returns a number for a protocol field: mostly a small one, sometimes an edge value or any
+    /// value.
     pub fn number(&mut self) -> u64 {
         match self.byte() {
             small @ 0..=239 => u64::from(small % 80),
@@ -48,7 +50,7 @@ impl<'a> Input<'a> {
         }
     }
 
-    /// A time as protocols use them: mostly short, sometimes the longest there is.
+    /// Returns a duration: mostly a short one, sometimes zero, very long or the maximum.
     pub fn time(&mut self) -> Duration {
         match self.byte() {
             0 => Duration::ZERO,
@@ -59,7 +61,7 @@ impl<'a> Input<'a> {
         }
     }
 
-    /// Bytes with their length in front, at most this many.
+    /// Returns at most `most` bytes. Their length is in one byte in front.
     pub fn bytes(&mut self, most: usize) -> &'a [u8] {
         let len = usize::from(self.byte()).min(most).min(self.0.len());
         let (taken, rest) = self.0.split_at(len);
@@ -67,7 +69,7 @@ impl<'a> Input<'a> {
         taken
     }
 
-    /// Bytes with their length, of two bytes, in front.
+    /// Returns bytes. Their length is in two bytes in front.
     pub fn long_bytes(&mut self) -> &'a [u8] {
         let len = usize::from(u16::from_le_bytes([self.byte(), self.byte()]));
         let (taken, rest) = self.0.split_at(len.min(self.0.len()));

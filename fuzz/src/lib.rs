@@ -58,7 +58,7 @@ pub fn message_survives(message: &Message) {
     }
     let json = json!({ "message": message_to_json(message) });
     let again = document_from_json(&json).expect("a message survives JSON");
-    // Only if all times are in UTC.
+    // This JSON has no envelope, so it is a message and not a letter.
     assert!(matches!(again, Document::Message(_)));
     let _ = message.to_string();
 }
@@ -78,7 +78,7 @@ pub fn envelope_survives(envelope: &Envelope) {
             });
             assert_eq!(len, written.len());
             if representation == Representation::Xml && dialect == Dialect::Jade {
-                // JADE reads one part only.
+                // JADE reads only one part of an envelope.
                 assert_eq!(again.base, envelope.effective());
             } else {
                 same(&again, envelope, dialect);
@@ -87,7 +87,7 @@ pub fn envelope_survives(envelope: &Envelope) {
     }
 }
 
-/// The dialect of fipa_services has times without a zone.
+/// Checks that both values are the same. The dialect of fipa_services has times without a zone.
 fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: Dialect) {
     if dialect == Dialect::FipaServices {
         let local = |what: &T| format!("{what:?}").replace("zone: Utc", "zone: Unspecified");

@@ -1,7 +1,8 @@
-//! Packets of multicast DNS from several sources, and time.
+//! Multicast DNS packets from several sources, and the passing of time.
 //!
-//! What is counted of each source is what is kept, within the bounds; entries that are found keep to
-//! their limits and survive being announced; only records that were found are gone.
+//! * The counters per source match the stored records and are within the limits.
+//! * Found entries are within their limits and can be announced and read again.
+//! * Only found records are reported as gone.
 
 use std::net::IpAddr;
 use std::time::{Duration, Instant, SystemTime};
@@ -12,7 +13,8 @@ use fipa_transport::Incarnation;
 
 use crate::input::Input;
 
-/// Plays a host as the bytes say: packets with their lengths, and what is put over them.
+/// Runs a host with the packets that the bytes encode: raw packets, and announcements with changed
+/// bytes.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let mut now = Instant::now();
@@ -28,7 +30,7 @@ pub fn play(bytes: &[u8]) {
             8..=12 => {
                 let entry = entry(&mut input);
                 for mut packet in announced(&entry) {
-                    // Some bytes are others on the way.
+                    // Changes some bytes of the packet.
                     for _ in 0..input.below(4) {
                         let at = usize::from(u16::from_le_bytes([input.byte(), input.byte()]));
                         let at = at % packet.len();

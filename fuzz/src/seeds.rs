@@ -1,4 +1,4 @@
-//! Seeds that our own encoders write, or that are drawn, for targets without recorded ones.
+//! Generated and random seeds for targets without recorded ones.
 
 use std::fs;
 use std::path::PathBuf;
@@ -21,7 +21,7 @@ pub fn write(target: &str) {
     }
 }
 
-/// The seeds of a target.
+/// Returns the seeds of a target.
 #[must_use]
 pub fn of(target: &str) -> Vec<Vec<u8>> {
     match target {
@@ -56,7 +56,7 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
     }
 }
 
-/// An entries file as a process writes it.
+/// An entries file in the format that a process writes.
 const HOST: &[u8] = br#"{"format":"fipa-directory","version":1,"mts":{"name":"arm-mts","incarnation":"00000000000000ab"},"entries":[{"name":"arm_left","type":"gripper","incarnation":"00000000000000cd","locations":["shm://00000000000000ab#00000000000000ab"],"description":"left","registered":1795172400000,"role":"agent"},{"name":"rover","incarnation":"00000000000000ce","locations":["tcp://192.0.2.7:7788#00000000000000ac"],"registered":1795172400000,"role":"agent","remote":{"name":"rover-mts","incarnation":"00000000000000ac"},"source":"mdns"}]}"#;
 
 fn entry(role: Role) -> Entry {
@@ -117,7 +117,8 @@ fn config() -> Vec<Vec<u8>> {
     texts.iter().map(|text| text.as_bytes().to_vec()).collect()
 }
 
-/// Inputs of random bytes, the same ones each time, of up to `most` bytes.
+/// Returns inputs of pseudorandom bytes. They are the same in each run. Each input has 16 to
+/// `most + 15` bytes.
 fn drawn(count: u64, most: usize) -> Vec<Vec<u8>> {
     // SplitMix64.
     let mut state = 0_u64;

@@ -1,5 +1,5 @@
-//! Descriptors in shared memory: headers of requests, with payloads of any length, and answers. Every
-//! place that a header announces lies in the payload.
+//! Descriptors in shared memory: headers of requests with payloads of any length, and answers.
+//! Every range that an accepted header announces is within the payload.
 
 use fipa_transport_shm::fuzzing::{HEADER_LEN, ack, header};
 
@@ -16,7 +16,7 @@ pub fn play(bytes: &[u8]) {
         return;
     };
     let mut head = *head;
-    // The version, so that what lies behind is looked at.
+    // A valid version, so that the parser reads the fields behind it.
     if kind % 4 != 1 {
         head[..4].copy_from_slice(&fipa_transport_shm::fuzzing::VERSION.to_le_bytes());
         head[4] %= 16;

@@ -1,8 +1,8 @@
-//! Texts from outside: names in certificates and certificates themselves, locations, names of agents,
-//! patterns.
+//! Untrusted texts: certificates and their names, locations, agent names, and patterns.
 //!
-//! What is read survives being written; nothing that is accepted can draw on a terminal; patterns of a
-//! legacy peer match as the names they stand for.
+//! * An accepted text is the same after it is written and read again.
+//! * No accepted name contains unprintable characters.
+//! * A name matches itself as the pattern of a legacy peer.
 
 use fipa_acl::is_unprintable;
 use fipa_sds::{Matcher, Pattern, check_name, is_legacy_pattern, is_pattern};
@@ -10,7 +10,7 @@ use fipa_transport::Location;
 use fipa_transport_net::fuzzing::certified;
 use fipa_transport_net::secure::{Certificate, Certified, alternative_names};
 
-/// Reads the bytes as each kind of text.
+/// Reads the bytes as the kind of text that the first byte selects.
 pub fn play(bytes: &[u8]) {
     let Some((kind, rest)) = bytes.split_first() else {
         return;
@@ -70,7 +70,7 @@ fn names(certified: &Certified) {
     }
     let uris = alternative_names(certified.mts(), agents);
     let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
-    let again = super::texts::certified(&uris).expect("what was read can be written");
+    let again = super::texts::certified(&uris).expect("accepted names can be written");
     assert_eq!(&again, certified);
     assert!(certified.speaks_for(certified.mts()));
 }

@@ -1,4 +1,4 @@
-//! Datagrams: the UDP transport's, and QUIC's.
+//! Datagrams of the UDP transport and of QUIC.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -11,10 +11,10 @@ use tokio::time::{sleep, timeout};
 
 use super::{Script, Writer, mutate};
 
-/// Longest datagram that is read.
+/// Maximum length of a received datagram, in bytes.
 const LARGEST: usize = 65_536;
 
-/// How long an answer is waited for.
+/// Timeout for an answer, for opening a stream and for a write.
 const PATIENCE: Duration = Duration::from_millis(500);
 
 async fn socket(to: SocketAddr) -> UdpSocket {
@@ -23,13 +23,13 @@ async fn socket(to: SocketAddr) -> UdpSocket {
     socket
 }
 
-/// Each piece is a datagram.
+/// Sends each piece as a datagram. Returns the number of bytes sent.
 pub(crate) async fn raw(to: SocketAddr, script: Script) -> u64 {
     let socket = socket(to).await;
     let mut sent = 0;
     for (mut piece, pause) in script.pieces {
         piece.truncate(60_000);
-        // The socket may be full, which is as good as lost on the way.
+        // A full socket buffer counts as a lost datagram.
         if socket.send(&piece).await.is_ok() {
             sent += piece.len() as u64;
         }
@@ -45,7 +45,7 @@ fn header(kind: u8, to: u64) -> Vec<u8> {
     bytes
 }
 
-/// A hello of the UDP transport.
+/// Returns a hello of the UDP transport.
 pub(crate) fn hello(number: u64, cookie: &[u8], body: &[u8]) -> Vec<u8> {
     let mut bytes = header(1, 0);
     bytes.extend(number.to_le_bytes());
@@ -56,8 +56,8 @@ pub(crate) fn hello(number: u64, cookie: &[u8], body: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Opens a connection of the UDP transport and says something over it, with mistakes. Nothing when
-/// it was not let in.
+/// Opens a connection of the UDP transport and sends packets with mutations. Returns the number of
+/// bytes sent, or `None` if the handshake failed.
 pub(crate) async fn udp(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> {
     let socket = socket(to).await;
     let number = writer.random.u64(1..);
@@ -123,7 +123,7 @@ pub(crate) async fn udp(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> 
     Some(sent)
 }
 
-/// The first datagram of a connection that a peer of ours opens.
+/// Returns the first datagram of a QUIC connection with this configuration.
 pub(crate) async fn initial(config: &ClientConfig) -> Vec<u8> {
     let trap = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
@@ -135,8 +135,9 @@ pub(crate) async fn initial(config: &ClientConfig) -> Vec<u8> {
     packet
 }
 
-/// Opens a QUIC connection as a peer that is trusted, through a relay that makes mistakes if asked
-/// for, and writes into its streams. Nothing when it was not let in.
+/// Opens a QUIC connection as a trusted peer and writes to its streams. If `relayed` is set, the
+/// datagrams pass a relay that mutates some of them. Returns the number of bytes written, or `None`
+/// if the handshake failed.
 pub(crate) async fn quic(
     to: SocketAddr,
     config: ClientConfig,
@@ -172,7 +173,7 @@ pub(crate) async fn quic(
             _ => break,
         }
         if let Some(mut letter) = letter {
-            // The connection may be lost by now.
+            // An error means that the connection is lost, which is allowed.
             let _ = match random.u8(..8) {
                 0 => letter.reset(VarInt::from_u32(7)).is_ok(),
                 _ => letter.finish().is_ok(),
@@ -188,7 +189,7 @@ pub(crate) async fn quic(
     Some(written)
 }
 
-/// Stands between a peer and the gateway and spoils some of the datagrams.
+/// A relay between a peer and the gateway. It mutates some datagrams of the peer.
 struct Relay {
     at: SocketAddr,
     task: tokio::task::JoinHandle<()>,
@@ -212,7 +213,7 @@ impl Relay {
                         }
                         for mut packet in packets {
                             packet.truncate(60_000);
-                            // A full socket loses it, as a network does.
+                            // A full socket buffer counts as a lost datagram.
                             let _ = back.send(&packet).await;
                         }
                     }

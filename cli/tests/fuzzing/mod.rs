@@ -1,5 +1,4 @@
-//! What is said to a gateway to find out whether it bears it: valid conversations, and what a seeded
-//! generator makes of them.
+//! Input for a gateway under test: valid conversations, and seeded random mutations of them.
 
 #![allow(dead_code, reason = "not every test uses all of it")]
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
@@ -17,13 +16,13 @@ use fipa_testbed::frame;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{Body, FailureReason, Incarnation, Outcome, Parcel, Report, Stream};
 
-/// Letters that legacy peers sent: a fipa_services peer in its own dialect, and in JADE's.
+/// Recorded letters of legacy peers: a fipa_services peer in its own dialect, and in JADE's.
 const LEGACY_PEERS: [&[u8]; 2] = [
     include_bytes!("../../../transport-net/tests/data/tcp_letter.bin"),
     include_bytes!("../../../transport-net/tests/data/tcp_letter_jade.bin"),
 ];
 
-/// Numbers at which lengths and counters go wrong.
+/// Values at the limits of lengths and counters.
 const EDGES: [u64; 14] = [
     0,
     1,
@@ -45,43 +44,43 @@ pub(crate) const HELLO: u8 = 1;
 pub(crate) const PARCEL: u8 = 2;
 const ANSWER: u8 = 3;
 
-/// What becomes of a connection when everything has been said.
+/// Behavior of the peer after the last piece.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ending {
-    /// It is closed at once.
+    /// Closes the connection at once.
     Drop,
-    /// Nothing more is written; what comes is read for a while.
+    /// Shuts down the write side, then reads for at most `patience`.
     Finish,
-    /// It stays as it is for a while, and what comes is read.
+    /// Keeps the connection open and reads for at most `patience`.
     Linger,
-    /// It stays as it is for a while, and nothing is read.
+    /// Keeps the connection open for `patience` without reading.
     Deaf,
 }
 
 /// One conversation.
 #[derive(Debug)]
 pub(crate) struct Script {
-    /// What is written, and how long is waited afterwards.
+    /// The pieces to write, each with the pause after it.
     pub(crate) pieces: Vec<(Vec<u8>, Duration)>,
     pub(crate) ending: Ending,
     pub(crate) patience: Duration,
 }
 
-/// Writes conversations.
+/// Generates conversations.
 pub(crate) struct Writer<'a> {
     pub(crate) random: &'a mut Rng,
-    /// What the other side believes the speaker is called.
+    /// Service name in each hello.
     pub(crate) name: &'a str,
-    /// To whom letters go.
+    /// Names of the receivers.
     pub(crate) receivers: &'a [String],
-    /// Registrations that the other side knows, by name: with a true one a letter gets past admission.
+    /// Registrations of existing agents, by name. A letter to one of them passes admission.
     pub(crate) known: &'a [(String, Incarnation)],
-    /// Registrations that the speaker claims to be, or to send for, beside made-up ones.
+    /// Registrations that hellos and parcels claim as the sender, in addition to random ones.
     pub(crate) claimed: &'a [Incarnation],
 }
 
 impl Writer<'_> {
-    /// Frames as they stand on a connection, with mistakes.
+    /// Returns the frames of a connection, with mutations.
     pub(crate) fn frames(&mut self) -> Script {
         let mut pieces = vec![frame(HELLO, 0, &self.hello())];
         for id in 1..=self.random.u64(0..6) {
@@ -95,7 +94,7 @@ impl Writer<'_> {
         self.script(pieces)
     }
 
-    /// A letter of a legacy peer, with mistakes.
+    /// Returns a letter of a legacy peer, with mutations.
     pub(crate) fn legacy_peer(&mut self) -> Script {
         let letter = LEGACY_PEERS[self.random.usize(..LEGACY_PEERS.len())];
         let pieces = letter.chunks(self.random.usize(16..600));
@@ -103,7 +102,7 @@ impl Writer<'_> {
         self.script(pieces)
     }
 
-    /// Bytes that were recorded, with mistakes.
+    /// Returns these recorded pieces, with mutations.
     pub(crate) fn recorded(&mut self, pieces: &[Vec<u8>]) -> Script {
         self.script(pieces.to_vec())
     }
@@ -112,7 +111,7 @@ impl Writer<'_> {
         for _ in 0..self.random.usize(..5) {
             mutate(self.random, &mut pieces);
         }
-        // Not all of it in the pieces that were meant.
+        // Splits some pieces at random positions.
         let mut script = Vec::new();
         for mut piece in pieces {
             while self.random.u8(..4) == 0 && piece.len() > 1 {
@@ -139,7 +138,8 @@ impl Writer<'_> {
         Duration::from_millis(self.random.u64(..most))
     }
 
-    /// The true registration of a receiver, most often.
+    /// Returns the known registration of a receiver in seven of eight cases, otherwise a number
+    /// below four.
     fn life_of(&mut self, receiver: &str) -> Incarnation {
         let known = self.known.iter().find(|(name, _)| name == receiver);
         match known {
@@ -148,7 +148,7 @@ impl Writer<'_> {
         }
     }
 
-    /// A registration that is not the speaker's.
+    /// Returns one of the registrations to claim, or a random one if there are none.
     fn claim(&mut self) -> u64 {
         match self.claimed {
             [] => self.random.u64(1..),
@@ -156,7 +156,7 @@ impl Writer<'_> {
         }
     }
 
-    /// A number of a letter.
+    /// Returns a sequence number: a small one, or in one of eight cases an edge value.
     fn counted(&mut self) -> u64 {
         match self.random.u8(..8) {
             0 => self.edge(),
@@ -168,7 +168,7 @@ impl Writer<'_> {
         EDGES[self.random.usize(..EDGES.len())]
     }
 
-    /// How somebody introduces himself.
+    /// Returns the body of a hello.
     pub(crate) fn hello(&mut self) -> Vec<u8> {
         let mut body = Vec::new();
         let service = match self.random.u8(..8) {
@@ -194,7 +194,7 @@ impl Writer<'_> {
         body
     }
 
-    /// A parcel as it stands in frames and packets.
+    /// Returns a random parcel in its encoding for frames and packets.
     pub(crate) fn parcel(&mut self) -> Vec<u8> {
         let receiver = &self.receivers[self.random.usize(..self.receivers.len())];
         let body = match self.random.u8(..12) {
@@ -231,7 +231,8 @@ impl Writer<'_> {
         written(&parcel)
     }
 
-    /// A parcel with a letter of so many bytes to nobody.
+    /// Returns a parcel with a letter that has `len` bytes of content. Its stream has random
+    /// registrations.
     pub(crate) fn letter_of(&mut self, len: usize) -> Vec<u8> {
         let letter = letter_with(self.random, &self.receivers[0], vec![7; len]);
         written(&Parcel {
@@ -248,7 +249,7 @@ impl Writer<'_> {
         })
     }
 
-    /// The body of an answer.
+    /// Returns the body of an answer.
     pub(crate) fn answer(&mut self) -> Vec<u8> {
         let mut body = vec![self.random.u8(..6)];
         body.extend(
@@ -261,7 +262,7 @@ impl Writer<'_> {
     }
 }
 
-/// A parcel as it stands in frames and packets.
+/// Returns the encoding of the parcel for frames and packets.
 fn written(parcel: &Parcel) -> Vec<u8> {
     let (header, pieces) = ParcelHeader::of(parcel).unwrap();
     let mut bytes = zerocopy::IntoBytes::as_bytes(&header).to_vec();
@@ -269,7 +270,7 @@ fn written(parcel: &Parcel) -> Vec<u8> {
     bytes
 }
 
-/// A letter that is one, of somebody who is nobody.
+/// Returns a valid letter from an agent that is not registered.
 fn letter(random: &mut Rng, receiver: &str) -> Letter {
     let content = match random.u8(..4) {
         0 => (0..random.usize(..200)).map(|_| random.u8(..)).collect(),
@@ -293,7 +294,7 @@ fn letter_with(random: &mut Rng, receiver: &str, content: Vec<u8>) -> Letter {
         base,
         extensions: Vec::new(),
     };
-    // What gateways say to each other is in letters as well.
+    // Gateways also use letters for the messages between them.
     let ontology = ["fipa-sds-exchange", "fipa-agent-management", "tea"][random.usize(..3)];
     let performative = [
         Performative::Inform,
@@ -312,7 +313,7 @@ fn letter_with(random: &mut Rng, receiver: &str, content: Vec<u8>) -> Letter {
     Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
 }
 
-/// Makes one mistake.
+/// Applies one random mutation to the pieces.
 pub(crate) fn mutate(random: &mut Rng, pieces: &mut Vec<Vec<u8>>) {
     if pieces.is_empty() {
         pieces.push(vec![random.u8(..)]);
@@ -321,11 +322,11 @@ pub(crate) fn mutate(random: &mut Rng, pieces: &mut Vec<Vec<u8>>) {
     let piece = &mut pieces[at];
     let len = piece.len();
     match random.u8(..12) {
-        // A bit,
+        // Flips a bit.
         0 | 1 if len > 0 => piece[random.usize(..len)] ^= 1 << random.u8(..8),
-        // a byte,
+        // Replaces a byte.
         2 if len > 0 => piece[random.usize(..len)] = random.u8(..),
-        // a number, most often near the beginning, where lengths stand,
+        // Overwrites a number, in half of the cases near the start, where the lengths are.
         3..=5 if len > 0 => {
             let near = if random.bool() { len.min(96) } else { len };
             let from = random.usize(..near);
@@ -335,16 +336,16 @@ pub(crate) fn mutate(random: &mut Rng, pieces: &mut Vec<Vec<u8>>) {
                 *byte = *new;
             }
         }
-        // a cut,
+        // Truncates a piece.
         6 => piece.truncate(random.usize(..=len)),
-        // something between,
+        // Inserts random bytes.
         7 => {
             let extra = (0..random.usize(1..64)).map(|_| random.u8(..));
             let extra: Vec<u8> = extra.collect();
             let from = random.usize(..=len);
             piece.splice(from..from, extra);
         }
-        // something twice, left out, in another order, or of something else.
+        // Repeats, removes or swaps a piece, or replaces its end by the end of another piece.
         8 => {
             let again = piece.clone();
             pieces.insert(other, again);

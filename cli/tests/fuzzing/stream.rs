@@ -1,4 +1,4 @@
-//! Connections over TCP, in the clear and with TLS.
+//! Connections over TCP, without and with TLS.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use tokio_rustls::TlsConnector;
 
 use super::{Ending, Script};
 
-/// Says something in the clear.
+/// Runs the script without TLS. Returns the number of bytes written.
 pub(crate) async fn plain(to: SocketAddr, script: Script) -> u64 {
     match TcpStream::connect(to).await {
         Ok(stream) => perform(stream, script).await,
@@ -20,7 +20,8 @@ pub(crate) async fn plain(to: SocketAddr, script: Script) -> u64 {
     }
 }
 
-/// Says something as a peer that is trusted. Nothing when that did not work.
+/// Runs the script over TLS as a trusted peer. Returns the number of bytes written, or `None` if
+/// the connection or the TLS handshake failed.
 pub(crate) async fn secured(
     to: SocketAddr,
     config: Arc<rustls::ClientConfig>,
@@ -32,7 +33,7 @@ pub(crate) async fn secured(
     Some(perform(stream.ok()?, script).await)
 }
 
-/// What a peer of ours says first.
+/// Returns the first bytes of a TLS client with this configuration.
 pub(crate) fn client_hello(config: &Arc<rustls::ClientConfig>) -> Vec<u8> {
     let name = ServerName::try_from("127.0.0.1").unwrap();
     let mut client = rustls::ClientConnection::new(config.clone(), name).unwrap();
@@ -41,12 +42,12 @@ pub(crate) fn client_hello(config: &Arc<rustls::ClientConfig>) -> Vec<u8> {
     hello
 }
 
-/// Bytes that were written.
+/// Runs the script. Returns the number of bytes written.
 async fn perform(stream: impl AsyncRead + AsyncWrite + Unpin, script: Script) -> u64 {
     let (mut read, mut write) = tokio::io::split(stream);
     let mut written = 0;
     for (piece, pause) in script.pieces {
-        // Whoever has had enough hangs up, or reads no more.
+        // The gateway may close the connection or stop reading.
         match timeout(Duration::from_secs(1), write.write_all(&piece)).await {
             Ok(Ok(())) => written += piece.len() as u64,
             _ => return written,
@@ -55,7 +56,7 @@ async fn perform(stream: impl AsyncRead + AsyncWrite + Unpin, script: Script) ->
             sleep(pause).await;
         }
     }
-    // The gateway may be gone by now; whether it should be is not for this side to say.
+    // The gateway may have closed the connection, which is allowed.
     let _ = write.flush().await;
     match script.ending {
         Ending::Drop => {}

@@ -1,4 +1,4 @@
-//! TLS as a peer with keys, who asks nobody who they are.
+//! TLS configurations of a peer with keys that accepts every server certificate.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use rustls::ClientConfig;
 use rustls::crypto::ring;
 use rustls::version::TLS13;
 
-/// As the peer with this name and these keys, over TCP.
+/// Returns the configuration of the peer with this name and these keys, for TLS over TCP.
 pub(crate) fn client(keys: &Keys, name: &str) -> Arc<ClientConfig> {
     let credentials = keys.credentials_of(name).unwrap();
     let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()));
@@ -23,7 +23,7 @@ pub(crate) fn client(keys: &Keys, name: &str) -> Arc<ClientConfig> {
     Arc::new(config)
 }
 
-/// The same over QUIC.
+/// Returns the same configuration for QUIC.
 pub(crate) fn quic(tls: &Arc<ClientConfig>) -> quinn::ClientConfig {
     let mut tls = (**tls).clone();
     tls.alpn_protocols = vec![b"fipa/1".to_vec()];

@@ -1,5 +1,5 @@
-//! Peers who mean no good, each at an address of its own on the loopback network, and somebody who
-//! takes whatever comes.
+//! Hostile peers, each with its own address on the loopback network, and a sink that reads and
+//! discards all input.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -9,37 +9,37 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpSocket, TcpStream, UdpSocket};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
-/// What they do. Each rate is that of one peer.
+/// Behavior of a hostile peer. Each rate is per peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Vice {
-    /// Opens connections and says nothing.
+    /// Opens connections and sends nothing.
     Silence,
-    /// Begins a handshake and goes on with a byte every 50 ms.
+    /// Sends a TLS handshake at one byte per 50 ms.
     Slowness,
-    /// Opens connections and writes what means nothing, 20 times a second.
+    /// Opens connections and writes bytes of no protocol, 20 times per second.
     Garbage,
-    /// Opens connections and closes them, 100 times a second.
+    /// Opens connections and closes them, 100 times per second.
     Reconnecting,
-    /// Has the other side begin a TLS handshake, and leaves, 50 times a second.
+    /// Starts TLS handshakes and closes the connection after the first answer, 50 times per second.
     Handshakes,
-    /// Writes 2,000 letters a second.
+    /// Writes 2,000 letters per second.
     Letters,
-    /// Announces letters of 60 MiB and sends them drop by drop.
+    /// Announces letters of 60 MiB and sends 64 bytes of them every 100 ms.
     Announcing,
-    /// Writes 500 letters a second and never reads what is said about them.
+    /// Writes 500 letters per second and never reads the answers.
     Deafness,
-    /// Begins UDP connections, 500 times a second.
+    /// Starts UDP connections, 500 times per second.
     Hellos,
-    /// Begins QUIC connections, 200 times a second.
+    /// Starts QUIC connections, 200 times per second.
     Initials,
 }
 
 use Vice::*;
 
-/// How many there are.
+/// Number of hostile peers.
 pub(crate) const PEERS: u8 = 50;
 
-/// What those do who come to a gateway with keys; whom it does not trust never gets to letters.
+/// Behaviors against a gateway with keys. The gateway never reads letters of untrusted peers.
 pub(crate) const AT_KEYS: [Vice; 10] = [
     Silence,
     Slowness,
@@ -53,7 +53,7 @@ pub(crate) const AT_KEYS: [Vice; 10] = [
     Initials,
 ];
 
-/// What those do who come to a gateway in the clear.
+/// Behaviors against a gateway without keys.
 pub(crate) const IN_THE_CLEAR: [Vice; 10] = [
     Silence,
     Slowness,
@@ -67,22 +67,22 @@ pub(crate) const IN_THE_CLEAR: [Vice; 10] = [
     Reconnecting,
 ];
 
-/// What they know and have.
+/// Target addresses and prepared bytes of the hostile peers.
 #[derive(Debug, Default)]
 pub(crate) struct Means {
     pub(crate) tcp: Option<SocketAddr>,
     pub(crate) datagrams: Option<SocketAddr>,
-    /// The beginning of a TLS handshake.
+    /// The start of a TLS handshake.
     pub(crate) client_hello: Vec<u8>,
     /// First datagrams of QUIC connections.
     pub(crate) initials: Vec<Vec<u8>>,
     /// A hello of the UDP transport.
     pub(crate) hello: Vec<u8>,
-    /// A hello, as it stands on connections.
+    /// A hello, as a frame of a connection.
     pub(crate) greeting: Vec<u8>,
-    /// A small letter, as it stands on connections.
+    /// A small letter, as a frame of a connection.
     pub(crate) letter: Vec<u8>,
-    /// The beginning of a large one.
+    /// The start of a frame with a large letter.
     pub(crate) announcement: Vec<u8>,
 }
 
@@ -90,7 +90,7 @@ fn address(peer: u8) -> IpAddr {
     IpAddr::V4(Ipv4Addr::new(127, 0, 1, peer + 1))
 }
 
-/// Does what they do, until the runtime ends.
+/// Starts all hostile peers. They run until the runtime ends.
 pub(crate) fn set_off(vices: &[Vice], means: &Arc<Means>) {
     for peer in 0..PEERS {
         let vice = vices[usize::from(peer) % vices.len()];
@@ -130,22 +130,22 @@ async fn indulge(vice: Vice, from: IpAddr, means: Arc<Means>) {
 
 fn pace(per_second: u64) -> tokio::time::Interval {
     let mut pace = interval(Duration::from_secs(1) / u32::try_from(per_second).unwrap());
-    // A timer goes off every millisecond at most; what was missed is made up for.
+    // A timer fires at most once per millisecond. Missed ticks follow in a burst.
     pace.set_missed_tick_behavior(MissedTickBehavior::Burst);
     pace
 }
 
 async fn connect(from: IpAddr, means: &Means) -> Option<TcpStream> {
     let socket = TcpSocket::new_v4().unwrap();
-    // Closed with a reset, so that ports do not run out.
+    // Closing with a reset avoids TIME_WAIT, so that the ports suffice.
     socket.set_zero_linger().ok()?;
     socket.bind((from, 0).into()).ok()?;
     let connecting = socket.connect(means.tcp?);
     timeout(Duration::from_secs(2), connecting).await.ok()?.ok()
 }
 
-/// What is done on one connection, until the other side has had enough. Whatever is written may not
-/// arrive any more, which ends it.
+/// Runs the behavior on one connection until the gateway closes it. A failed write ends the
+/// connection.
 async fn connection(
     vice: Vice,
     mut stream: TcpStream,
@@ -170,7 +170,7 @@ async fn connection(
         }
         Handshakes => {
             if stream.write_all(&means.client_hello).await.is_ok() {
-                // Until it has been answered.
+                // Waits for the first answer.
                 let _ = timeout(Duration::from_secs(2), stream.read(&mut sink)).await;
             }
         }
@@ -229,7 +229,7 @@ async fn datagrams(vice: Vice, from: IpAddr, means: &Means, per_second: u64) {
     }
 }
 
-/// Takes whatever comes and does nothing about it; says where.
+/// Starts a sink that reads and discards all input. Returns its TCP and UDP addresses.
 pub(crate) async fn sink() -> (SocketAddr, SocketAddr) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
@@ -239,7 +239,7 @@ pub(crate) async fn sink() -> (SocketAddr, SocketAddr) {
             tokio::spawn(async move {
                 let mut bytes = [0; 4096];
                 let taking = async { while matches!(stream.read(&mut bytes).await, Ok(1..)) {} };
-                // As long as a gateway waits for those who say nothing.
+                // The timeout of a gateway for silent peers.
                 let _ = timeout(Duration::from_secs(5), taking).await;
             });
         }
@@ -247,7 +247,7 @@ pub(crate) async fn sink() -> (SocketAddr, SocketAddr) {
     tokio::spawn(async move {
         let mut bytes = vec![0; 65_536];
         loop {
-            // What cannot be received is not missed.
+            // Receive errors are irrelevant for the sink.
             let _ = socket.recv_from(&mut bytes).await;
         }
     });

@@ -1,5 +1,5 @@
-//! Two gateway processes and an honest pair of agents that talk through them, whatever others do to
-//! the gateways meanwhile.
+//! Two gateway processes, and an honest pair of agents that exchanges letters through them while a
+//! test attacks the gateways.
 
 #![allow(dead_code, reason = "not every test uses all of it")]
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
@@ -24,64 +24,64 @@ use parking_lot::Mutex;
 use serde_json::Value;
 use tokio::runtime::Runtime;
 
-/// Ends what hangs; nothing is expected to take this long.
+/// Timeout that ends a hung test.
 pub(crate) const WATCHDOG: Duration = Duration::from_secs(90);
 
-/// Lines of a gateway's log that are kept, the latest.
+/// Maximum number of stored log lines per gateway. The oldest ones are dropped.
 const LINES: usize = 200;
 
-/// What the content of the pair's letters begins with.
+/// Prefix of the content of the honest pair's letters.
 const HONEST: &str = "honest ";
 
 /// Waits for a condition.
 pub(crate) fn until(what: &str, condition: impl Fn() -> bool) {
     let begun = Instant::now();
     while !condition() {
-        assert!(begun.elapsed() < WATCHDOG, "never: {what}");
+        assert!(begun.elapsed() < WATCHDOG, "timed out waiting until {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }
 
-/// The number in this environment variable.
+/// Returns the number in this environment variable.
 pub(crate) fn number(variable: &str) -> Option<u64> {
     let text = std::env::var(variable).ok()?;
     Some(
         text.parse()
-            .unwrap_or_else(|_| panic!("{variable} is no number: {text}")),
+            .unwrap_or_else(|_| panic!("{variable} is not a number: {text}")),
     )
 }
 
-/// Keys in this directory, of a service with this name.
+/// Creates keys in this directory for a service with this name.
 pub(crate) fn keys(dir: impl Into<std::path::PathBuf>, name: &str) -> Keys {
     let keys = Keys::at(dir);
     keys.init(name, &[], VALID).unwrap();
     keys
 }
 
-/// Each trusts the other.
+/// Makes each of two services trust the other one.
 pub(crate) fn befriend(one: &Keys, other: &Keys) {
     one.trust(&fs::read(other.own_file()).unwrap()).unwrap();
     other.trust(&fs::read(one.own_file()).unwrap()).unwrap();
 }
 
-/// What a process uses.
+/// Resources of a process.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Usage {
-    /// Memory that it has, in KiB.
+    /// Resident memory, in KiB.
     pub(crate) resident: u64,
     pub(crate) descriptors: usize,
-    /// Time on a processor so far.
+    /// Processor time since the start.
     pub(crate) processor: Duration,
 }
 
-/// What the process with this number uses.
+/// Returns the resource usage of the process with this identifier.
 pub(crate) fn usage(process: u32) -> Usage {
     let proc = format!("/proc/{process}");
     let status = fs::read_to_string(format!("{proc}/status")).unwrap();
     let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
     let resident = resident.unwrap().trim_end_matches("kB").trim();
     let stat = fs::read_to_string(format!("{proc}/stat")).unwrap();
-    // Fields 14 and 15 of proc_pid_stat(5); the name, which may have blanks, ends with the last ).
+    // Fields 14 and 15 of proc_pid_stat(5). The name may contain blanks and ends at the last `)`.
     let fields: Vec<&str> = stat
         .rsplit_once(')')
         .unwrap()
@@ -99,7 +99,7 @@ pub(crate) fn usage(process: u32) -> Usage {
     }
 }
 
-/// A gateway process; killed when it is dropped.
+/// A gateway process. Dropping it kills the process.
 pub(crate) struct Gateway {
     child: Child,
     pub(crate) settings: Vec<String>,
@@ -108,7 +108,7 @@ pub(crate) struct Gateway {
 }
 
 impl Gateway {
-    /// Starts it with a command for the program, and waits until it is ready.
+    /// Starts the gateway with this command of the program, and waits until it is ready.
     pub(crate) fn start(mut command: Command, settings: Vec<String>) -> Self {
         command.args(["up", "--json"]);
         for setting in &settings {
@@ -122,7 +122,7 @@ impl Gateway {
         std::thread::spawn(move || {
             for line in BufReader::new(errors).lines().map_while(Result::ok) {
                 let mut kept = keep.lock();
-                // What it complains of when it panics is worth more than what others did to it.
+                // A panic message is always stored.
                 if kept.len() >= LINES && !line.contains("panicked") {
                     kept.remove(0);
                 }
@@ -147,7 +147,7 @@ impl Gateway {
         }
     }
 
-    /// Where it is, as others are told in `discovery.static`.
+    /// Returns the `discovery.static` setting with the locations of this gateway.
     pub(crate) fn known_as(&self, name: &str) -> String {
         let network = self.locations.iter().filter(|it| !it.starts_with("shm"));
         let locations: Vec<String> = network.map(|location| format!("{location:?}")).collect();
@@ -157,7 +157,7 @@ impl Gateway {
         )
     }
 
-    /// Where it listens, by this kind of transport.
+    /// Returns the listening address of this kind of transport.
     pub(crate) fn at(&self, kind: &str) -> SocketAddr {
         let mut locations = self.locations.iter();
         let found = locations.find_map(|it| it.strip_prefix(kind)?.strip_prefix("://"));
@@ -168,12 +168,15 @@ impl Gateway {
         usage(self.child.id())
     }
 
-    /// Ends it in good order.
+    /// Ends the gateway with SIGTERM and checks that it exits successfully.
     pub(crate) fn end(mut self) {
         let told = self.told.lock().join("\n");
         assert!(!told.contains("panicked"), "{told}");
         let ended = self.child.try_wait().unwrap();
-        assert!(ended.is_none(), "it has ended before ({ended:?}): {told}");
+        assert!(
+            ended.is_none(),
+            "the gateway has already ended ({ended:?}): {told}"
+        );
         let pid = self.child.id().to_string();
         let sent = Command::new("kill").args(["-TERM", &pid]).status().unwrap();
         assert!(sent.success());
@@ -194,15 +197,15 @@ impl Gateway {
 
 impl Drop for Gateway {
     fn drop(&mut self) {
-        // It may have ended already, which is as good.
+        // An error means that the process has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// Two gateways that know each other, and an agent on the host of each.
+/// Two connected gateways, and an agent on the host of each.
 pub(crate) struct Pair {
-    /// The one that others may do something to.
+    /// The gateway that a test may attack.
     pub(crate) gateway: Gateway,
     other: Gateway,
     pub(crate) rover: Party,
@@ -210,7 +213,8 @@ pub(crate) struct Pair {
 }
 
 impl Pair {
-    /// With keys in directories of this place, or without any. `what` tells its domains from others.
+    /// Starts the pair, with keys in directories below `place`, or without keys. `what` makes the
+    /// names of its domains unique.
     pub(crate) fn new(place: &Path, secured: bool, what: &str) -> Self {
         let mark = if secured { "keys" } else { "clear" };
         let mark = format!("{what}-{}-{mark}", std::process::id());
@@ -230,7 +234,7 @@ impl Pair {
                 "discovery.mdns=false".to_owned(),
                 // Two hosts on one machine.
                 "security.loopback=true".to_owned(),
-                // Whoever waits this long waits for ever, on the busiest machine.
+                // Long enough for a busy machine.
                 "mts.deadline=60s".to_owned(),
             ];
             match secured {
@@ -258,8 +262,7 @@ impl Pair {
         }
     }
 
-    /// The registrations that the first gateway's host knows, by name: its own agent, the gateways and
-    /// the agent of the other host.
+    /// Returns the registrations of both agents and both gateways, by name.
     pub(crate) fn registrations(&self) -> Vec<(String, Incarnation)> {
         self.arm.knows("rover");
         let entries = self.arm.agent.domain().directory().entries();
@@ -279,12 +282,12 @@ impl Pair {
         gateway.unwrap().incarnation
     }
 
-    /// Letters of others than the pair that the agent of the first host has received.
+    /// Returns the number of foreign letters that the agent of the first host has received.
     pub(crate) fn strange(&self) -> u64 {
         self.arm.strange.load(Ordering::Relaxed)
     }
 
-    /// Ends all of it in good order.
+    /// Ends both agents and both gateways in order.
     pub(crate) fn end(self) {
         self.rover.end();
         self.arm.end();
@@ -297,12 +300,12 @@ impl Pair {
 pub(crate) struct Party {
     runtime: Runtime,
     agent: Arc<Agent>,
-    /// Letters of others than the pair, while it answers.
+    /// Number of letters from other senders than the pair, counted by [`answer`](Self::answer).
     strange: Arc<AtomicU64>,
 }
 
 impl Party {
-    /// On the host of the gateway with these settings.
+    /// Registers an agent on the host of the gateway with these settings.
     pub(crate) fn new(settings: &[String], name: &str) -> Self {
         let sources = Sources {
             set: settings.to_vec(),
@@ -320,7 +323,7 @@ impl Party {
         }
     }
 
-    /// Answers every honest letter with what it says, and takes none twice.
+    /// Answers every honest letter with its own content. A repeated letter panics.
     pub(crate) fn answer(&self) {
         let (agent, strange) = (Arc::clone(&self.agent), Arc::clone(&self.strange));
         self.runtime.spawn(async move {
@@ -335,15 +338,15 @@ impl Party {
                     strange.fetch_add(1, Ordering::Relaxed);
                     continue;
                 };
-                assert!(taken.insert(content.clone()), "twice: {content}");
+                assert!(taken.insert(content.clone()), "received twice: {content}");
                 let answer = agent.reply(&incoming.message, Performative::Inform);
-                // The other side says whether it has come.
+                // The other agent checks that the answer arrives.
                 drop(agent.send(answer.content(content).build().unwrap()));
             }
         });
     }
 
-    /// Writes letters to an agent that answers, one after the other, until it is told to end.
+    /// Sends letters to an answering agent, one after the other, until [`Talk::end`].
     pub(crate) fn talk(&self, to: &str) -> Talk {
         let (agent, to) = (Arc::clone(&self.agent), AgentId::new(to).unwrap());
         let stop = Arc::new(AtomicBool::new(false));
@@ -368,20 +371,20 @@ impl Party {
         }
     }
 
-    /// Waits until it knows an agent of the other host.
+    /// Waits until the directory has an agent of the other host.
     pub(crate) fn knows(&self, name: &str) {
-        until("the agent of the other host is known", || {
+        until("the directory has the agent of the other host", || {
             self.agent.domain().directory().lookup(name).is_some()
         });
     }
 
     pub(crate) fn end(self) {
-        // Whoever answers holds the agent.
+        // The answering task holds a reference to the agent.
         self.runtime.shutdown_timeout(Duration::from_secs(5));
     }
 }
 
-/// Letters of the honest pair, one after the other.
+/// A running exchange of letters of the honest pair.
 pub(crate) struct Talk {
     stop: Arc<AtomicBool>,
     said: Arc<AtomicU64>,
@@ -390,20 +393,20 @@ pub(crate) struct Talk {
 }
 
 impl Talk {
-    /// Waits until so many more letters were answered.
+    /// Waits until this number of further letters has been answered.
     pub(crate) fn goes_on(&self, letters: u64) {
         let before = self.said.load(Ordering::Relaxed);
-        until("the honest pair goes on talking", || {
+        until("the honest pair exchanges more letters", || {
             self.said.load(Ordering::Relaxed) >= before + letters || self.thread.is_finished()
         });
     }
 
-    /// How long each letter and its answer took since this was asked before.
+    /// Returns the round-trip times since the previous call.
     pub(crate) fn take(&self) -> Vec<Duration> {
         std::mem::take(&mut self.took.lock())
     }
 
-    /// Ends it.
+    /// Ends the exchange. A panic of its thread continues here.
     pub(crate) fn end(self) {
         self.stop.store(true, Ordering::Release);
         if let Err(panic) = self.thread.join() {
@@ -418,7 +421,7 @@ fn honest(message: &fipa::Message) -> Option<String> {
     is_honest.then(|| content.to_owned())
 }
 
-/// One letter there and its answer back; each has one outcome and arrives.
+/// Sends one letter and waits for its answer. The letter must have one outcome and be delivered.
 async fn round(agent: &Agent, to: &AgentId) -> Duration {
     let content = format!("{HONEST}{}", agent.unique_id());
     let message = agent.message(Performative::Inform).receiver(to.clone());
@@ -436,14 +439,14 @@ async fn round(agent: &Agent, to: &AgentId) -> Duration {
     let (sent, took) = tokio::time::timeout(WATCHDOG, both).await.unwrap();
     let deliveries = sent.unwrap();
     let [delivery] = &deliveries.0[..] else {
-        panic!("not one outcome: {deliveries}");
+        panic!("expected one outcome: {deliveries}");
     };
     let arrived = matches!(delivery.outcome, Outcome::Delivered { .. });
     assert!(arrived, "{deliveries}");
     took
 }
 
-/// The median and the 99th percentile.
+/// Returns the median and the 99th percentile.
 pub(crate) fn percentiles(mut took: Vec<Duration>) -> (Duration, Duration) {
     took.sort_unstable();
     (took[took.len() / 2], took[took.len() * 99 / 100])

@@ -28,14 +28,14 @@ use super::journal::{Event, Id, Journal};
 /// The environment variable that holds a [`Part`].
 pub(crate) const PART: &str = "FIPA_SOAK_PART";
 
-/// Letters of one sender to one receiver that have no outcome yet.
+/// Maximum number of letters without an outcome from one sender to one receiver.
 const UNDER_WAY: usize = 24;
 /// Pause of a sender between two letters, in milliseconds.
 const PAUSE: std::ops::Range<u64> = 4..40;
-/// Letters that are sent with this performative are refused by the gateways.
+/// Gateways refuse letters with this performative.
 pub(crate) const FORBIDDEN: Performative = Performative::Cancel;
 
-/// What a process does. Every field is one line or several.
+/// The task of a process. Each field is encoded as one or several lines.
 #[derive(Debug, Clone)]
 pub(crate) struct Part {
     pub(crate) seed: u64,
@@ -65,14 +65,14 @@ impl Part {
 
 fn say(line: &str) {
     let mut out = std::io::stdout().lock();
-    // When the reader is gone, the input ends, too.
+    // If the reader has ended, the input of this process ends, too.
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
-/// Plays a part until told to quit, or killed.
+/// Runs a part until the command `quit`, or until the process is killed.
 pub(crate) fn play(text: &str) {
     let part = Part::from_text(text);
-    // Ends a line that the test harness may have begun.
+    // Ends a line that the test harness may have started.
     say("");
     let (commands, queue) = unbounded_channel();
     std::thread::spawn(move || {
@@ -81,7 +81,7 @@ pub(crate) fn play(text: &str) {
                 return;
             }
         }
-        // The test is over.
+        // The test has ended.
         std::process::exit(3);
     });
     let mut builder = tokio::runtime::Builder::new_multi_thread();
@@ -90,17 +90,17 @@ pub(crate) fn play(text: &str) {
     say("bye");
 }
 
-/// What all agents of the process share.
+/// State that all agents of the process share.
 struct Shared {
     domain: Domain,
     journal: Journal,
     names: Vec<String>,
     rests: AtomicBool,
-    /// Letters that have not all outcomes yet.
+    /// Number of letters with a missing outcome.
     open: AtomicUsize,
 }
 
-/// An agent that was told to register.
+/// An agent with a `register` command.
 struct Presence {
     sender: Arc<Mutex<Option<Arc<Sender>>>>,
     leave: oneshot::Sender<()>,
@@ -173,14 +173,14 @@ async fn perform(part: Part, mut queue: UnboundedReceiver<String>) {
         let _ = presence.leave.send(());
         presence.task.await.unwrap();
     }
-    // Letters that are under way get their outcomes.
+    // Letters under way get their outcomes.
     shared.domain.clone().close().await;
     while shared.open.load(Ordering::SeqCst) > 0 {
         sleep(Duration::from_millis(5)).await;
     }
 }
 
-/// Registers as soon as the name is free, then sends and receives until told to leave.
+/// Registers as soon as the name is free, then sends and receives until the command `leave`.
 async fn agent(
     shared: Arc<Shared>,
     name: String,
@@ -232,7 +232,7 @@ async fn agent(
     shared.journal.note(&Event::Left { agent: incarnation });
 }
 
-/// Content that only this letter has.
+/// Returns the unique content of this letter.
 fn content(id: Id, size: usize) -> Vec<u8> {
     let Id { sender, number } = id;
     let mut content = format!("{sender:x} {number} ").into_bytes();
@@ -253,7 +253,7 @@ fn id_in(content: &[u8]) -> Option<Id> {
 
 fn take(shared: &Shared, agent: u64, incoming: &Incoming) {
     let message = &incoming.message;
-    // Gateways tell of failures by message.
+    // Gateways report failures in messages.
     if ![Performative::Inform, FORBIDDEN].contains(message.performative()) {
         return;
     }
@@ -317,7 +317,7 @@ impl Sender {
         }
     }
 
-    /// Sends one letter to every other agent until it is delivered.
+    /// Sends letters to every other agent until one to each is delivered.
     async fn prove(self: Arc<Self>) {
         let own = self.agent.lock().as_ref().map(|it| it.name().to_owned());
         let names = self.shared.names.clone().into_iter();
@@ -341,7 +341,7 @@ impl Sender {
         proofs.collect::<JoinSet<()>>().join_all().await;
     }
 
-    /// Sends a letter, in the order of its number. The outcomes are logged by the future.
+    /// Sends a letter in the order of its number. The returned future logs the outcomes.
     fn send(&self, draft: Draft) -> Option<impl Future<Output = Deliveries> + Send + use<>> {
         let agent = self.agent.lock().clone()?;
         let mut last = self.last.lock();
@@ -396,7 +396,7 @@ fn draft(random: &mut Rng, to: impl Iterator<Item = String>) -> Draft {
         15..100 => 5000,
         _ => 40,
     };
-    // From 10 ms to 60 s, as many between 10 and 100 ms as between 1 and 10 s.
+    // Log-uniform from 10 ms to 60 s.
     let deadline = 10.0 * 6000_f64.powf(random.f64());
     Draft {
         to: to.collect(),

@@ -1,4 +1,4 @@
-//! Tests of the checker, with logs that are made up.
+//! Tests of the checker with constructed logs.
 
 use super::checker::{self, Life, Quiet};
 use super::journal::{Event, Id};
@@ -6,7 +6,7 @@ use super::journal::{Event, Id};
 /// Events with their times.
 type Log<'a> = &'a [(u64, Event)];
 
-/// The registrations of `arm` in the tests of the checker.
+/// Two registrations of `arm`, one after the other.
 const ARM: u64 = 0xa;
 const NEXT_ARM: u64 = 0xb;
 
@@ -45,8 +45,8 @@ fn takes(agent: u64, number: u64) -> Event {
     }
 }
 
-/// Returns the breaches in the logs of a sender and of two processes that were the receiver, one
-/// after the other. The first of them was killed at `killed`. All times are in seconds.
+/// Returns the breaches in the logs of a sender and of two successive receiver processes. The first
+/// receiver process was killed at `killed`. All times are in seconds.
 fn breaches(logs: [Log; 3], killed: Option<u64>) -> Vec<String> {
     const SECOND: u64 = 1_000_000;
     let directory = tempfile::tempdir().unwrap();
@@ -68,7 +68,7 @@ fn breaches(logs: [Log; 3], killed: Option<u64>) -> Vec<String> {
     checker::check(&lives.collect::<Vec<_>>(), &[quiet]).breaches
 }
 
-/// The same, where the receiver is registered once, and lives.
+/// Returns the breaches in the logs of a sender and of one receiver process that was not killed.
 fn breaches_of(sender: Log, receiver: Log) -> Vec<String> {
     let here = registered("arm", ARM).map(|event| (0, event));
     breaches([sender, &[&here, receiver].concat(), &[]], None)
@@ -163,18 +163,18 @@ fn the_checker_knows_what_a_killed_receiver_may_have_accepted() {
         (2, ends(1, None)),
         (2, ends(2, None)),
     ];
-    // The letter after the last that was logged may have been lost with the process.
+    // The killed process may have accepted the letter after the last one in its log.
     let first = [&here[..], &[(2, takes(ARM, 1))]].concat();
     assert_eq!(
         breaches([&sender, &first, &[]], Some(3)),
         Vec::<String>::new()
     );
-    // It was dead before the letter was sent.
+    // The process was killed before the letter was sent.
     one(
         &breaches([&sender, &here, &[]], Some(0)),
         "delivered, and not taken",
     );
-    // It took a later one, so it would have logged this one.
+    // The process logged a later letter, so it would have logged this one.
     let later = [&here[..], &[(2, takes(ARM, 2))]].concat();
     one(
         &breaches([&sender, &later, &[]], Some(3)),

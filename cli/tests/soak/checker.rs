@@ -1,42 +1,42 @@
-//! Reads the logs of all processes, and finds letters about which a promise was broken.
+//! Reads the logs of all processes and finds letters that break a promise of delivery.
 //!
-//! What the checker can know of a killed process: a letter that it accepted and had not received, or
-//! had not logged, when it was killed is *delivered*, and no log says that it was taken. Such a
-//! letter is later than every letter of its sender that the killed registration logged, because a
-//! queue is received in order. An outcome that a killed sender did not log is missing.
+//! A process may be killed after it accepted a letter and before it received or logged the letter.
+//! Such a letter is *delivered*, and no log contains it as taken. It is later than every letter of
+//! its sender that the killed registration logged, because a queue is received in order. An outcome
+//! that a killed sender did not log is missing.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 
 use super::journal::{self, Event, Id};
 
-/// Time that may pass between the end of a letter in its process and the line in the log, in
-/// microseconds. Processes are stopped for less.
+/// Maximum time between the end of a letter in its process and the line in the log, in
+/// microseconds. The test stops processes for a shorter time.
 const LATE: u64 = 6_000_000;
-/// A letter of a stream that works has its outcome within this time, in microseconds.
+/// Maximum time until the outcome of a letter on a working stream, in microseconds.
 const PROMPT: u64 = 1_000_000;
-/// Deadlines, in milliseconds, that are no reason to fail on a network without faults.
+/// Deadline that a letter on a network without faults always meets, in milliseconds.
 const AMPLE: u64 = 10_000;
 
 /// A process, and how it ended.
 #[derive(Debug, Clone)]
 pub(crate) struct Life {
     pub(crate) log: PathBuf,
-    /// When it was dead, if it was killed.
+    /// Time after which the process was no longer running, if it was killed.
     pub(crate) killed: Option<u64>,
 }
 
 /// A time without faults.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Quiet {
-    /// When the last fault ended.
+    /// End of the last fault.
     pub(crate) healed: u64,
-    /// When a letter of every stream that was sent after that had been delivered.
+    /// Time at which every stream had delivered a letter that was sent after `healed`.
     pub(crate) proved: u64,
-    /// When the next fault began.
+    /// Start of the next fault.
     pub(crate) end: u64,
-    /// The part of the time until `proved` in which processes of the machine waited for a processor,
-    /// if the kernel says so. A busy machine is slow to recover.
+    /// Percentage of the time from `healed` to `proved` in which a process of the machine waited
+    /// for a processor. Zero if the kernel does not report it. A busy machine recovers slowly.
     pub(crate) busy_percent: u64,
 }
 
@@ -53,12 +53,13 @@ struct Copy {
     sent: u64,
     deadline_ms: u64,
     forbidden: bool,
-    /// Whether the letter has no other receiver. Outcomes are logged when all of them are known.
+    /// Whether the letter has no other receiver. A process logs the outcomes of a letter after the
+    /// last one of them.
     alone: bool,
     sender_killed: bool,
-    /// When, the reason of a failure, and all that is known.
+    /// Time, reason of a failure, and text of each outcome.
     outcomes: Vec<(u64, Option<String>, String)>,
-    /// When and by which registrations.
+    /// Time and registration of each event of taking.
     taken: Vec<(u64, u64)>,
 }
 
@@ -85,7 +86,7 @@ impl Copy {
     }
 }
 
-/// What the logs say.
+/// Result of a check.
 #[derive(Default)]
 pub(crate) struct Report {
     pub(crate) breaches: Vec<String>,
@@ -94,19 +95,19 @@ pub(crate) struct Report {
     pub(crate) lost_with_receiver: usize,
     /// Outcomes by reason.
     pub(crate) outcomes: BTreeMap<String, usize>,
-    /// From the end of the last fault until the directories of all senders had all receivers.
+    /// Time from the end of the last fault until the directories of all senders had all receivers.
     pub(crate) directory: Recovery,
-    /// From the end of the last fault until every stream delivered every letter whose receiver was
-    /// in the directory.
+    /// Time from the end of the last fault until every stream promptly delivered every letter whose
+    /// receiver was in the directory.
     pub(crate) delivery: Recovery,
 }
 
-/// How streams came back after faults.
+/// Recovery times of streams after faults.
 #[derive(Debug, Default)]
 pub(crate) struct Recovery {
-    /// For each stream and each time without faults, in microseconds, where it took any time.
+    /// Recovery time of each affected stream in each time without faults, in microseconds.
     pub(crate) took: Vec<u64>,
-    /// The last letter of the slowest one that was late or failed.
+    /// The last late or failed letter of the slowest stream.
     pub(crate) slowest: String,
 }
 
@@ -118,7 +119,7 @@ impl Recovery {
         self.took.push(took);
     }
 
-    /// Streams that took more than the two seconds of the promise.
+    /// Returns the number of streams that took more than the promised two seconds.
     pub(crate) fn slow(&self) -> usize {
         self.took.iter().filter(|took| **took > 2_000_000).count()
     }
@@ -131,9 +132,9 @@ impl Recovery {
 #[derive(Default)]
 struct Logs {
     registrations: Vec<Registration>,
-    /// Every letter, once per receiver.
+    /// Every letter, with one entry per receiver.
     copies: BTreeMap<(Id, String), Copy>,
-    /// What each registration took, in order.
+    /// Letters that each registration took, in order.
     takes: BTreeMap<u64, Vec<(u64, Id)>>,
     breaches: Vec<String>,
 }
@@ -161,7 +162,8 @@ impl Logs {
                 self.note(life, time, event);
             }
         }
-        // Outcomes may be of letters whose sender has left; letters are all known now.
+        // An outcome can follow the departure of its sender, so the first pass collects all
+        // letters.
         for life in lives {
             for (time, event) in journal::read(&life.log) {
                 if let Event::Outcome {
@@ -248,7 +250,8 @@ impl Logs {
         }
     }
 
-    /// Each registration takes the letters of a sender's registration in order, and none twice.
+    /// Checks that each registration takes the letters of a sender's registration in order, and
+    /// none twice.
     fn check_order(&mut self) {
         for (agent, takes) in &self.takes {
             let mut last: HashMap<u64, u64> = HashMap::new();
@@ -320,7 +323,8 @@ impl Logs {
         self.breaches.append(&mut breaches);
     }
 
-    /// No letter is taken while an earlier one of its stream is open, and then fails.
+    /// Checks that no open letter was passed over: a letter must not fail after a later letter of
+    /// its stream was taken.
     fn check_passed_over(&mut self) {
         let mut breaches = Vec::new();
         for (agent, takes) in &self.takes {
@@ -346,7 +350,7 @@ impl Logs {
         self.breaches.append(&mut breaches);
     }
 
-    /// After the last fault, every stream delivers everything.
+    /// Checks that every stream delivers every letter after the last fault.
     fn check_quiet(&mut self, quiet: &[Quiet], report: &mut Report) {
         let mut breaches = Vec::new();
         for window in quiet {

@@ -1,4 +1,4 @@
-//! The log of a process: a line for everything that concerns its letters, written at once.
+//! The log of a process: one line per event of a letter, written immediately.
 //!
 //! A line is one `write`, so a killed process loses at most the line that it was writing. A letter
 //! is logged before it is sent, its outcome as soon as it is known, and a taken letter as soon as
@@ -11,13 +11,13 @@ use std::path::Path;
 use parking_lot::Mutex;
 use rustix::time::{ClockId, clock_gettime};
 
-/// Returns the time in microseconds, the same for all processes of the machine.
+/// Returns the monotonic time in microseconds. All processes of the machine share this clock.
 pub(crate) fn now() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000 + now.tv_nsec as u64 / 1000
 }
 
-/// A letter: the registration of its sender, and its number there, which rises by one.
+/// Identifies a letter by the registration of its sender and a number that increases by one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct Id {
     pub(crate) sender: u64,
@@ -27,7 +27,7 @@ pub(crate) struct Id {
 /// An entry of a log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Event {
-    /// The process starts to register this name: letters for it may arrive from now on.
+    /// The process starts to register this name. Letters for the name may arrive from now on.
     Begins {
         name: String,
     },
@@ -43,11 +43,12 @@ pub(crate) enum Event {
     Sends {
         id: Id,
         deadline_ms: u64,
-        /// Whether access rules of gateways forbid it.
+        /// Whether access rules of the gateways forbid the letter.
         forbidden: bool,
         receivers: Vec<String>,
     },
-    /// `failure` is the reason, or nothing when the letter was delivered.
+    /// An outcome of a letter. `failure` is the reason of a failure, or `None` if the letter was
+    /// delivered.
     Outcome {
         id: Id,
         receiver: String,
@@ -58,14 +59,14 @@ pub(crate) enum Event {
         agent: u64,
         id: Id,
     },
-    /// A letter was taken whose content is not what was sent.
+    /// The agent took a letter whose content differs from the sent content.
     Torn {
         agent: u64,
     },
 }
 
 impl Event {
-    /// Returns the line of this event, which happened at this time.
+    /// Returns the log line of this event at this time.
     pub(crate) fn to_line(&self, time: u64) -> String {
         let event = match self {
             Self::Begins { name } => format!("B {name}"),
@@ -138,7 +139,7 @@ impl Event {
     }
 }
 
-/// The log of one process, as it is written.
+/// Writer of the log of one process.
 pub(crate) struct Journal(Mutex<File>);
 
 impl Journal {
@@ -153,7 +154,7 @@ impl Journal {
     }
 }
 
-/// Reads a log. The last line may be a part of one, which does not count.
+/// Reads a log. An incomplete last line is ignored.
 pub(crate) fn read(path: &Path) -> Vec<(u64, Event)> {
     let text = std::fs::read_to_string(path).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);

@@ -1,5 +1,5 @@
-//! Processes on three hosts that exchange letters and log everything, the faults that they meet, and
-//! the checker of their logs.
+//! Processes on three hosts that exchange letters and log all events, the injected faults, and the
+//! checker of the logs.
 
 pub(crate) mod actor;
 mod breaches;

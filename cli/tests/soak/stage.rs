@@ -1,4 +1,4 @@
-//! Three hosts with gateways, processes and agents that move, and all that happens to them.
+//! Three hosts with gateways, processes and moving agents, and the faults that the test injects.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead as _, BufReader, Write as _};
@@ -16,7 +16,7 @@ use super::checker::{Life, Quiet};
 use super::journal::now;
 use crate::hosts::{PORT, filter, gateway, keys, make_keys, nft};
 
-/// Ends what hangs.
+/// Timeout that ends a hung test.
 const WATCHDOG: Duration = Duration::from_secs(90);
 const HOSTS: usize = 3;
 const PROCESSES_PER_HOST: usize = 2;
@@ -24,10 +24,10 @@ const MOVERS: usize = 2;
 /// Transports between hosts.
 const ORDERS: [&[&str]; 3] = [&["tcp"], &["udp", "tcp"], &["quic", "tcp"]];
 
-/// A name for `FIPA_SOAK_FAULTS`, and the fault.
+/// A fault and its name in `FIPA_SOAK_FAULTS`.
 type Fault = (&'static str, fn(&mut Stage));
 
-/// All faults. Those that stand here twice are twice as frequent.
+/// All faults. A repeated entry makes its fault more frequent.
 const FAULTS: [Fault; 13] = [
     ("kill", Stage::kill_process),
     ("kill", Stage::kill_process),
@@ -61,16 +61,16 @@ fn faults() -> Vec<Fault> {
     faults
 }
 
-/// The last number of each address that a host can have.
+/// Returns the last octets of the addresses that a host can have.
 fn addresses(at: usize) -> [usize; 3] {
     [at + 1, at + 51, at + 101]
 }
 
-/// What runs, or does not.
+/// State of a process.
 enum State<T> {
     Runs(T),
     Stopped(T),
-    /// It was told to end.
+    /// The process has received the command to end.
     Ends(T),
     Down,
 }
@@ -84,10 +84,10 @@ struct Host {
     disturbed: bool,
 }
 
-/// A process with its agents, which is started again when it was killed.
+/// A process with its agents. The stage restarts the process after its end.
 struct Seat {
     host: usize,
-    /// Agents that belong here, now.
+    /// Agents that belong to this process at present.
     names: BTreeSet<String>,
     process: State<Process>,
 }
@@ -101,7 +101,7 @@ struct Process {
 
 impl Process {
     fn tell(&mut self, line: &str) {
-        // The end of a process that was not killed is noticed elsewhere.
+        // An error means that the process has ended; `notice_ends` reports that.
         let _ = writeln!(self.input, "{line}");
     }
 
@@ -118,7 +118,8 @@ impl Process {
             .count()
     }
 
-    /// Whether the agent is registered here: agents that move come and go.
+    /// Whether the agent is registered in this process at present. Moving agents register and leave
+    /// repeatedly.
     fn has(&self, name: &str) -> bool {
         let (came, left) = (format!("registered {name}"), format!("left {name}"));
         let said = self.said.lock();
@@ -150,8 +151,9 @@ enum Repair {
 /// An agent on its way to another process.
 struct Move {
     name: String,
-    /// The process that it leaves, and how often it had left that before.
+    /// The process that the agent leaves.
     life: usize,
+    /// Number of times that the agent had left that process before.
     left_before: usize,
     to: usize,
 }
@@ -230,7 +232,7 @@ impl Stage {
         stage
     }
 
-    /// Faults for this long, and then quiet for at least this long.
+    /// Injects faults for the duration `faults`, then none for at least the duration `quiet`.
     pub(crate) fn disturb(&mut self, faults: Duration, quiet: Duration) {
         if let Some(last) = self.quiet.last_mut() {
             last.end = now();
@@ -257,7 +259,7 @@ impl Stage {
         });
     }
 
-    /// No new letters; every letter gets its outcomes, and all processes end.
+    /// Stops new letters, waits until every letter has its outcomes, and ends all processes.
     pub(crate) fn close(&mut self) {
         if let Some(last) = self.quiet.last_mut() {
             last.end = now();
@@ -291,7 +293,7 @@ impl Stage {
             }
             assert!(
                 started.elapsed() < WATCHDOG,
-                "not all processes say {line}: {}",
+                "not all processes have written {line}: {}",
                 self.stand()
             );
             std::thread::sleep(Duration::from_millis(2));
@@ -315,7 +317,8 @@ impl Stage {
         seats.collect()
     }
 
-    /// Ends every fault, and waits until all gateways and agents are there. Returns when that was.
+    /// Ends every fault and waits until all gateways and agents run. Returns the time of that
+    /// moment.
     fn settle(&mut self) -> u64 {
         let started = Instant::now();
         loop {
@@ -333,14 +336,15 @@ impl Stage {
             }
             assert!(
                 started.elapsed() < WATCHDOG,
-                "not all are there: {}",
+                "not all gateways and agents run: {}",
                 self.stand()
             );
             std::thread::sleep(Duration::from_millis(2));
         }
     }
 
-    /// Waits until a letter of every stream that was sent after the last fault is delivered.
+    /// Waits until every stream has delivered a letter that was sent after the last fault. Returns
+    /// the time of that moment.
     fn prove(&mut self) -> u64 {
         self.proofs += 1;
         let token = self.proofs;
@@ -349,7 +353,8 @@ impl Stage {
         now()
     }
 
-    /// Carries out what is due, and notices processes that ended by themselves.
+    /// Carries out the repairs and restarts that are due, and panics if a process ended
+    /// unexpectedly.
     fn work(&mut self, due: Instant) {
         self.notice_ends();
         let (due, later) = self.repairs.drain(..).partition(|(at, _)| *at <= due);
@@ -460,7 +465,7 @@ impl Stage {
         self.later(1..700, Repair::StartProcess(seat));
     }
 
-    /// The process ends in order, and is started again.
+    /// Ends a process in order. [`work`](Self::work) schedules its restart.
     fn restart_process(&mut self) {
         let seat = self.any_seat();
         let state = std::mem::replace(&mut self.seats[seat].process, State::Down);
@@ -563,7 +568,7 @@ impl Stage {
         let network = self.network.host(at);
         network.ip(&format!("addr add 10.99.0.{}/24 dev eth0", all[next]));
         network.ip(&format!("addr del 10.99.0.{old}/24 dev eth0"));
-        // A deleted first address may take the others with it.
+        // Deleting the primary address may delete the secondary ones.
         let promoted = network
             .command("ip")
             .args(["-4", "addr", "show", "dev", "eth0"])
@@ -635,7 +640,7 @@ impl Stage {
 
     fn start_gateway(&mut self, at: usize) {
         let mut command = gateway(self.network.host(at), &self.hosts[at].settings);
-        // A stopped process may hold it up, so nothing waits for it here.
+        // A stopped process may delay the gateway, so a thread waits for it.
         self.hosts[at].starting = Some(std::thread::spawn(move || {
             let (gateway, ready) = Running::until_ready(&mut command);
             assert!(ready.starts_with('{'), "the gateway is not ready: {ready}");
@@ -690,7 +695,8 @@ impl Stage {
     }
 }
 
-/// Returns the time, in microseconds, in which some process of the machine waited for a processor.
+/// Returns the total time in which a process of the machine waited for a processor, in
+/// microseconds.
 fn waited_for_processors() -> u64 {
     let pressure = std::fs::read_to_string("/proc/pressure/cpu").unwrap_or_default();
     let total = pressure.split("total=").nth(1);

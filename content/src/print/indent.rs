@@ -3,11 +3,11 @@
 use crate::Dialect;
 use crate::lex::{Lexer, Token};
 
-/// Longest list on one line.
+/// Maximum length of a list on one line, in bytes.
 const WIDTH: usize = 80;
-/// Columns of one level.
+/// Number of columns per level.
 const STEP: usize = 2;
-/// Deepest indentation, which bounds the blanks that deep text takes.
+/// Maximum indentation, which bounds the number of blanks for deep text.
 const MAX_INDENT: usize = 60;
 
 /// A token of the text on one line.
@@ -74,7 +74,7 @@ fn columns(depth: usize) -> usize {
     (depth * STEP).min(MAX_INDENT)
 }
 
-/// The tokens, and where the list of each opening parenthesis ends.
+/// Returns the tokens, with the end of the list of each opening parenthesis.
 fn spans(line: &[u8]) -> Vec<Span> {
     // Only the extent of byte strings matters, which the standard's rules give in every dialect.
     let mut lexer = Lexer::new(line, Dialect::Standard);

@@ -7,7 +7,7 @@ use serde::{de, ser};
 
 use crate::error::{ParseError, PrintError};
 
-/// Longest piece of received text in an error, in characters.
+/// Maximum length of quoted text in an error, in characters.
 const MAX_QUOTED: usize = 60;
 
 /// A Rust value that cannot be written as an SL term.
@@ -17,8 +17,8 @@ pub enum SerializeError {
     /// NaN or an infinity. SL has no notation for them.
     #[error("the number is not finite, and SL has no notation for it")]
     NotFinite,
-    /// `None` where something has to stand: as the whole value, in a sequence, as an argument by
-    /// position, or as the key of a map. Only a slot can be left out.
+    /// `None` as the whole value, in a sequence, as an argument by position, or as the key of a
+    /// map. Only a slot can be absent.
     #[error("an absent value can only be written in a slot, which is left out then")]
     Absent,
     /// Two fields of one struct have the same slot.
@@ -27,11 +27,11 @@ pub enum SerializeError {
     /// A value that the dialect has no notation for.
     #[error(transparent)]
     Print(#[from] PrintError),
-    /// A value that is no predicate and no proposition: neither a function symbol with arguments by
-    /// position nor a word.
+    /// A value that is neither a predicate nor a proposition: neither a function symbol with
+    /// arguments by position nor a word.
     #[error("the value is no predicate and no proposition; arguments of predicates have no names")]
     Predicate,
-    /// A [`Term`](crate::Term) inside that is none.
+    /// An invalid [`Term`](crate::Term) inside of the value.
     #[error("the term inside is malformed")]
     Term(#[from] ParseError),
     /// An error of the value's own `Serialize`.
@@ -95,7 +95,7 @@ pub enum DeserializeErrorKind {
         /// The allowed numbers.
         expected: String,
     },
-    /// Another function symbol than that of the type.
+    /// A function symbol that differs from that of the type.
     #[error("found the function symbol \"{}\" where {expected:?} should be", escape(.found))]
     Symbol {
         /// The symbol.
@@ -111,13 +111,13 @@ pub enum DeserializeErrorKind {
         /// The symbols of the enum.
         expected: &'static [&'static str],
     },
-    /// A slot without which there is no value of the type.
+    /// A missing slot that the type requires.
     #[error("the slot :{0} is missing")]
     MissingSlot(&'static str),
-    /// A slot that is there twice.
+    /// A slot that occurs twice.
     #[error("the slot :{0} is there twice")]
     DuplicateSlot(&'static str),
-    /// A slot that the type does not have, where the type denies unknown ones.
+    /// A slot that a type with `deny_unknown_fields` does not have.
     #[error("unknown slot :{}, there are {expected:?}", escape(.found))]
     UnknownSlot {
         /// The slot.
@@ -125,7 +125,7 @@ pub enum DeserializeErrorKind {
         /// The slots of the type.
         expected: &'static [&'static str],
     },
-    /// A term, made by hand, that has no text to read from.
+    /// A constructed term without an SL notation.
     #[error(transparent)]
     Print(#[from] PrintError),
     /// An error of the type's own `Deserialize`.
@@ -152,14 +152,14 @@ impl DeserializeError {
         }))
     }
 
-    /// The reason.
+    /// Returns the reason.
     #[must_use]
     pub fn kind(&self) -> &DeserializeErrorKind {
         &self.0.kind
     }
 
-    /// Offset of the offending term, counted from the start of the bytes that were read. For a
-    /// missing slot, that of the term that lacks it.
+    /// Returns the offset of the offending term from the start of the read bytes. For a missing
+    /// slot, this is the offset of the term without the slot.
     #[must_use]
     pub fn offset(&self) -> usize {
         match &self.0.kind {
@@ -168,8 +168,8 @@ impl DeserializeError {
         }
     }
 
-    /// The path of slots from the whole value to the offending term, for example `target.x` or
-    /// `waypoints[2].yaw`. Empty for the whole value.
+    /// Returns the path of slots from the whole value to the offending term, for example `target.x`
+    /// or `waypoints[2].yaw`. Empty for the whole value.
     #[must_use]
     pub fn slot(&self) -> String {
         let mut path = String::new();
@@ -187,7 +187,7 @@ impl DeserializeError {
         path
     }
 
-    /// Sets the offset, unless it is known.
+    /// Sets the offset, unless it is already set.
     #[cold]
     pub(super) fn at(mut self, offset: usize) -> Self {
         self.0.offset.get_or_insert(offset);
@@ -285,7 +285,7 @@ impl de::Error for DeserializeError {
     }
 }
 
-/// The beginning of a text from outside.
+/// Returns the start of an untrusted text.
 pub(super) fn quoted(text: &str) -> String {
     text.chars().take(MAX_QUOTED).collect()
 }

@@ -1,5 +1,5 @@
-//! Names of newtypes that the serializer and the deserializer treat in a way of their own. In other
-//! formats than SL they are what serde makes of any newtype: the value inside.
+//! Names of newtypes with special treatment by the serializer and the deserializer. Other formats
+//! than SL treat them as any newtype: as the value inside.
 
 /// A sequence that is written as a set.
 pub(super) const SET: &str = "$fipa_content::Set";

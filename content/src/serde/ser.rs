@@ -1,4 +1,4 @@
-//! The serializer: Rust values to SL text, without a tree in between.
+//! The serializer. It converts Rust values to SL text without an intermediate tree.
 
 use std::{fmt, mem};
 
@@ -93,7 +93,7 @@ impl Serializer {
     }
 
     fn open(&mut self) -> Result {
-        // A mode is for a collection or a text, not for what is inside of another term.
+        // A mode applies to a collection or a text, not to the parts of another term.
         self.mode = Mode::Plain;
         self.depth += 1;
         if self.depth > MAX_DEPTH {
@@ -145,7 +145,7 @@ impl Serializer {
         }
     }
 
-    /// Appends the text of a term, at any depth that is left.
+    /// Appends the text of a term within the remaining depth.
     fn term(&mut self, text: &[u8]) -> Result {
         let term = Parser::whole_at(self.depth, Dialect::Standard, text, Parser::term)?;
         if self.dialect == Dialect::Standard {

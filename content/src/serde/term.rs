@@ -12,7 +12,7 @@ use crate::term::{Arguments, FunctionalTerm, Term};
 use crate::wff::Wff;
 
 impl Term<'static> {
-    /// The term that the value is written as.
+    /// Returns the value as a term.
     ///
     /// # Errors
     /// When SL has no notation for a part of the value, or `Serialize` of the value fails.
@@ -35,8 +35,8 @@ impl Term<'_> {
 }
 
 impl Wff<'static> {
-    /// The formula of a value: a predicate for a function symbol with arguments by position, a
-    /// proposition for a word. So an enum can hold the reasons of a refusal:
+    /// Returns the formula of a value: a predicate for a function symbol with arguments by
+    /// position, a proposition for a word. So an enum can hold the reasons of a refusal:
     /// `(missing-parameter dock target)`, `unauthorised`.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! Types for parts of Rust values that serde has no name for: sets, times and agent identifiers.
+//! Types for values without a serde type of their own: sets, times and agent identifiers.
 
 use std::time::SystemTime;
 use std::{fmt, ops};
@@ -12,8 +12,8 @@ use crate::term::Term;
 
 /// A collection that is written as a set: `(set tcp udp)`.
 ///
-/// serde cannot tell a set from a sequence. So collections are written as sequences, but for those in
-/// this type, and both notations are read into either.
+/// serde does not distinguish sets from sequences. So only collections in this type are written as
+/// sets. All collections read both notations.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Set<C>(pub C);
 
@@ -45,12 +45,12 @@ impl<C> ops::Deref for Set<C> {
 
 /// A time that is written as a date-time constant: `20000508T042651481Z`.
 ///
-/// In other formats than SL it is the same text.
+/// Other formats than SL use the same text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct DateTime(pub Time);
 
 impl DateTime {
-    /// The time, in UTC and cut to milliseconds.
+    /// Returns the time in UTC, truncated to milliseconds.
     ///
     /// # Errors
     /// When the year does not have four digits.
@@ -100,7 +100,7 @@ impl<'de> Visitor<'de> for TimeVisitor {
 
 /// An agent identifier: `(agent-identifier :name crex)`.
 ///
-/// In other formats than SL it is the text of that term.
+/// Other formats than SL use the text of that term.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Agent(pub AgentId);
 

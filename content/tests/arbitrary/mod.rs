@@ -11,7 +11,7 @@ use proptest::option;
 use proptest::prelude::*;
 use proptest::sample::select;
 
-/// Text that the notation has to be careful with.
+/// Text with special cases of the notation.
 pub(crate) fn text() -> BoxedStrategy<String> {
     const SPECIAL: [&str; 37] = [
         "",
@@ -86,7 +86,7 @@ fn constant() -> BoxedStrategy<Term<'static>> {
         "-00010105T000000000",
     ];
     let bytes = vec(any::<u8>(), 0..12).prop_map(|mut bytes| {
-        // What is UTF-8 reads as a string.
+        // Bytes that are UTF-8 read as a string.
         bytes.push(0xff);
         Term::Bytes(Cow::Owned(bytes))
     });
@@ -111,7 +111,7 @@ fn arguments(term: BoxedStrategy<Term<'static>>) -> BoxedStrategy<Arguments<'sta
     .boxed()
 }
 
-/// Terms and formulas nested so deep.
+/// Generates terms and formulas of this depth.
 pub(crate) fn nested(depth: usize) -> (BoxedStrategy<Term<'static>>, BoxedStrategy<Wff<'static>>) {
     let atom = prop_oneof![
         any::<bool>().prop_map(Wff::Truth),
@@ -214,7 +214,7 @@ fn action(
     .boxed()
 }
 
-/// A content.
+/// Generates a content.
 pub(crate) fn content() -> BoxedStrategy<Content<'static>> {
     let (term, wff) = nested(3);
     let expression = prop_oneof![

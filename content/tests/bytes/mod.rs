@@ -1,5 +1,5 @@
-//! Properties of any bytes: they are read or refused, in every way alike. The fuzz target `content`
-//! has the same body.
+//! Properties of arbitrary bytes: all readers agree on accepting or refusing them. The fuzz target
+//! `content` has the same body.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 pub(crate) const DIALECTS: [Dialect; 2] = [Dialect::Standard, Dialect::Jade];
 
-/// Reads the bytes as everything that they can be.
+/// Reads the bytes as each kind of expression and as values.
 pub(crate) fn are_read_or_refused(bytes: &[u8]) {
     for dialect in DIALECTS {
         match Content::parse_in(dialect, bytes) {
@@ -25,8 +25,8 @@ pub(crate) fn are_read_or_refused(bytes: &[u8]) {
         let read = from_slice_in::<Term<'_>>(dialect, bytes);
         match (&term, &read) {
             (Ok(term), Ok(read)) => {
-                // A byte string of JADE that is UTF-8 is text in the standard, which the
-                // deserializer hands terms on in.
+                // The deserializer passes terms in the standard notation, in which a byte string of
+                // JADE that is UTF-8 becomes text.
                 if dialect == Dialect::Standard {
                     assert_eq!(term, read);
                 }
@@ -44,8 +44,8 @@ pub(crate) fn are_read_or_refused(bytes: &[u8]) {
     }
 }
 
-/// The content is the same after it was printed, in every layout and every dialect that has a
-/// notation for it.
+/// Checks that the content is the same after printing and parsing, in every layout and in every
+/// dialect that has a notation for it.
 pub(crate) fn survives(content: &Content<'_>, dialect: Dialect) {
     let printer = Printer::new().dialect(dialect);
     let mut layouts = vec![printer, printer.indented()];
@@ -61,7 +61,7 @@ pub(crate) fn survives(content: &Content<'_>, dialect: Dialect) {
     }
     assert_eq!(&content.clone().into_owned(), content);
     assert!(!content.to_string().contains('\n'));
-    // Profiles contain each other.
+    // Each profile contains the previous one.
     let least = Profile::of(content);
     for profile in Profile::ALL {
         let is_in = least.is_some_and(|least| profile >= least);
@@ -78,7 +78,7 @@ pub(crate) fn survives(content: &Content<'_>, dialect: Dialect) {
     }
 }
 
-/// A value with what usual types have.
+/// A value with the usual kinds of fields.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum Value {

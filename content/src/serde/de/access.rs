@@ -1,4 +1,4 @@
-//! Elements, slots, properties and variants, one after the other, for visitors.
+//! Access of visitors to elements, slots, properties and variants, one after the other.
 
 use std::borrow::Cow;
 
@@ -89,7 +89,7 @@ pub(super) struct Properties<'d, 'de> {
 }
 
 impl Properties<'_, '_> {
-    /// Reads the name of the slot that has to come now.
+    /// Reads the name of the slot, which must be the next token.
     fn slot(&mut self, slot: &'static str) -> Result<()> {
         let start = self.deserializer.start();
         match self.deserializer.lexer.next()? {
@@ -184,7 +184,7 @@ impl<'de> de::VariantAccess<'de> for Function<'_, 'de> {
     }
 }
 
-/// The argument that a functional term does not have: only `None` is read from it.
+/// A missing argument of a functional term, which reads only as `None`.
 struct Nothing;
 
 impl<'de> de::Deserializer<'de> for Nothing {

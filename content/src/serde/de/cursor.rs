@@ -1,4 +1,4 @@
-//! The position in the text, and what is read from there for the deserializer.
+//! The position of the deserializer in the text, and the readers of the parts of a term.
 
 use std::borrow::Cow;
 
@@ -31,7 +31,7 @@ pub(super) enum Head<'de> {
 }
 
 impl Head<'_> {
-    /// The kind of term, for errors.
+    /// Returns the kind of term, for errors.
     pub(super) fn kind(&self) -> Unexpected<'static> {
         Unexpected::Other(match self {
             Self::Sequence => "a sequence or set",
@@ -46,7 +46,7 @@ impl<'de> Deserializer<'de> {
         Self { lexer, depth: 0 }
     }
 
-    /// Checks that nothing is left.
+    /// Checks that no bytes are left.
     pub(super) fn end(&mut self) -> Result<()> {
         if self.lexer.peek().is_some() {
             let left = Problem::Trailing(self.lexer.remaining());
@@ -55,7 +55,7 @@ impl<'de> Deserializer<'de> {
         Ok(())
     }
 
-    /// Offset of the next token.
+    /// Returns the offset of the next token.
     #[inline]
     pub(super) fn start(&mut self) -> usize {
         self.lexer.peek();
@@ -84,7 +84,7 @@ impl<'de> Deserializer<'de> {
         })
     }
 
-    /// Whether the list ends here. Its parenthesis is not read.
+    /// Whether the list ends here. The closing parenthesis stays unread.
     #[inline]
     pub(super) fn closes(&mut self) -> Result<bool> {
         match self.lexer.peek() {
@@ -94,7 +94,7 @@ impl<'de> Deserializer<'de> {
         }
     }
 
-    /// Reads the closing parenthesis after a visitor has taken what it wanted.
+    /// Reads the closing parenthesis after a visitor has read the elements.
     #[inline]
     pub(super) fn close(&mut self, expected: &str) -> Result<()> {
         if !self.closes()? {
@@ -124,7 +124,7 @@ impl<'de> Deserializer<'de> {
         Ok(value)
     }
 
-    /// Arguments by name, without the closing parenthesis.
+    /// Visits arguments by name, without the closing parenthesis.
     pub(super) fn slots<V: Visitor<'de>>(&mut self, visitor: V) -> Result<V::Value> {
         let mut slots = Slots {
             deserializer: self,
@@ -139,7 +139,7 @@ impl<'de> Deserializer<'de> {
         })
     }
 
-    /// Arguments by name, or in the order of the fields, without the closing parenthesis.
+    /// Visits arguments by name or in the order of the fields, without the closing parenthesis.
     pub(super) fn arguments<V: Visitor<'de>>(&mut self, visitor: V) -> Result<V::Value> {
         match self.lexer.peek() {
             Some(b':' | b')') => self.slots(visitor),
@@ -150,7 +150,7 @@ impl<'de> Deserializer<'de> {
         }
     }
 
-    /// Begins a functional term with this symbol.
+    /// Starts a functional term with this symbol.
     pub(super) fn functional(&mut self, symbol: &'static str) -> Result<()> {
         let start = self.start();
         if self.lexer.peek() != Some(b'(') {
@@ -158,7 +158,7 @@ impl<'de> Deserializer<'de> {
         }
         self.open()?;
         self.lexer.peek();
-        // The symbol is mostly written without quotation marks.
+        // Most writers use no quotation marks for the symbol.
         let found = match self.lexer.word()? {
             Some(word) if word == symbol && !is_term_keyword(word) => return Ok(()),
             Some(word) => quoted(word),
@@ -175,7 +175,7 @@ impl<'de> Deserializer<'de> {
         Err(DeserializeError::new(start, kind))
     }
 
-    /// The error about the next token, which is none of the requested type.
+    /// Returns the error for the next token, which is not of the requested type.
     #[cold]
     pub(super) fn mistaken(&mut self, expected: &dyn de::Expected) -> DeserializeError {
         let start = self.start();
@@ -319,7 +319,7 @@ impl<'de> Deserializer<'de> {
         self.skip()?;
         let text = self.lexer.since(start);
         let dialect = self.lexer.dialect();
-        // Checked and counted here, with the offset in the whole.
+        // Parsed here, so that the depth counts and offsets refer to the whole text.
         let term = Parser::whole_at(depth, dialect, text, Parser::term)
             .map_err(|error| error.moved(start))?;
         let visited = match dialect {
@@ -346,7 +346,7 @@ impl<'de> Deserializer<'de> {
     }
 }
 
-/// An integer with a sign, of many digits, or of hexadecimal ones.
+/// Visits an integer with a sign, with many digits, or with hexadecimal digits.
 fn visit_long_integer<'de, V: Visitor<'de>>(
     start: usize,
     bytes: &[u8],

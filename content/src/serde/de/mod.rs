@@ -1,4 +1,4 @@
-//! The deserializer: SL text to Rust values, without a tree in between.
+//! The deserializer. It converts SL text to Rust values without an intermediate tree.
 
 mod access;
 mod cursor;
@@ -22,8 +22,8 @@ const TERM: &str = "FIPA00008 Term";
 
 /// Reads one term in the standard dialect as a value; the crate's documentation has the mapping.
 ///
-/// Ignored slots are checked for tokens, parentheses and depth only. Memory is taken for what was
-/// read, never for what a length announces.
+/// Ignored slots are checked for tokens, parentheses and depth only. Memory use depends on the
+/// bytes that were read, and never on an announced length.
 ///
 /// # Errors
 /// When the bytes are not one term, or the term is not a value of the type.
@@ -113,7 +113,7 @@ impl<'de> de::Deserializer<'de> for &mut Deserializer<'de> {
     fn deserialize_f32<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value> {
         let (start, bytes, decimal) = self.number(&visitor)?;
         let value = self.float(start, bytes, decimal)?;
-        // Rounded once, from the digits. Hexadecimal ones have no such reading.
+        // Rounds once, from the digits. Hexadecimal digits have no such conversion.
         let text = std::str::from_utf8(bytes).unwrap_or_default();
         let visited = match text.parse::<f32>() {
             Ok(value) if value.is_finite() => visitor.visit_f32(value),
