@@ -85,7 +85,7 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
     for process in [gateway, parrot] {
         let (code, log) = process.signal("-INT");
         assert_eq!(code, Some(0), "{log}");
-        assert_eq!(log.matches("were removed by").count(), 1, "{log}");
+        assert_eq!(log.matches("another program removed files").count(), 1, "{log}");
         assert!(!log.contains("ERROR"), "{log}");
     }
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
