@@ -6,7 +6,7 @@ use crate::error::ReceiveError;
 use crate::incoming::Incoming;
 
 #[derive(Default)]
-pub(crate) struct Demultiplexer;
+pub(crate) struct Demultiplexer(());
 
 impl Demultiplexer {
     pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {

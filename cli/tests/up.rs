@@ -62,7 +62,11 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
     // An error means that the processes have created files again before all were removed.
     let _ = std::fs::remove_dir_all(host.path("run"));
     for process in [&mut gateway, &mut parrot] {
-        process.wait_for_log(&["WARN", "another program removed files", "joining the domain again"]);
+        process.wait_for_log(&[
+            "WARN",
+            "another program removed files",
+            "joining the domain again",
+        ]);
     }
     let watchdog = Instant::now() + Duration::from_secs(60);
     loop {
@@ -85,7 +89,11 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
     for process in [gateway, parrot] {
         let (code, log) = process.signal("-INT");
         assert_eq!(code, Some(0), "{log}");
-        assert_eq!(log.matches("another program removed files").count(), 1, "{log}");
+        assert_eq!(
+            log.matches("another program removed files").count(),
+            1,
+            "{log}"
+        );
         assert!(!log.contains("ERROR"), "{log}");
     }
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
