@@ -142,31 +142,37 @@ impl Access {
         let Some(rate) = self.rate else {
             return Ok(());
         };
-        self.senders.of(source, sender, rate, now).take(rate, now)
+        if let Some(known) = self.senders.get_mut(source, sender) {
+            return known.take(rate, now);
+        }
+        self.senders
+            .insert(source, sender, rate, now)
+            .take(rate, now)
     }
 }
 
 impl Senders {
-    /// Returns the rate of this sender by this source, and creates it if necessary.
-    fn of(&mut self, source: Source, sender: &str, rate: f64, now: Instant) -> &mut Sender {
-        let known = self.sources.get(&source);
-        if !known.is_some_and(|known| known.senders.contains_key(sender)) {
-            if self.len >= MAX_SENDERS {
-                self.make_room(now);
-            }
-            let known = self.sources.entry(source).or_default();
-            known.order.push_back(sender.into());
-            let before = known.order.len() - 1;
-            self.sizes.remove(&(before, source));
-            self.sizes.insert((before + 1, source));
-            self.len += 1;
+    /// Returns the rate of this sender by this source, if it is stored.
+    fn get_mut(&mut self, source: Source, sender: &str) -> Option<&mut Sender> {
+        self.sources.get_mut(&source)?.senders.get_mut(sender)
+    }
+
+    /// Stores a new sender of this source, and makes room for it if necessary.
+    fn insert(&mut self, source: Source, sender: &str, rate: f64, now: Instant) -> &mut Sender {
+        if self.len >= MAX_SENDERS {
+            self.make_room(now);
         }
         let known = self.sources.entry(source).or_default();
-        let fresh = || Sender {
+        let sender: Arc<str> = sender.into();
+        known.order.push_back(Arc::clone(&sender));
+        let size = known.order.len();
+        self.sizes.remove(&(size - 1, source));
+        self.sizes.insert((size, source));
+        self.len += 1;
+        known.senders.entry(sender).or_insert_with(|| Sender {
             bucket: TokenBucket::new(rate, now),
             told: None,
-        };
-        known.senders.entry(sender.into()).or_insert_with(fresh)
+        })
     }
 
     /// Removes the senders without a letter in the last second, at most once per second. The bucket

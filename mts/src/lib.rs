@@ -17,6 +17,9 @@ pub mod watch;
 /// keys that untrusted peers choose without a close bound: timing can reveal which keys collide.
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
+/// A hash set with the hash of [`Map`], for the same keys.
+type Set<K> = std::collections::HashSet<K, foldhash::fast::RandomState>;
+
 pub use failure::DeliveryFailure;
 pub use gate::{AccessGate, Link, Source};
 pub use post::{PostError, letter_around, letter_for};

@@ -262,15 +262,24 @@ impl NameConflicts {
     }
 }
 
-/// The names that agents of two other hosts claim, both with proof: the start of each dispute, and
-/// whether it was reported to the gateways of the agents.
+/// The names that agents of two other hosts claim, both with proof, and the reports about them to
+/// the gateways of the agents.
 #[derive(Default)]
 struct Disputes {
-    all: HashMap<(Arc<str>, Incarnation), (Instant, bool)>,
-    /// The gateways of the agents that claim the names but do not hold them.
-    by: HashMap<(Arc<str>, Incarnation), Incarnation>,
+    /// By name and agent of the claimant that does not hold the name.
+    all: HashMap<(Arc<str>, Incarnation), Dispute>,
     /// Time of the last report about a claim of each gateway.
     told: HashMap<Incarnation, Instant>,
+}
+
+/// A name that agents of two other hosts claim.
+struct Dispute {
+    since: Instant,
+    is_told: bool,
+    /// The gateway of the agent that claims the name but does not hold it.
+    gateway: Incarnation,
+    /// Whether the directory still shows it.
+    is_present: bool,
 }
 
 impl Disputes {
@@ -279,12 +288,12 @@ impl Disputes {
 
     /// Returns the time of the next report.
     fn due(&self) -> Option<Instant> {
-        let untold = self.all.iter().filter(|(_, (_, told))| !told);
+        let untold = self.all.values().filter(|dispute| !dispute.is_told);
         untold
-            .map(|(key, (since, _))| {
-                let told = self.by.get(key).and_then(|gateway| self.told.get(gateway));
-                let free = told.map_or(*since, |told| *told + Self::PAUSE);
-                free.max(*since + CONTESTED)
+            .map(|dispute| {
+                let told = self.told.get(&dispute.gateway);
+                let free = told.map_or(dispute.since, |told| *told + Self::PAUSE);
+                free.max(dispute.since + CONTESTED)
             })
             .min()
     }
@@ -318,23 +327,29 @@ impl Disputes {
         if contested.is_empty() && self.all.is_empty() {
             return Vec::new();
         }
-        let key = |other: &Entry| (Arc::clone(&other.name), other.incarnation);
-        let present = contested
-            .iter()
-            .map(|(_, other)| (key(other), other.mts.incarnation));
-        self.by = present.collect();
-        self.all.retain(|key, _| self.by.contains_key(key));
+        for dispute in self.all.values_mut() {
+            dispute.is_present = false;
+        }
         self.told.retain(|_, told| now < *told + Self::PAUSE);
         let mut due = Vec::new();
         for (holder, other) in contested {
-            let (since, told) = self.all.entry(key(other)).or_insert((now, false));
-            let is_free = !self.told.contains_key(&other.mts.incarnation);
-            if !*told && is_free && now >= *since + CONTESTED {
-                *told = true;
-                self.told.insert(other.mts.incarnation, now);
+            let gateway = other.mts.incarnation;
+            let key = (Arc::clone(&other.name), other.incarnation);
+            let dispute = self.all.entry(key).or_insert(Dispute {
+                since: now,
+                is_told: false,
+                gateway,
+                is_present: true,
+            });
+            (dispute.gateway, dispute.is_present) = (gateway, true);
+            let is_due = now >= dispute.since + CONTESTED;
+            if !dispute.is_told && is_due && !self.told.contains_key(&gateway) {
+                dispute.is_told = true;
+                self.told.insert(gateway, now);
                 due.push((Arc::clone(holder), Arc::clone(other)));
             }
         }
+        self.all.retain(|_, dispute| dispute.is_present);
         due
     }
 }

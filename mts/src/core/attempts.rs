@@ -16,7 +16,7 @@ use super::departed::Departed;
 use super::lane::{Delivery, LaneId};
 use super::routes::Tallies;
 use super::{CoreConfig, News, Notice, SendId};
-use crate::Map;
+use crate::{Map, Set};
 
 /// An action that the runtime performs for the delivery core.
 #[derive(Debug)]
@@ -200,7 +200,7 @@ pub(crate) struct AttemptTable {
     /// Smoothed time in which each service acknowledges reports.
     round_trips: Map<Incarnation, Duration>,
     /// Hand-overs whose end was reported and neither acknowledged nor refused yet.
-    open_reports: Map<(Stream, u64, u64), ()>,
+    open_reports: Set<(Stream, u64, u64)>,
     /// Lanes that found no room on the route to a location, in order.
     waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
@@ -233,7 +233,7 @@ impl AttemptTable {
             watched: false,
             health: Map::default(),
             round_trips: Map::default(),
-            open_reports: Map::default(),
+            open_reports: Set::default(),
             waiting_for_room: Map::default(),
             next_attempt: 1,
         }
@@ -284,7 +284,7 @@ impl AttemptTable {
             note.location = self.present_location(&note);
         }
         if note.tries == 0 && note.is_report() {
-            self.open_reports.insert(note.transfer(), ());
+            self.open_reports.insert(note.transfer());
         }
         note.tries += 1;
         let (location, parcel) = (note.location.clone(), note.parcel.clone());
@@ -521,8 +521,7 @@ impl AttemptTable {
 
     /// Whether the end of this hand-over of a letter is being reported and not acknowledged yet.
     pub(crate) fn is_reporting(&self, stream: Stream, sequence: u64, transfer: u64) -> bool {
-        self.open_reports
-            .contains_key(&(stream, sequence, transfer))
+        self.open_reports.contains(&(stream, sequence, transfer))
     }
 
     /// Records the time in which a service acknowledged a report.

@@ -60,30 +60,24 @@ impl Principals {
     /// it is connected; afterwards, a service of the same name may have renewed its certificate.
     pub(super) fn introduced(&mut self, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
-        if !peer.hop.is_remote() || !incarnation.is_known() {
+        if !peer.hop.is_remote() || !incarnation.is_known() || !self.accepts(peer) {
             return;
         }
-        if !self.accepts(peer) {
-            return;
-        }
-        let principal = peer.hop.principal;
-        if let Some(known) = self.services.get_mut(&incarnation) {
-            if known.principal != principal {
-                // Connections of the former principal do not count for this one.
-                known.connections = 0;
-            }
-            known.principal = principal;
-            known.connections += 1;
-            return;
-        }
-        self.make_room();
         let service = Service {
-            principal,
+            principal: peer.hop.principal,
             name: Arc::clone(&peer.name),
             connections: 1,
         };
-        self.services.insert(incarnation, service);
-        self.order.push_back(incarnation);
+        match self.services.get_mut(&incarnation) {
+            Some(known) if known.principal == service.principal => known.connections += 1,
+            // Name and connections of the former principal do not count for this one.
+            Some(known) => *known = service,
+            None => {
+                self.make_room();
+                self.services.insert(incarnation, service);
+                self.order.push_back(incarnation);
+            }
+        }
     }
 
     /// Whether the peer may be the service that it claims to be.
