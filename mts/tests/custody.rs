@@ -26,12 +26,13 @@ const DEADLINE: Duration = Duration::from_secs(60);
 /// The core of one service, whose directory has one agent `arm`, behind another service.
 struct Service {
     core: Core,
+    directory: Arc<MemoryDirectory>,
     start: Instant,
 }
 
 impl Service {
     fn new(forwards: bool) -> Self {
-        let directory = MemoryDirectory::new(Mts::new("mts", NEXT));
+        let directory = Arc::new(MemoryDirectory::new(Mts::new("mts", NEXT)));
         let at = shm(NEXT);
         directory
             .register(Registration::new("arm", ARM, vec![at]))
@@ -40,10 +41,11 @@ impl Service {
             forwards,
             ..CoreConfig::new("mts", OWN, vec![Kind::Shm])
         };
-        let mut core = Core::new(config, Arc::new(directory));
+        let mut core = Core::new(config, Arc::clone(&directory) as Arc<dyn Directory>);
         core.register("rover".into(), ROVER);
         Self {
             core,
+            directory,
             start: Instant::now(),
         }
     }
@@ -57,13 +59,17 @@ impl Service {
     }
 
     fn send(&mut self) {
+        self.send_at(0);
+    }
+
+    fn send_at(&mut self, ms: u64) {
         let submission = Submission {
             sender: ROVER,
             letter: letter(),
             receivers: vec!["arm".into()],
             deadline: DEADLINE,
         };
-        self.core.send(self.at(0), submission);
+        self.core.send(self.at(ms), submission);
     }
 
     /// A letter arrives for `arm`, in this transfer of the previous service.
@@ -75,8 +81,12 @@ impl Service {
     }
 
     fn receive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Verdict {
+        self.receive_from(ms, via, shm(OWN), parcel)
+    }
+
+    fn receive_from(&mut self, ms: u64, via: Kind, location: Location, parcel: Parcel) -> Verdict {
         let from = Hop {
-            location: shm(OWN),
+            location,
             principal: Principal::Host,
         };
         let arrival = Arrival {
@@ -220,6 +230,66 @@ fn a_custodian_that_has_the_letter_keeps_it_and_is_asked_again() {
         ms = later;
     }
     assert_eq!(sender.outcome(), None);
+}
+
+/// A letter that moved to the receiver's new registration is before the others in the lane, so that
+/// the first letter of the lane is not one for the registration that ended.
+#[test]
+fn letters_for_an_ended_registration_wait_two_seconds_behind_one_for_its_successor() {
+    const NEW: Incarnation = Incarnation::from_u64(4);
+    let mut sender = Service::new(false);
+    let moving = in_custody(&mut sender);
+    in_custody(&mut sender);
+    sender.directory.deregister("arm", ARM).unwrap();
+    let new = Registration::new("arm", NEW, vec![shm(NEXT)]);
+    sender.directory.register(new).unwrap();
+    sender.core.handle_directory_change(sender.at(10));
+    let moved = Body::Report(Report::Moved);
+    let report = parcel(moving.sequence, moving.transfer, moved);
+    sender.receive_from(20, Kind::Shm, shm(NEXT), report);
+    let (attempt, again) = sender.dispatched().unwrap();
+    assert_eq!(again.stream.receiver, NEW);
+    // Any change of the directory.
+    sender.core.handle_directory_change(sender.at(30));
+    sender.answer(40, attempt, Answer::Accepted);
+    let outcome = sender.outcome();
+    assert!(
+        matches!(outcome, Some(Outcome::Delivered { .. })),
+        "{outcome:?}"
+    );
+    sender.send_at(50);
+    let mut ms = 50;
+    let outcome = loop {
+        ms += 10;
+        sender.core.handle_timeout(sender.at(ms));
+        let mut ended = None;
+        while let Some(action) = sender.core.poll_action() {
+            match action {
+                Action::Outcome { outcome, .. } => ended = Some(outcome),
+                // The custodian has the letter.
+                Action::Dispatch {
+                    attempt, parcel, ..
+                } if parcel.body == Body::Predecessor => {
+                    sender.answer(ms, attempt, Answer::Accepted);
+                }
+                Action::Dispatch { parcel, .. } => panic!("sent early: {parcel:?}"),
+                _ => {}
+            }
+            if ended.is_some() {
+                break;
+            }
+        }
+        if let Some(ended) = ended {
+            break ended;
+        }
+        assert!(ms < 2100, "the letter in custody has no outcome");
+    };
+    assert!(
+        matches!(&outcome, Outcome::Failed { reason, .. } if *reason == FailureReason::Unconfirmed),
+        "{outcome:?}"
+    );
+    let (_, next) = sender.dispatched().unwrap();
+    assert_eq!(next.stream.receiver, NEW);
 }
 
 #[test]

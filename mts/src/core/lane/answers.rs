@@ -37,7 +37,7 @@ impl Lane {
             _ => return,
         };
         self.back();
-        self.record_event(now);
+        self.record_event(now, index);
         self.letters[index].progress.state = State::Waiting;
         // The timer visits the letter again, also if its deadline passed in the meantime.
         self.due_at(self.letters[index].deadline);
@@ -309,7 +309,7 @@ impl Lane {
             None => delivery.progress.attempts.last().map(|it| it.via),
         };
         self.end_hand_over(index, transfer, table);
-        self.record_event(now);
+        self.record_event(now, index);
         match report {
             Report::Settled(outcome) => {
                 self.settled_by_report(now, index, taken_by, outcome, table);
@@ -420,29 +420,40 @@ impl Lane {
         }
     }
 
-    /// Detects that the registration of the first letters has left the directory; letters for its
-    /// successor then wait only for a limited time.
-    fn notice_end(&mut self, now: Instant, table: &AttemptTable) {
-        if self.is_custody() {
+    /// Detects that a registration with letters in the lane has left the directory; letters for its
+    /// successor then wait only for a limited time. Letters before the first one for that
+    /// registration may have moved to the successor.
+    pub(super) fn notice_end(&mut self, now: Instant, table: &AttemptTable) {
+        if self.is_custody() || self.stated.is_some() {
             return;
         }
-        let Some(first) = self.letters.front().map(|first| first.registration) else {
-            return;
-        };
-        let is_there = self.stated.is_some() || table.receiver(first, &self.receiver).is_some();
-        match self.ended {
-            _ if is_there => self.ended = None,
-            Some((ended, _)) if ended == first => {}
-            _ => {
-                self.ended = Some((first, now));
+        let mut present = None;
+        let mut registrations = self.letters.iter().map(|letter| letter.registration);
+        let ended = registrations.find(|registration| {
+            let is_there = present == Some(*registration)
+                || table.receiver(*registration, &self.receiver).is_some();
+            if is_there {
+                present = Some(*registration);
+            }
+            !is_there
+        });
+        match (self.ended, ended) {
+            (_, None) => self.ended = None,
+            (Some((known, _)), Some(ended)) if known == ended => {}
+            (_, Some(ended)) => {
+                self.ended = Some((ended, now));
                 self.due_at(now + ENDED_PATIENCE);
             }
         }
     }
 
-    /// Restarts the wait for letters of an ended registration after an event of one of them.
-    fn record_event(&mut self, now: Instant) {
-        if let Some((_, heard)) = &mut self.ended {
+    /// Restarts the wait for letters of an ended registration after an event of the letter at
+    /// `index`, if that is one of them.
+    fn record_event(&mut self, now: Instant, index: usize) {
+        let registration = self.letters[index].registration;
+        if let Some((ended, heard)) = &mut self.ended
+            && *ended == registration
+        {
             *heard = now;
         }
     }

@@ -75,6 +75,10 @@ impl Lane {
             }
             index += 1;
         }
+        if ended.is_some() {
+            // Another registration may have ended, too.
+            self.notice_end(now, table);
+        }
         self.due = self.next_due(now);
     }
 
