@@ -4,9 +4,8 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use bytes::Bytes;
 use fipa_acl::{AgentId, AgentIdError, Letter, Message, MessageBuilder, Performative};
-use fipa_mts::{PostError, letter_around, letter_for};
+use fipa_mts::{LetterDraft, PostError, letter_for};
 use fipa_sds::{DeregisterError, Directory, RegisterError, Registration};
 use fipa_transport::{Incarnation, LoanedContent};
 
@@ -158,18 +157,17 @@ impl Agent {
     /// If the message cannot be sent at all.
     pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
         self.endpoint.check(&message)?;
-        // The length of everything around the content does not depend on the time of sending.
-        let empty = letter_around(&message, Bytes::new(), SystemTime::now())?;
-        let (head, tail) = message.around_content(len).map_err(PostError::from)?;
-        let receivers: Vec<&str> = message.receivers().iter().map(AgentId::name).collect();
+        let draft = LetterDraft::new(message, len, SystemTime::now())?;
+        let receivers = draft.message().receivers().iter();
+        let receivers: Vec<&str> = receivers.map(AgentId::name).collect();
         let name = receivers.iter().map(|name| name.len()).max();
-        let head_room = name.unwrap_or(0) + longest_envelope(&empty) + head.len();
+        let head_room = name.unwrap_or(0) + draft.head_len();
         let incarnation = self.endpoint.incarnation;
-        let content = self
-            .endpoint
-            .mts()
-            .loan(incarnation, &receivers, head_room, len, tail.len());
-        Ok(Loan { message, content })
+        let content =
+            self.endpoint
+                .mts()
+                .loan(incarnation, &receivers, head_room, len, draft.tail_len());
+        Ok(Loan { draft, content })
     }
 
     /// Sends the message of a loan with the content written into it.
@@ -180,9 +178,15 @@ impl Agent {
         &self,
         loan: Loan,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        let Loan { message, content } = loan;
-        let letter = letter_around(&message, content.freeze(), SystemTime::now());
-        self.post(&message, letter, self.endpoint.domain.inner.deadline)
+        let Loan { draft, content } = loan;
+        let sending = draft
+            .complete(content.freeze(), SystemTime::now())
+            .map_err(SendError::from)
+            .and_then(|(message, letter)| {
+                let deadline = self.endpoint.domain.inner.deadline;
+                self.endpoint.send(&message, Ok(letter), deadline)
+            });
+        async move { Ok(deliveries(sending?).await) }
     }
 
     /// Sends a letter before it returns; the future yields the outcomes.
@@ -262,15 +266,9 @@ impl Drop for Agent {
     }
 }
 
-/// Returns the length of the longest envelope. Only the digits of the payload length depend on the
-/// content: at most 20 more digits, encoded as two per byte.
-fn longest_envelope(letter: &Letter) -> usize {
-    letter.envelope_len() + 10
-}
-
 /// A message with loaned memory for its content.
 pub struct Loan {
-    message: Message,
+    draft: LetterDraft,
     content: Box<dyn LoanedContent>,
 }
 
@@ -284,7 +282,7 @@ impl Loan {
 impl fmt::Debug for Loan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Loan")
-            .field("message", &self.message)
+            .field("message", self.draft.message())
             .finish_non_exhaustive()
     }
 }

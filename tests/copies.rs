@@ -9,8 +9,8 @@ mod services;
 use std::time::{Duration, SystemTime};
 
 use fipa::{AgentId, Kind, Message, Performative};
+use fipa_mts::LetterDraft;
 use fipa_mts::core::{Received, Submission};
-use fipa_mts::letter_around;
 use fipa_transport_net::Counters;
 use fipa_transport_shm::ShmCounters;
 use tokio::time::timeout;
@@ -57,11 +57,13 @@ async fn only_the_kernel_copies_large_content() {
     let message = message();
     for number in 0..LETTERS {
         let len = LEN + number;
-        let (head, tail) = message.around_content(len).unwrap();
-        let room = 4096 + head.len();
-        let mut loan = rovers.mts.loan(ROVER, &["arm"], room, len, tail.len());
+        let draft = LetterDraft::new(message.clone(), len, SystemTime::now()).unwrap();
+        let room = "arm".len() + draft.head_len();
+        let mut loan = rovers
+            .mts
+            .loan(ROVER, &["arm"], room, len, draft.tail_len());
         loan.content_mut().fill(number as u8);
-        let letter = letter_around(&message, loan.freeze(), SystemTime::now()).unwrap();
+        let (_, letter) = draft.complete(loan.freeze(), SystemTime::now()).unwrap();
         let sending = rovers.mts.send(Submission {
             sender: ROVER,
             letter,

@@ -7,7 +7,7 @@ use fipa_acl::{
     AclRepresentation, EncodeError, Envelope, Letter, Message, Payload, Time, TimeError,
 };
 
-/// Error of [`letter_for`] and [`letter_around`].
+/// Error of [`letter_for`] and [`LetterDraft`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PostError {
@@ -30,24 +30,73 @@ pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostErro
     Ok(Letter::new(envelope, payload))
 }
 
-/// Encodes a message as a letter around separate content, which is shared, not copied. The
-/// message's own content is ignored.
-///
-/// # Errors
-/// Fails when the message or its envelope cannot be encoded.
-pub fn letter_around(
-    message: &Message,
-    content: Bytes,
-    utc: SystemTime,
-) -> Result<Letter, PostError> {
-    let (head, tail) = message.around_content(content.len())?;
-    let payload = Payload {
-        head,
-        content,
-        tail,
-    };
-    let envelope = envelope_for(message, payload.len(), utc)?;
-    Ok(Letter::new(envelope, payload))
+/// A letter whose content is written later, into memory that is loaned for it. The message is
+/// encoded once, before.
+#[derive(Debug)]
+pub struct LetterDraft {
+    message: Message,
+    /// The encoded message before and after the content.
+    head: Bytes,
+    tail: Bytes,
+    content_len: usize,
+    envelope_len: usize,
+}
+
+impl LetterDraft {
+    /// Encodes the message around content of this length, in bytes. The message's own content is
+    /// ignored.
+    ///
+    /// # Errors
+    /// Fails when the message or its envelope cannot be encoded.
+    pub fn new(message: Message, content_len: usize, utc: SystemTime) -> Result<Self, PostError> {
+        let (head, tail) = message.around_content(content_len)?;
+        let payload_len = head.len() + content_len + tail.len();
+        // Its length does not depend on the time.
+        let envelope_len = envelope_for(&message, payload_len, utc)?.len();
+        Ok(Self {
+            message,
+            head,
+            tail,
+            content_len,
+            envelope_len,
+        })
+    }
+
+    /// The message, without the content to come.
+    pub fn message(&self) -> &Message {
+        &self.message
+    }
+
+    /// Length of envelope and message before the content, in bytes.
+    #[must_use]
+    pub fn head_len(&self) -> usize {
+        self.envelope_len + self.head.len()
+    }
+
+    /// Length of the message behind the content, in bytes.
+    #[must_use]
+    pub fn tail_len(&self) -> usize {
+        self.tail.len()
+    }
+
+    /// Completes the letter, with an envelope dated `utc`. The content is shared, not copied; it has
+    /// the length given before.
+    ///
+    /// # Errors
+    /// Fails when the envelope cannot be encoded.
+    ///
+    /// # Panics
+    /// Panics if the content has another length.
+    pub fn complete(self, content: Bytes, utc: SystemTime) -> Result<(Message, Letter), PostError> {
+        assert_eq!(content.len(), self.content_len, "the length of the content");
+        let payload = Payload {
+            head: self.head,
+            content,
+            tail: self.tail,
+        };
+        let envelope = envelope_for(&self.message, payload.len(), utc)?;
+        Ok((self.message, Letter::new(envelope, payload)))
+    }
 }
 
 fn envelope_for(
