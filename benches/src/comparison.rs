@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use fipa::Kind;
 use serde_json::Value;
 
+use crate::baseline::{Baseline, Changes};
 use crate::error::BenchError;
 use crate::machine::Machine;
 use crate::measure::{self, Effort, Measured};
@@ -180,6 +181,11 @@ impl Measurement {
     /// members end with their unit.
     pub fn to_json(&self) -> Value {
         report::json(&self.machine, &self.effort, &self.measured)
+    }
+
+    /// Compares the result with an earlier one.
+    pub fn compare(&self, baseline: &Baseline) -> Changes {
+        baseline.compare(&self.measured.rows)
     }
 
     /// The result as a table with a legend.

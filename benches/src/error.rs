@@ -23,6 +23,22 @@ pub enum BenchError {
     /// A diagram could not be drawn.
     #[error("cannot draw the diagram: {0}")]
     Draw(String),
+    /// A file could not be read.
+    #[error("cannot read {}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// A file is not the JSON output of a measurement.
+    #[error("{} is not the JSON output of a measurement", path.display())]
+    Baseline {
+        /// The file.
+        path: PathBuf,
+        /// The cause.
+        source: serde_json::Error,
+    },
     /// A file could not be written.
     #[error("cannot write {}", path.display())]
     Write {

@@ -7,12 +7,14 @@
 //!
 //! * [`Comparison`] measures agents, gateways and the bare mechanisms; [`play`] is the part of one
 //!   process in it.
+//! * [`Baseline`] is an earlier result, and [`Changes`] are the differences from it.
 //! * [`Paper`] repeats the evaluation of the C++ libraries: lengths and times of all encodings.
 //! * [`Machine`] describes the machine that was measured.
 //!
 //! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
 
 mod bars;
+mod baseline;
 mod comparison;
 mod error;
 mod machine;
@@ -25,6 +27,7 @@ mod plot;
 mod report;
 mod stage;
 
+pub use baseline::{Baseline, Changes};
 pub use comparison::{Comparison, Measurement, Program, Selection};
 pub use error::{BenchError, PartError};
 pub use machine::Machine;

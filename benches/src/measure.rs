@@ -99,16 +99,18 @@ pub(super) struct Row {
     pub(super) one_way_us: Percentiles,
     /// From before sending until the sender knows that it has arrived.
     pub(super) round_trip_us: Percentiles,
-    /// Letters a second with a window of letters under path.
+    /// Letters per second with several letters in flight.
     pub(super) rate_per_s: Option<f64>,
     /// Processor time of all processes of the path, one letter at a time.
     pub(super) cpu_us_per_letter: f64,
     pub(super) limit: Option<Limit>,
-    /// Ratio of the one-path time to the limit's: the median over all rounds of the ratio of medians.
+    /// Ratio of the one-way time to the limit's: the median over all rounds of the ratio of medians.
     pub(super) ratio: Option<f64>,
     /// Middle half of these ratios.
     pub(super) ratio_spread: Option<[f64; 2]>,
     pub(super) round_trip_ratio: Option<f64>,
+    /// Middle half of these ratios.
+    pub(super) round_trip_ratio_spread: Option<[f64; 2]>,
     pub(super) rate_ratio: Option<f64>,
     pub(super) cpu_ratio: Option<f64>,
     /// Cost of encryption, beside the same path without.
@@ -254,7 +256,11 @@ async fn cell(
                 continue;
             };
             let is_rate = round > effort.rounds;
-            let window = if is_rate { Mechanism::window(fill) } else { 1 };
+            let window = if is_rate {
+                Mechanism::window(fill, size)
+            } else {
+                1
+            };
             let count = match is_rate {
                 true => (cell.letters * RATE_TURN as usize).max(4 * window),
                 false => cell.letters + WARMING,
@@ -424,6 +430,7 @@ fn row(
         ratio: ratios.as_ref().map(|it| median(&it.one_way)),
         ratio_spread: ratios.as_ref().map(|it| spread(&it.one_way)),
         round_trip_ratio: ratios.as_ref().map(|it| median(&it.round_trip)),
+        round_trip_ratio_spread: ratios.as_ref().map(|it| spread(&it.round_trip)),
         rate_ratio: limit.and_then(|(_, limit)| rate_ratio(cell, limit)),
         cpu_ratio: ratios.map(|it| median(&it.cpu)),
         plain,

@@ -10,15 +10,24 @@ mod letters;
 mod orders;
 mod relay;
 mod socket;
+mod wire;
+
+use std::time::Duration;
 
 use fipa::Config;
 use fipa_transport_shm::raw::Wait as RawWait;
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
 
 use crate::error::PartError;
 use crate::machine;
 
 pub(super) use self::orders::{End, Event, Fill, Letters, Order, Spread};
+pub(super) use self::wire::Wire;
+
+/// Time in which a part ends by itself after its orders have ended.
+const GRACE: Duration = Duration::from_millis(100);
 
 /// The part of a process; the argument of `--part`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -36,8 +45,8 @@ pub(super) enum Part {
     Iceoryx { end: End, wait: Wait },
     /// A bare socket; the address comes with the first order of the end that connects.
     Socket { end: End, kind: Socket },
-    /// Between bare iceoryx2 and a bare TCP connection.
-    Relay { end: End },
+    /// Between bare iceoryx2 and a bare connection.
+    Relay { end: End, wire: Wire },
 }
 
 impl Part {
@@ -90,10 +99,28 @@ impl From<Wait> for RawWait {
 ///
 /// If `part` is not such a text, the processor is not available, or the part could not be played.
 pub fn play(part: &str, core: Option<usize>, config: &Config) -> Result<(), PartError> {
+    std::thread::spawn(end_with_orders);
     let pinned = core.map_or(Ok(()), machine::pin_to);
     let part = serde_json::from_str(part).map_err(|error| error.to_string());
     let played = pinned.and(part).and_then(|part| play_part(part, config));
     played.map_err(PartError)
+}
+
+/// Ends the process soon after its orders end, also if it waits for a process that has ended.
+fn end_with_orders() {
+    let stdin = std::io::stdin();
+    loop {
+        // The end of the writing side is reported without being asked for.
+        let mut watched = [PollFd::new(&stdin, PollFlags::empty())];
+        match poll(&mut watched, None) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(_) => return,
+        }
+        if !watched[0].revents().is_empty() {
+            std::thread::sleep(GRACE);
+            std::process::exit(0);
+        }
+    }
 }
 
 fn play_part(part: Part, config: &Config) -> Result<(), String> {
@@ -108,6 +135,6 @@ fn play_part(part: Part, config: &Config) -> Result<(), String> {
         Part::Letters { end } => letters::play(config, end),
         Part::Iceoryx { end, wait } => iceoryx::play(config, end, wait.into()),
         Part::Socket { end, kind } => socket::play(end, kind),
-        Part::Relay { end } => relay::play(config, end),
+        Part::Relay { end, wire } => relay::play(config, end, wire),
     }
 }

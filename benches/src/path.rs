@@ -2,7 +2,7 @@
 
 use fipa::Kind;
 
-use super::part::{End, Event, Fill, Letters, Order, Part, Socket, Wait};
+use super::part::{End, Event, Fill, Letters, Order, Part, Socket, Wait, Wire};
 use super::stage::{ProcessIndex, Stage};
 
 /// The mechanism of a path.
@@ -22,8 +22,8 @@ pub(super) enum Mechanism {
     Socket(Socket),
     /// Publications of zenoh, in shared memory of its own or through TCP alone.
     Zenoh { shared_memory: bool },
-    /// Bare iceoryx2, then bare TCP, then bare iceoryx2.
-    Relay,
+    /// Bare iceoryx2, then a bare connection, then bare iceoryx2.
+    Relay(Wire),
 }
 
 impl Mechanism {
@@ -32,12 +32,14 @@ impl Mechanism {
         match self {
             Self::Agents(Kind::Shm) | Self::Letters => Some(Self::Iceoryx),
             Self::Agents(_) => Some(Self::Socket(Socket::Unix)),
-            Self::Gateways(_) | Self::Secured(_) => Some(Self::Relay),
+            Self::Gateways(_) => Some(Self::Relay(Wire::Tcp)),
+            Self::Secured(Kind::Tcp) => Some(Self::Relay(Wire::Tls)),
+            Self::Secured(_) => Some(Self::Relay(Wire::Quic)),
             Self::Zenoh {
                 shared_memory: true,
             } => Some(Self::Iceoryx),
             Self::Zenoh { .. } => Some(Self::Socket(Socket::Tcp)),
-            Self::Iceoryx | Self::Socket(_) | Self::Relay => None,
+            Self::Iceoryx | Self::Socket(_) | Self::Relay(_) => None,
         }
     }
 
@@ -60,7 +62,9 @@ impl Mechanism {
                 shared_memory: true,
             } => "zenoh shm".to_owned(),
             Self::Zenoh { .. } => "zenoh tcp".to_owned(),
-            Self::Relay => "raw relay".to_owned(),
+            Self::Relay(Wire::Tcp) => "raw relay".to_owned(),
+            Self::Relay(Wire::Tls) => "raw relay, rustls".to_owned(),
+            Self::Relay(Wire::Quic) => "raw relay, quinn".to_owned(),
         }
     }
 
@@ -82,15 +86,21 @@ impl Mechanism {
         matches!(self, Self::Agents(_) | Self::Gateways(_) | Self::Secured(_))
     }
 
-    /// Number of letters under path when the rate is measured.
-    pub(super) fn window(fill: Fill) -> usize {
-        match fill {
+    /// Number of letters in flight when the rate of letters with content of this size, in bytes, is
+    /// measured.
+    pub(super) fn window(fill: Fill, size: usize) -> usize {
+        let letters = match fill {
             Fill::Copied => 16,
             // The maximum number of loans of a process.
             _ => 8,
-        }
+        };
+        letters.min(MAX_IN_FLIGHT / size).max(1)
     }
 }
+
+/// Maximum content in flight when the rate is measured, in bytes: it fits into a receiver's queue,
+/// which holds 64 MiB by default.
+pub(super) const MAX_IN_FLIGHT: usize = 48 << 20;
 
 /// A path whose processes run.
 #[derive(Debug)]
@@ -199,10 +209,10 @@ impl BenchPath {
                 let (sender, _) = stage.start_zenoh(End::Sender, shared_memory).await?;
                 (sender, receiver, Some(address))
             }
-            Mechanism::Relay => {
+            Mechanism::Relay(wire) => {
                 let settings = settings("shm");
                 let [from, to] = ends.map(|end| Part::Iceoryx { end, wait });
-                let [near, far] = ends.map(|end| Part::Relay { end });
+                let [near, far] = ends.map(|end| Part::Relay { end, wire });
                 let (receiver, _) = stage.start(&to, &own("2"), &settings).await?;
                 let (far, address) = stage.start(&far, &own("2"), &settings).await?;
                 let (near, _) = stage.start(&near, &own("1"), &settings).await?;
@@ -319,6 +329,6 @@ fn short(mechanism: Mechanism, wait: Wait) -> String {
         Mechanism::Letters => format!("let{wait}"),
         Mechanism::Iceoryx => format!("ice{wait}"),
         Mechanism::Socket(_) | Mechanism::Zenoh { .. } => "raw".to_owned(),
-        Mechanism::Relay => format!("rel{wait}"),
+        Mechanism::Relay(wire) => format!("r{wire:?}{wait}").to_lowercase(),
     }
 }

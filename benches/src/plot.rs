@@ -6,14 +6,14 @@ use plotters::coord::ranged1d::{KeyPointHint, Ranged};
 use plotters::prelude::*;
 
 use super::measure::Row;
-use super::part::{Fill, Socket, Wait};
+use super::part::{Fill, Socket, Wait, Wire};
 use super::path::Mechanism;
 use fipa::Kind;
 
-const WIDTH: u32 = 960;
+const WIDTH: u32 = 1000;
 const HEIGHT: u32 = 560;
 /// Width for the names at the right.
-const NAMES: u32 = 250;
+const NAMES: u32 = 280;
 const INK: RGBColor = RGBColor(0x33, 0x3a, 0x44);
 const FAINT: RGBColor = RGBColor(0xdd, 0xe1, 0xe6);
 
@@ -38,34 +38,42 @@ pub(super) fn svg(rows: &[Row], subtitle: &str) -> Result<String, String> {
 }
 
 /// The lines of a diagram: loaned and filled content over shared memory, copied content over the
-/// network; spinning where it was measured. Letters that are not decoded have no line.
+/// network. Every name tells how the processes wait. Paths that were measured spinning and blocking
+/// have both lines for filled content, so that each other path has one that waits as it does. Letters
+/// that are not decoded have no line.
 fn lines(rows: &[Row]) -> Vec<Line> {
     let spinning = |mechanism: Mechanism| {
         rows.iter()
             .any(|row| row.mechanism == mechanism && row.wait == Wait::Spin)
     };
-    let mut lines: BTreeMap<(usize, Fill), Line> = BTreeMap::new();
+    let mut lines: BTreeMap<(usize, Fill, Wait), Line> = BTreeMap::new();
     for row in rows {
-        let wanted = if row.mechanism.loans() {
-            row.fill != Fill::Copied && (row.wait == Wait::Spin || !spinning(row.mechanism))
-        } else {
-            row.fill == Fill::Filled
+        let wanted = match (row.mechanism.loans(), row.fill) {
+            (_, Fill::Copied) => false,
+            (true, Fill::Loaned) => row.wait == Wait::Spin || !spinning(row.mechanism),
+            (_, fill) => fill == Fill::Filled,
         };
         if !wanted || row.mechanism == Mechanism::Letters {
             continue;
         }
-        let (order, colour) = look(row.mechanism, row.fill);
-        let name = match (row.mechanism.loans(), row.fill) {
-            (true, Fill::Loaned) => format!("{}, loaned", row.path),
-            (true, _) => format!("{}, filled", row.path),
-            (false, _) => row.path.clone(),
+        let (order, colour) = look(row.mechanism, row.fill, row.wait);
+        let wait = match row.wait {
+            Wait::Spin => "spinning",
+            Wait::Block => "blocking",
         };
-        let line = lines.entry((order, row.fill)).or_insert_with(|| Line {
-            name,
-            colour,
-            is_limit: row.mechanism.limit().is_none(),
-            points: Vec::new(),
-        });
+        let name = match (row.mechanism.loans(), row.fill) {
+            (true, Fill::Loaned) => format!("{}, loaned, {wait}", row.path),
+            (true, _) => format!("{}, filled, {wait}", row.path),
+            (false, _) => format!("{}, {wait}", row.path),
+        };
+        let line = lines
+            .entry((order, row.fill, row.wait))
+            .or_insert_with(|| Line {
+                name,
+                colour,
+                is_limit: row.mechanism.limit().is_none(),
+                points: Vec::new(),
+            });
         line.points.push((row.size as f64, row.one_way_us.p50));
     }
     let mut lines: Vec<Line> = lines.into_values().collect();
@@ -76,10 +84,11 @@ fn lines(rows: &[Row]) -> Vec<Line> {
 }
 
 /// Order and color of a line; a path and its limit share them.
-fn look(mechanism: Mechanism, fill: Fill) -> (usize, RGBColor) {
-    let shm = match fill {
-        Fill::Loaned => RGBColor(0x0b, 0x7a, 0x75),
-        _ => RGBColor(0x1f, 0x6f, 0xd1),
+fn look(mechanism: Mechanism, fill: Fill, wait: Wait) -> (usize, RGBColor) {
+    let shm = match (fill, wait) {
+        (Fill::Loaned, _) => RGBColor(0x0b, 0x7a, 0x75),
+        (_, Wait::Spin) => RGBColor(0x1f, 0x6f, 0xd1),
+        (_, Wait::Block) => RGBColor(0x12, 0x3c, 0x73),
     };
     match mechanism {
         Mechanism::Agents(Kind::Shm) | Mechanism::Letters => (0, shm),
@@ -89,11 +98,13 @@ fn look(mechanism: Mechanism, fill: Fill) -> (usize, RGBColor) {
         Mechanism::Socket(Socket::Tcp) => (4, RGBColor(0x7a, 0x83, 0x8f)),
         Mechanism::Gateways(Kind::Udp) => (7, RGBColor(0xb0, 0x3a, 0x7a)),
         Mechanism::Gateways(_) => (8, RGBColor(0x7b, 0x3f, 0xb5)),
-        Mechanism::Relay => (9, RGBColor(0x7b, 0x3f, 0xb5)),
+        Mechanism::Relay(Wire::Tcp) => (9, RGBColor(0x7b, 0x3f, 0xb5)),
         Mechanism::Secured(Kind::Tcp) => (10, RGBColor(0x2f, 0x8f, 0x3f)),
-        Mechanism::Secured(_) => (11, RGBColor(0x4a, 0x4f, 0xc9)),
+        Mechanism::Relay(Wire::Tls) => (11, RGBColor(0x2f, 0x8f, 0x3f)),
+        Mechanism::Secured(_) => (12, RGBColor(0x4a, 0x4f, 0xc9)),
+        Mechanism::Relay(Wire::Quic) => (13, RGBColor(0x4a, 0x4f, 0xc9)),
         Mechanism::Zenoh { shared_memory } => {
-            let order = if shared_memory { 12 } else { 13 };
+            let order = if shared_memory { 14 } else { 15 };
             (order, RGBColor(0x9a, 0x2a, 0x2a))
         }
     }

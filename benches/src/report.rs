@@ -6,7 +6,8 @@ use serde_json::{Value, json};
 use super::machine::Machine;
 use super::many::Many;
 use super::measure::{Effort, Measured, Row, name_of};
-use super::part::Wait;
+use super::part::{Fill, Wait};
+use super::path::MAX_IN_FLIGHT;
 
 /// All results as JSON.
 pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> Value {
@@ -14,7 +15,9 @@ pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> V
         "machine": machine,
         "method": {
             "rounds": effort.rounds,
-            "letters_in_flight_for_rate": { "copied": 16, "loaned": 8, "filled": 8 },
+            "letters_in_flight_for_rate": {
+                "copied": 16, "loaned": 8, "filled": 8, "max_content_bytes": MAX_IN_FLIGHT,
+            },
         },
         "rows": measured.rows,
         "multicast": measured.many,
@@ -42,6 +45,7 @@ pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> S
     for note in &measured.notes {
         text.push_str(&format!("note: {note}\n"));
     }
+    text.push_str(&summary(&measured.rows));
     text
 }
 
@@ -54,11 +58,59 @@ n           number of samples
 p50-p99.9   percentiles of the one-way time: from the call of send until the receiver has the
             decoded message
 round trip  from the call of send until the sender has the acknowledgment
-rate/s      letters per second with 16 letters in flight (8 if loaned or filled)
+rate/s      letters per second with 16 letters in flight (8 if loaned or filled), and at most
+            48 MiB of content
 cpu         CPU time of all processes of the route per letter, one letter at a time
 x limit     ratio of the one-way time to that of the same bytes through the raw mechanism in the same
             rounds (spread: the middle half of the rounds); trip, rate and cpu are the other ratios
 ";
+
+/// The round trips of one size, a line per path: the result in one screen.
+fn summary(rows: &[Row]) -> String {
+    /// The size that users send most: the nearest measured size is shown.
+    const TYPICAL: usize = 1024;
+    let sizes = rows.iter().map(|row| row.size);
+    let Some(typical) = sizes.min_by_key(|size| size.abs_diff(TYPICAL)) else {
+        return String::new();
+    };
+    let shown = rows.iter().filter(|row| {
+        row.size == typical && row.fill == Fill::Copied && row.round_trip_ratio.is_some()
+    });
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.set_header([
+        "route",
+        "wait",
+        "round trip",
+        "limit",
+        "ratio",
+        "rate/s",
+        "ratio",
+    ]);
+    for column in table.column_iter_mut().skip(2) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let ratio = |ratio: Option<f64>| ratio.map_or_else(String::new, |ratio| format!("{ratio:.2}"));
+    for row in shown {
+        let limit = row.limit.as_ref();
+        table.add_row([
+            row.path.clone(),
+            wait(row.wait).to_owned(),
+            format!("{} µs", micro(row.round_trip_us.p50)),
+            limit.map_or_else(String::new, |limit| {
+                format!("{} µs", micro(limit.round_trip_p50_us))
+            }),
+            ratio(row.round_trip_ratio),
+            row.rate_per_s
+                .map_or_else(String::new, |rate| format!("{rate:.0}")),
+            ratio(row.rate_ratio),
+        ]);
+    }
+    format!(
+        "\nIn short, {} copied, acknowledged:\n{table}\n`fipa bench --svg FILE` draws all sizes.\n",
+        size(typical)
+    )
+}
 
 /// Cost of encryption, one line per path and content.
 fn encrypted(rows: &[Row]) -> String {

@@ -14,8 +14,13 @@ use crate::part::{End, Event, Order, Part};
 /// Timeout of an answer, which usually takes less than a second.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Time that a process has to end after its orders end.
-const ENDING: Duration = Duration::from_secs(5);
+/// Time that a process of zenoh has to end after its orders end. Only zenoh removes its files.
+const ENDING: Duration = Duration::from_millis(300);
+
+/// Beginning of the name of a measurement's directory; the process identifier follows.
+const DIRECTORY: &str = "fipa-bench-";
+/// Beginning of the names of a measurement's files in shared memory; the process identifier follows.
+const SHARED_MEMORY: &str = "fipa_bench-";
 
 /// All processes of a measurement, and their directory, apart from the domains of this user.
 ///
@@ -43,7 +48,8 @@ struct Process {
 
 impl Stage {
     pub(super) fn new(program: Program, zenoh: Option<PathBuf>) -> Result<Self, String> {
-        let place = std::env::temp_dir().join(format!("fipa-bench-{}", std::process::id()));
+        remove_leftovers();
+        let place = std::env::temp_dir().join(format!("{DIRECTORY}{}", std::process::id()));
         let mut private = std::fs::DirBuilder::new();
         std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
         let made = private.create(&place);
@@ -214,7 +220,7 @@ impl Stage {
 
     /// Files of the measurement in shared memory.
     fn shared_memory() -> impl Iterator<Item = PathBuf> {
-        let mark = format!("fipa_bench-{}-", std::process::id());
+        let mark = format!("{SHARED_MEMORY}{}-", std::process::id());
         let files = std::fs::read_dir("/dev/shm");
         let files = files.into_iter().flatten().flatten();
         let ours = files.filter(move |file| file.file_name().to_string_lossy().starts_with(&mark));
@@ -228,7 +234,8 @@ impl Drop for Stage {
             process.orders = None;
         }
         let until = Instant::now() + ENDING;
-        for process in &mut self.processes {
+        let zenoh = self.zenoh.is_some();
+        for process in self.processes.iter_mut().filter(|_| zenoh) {
             while matches!(process.child.try_wait(), Ok(None)) && Instant::now() < until {
                 std::thread::sleep(Duration::from_millis(1));
             }
@@ -245,6 +252,34 @@ impl Drop for Stage {
             let _ = std::fs::remove_file(file);
         }
         remove(&self.place);
+    }
+}
+
+/// Removes what measurements left that were killed. Their other processes end with their standard
+/// input.
+fn remove_leftovers() {
+    let is_left = |name: &str, mark: &str| {
+        let rest = name.strip_prefix(mark)?;
+        let end = rest.find(|c: char| !c.is_ascii_digit());
+        let process = rest.get(..end.unwrap_or(rest.len()))?;
+        let ended = !process.is_empty() && !Path::new("/proc").join(process).exists();
+        ended.then_some(())
+    };
+    let left = |place: &Path, mark: &str| {
+        let entries = std::fs::read_dir(place).into_iter().flatten().flatten();
+        let named = entries.filter_map(|entry| {
+            is_left(entry.file_name().to_str()?, mark)?;
+            Some(entry.path())
+        });
+        named.collect::<Vec<_>>()
+    };
+    for directory in left(&std::env::temp_dir(), DIRECTORY) {
+        remove(&directory);
+    }
+    for file in left(Path::new("/dev/shm"), SHARED_MEMORY) {
+        if let Err(error) = std::fs::remove_file(&file) {
+            tracing::warn!(%error, file = %file.display(), "could not be removed");
+        }
     }
 }
 

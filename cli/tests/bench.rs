@@ -139,6 +139,77 @@ fn an_interrupted_measurement_leaves_no_files_and_processes() {
     assert_eq!(processes(pid), 0);
 }
 
+/// A baseline with this ratio in all rows of a path, and no spread.
+fn baseline(file: &std::path::Path, ratio: f64) {
+    let rows: Vec<Value> = ["loaned", "filled", "copied"]
+        .iter()
+        .map(|fill| {
+            serde_json::json!({
+                "path": "shm", "wait": "spin", "size": 100, "fill": fill,
+                "ratio": ratio, "ratio_spread": [ratio, ratio],
+                "round_trip_ratio": ratio, "round_trip_ratio_spread": [ratio, ratio],
+            })
+        })
+        .collect();
+    let text = serde_json::json!({ "rows": rows }).to_string();
+    std::fs::write(file, text).unwrap();
+}
+
+#[test]
+fn a_run_is_compared_with_an_earlier_one() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("before.json");
+    let compare = |ratio| {
+        baseline(&file, ratio);
+        let mut command = bench(&["shm", "--quick", "--sizes", "100B", "--baseline"]);
+        let output = command.arg(&file).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        (output.status.code(), text)
+    };
+    let (code, text) = compare(0.001);
+    assert!(text.contains("slower: shm, spin, 100 B loaned"), "{text}");
+    assert_eq!(code, Some(1));
+    let (code, text) = compare(1000.0);
+    assert!(text.contains("faster: shm, spin, 100 B copied"), "{text}");
+    assert_eq!(code, Some(0));
+    assert!(text.contains("In short, 100 B copied"), "{text}");
+    std::fs::write(&file, "{}").unwrap();
+    let mut command = bench(&["shm", "--baseline"]);
+    let output = command.arg(&file).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(errors.contains("not the JSON output"), "{errors}");
+}
+
+#[test]
+fn the_next_measurement_removes_what_a_killed_one_left() {
+    let mut child = bench(&["shm"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    while processes(pid) < 6 {
+        assert!(
+            child.try_wait().unwrap().is_none(),
+            "the command ended early"
+        );
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    while processes(pid) > 0 {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_ne!(files(pid), Vec::<String>::new());
+    let next = bench(&["shm", "--quick", "--sizes", "100B"])
+        .stdout(Stdio::null())
+        .status()
+        .unwrap();
+    assert!(next.success());
+    assert_eq!(files(pid), Vec::<String>::new());
+}
+
 #[test]
 fn the_evaluation_of_the_paper_is_repeated() {
     let directory = tempfile::tempdir().unwrap();
@@ -200,10 +271,11 @@ fn the_evaluation_of_the_paper_is_repeated() {
 
 #[test]
 fn invalid_options_have_exit_code_2() {
-    let cases: [(&[&str], &str); 4] = [
+    let cases: [(&[&str], &str); 5] = [
         (&["shm", "--sizes", "1GiB"], "--sizes"),
         (&["shm", "--dir", "/tmp"], "--dir"),
         (&["paper", "--svg", "/dev/null"], "--svg"),
+        (&["paper", "--baseline", "/dev/null"], "--baseline"),
         (&["paper", "--dir", "/nowhere"], "--dir"),
     ];
     for (arguments, wrong) in cases {

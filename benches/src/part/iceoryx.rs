@@ -47,7 +47,9 @@ pub(super) fn place(config: &Config, what: &str) -> Result<ShmConfig, String> {
     let place = std::env::var_os("FIPA_RUNTIME_DIR")
         .filter(|place| place != OsStr::new(""))
         .ok_or("FIPA_RUNTIME_DIR is not set")?;
-    let root = PathBuf::from(place).join(format!("{what}-{}", config.domain));
+    // iceoryx2 has sockets there, whose paths are short: the last word distinguishes the domains.
+    let path = config.domain.rsplit('-').next().unwrap_or_default();
+    let root = PathBuf::from(place).join(format!("{what}-{path}"));
     let shm = &config.transport.shm;
     Ok(ShmConfig {
         capacity: shm.capacity,

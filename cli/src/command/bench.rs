@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
-use fipa_bench::{BenchError, Comparison, Effort, Machine, Measurement, Paper, Program, Selection};
+use fipa_bench::{
+    Baseline, BenchError, Comparison, Effort, Machine, Measurement, Paper, Program, Selection,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::options::Global;
@@ -17,7 +19,8 @@ use crate::{membership, output};
 /// Measures one-way latency, round trip, throughput and CPU time of every configured transport, for
 /// content from 100 bytes to 4 MB. Each transport is compared with its limit, which is measured in the
 /// same rounds: raw iceoryx2, a raw Unix domain socket, or a raw relay. Gateways are also measured
-/// with TCP over TLS and with QUIC, with temporary keys. All traffic stays on this machine, and no
+/// with TCP over TLS and with QUIC, with temporary keys; their limits are relays of bare rustls and
+/// of bare quinn. All traffic stays on this machine, and no
 /// files are left.
 ///
 /// On a busy machine the times are unreliable; the ratios are less affected.
@@ -28,6 +31,7 @@ Examples:
   fipa bench shm --quick
   fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
   fipa bench --svg latency.svg
+  fipa bench --json > before.json; fipa bench --baseline before.json
   fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench paper --dir docs")]
 pub(crate) struct Arguments {
@@ -40,6 +44,12 @@ pub(crate) struct Arguments {
     /// Also draw latency over content size to this file
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
+    /// Compare with the JSON output of an earlier run
+    ///
+    /// Prints the ratios to the limits that changed beyond the spread of both runs. The exit code is
+    /// 1 if one has risen.
+    #[arg(long, value_name = "FILE")]
+    baseline: Option<PathBuf>,
     /// Take fewer samples: a few seconds, with a larger spread
     #[arg(long)]
     quick: bool,
@@ -95,6 +105,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             "omit --dir, or use --svg FILE for a drawing",
         ));
     }
+    // Read first: a wrong file is reported before the measurement.
+    let baseline = arguments.baseline.as_deref().map(Baseline::read);
+    let baseline = baseline.transpose().map_err(failed)?;
     let mut comparison = Comparison::new(
         config.mts.transports.clone(),
         effort(&arguments)?,
@@ -117,10 +130,28 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         });
         drawn.map_err(failed)?;
     }
+    let changes = baseline.map(|baseline| measurement.compare(&baseline));
     if arguments.json {
-        return output::json(&measurement.to_json());
+        let mut report = measurement.to_json();
+        if let (Some(report), Some(changes)) = (report.as_object_mut(), &changes) {
+            report.insert("changes".to_owned(), changes.to_json());
+        }
+        output::json(&report)?;
+    } else {
+        output::text(&measurement.to_text())?;
+        if let Some(changes) = &changes {
+            output::text(&format!("\n{changes}"))?;
+        }
     }
-    output::text(&measurement.to_text())
+    match changes {
+        Some(changes) if changes.compared() == 0 => Err(Failure::failed(
+            "the runs have no measurement in common",
+            "--baseline",
+            "use a baseline with the same part, sizes and transports",
+        )),
+        Some(changes) if changes.is_slower() => Err(Failure::already_reported()),
+        _ => Ok(()),
+    }
 }
 
 async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {
@@ -139,6 +170,13 @@ fn measure_paper(arguments: &Arguments) -> Result<(), Failure> {
             "`fipa bench paper` has no --svg: it always writes its drawings",
             "--svg",
             "omit --svg, and give the directory of the drawings with --dir",
+        ));
+    }
+    if arguments.baseline.is_some() {
+        return Err(Failure::wrong_usage(
+            "`fipa bench paper` has no --baseline",
+            "--baseline",
+            "omit --baseline or `paper`",
         ));
     }
     if arguments.zenoh.is_some() {
@@ -186,7 +224,9 @@ async fn observe() -> Machine {
 
 fn failed(error: BenchError) -> Failure {
     let place = match &error {
-        BenchError::Write { path, .. } => path.display().to_string(),
+        BenchError::Write { path, .. }
+        | BenchError::Read { path, .. }
+        | BenchError::Baseline { path, .. } => path.display().to_string(),
         _ => "fipa bench".to_owned(),
     };
     let advice = match &error {
@@ -194,6 +234,8 @@ fn failed(error: BenchError) -> Failure {
         BenchError::NothingMeasured(_) => {
             "check mts.transports (`fipa config show`), and run the command with -v for the logs"
         }
+        BenchError::Read { .. } => "check the name of the file",
+        BenchError::Baseline { .. } => "make a baseline with `fipa bench --json > FILE`",
         BenchError::Write { .. } => "check that this user can write there",
         _ => "report it as a bug of fipa, with this text",
     };
@@ -241,7 +283,7 @@ fn this_program() -> Result<Program, Failure> {
 /// A bar that is not drawn when standard error is no terminal.
 fn progress(steps: usize) -> ProgressBar {
     let progress = ProgressBar::new(steps as u64);
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {msg}");
+    let style = ProgressStyle::with_template("{bar:30} {elapsed}, {eta} left: {msg}");
     progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
     progress.enable_steady_tick(Duration::from_millis(200));
     progress
