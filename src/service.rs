@@ -287,7 +287,7 @@ fn transports(
                 // Cannot happen: the check of the configuration demands keys for QUIC.
                 None => continue,
             },
-            // One configuration serves all processes of a robot, with whatever features they were built.
+            // One configuration serves all processes of a robot; their features may differ.
             other => {
                 tracing::debug!(kind = %other, "this program was built without a transport");
                 continue;

@@ -33,7 +33,7 @@ pub enum BenchError {
     },
 }
 
-/// A process that could not play its part in a measurement.
+/// The failure of a process of a measurement.
 #[derive(Debug, Error)]
 #[error("{0}")]
 pub struct PartError(pub(crate) String);

@@ -68,7 +68,7 @@ impl Reader {
         Self(reader)
     }
 
-    /// Returns when the output has no reader any more. Safe to cancel.
+    /// Returns when the output has no reader left. Safe to cancel.
     pub(crate) async fn gone(&mut self) {
         if (&mut self.0).await.is_err() {
             std::future::pending().await

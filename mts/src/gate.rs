@@ -19,7 +19,7 @@ pub struct Link {
 }
 
 /// The party at the other end of a link, as far as the link proves it. Quotas count letters by
-/// their source, whatever names the letters have.
+/// source, and ignore the names in the letters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Source {
     /// The service with this incarnation in a process of this user on this host.

@@ -189,7 +189,7 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     assert_eq!(found.agent_type, "crane");
     drop(peer);
     gone(directory, "crane").await;
-    // It joined once and left once, whatever arrived of it in between.
+    // It joined once and left once, regardless of what arrived in between.
     let mut told = Vec::new();
     while let Some(change) = watch.try_next() {
         told.push(change);

@@ -597,7 +597,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         other => panic!("{other:?}"),
     }
 
-    // Agents of this host precede those of the network, whatever time of registration those state.
+    // Agents of this host precede those of the network, even if those state an earlier time.
     let local = here.register(registration("arm")).unwrap();
     let impostor = Entry {
         name: "arm".into(),

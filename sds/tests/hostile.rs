@@ -246,7 +246,7 @@ async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
         }
         packet.build_bytes_vec_compressed().unwrap()
     };
-    // Until the limit is reached in both, whatever was lost. `FIPA_FLOOD` sets a higher number of
+    // Until both have reached the limit; packets may be lost. `FIPA_FLOOD` sets a higher number of
     // packets.
     let flood = std::env::var("FIPA_FLOOD").map_or(0, |flood| flood.parse().unwrap());
     let mut sent = 0;

@@ -184,7 +184,7 @@ fn removes(root: &Path) -> bool {
         let found = std::fs::read_dir(directory).into_iter().flatten().flatten();
         later.extend(found.map(|file| file.path()));
     }
-    // Drop-ins are applied in the order of their names, whatever their directory.
+    // Drop-ins of all directories are applied in the order of their file names.
     later.sort_by_key(|path| path.file_name().map(ToOwned::to_owned));
     files.extend(later);
     let texts = files

@@ -173,7 +173,7 @@ async fn missing_and_invalid_answers_are_errors() {
         Err(DialogueError::TimedOut)
     ));
     let first = next_message(&arm).await.unwrap().message;
-    // No call leads the conversation any more, so its message goes to `receive`.
+    // No call leads the conversation, so its message goes to `receive`.
     let late = arm.reply(&first, Performative::Agree).build().unwrap();
     assert!(arm.send(late).await.unwrap().all_succeeded());
     let late = next_message(&rover).await.unwrap().message;

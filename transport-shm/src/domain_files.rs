@@ -445,7 +445,7 @@ impl DomainFiles {
         }
     }
 
-    /// Removes connections of ports that no process has any more. iceoryx2 0.10 leaves one if a
+    /// Removes connections of ports that no process has. iceoryx2 0.10 leaves one if a
     /// process is killed between creating its file and recording its own end: then neither end is
     /// the last to close. The caller must hold the lock, under which no process creates a port. A
     /// port is tagged before it connects, and as long as it exists.

@@ -502,7 +502,7 @@ fn a_cleanup_without_free_descriptors_keeps_the_files_of_living_processes() {
 }
 
 /// iceoryx2 leaves a mailbox like this if the process that removes its last node is killed at that
-/// moment: no node claims to use it any more.
+/// moment: no node claims to use it.
 #[test]
 fn an_unused_mailbox_is_removed() {
     let domain = TestDomain::new();

@@ -226,7 +226,7 @@ fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
     })
 }
 
-/// This command, which plays the parts of a measurement too.
+/// Returns this program, which also runs as the processes of a measurement.
 fn this_program() -> Result<Program, Failure> {
     let path = std::env::current_exe().map_err(|error| {
         let advice = "check that /proc is mounted and the command was not removed";

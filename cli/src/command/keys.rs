@@ -199,7 +199,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     }
 }
 
-/// The directory of the keys without `--dir` and `security.keys`.
+/// Returns the directory of the keys if neither `--dir` nor `security.keys` names one.
 fn default_directory() -> Result<PathBuf, Failure> {
     let home = std::env::var_os("HOME").filter(|home| !home.is_empty());
     let home = home.ok_or_else(|| {

@@ -124,7 +124,7 @@ pub struct Core {
     contact_limit: SenderLimit,
     /// Whether letters of others are no longer accepted.
     ending: bool,
-    /// Whether the service has ended, so that nothing is sent any more.
+    /// Whether the service has ended, and so sends nothing.
     closed: bool,
     next_lane: u64,
     next_send: u64,
