@@ -76,6 +76,7 @@ pub use error::{ConfigError, Mistake, Origin};
 pub use sources::Sources;
 
 use crate::access;
+pub use crate::access::RuleError;
 
 /// A complete and checked configuration.
 ///
@@ -269,7 +270,7 @@ impl AccessRule {
 
 impl Access {
     /// The rules that this section configures; `None` if it has none.
-    pub(crate) fn rules(&self) -> Result<Option<access::Access>, access::RuleError> {
+    pub(crate) fn rules(&self) -> Result<Option<access::Access>, RuleError> {
         let deny = self.deny.iter().map(AccessRule::parts);
         let allow = self.allow.iter().map(AccessRule::parts);
         access::Access::new(deny, allow, self.rate)

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use fipa::config::Sources;
 use fipa::routes::{self, Standing};
 use fipa::{
-    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Message, OpenError,
-    Outcome, Performative, Query, TransportErrorKind,
+    Agent, AgentId, Config, Deliveries, Domain, ErrorChain, FailureReason, Gateway, Kind, Message,
+    OpenError, Outcome, Performative, Query, TransportErrorKind,
 };
 
 /// A simulated host with a domain and names that no other test uses.
@@ -274,7 +274,8 @@ async fn a_second_gateway_of_a_domain_or_on_a_port_is_refused() {
     let other = Host::new(&["discovery.mdns=false", &taken]);
     match Gateway::open(&other.config).await {
         Err(error @ OpenError::Listen { .. }) => {
-            assert!(error.to_string().contains(location.address()), "{error}");
+            let error = ErrorChain(&error).to_string();
+            assert!(error.contains(location.address()), "{error}");
         }
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two on one port"),

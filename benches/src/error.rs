@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use fipa::ErrorChain;
 use thiserror::Error;
 
 /// A measurement that could not be made or shown.
@@ -37,3 +38,8 @@ pub enum BenchError {
 #[derive(Debug, Error)]
 #[error("{0}")]
 pub struct PartError(pub(crate) String);
+
+/// Returns the text of an error of `fipa` with its causes.
+pub(crate) fn chain_text(error: impl std::error::Error + 'static) -> String {
+    ErrorChain(&error).to_string()
+}

@@ -19,8 +19,8 @@ use fipa::config::Sources;
 use fipa::monitor::ViolationKind;
 use fipa::protocol::{Decision, DialogueError, Reply, Task};
 use fipa::{
-    Agent, AgentId, Config, Domain, Incoming, Message, MessageBuilder, OpenError, Performative,
-    ReceiveError, SendError,
+    Agent, AgentId, Config, Domain, ErrorChain, Incoming, Message, MessageBuilder, OpenError,
+    Performative, ReceiveError, SendError,
 };
 
 /// Time limit of all calls, which a passing test does not reach.
@@ -502,11 +502,10 @@ async fn protocols_of_the_configuration_are_read_and_checked() {
     std::fs::write(&file, own.replace("target=\"3\"", "target=\"4\"")).unwrap();
     let error = Domain::open(&config(&[&set])).await.err().unwrap();
     assert!(matches!(error, OpenError::Protocol(_)));
+    let text = ErrorChain(&error).to_string();
     assert!(
-        error
-            .to_string()
-            .contains("handover.scxml:3: there is no state \"4\""),
-        "{error}"
+        text.contains("handover.scxml:3: there is no state \"4\""),
+        "{text}"
     );
     std::fs::remove_file(&file).unwrap();
     let error = Domain::open(&config(&[&set])).await.err().unwrap();

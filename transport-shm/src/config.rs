@@ -161,7 +161,7 @@ pub enum ShmError {
     },
     /// The shared memory file system became full while the endpoint was opened.
     #[error(
-        "{path} is full: cannot allocate {needed} more bytes ({source}); enlarge it \
+        "{path} is full: cannot allocate {needed} more bytes; enlarge it \
          (mount -o remount,size=512M {path}; for containers --shm-size=512m) or remove the transport \"shm\""
     )]
     Full {
@@ -173,7 +173,7 @@ pub enum ShmError {
         source: std::io::Error,
     },
     /// An operation on a file or directory failed.
-    #[error("{what} {path}: {source}")]
+    #[error("{what} {path}")]
     File {
         /// The failed operation, such as `cannot lock`.
         what: &'static str,

@@ -25,7 +25,7 @@ mod transport;
 pub mod wire;
 
 pub use faulty::{Fault, Faulty};
-pub use incarnation::Incarnation;
+pub use incarnation::{Incarnation, IncarnationError};
 pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
+use fipa::ErrorChain;
 use fipa_bench::{BenchError, Comparison, Effort, Machine, Measurement, Paper, Program, Selection};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -197,11 +198,7 @@ fn failed(error: BenchError) -> Failure {
         BenchError::Write { .. } => "check that this user can write there",
         _ => "report it as a bug of fipa, with this text",
     };
-    let text = match std::error::Error::source(&error) {
-        Some(source) => format!("{error}: {source}"),
-        None => error.to_string(),
-    };
-    Failure::failed(text, place, advice)
+    Failure::failed(ErrorChain(&error).to_string(), place, advice)
 }
 
 fn size(text: &str) -> Result<ByteSize, String> {
