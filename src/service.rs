@@ -372,15 +372,17 @@ fn tcp(
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{TcpConfig, TcpTransport};
-    let config = TcpConfig {
-        listen: listen(&config.transport.tcp.listen, role),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: stream_limits(config),
-        processes: config.transport.tcp.processes,
-        #[cfg(feature = "secure")]
-        security: role.security.clone(),
-    };
-    Ok(Arc::new(TcpTransport::new(config, handle.clone())))
+    let mut tcp = TcpConfig::new(
+        listen(&config.transport.tcp.listen, role),
+        identity(config, role, dir, incarnation)?,
+    );
+    tcp.limits = stream_limits(config);
+    tcp.processes = config.transport.tcp.processes;
+    #[cfg(feature = "secure")]
+    {
+        tcp.security = role.security.clone();
+    }
+    Ok(Arc::new(TcpTransport::new(tcp, handle.clone())))
 }
 
 #[cfg(feature = "net")]

@@ -1,6 +1,8 @@
 //! Each error of the public interface has a message without the messages of its causes, and reports
 //! the causes as sources. [`ErrorChain`] prints all of them once.
 
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
 use std::error::Error;
 use std::io;
 use std::sync::Arc;

@@ -10,12 +10,12 @@
 mod blocking;
 mod proxies;
 mod selling;
+#[path = "../support/mod.rs"]
+mod support;
 mod verdicts;
 
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::monitor::ViolationKind;
 use fipa::protocol::{Decision, DialogueError, Reply, Task};
 use fipa::{
@@ -34,25 +34,11 @@ async fn next_message(agent: &Agent) -> Result<Incoming, ReceiveError> {
 
 /// Makes a configuration for a domain that no other test uses.
 fn config(set: &[&str]) -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let mut all = vec![
-        format!("domain=protocols-{}-{number}", std::process::id()),
-        "discovery.mdns=false".to_owned(),
-        "mts.deadline=2min".to_owned(),
-    ];
-    all.extend(set.iter().map(|setting| (*setting).to_owned()));
-    Config::load(&Sources {
-        set: all,
-        ..Sources::default()
-    })
-    .unwrap()
+    support::config(&[&["mts.deadline=2min"], set].concat())
 }
 
 async fn two(set: &[&str]) -> (Domain, Domain) {
-    let config = config(set);
-    let member = || async { Domain::open(&config).await.unwrap() };
-    (member().await, member().await)
+    support::two(&config(set)).await
 }
 
 /// Registers a rover, and an arm of another process.
