@@ -205,7 +205,7 @@ pub enum ShmError {
     /// An iceoryx2 operation failed.
     #[error(
         "{what}: {reason} (shared memory prefix {prefix:?}); the limit of open files may be too low: \
-         an endpoint needs about 20, and about 10 more for each process it talks to"
+         an endpoint needs about 20, and about 10 more for each connected process"
     )]
     Iceoryx {
         /// The failed operation, such as `cannot create a node`.

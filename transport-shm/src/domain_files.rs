@@ -40,7 +40,7 @@ pub struct Cleaned {
 }
 
 /// Removes the files of killed processes of a domain. For tools: an endpoint does this by itself
-/// when it starts, when it closes, and when a process that it talks to ends.
+/// when it starts, when it closes, and when a connected process ends.
 ///
 /// Blocks until all living processes have polled their mailboxes, at most a second. The
 /// configuration's incarnation is not used, but must be known.
