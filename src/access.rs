@@ -49,7 +49,7 @@ pub(crate) enum Refusal {
 /// The error of a rule that cannot be parsed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct RuleError(String);
+pub struct RuleError(String);
 
 /// The rules, and the current rates of senders.
 #[derive(Debug)]

@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{AgentId, AgentIdError, Letter, Message, MessageBuilder, Performative};
+use fipa_acl::{AgentId, AgentIdError, ErrorChain, Letter, Message, MessageBuilder, Performative};
 use fipa_mts::{LetterDraft, PostError, letter_for};
 use fipa_sds::{DeregisterError, Directory, RegisterError, Registration};
 use fipa_transport::{Incarnation, LoanedContent};
@@ -259,7 +259,7 @@ impl Drop for Agent {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(%error, agent = %self.endpoint.name, "cannot deregister an agent")
+                    tracing::warn!(error = %ErrorChain(&error), agent = %self.endpoint.name, "cannot deregister an agent")
                 }
             }
         }

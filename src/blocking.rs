@@ -11,11 +11,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{Message, MessageBuilder, Performative};
-use fipa_sds::{DeregisterError, Directory, RegisterError};
+use fipa_sds::{DeregisterError, RegisterError};
 use tokio::runtime::{Builder, Runtime};
 
 use crate::owner::Owner;
-use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError, Unread};
+use crate::{
+    AgentId, Config, Deliveries, DirectoryView, Incoming, Loan, ReceiveError, SendError, Unread,
+};
 
 #[cfg(feature = "monitor")]
 pub use self::protocol::Side;
@@ -25,7 +27,7 @@ pub use self::protocol::Side;
 #[non_exhaustive]
 pub enum OpenError {
     /// The background thread cannot be started.
-    #[error("cannot start the background thread: {0}")]
+    #[error("cannot start the background thread")]
     Thread(#[from] std::io::Error),
     /// The domain cannot be joined.
     #[error(transparent)]
@@ -122,7 +124,7 @@ impl Domain {
 
     /// Returns the directory; see [`crate::Domain::directory`].
     #[must_use]
-    pub fn directory(&self) -> &dyn Directory {
+    pub fn directory(&self) -> DirectoryView<'_> {
         self.domain.directory()
     }
 

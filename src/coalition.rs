@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use fipa_acl::ErrorChain;
 use fipa_sds::{
     DeregisterError, Directory, Members, MembersError, RegisterError, Registration, Role,
 };
@@ -193,7 +194,7 @@ impl Drop for Coalition {
                 // Closing the domain has already removed the name.
                 Ok(()) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(%error, coalition = self.name(), "cannot remove a coalition");
+                    tracing::warn!(error = %ErrorChain(&error), coalition = self.name(), "cannot remove a coalition");
                 }
             }
         }

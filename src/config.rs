@@ -76,6 +76,7 @@ pub use error::{ConfigError, Mistake, Origin};
 pub use sources::Sources;
 
 use crate::access;
+pub use crate::access::RuleError;
 
 /// A complete and checked configuration.
 ///
@@ -224,8 +225,8 @@ pub struct Security {
     /// letters in their dialects with them despite its keys. At most 64.
     pub legacy_peers: Vec<IpAddr>,
     /// `peer_connections`: maximum number of connections of each transport from the peers with one
-    /// certificate or, without keys, from one address. This and the next two limits apply to other
-    /// hosts, and to loopback addresses if those must prove their identity.
+    /// certificate, or from one address if the peer has no keys. This and the next two limits apply
+    /// to other hosts, and to loopback addresses if those must prove their identity.
     pub peer_connections: usize,
     /// `peer_letters`: maximum number of letters per second that each transport accepts from one
     /// address; also the maximum burst. Further letters wait at the sender. 0: no limit.
@@ -269,7 +270,7 @@ impl AccessRule {
 
 impl Access {
     /// The rules that this section configures; `None` if it has none.
-    pub(crate) fn rules(&self) -> Result<Option<access::Access>, access::RuleError> {
+    pub(crate) fn rules(&self) -> Result<Option<access::Access>, RuleError> {
         let deny = self.deny.iter().map(AccessRule::parts);
         let allow = self.allow.iter().map(AccessRule::parts);
         access::Access::new(deny, allow, self.rate)

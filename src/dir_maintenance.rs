@@ -4,6 +4,7 @@
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
+use fipa_acl::ErrorChain;
 use fipa_sds::{HostDirectory, HostError};
 use fipa_transport_net::{UnixError, UnixTransport};
 #[cfg(feature = "shm")]
@@ -98,9 +99,9 @@ impl DirMaintenance {
                     tracing::info!("joined the domain in {} again", self.dir.path().display());
                 }
                 Ok(Err(error)) => {
-                    let text = error.to_string();
+                    let text = ErrorChain(&error).to_string();
                     if problem.as_ref() != Some(&text) {
-                        tracing::error!(%error, "cannot join the domain again; retrying");
+                        tracing::error!(error = text, "cannot join the domain again; retrying");
                     }
                     problem = Some(text);
                 }

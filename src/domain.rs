@@ -4,9 +4,10 @@ use std::fmt;
 use std::sync::Arc;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
-use fipa_sds::{Directory, Query};
+use fipa_sds::Query;
 
 use crate::checks::Rules;
+use crate::directory_view::DirectoryView;
 use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::routes::{self, Report};
@@ -99,8 +100,8 @@ impl Domain {
     /// Returns the directory: the agents of this host and, if a gateway is running, the agents that it
     /// has discovered on other hosts.
     #[must_use]
-    pub fn directory(&self) -> &dyn Directory {
-        &*self.inner.service.host
+    pub fn directory(&self) -> DirectoryView<'_> {
+        DirectoryView::of(&*self.inner.service.host)
     }
 
     /// Reports the routes that letters from this process to the matching agents would take now, and
@@ -108,7 +109,7 @@ impl Domain {
     /// gateway; [`routes::of_gateway`](crate::routes::of_gateway) reports the routes from there.
     #[must_use]
     pub fn routes(&self, to: &Query) -> Report {
-        let entries = routes::agents(self.directory(), to);
+        let entries = routes::agents(&*self.inner.service.host, to);
         self.inner.service.report(&entries)
     }
 

@@ -67,7 +67,7 @@ struct DirLocks {
 #[non_exhaustive]
 pub enum DomainDirError {
     /// The directory cannot be created or examined.
-    #[error("cannot use the directory {}: {source}", path.display())]
+    #[error("cannot use the directory {}", path.display())]
     Io {
         /// The directory.
         path: PathBuf,

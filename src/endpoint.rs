@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{AgentId, Letter, Message, MessageBuilder, Performative};
+use fipa_acl::{AgentId, ErrorChain, Letter, Message, MessageBuilder, Performative};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Mts, PostError, Sending, letter_for};
 use fipa_sds::{DeregisterError, Directory};
@@ -166,7 +166,7 @@ impl Endpoint {
                 let deadline = self.domain.inner.deadline;
                 let sending = self
                     .submit(&answer, letter, deadline, Checked::No)
-                    .map_err(|error| error.to_string())?;
+                    .map_err(|error| ErrorChain(&error).to_string())?;
                 // No caller waits for its outcomes.
                 drop(sending);
                 Ok(answer)

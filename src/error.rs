@@ -9,13 +9,17 @@ use fipa_monitor::LibraryFull;
 #[cfg(feature = "monitor")]
 use fipa_monitor::scxml::ScxmlError;
 use fipa_mts::PostError;
-use fipa_sds::{HostError, RegisterError};
+#[cfg(feature = "mdns")]
+use fipa_sds::MdnsError;
+use fipa_sds::{EntryError, HostError, RegisterError};
 use fipa_transport::{Forked, Kind, ListenError};
 
-use crate::config::ConfigError;
+use crate::config::{ConfigError, RuleError};
 use crate::domain_dir::DomainDirError;
 #[cfg(feature = "monitor")]
 use crate::incoming::Incoming;
+#[cfg(feature = "secure")]
+use crate::keys::KeysError;
 
 /// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +43,7 @@ pub enum OpenError {
     #[error(transparent)]
     Directory(#[from] HostError),
     /// A transport that the gateway needs cannot be opened.
-    #[error("{kind}: {source}")]
+    #[error("cannot open the transport {kind}")]
     Listen {
         /// The transport.
         kind: Kind,
@@ -50,23 +54,36 @@ pub enum OpenError {
     #[error("no transport can be used: {0}")]
     NoTransport(String),
     /// The name of the gateway (`mts.name`) is taken or invalid.
-    #[error("cannot register the gateway: {0}")]
+    #[error("cannot register the gateway")]
     Name(#[from] RegisterError),
     /// Another gateway is running in the domain. Holds its name.
     #[error("the gateway {0:?} is already running in this domain; stop it, or use another domain")]
     GatewayRunning(String),
     /// The socket of a watcher cannot be used.
-    #[error("cannot listen to the processes of the domain: {0}")]
+    #[error("cannot listen to the processes of the domain")]
     Watch(#[source] std::io::Error),
     /// The access rules of the configuration cannot be used.
-    #[error("access: {0}")]
-    Access(String),
+    #[error("the section [access] of the configuration")]
+    Access(#[source] RuleError),
     /// The keys that the configuration names cannot be used.
-    #[error("security.keys: {0}")]
-    Keys(String),
-    /// The discovery of other hosts cannot start.
-    #[error("discovery: {0}")]
-    Discovery(String),
+    #[cfg(feature = "secure")]
+    #[error("cannot use security.keys")]
+    Keys(#[source] KeysError),
+    /// The configuration has a key for a feature that this program was built without.
+    #[error("this program was built without the feature `{feature}`, which {key} needs")]
+    NoFeature {
+        /// The key of the configuration.
+        key: &'static str,
+        /// The feature of this crate.
+        feature: &'static str,
+    },
+    /// The agents of legacy peers in `discovery.static` cannot be used.
+    #[error("cannot use discovery.static")]
+    StaticPeers(#[source] EntryError),
+    /// The discovery of other hosts by multicast DNS cannot start.
+    #[cfg(feature = "mdns")]
+    #[error("cannot start the discovery by multicast DNS")]
+    Mdns(#[source] MdnsError),
 }
 
 /// The error if a message is not sent.
@@ -113,7 +130,7 @@ pub enum ReceiveError {
     #[error(transparent)]
     Forked(#[from] Forked),
     /// The message of a received letter cannot be decoded. Its sender gets a failure message.
-    #[error("received a letter with a message that cannot be decoded: {source}")]
+    #[error("received a letter with a message that cannot be decoded")]
     Malformed {
         /// The error of the decoder.
         source: DecodeError,
@@ -137,7 +154,7 @@ pub enum ReceiveError {
 #[non_exhaustive]
 pub enum ProtocolError {
     /// The file cannot be read.
-    #[error("monitor.protocols: cannot read {}: {source}", path.display())]
+    #[error("monitor.protocols: cannot read {}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -145,9 +162,9 @@ pub enum ProtocolError {
         source: std::io::Error,
     },
     /// The protocol in the file is invalid.
-    #[error("monitor.protocols: {0}; see `fipa protocol check`")]
+    #[error("monitor.protocols: a protocol is not valid (`fipa protocol check` lists all errors)")]
     Scxml(#[from] ScxmlError),
     /// The files define too many protocols.
-    #[error("monitor.protocols: {0}")]
+    #[error("monitor.protocols: too many protocols")]
     Full(#[from] LibraryFull),
 }

@@ -12,9 +12,11 @@ mod guard;
 mod neighbours;
 mod publisher;
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
 
+use fipa_acl::ErrorChain;
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
@@ -33,6 +35,7 @@ pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::publisher::{PublishTask, Publisher};
 use crate::config::ConfigError;
+use crate::directory_view::DirectoryView;
 use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::service::{Role, Service};
@@ -62,8 +65,8 @@ impl Gateway {
         let guard = Guard::open(&config.security, &config.mts.name)?;
         #[cfg(not(feature = "secure"))]
         if !config.security.keys.is_empty() {
-            let without = "this program was built without the feature `secure`";
-            return Err(OpenError::Keys(without.to_owned()));
+            let (key, feature) = ("security.keys", "secure");
+            return Err(OpenError::NoFeature { key, feature });
         }
         let contacts = Arc::new(KnownPeers::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
@@ -223,8 +226,8 @@ impl Gateway {
 
     /// Returns the directory of this host and of other hosts.
     #[must_use]
-    pub fn directory(&self) -> &dyn Directory {
-        &*self.view
+    pub fn directory(&self) -> DirectoryView<'_> {
+        DirectoryView::of(&*self.view)
     }
 
     /// Returns the gateways of other hosts with which a connection is open now, whether this
@@ -328,6 +331,14 @@ impl Gateway {
     }
 }
 
+impl fmt::Debug for Gateway {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Gateway")
+            .field("mts", &self.service.own)
+            .finish_non_exhaustive()
+    }
+}
+
 impl Drop for Gateway {
     fn drop(&mut self) {
         self.abort();
@@ -364,7 +375,7 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
             "the locations of this gateway have changed"
         );
         if let Err(error) = register(&service) {
-            tracing::warn!(%error, "cannot update the gateway in the directory of this host");
+            tracing::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
         }
         service.mts.greet(neighbours.to_greet(Instant::now()));
     }
@@ -392,7 +403,7 @@ fn is_legacy(peer: &crate::config::Peer) -> bool {
 fn legacy_peers(config: &Config) -> Result<StaticDirectory, OpenError> {
     let peers = config.discovery.peers.iter().filter(|peer| is_legacy(peer));
     let agents = peers.map(|peer| (peer.name.as_str(), peer.locations.clone()));
-    StaticDirectory::new(agents).map_err(|error| OpenError::Discovery(error.to_string()))
+    StaticDirectory::new(agents).map_err(OpenError::StaticPeers)
 }
 
 /// Returns the gateways that the configuration names.
@@ -467,8 +478,7 @@ fn network(config: &Config, mts: &fipa_sds::Mts) -> Result<Option<Arc<dyn Networ
         interfaces,
         ..fipa_sds::MdnsConfig::new(mts.clone())
     };
-    let directory = fipa_sds::MdnsDirectory::open(config)
-        .map_err(|error| OpenError::Discovery(error.to_string()))?;
+    let directory = fipa_sds::MdnsDirectory::open(config).map_err(OpenError::Mdns)?;
     Ok(Some(Arc::new(directory)))
 }
 
@@ -496,7 +506,9 @@ impl Contacts for KnownPeers {
                 }
             }
             Ok(false) => {}
-            Err(error) => tracing::info!(%error, "cannot record the sender of a letter"),
+            Err(error) => {
+                tracing::info!(error = %ErrorChain(&error), "cannot record the sender of a letter")
+            }
         }
     }
 

@@ -23,7 +23,9 @@ use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-pub use fipa_transport_net::secure::{Certificate, CertificateError, Certified, Fingerprint};
+pub use fipa_transport_net::secure::{
+    Certificate, CertificateError, Certified, CredentialsError, Fingerprint,
+};
 use fipa_transport_net::secure::{Credentials, alternative_names};
 use rcgen::{CertificateParams, DnType, KeyPair, SanType};
 use rustls_pki_types::pem::PemObject as _;
@@ -192,7 +194,7 @@ impl Keys {
         agents: &[String],
         valid: Duration,
     ) -> Result<Certificate, KeysError> {
-        let failed = |error: rcgen::Error| KeysError::Make(error.to_string());
+        let failed = |error: rcgen::Error| KeysError::Make(Box::new(error));
         let now = SystemTime::now();
         let until = now.checked_add(valid);
         let until =

@@ -53,6 +53,7 @@ mod demultiplexer;
 #[path = "demultiplexer_disabled.rs"]
 mod demultiplexer;
 mod dir_maintenance;
+mod directory_view;
 pub mod doctor;
 mod domain;
 mod domain_dir;
@@ -78,25 +79,29 @@ pub use agent::{Agent, Loan, Unread};
 pub use coalition::{Coalition, CoalitionError};
 pub use config::Config;
 pub use delivery::{Deliveries, Delivery};
+pub use directory_view::DirectoryView;
 pub use domain::{Domain, RegisterOptions};
 pub use domain_dir::DomainDirError;
 #[cfg(feature = "monitor")]
 pub use error::ProtocolError;
 pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
-    AgentId, AgentIdError, BuildError, DecodeError, EncodeError, Envelope, EnvelopeParams, Letter,
-    Message, MessageBuilder, Payload, Performative, Time, TimeError,
+    AgentId, AgentIdError, BuildError, DecodeError, EncodeError, Envelope, EnvelopeParams,
+    ErrorChain, Letter, Message, MessageBuilder, Payload, Performative, PerformativeError, Problem,
+    Time, TimeError,
 };
 #[cfg(feature = "monitor")]
 pub use fipa_monitor as monitor;
 pub use fipa_mts::{DeliveryFailure, PostError};
+#[cfg(feature = "mdns")]
+pub use fipa_sds::MdnsError;
 pub use fipa_sds::{
-    Change, DeregisterError, Directory, Entry, HostError, Matcher, Members, MembersError, Pattern,
-    PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
+    Change, DeregisterError, Entry, EntryError, HostError, Matcher, Members, MembersError,
+    NameError, Pattern, PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
-    Attempt, FailureReason, Forked, Incarnation, Kind, ListenError, Location, Outcome, Signature,
-    TransportError, TransportErrorKind,
+    Attempt, FailureReason, Forked, Incarnation, IncarnationError, Kind, ListenError, Location,
+    LocationError, Outcome, Signature, TransportError, TransportErrorKind,
 };
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};

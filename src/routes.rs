@@ -76,10 +76,10 @@ pub struct Connected {
 #[non_exhaustive]
 pub enum AskError {
     /// The request cannot be built.
-    #[error("cannot build the request to the gateway: {0}")]
+    #[error("cannot build the request to the gateway")]
     Build(#[from] fipa_acl::BuildError),
     /// The request cannot be sent.
-    #[error("cannot send the request to the gateway: {0}")]
+    #[error("cannot send the request to the gateway")]
     Send(#[from] SendError),
     /// The request was not delivered to the gateway.
     #[error("the request did not reach the gateway: {0}")]

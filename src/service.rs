@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa_acl::ErrorChain;
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory, Entry, HostDirectory, Pattern};
@@ -115,7 +116,7 @@ impl Service {
                     source: error,
                 });
             }
-            refused.push((kind, error.to_string()));
+            refused.push((kind, ErrorChain(&error).to_string()));
         }
         if service.locations().is_empty() {
             service.abort();
@@ -178,7 +179,7 @@ impl Service {
         self.maintenance.abort();
         self.mts.abort();
         if let Err(error) = self.host.close() {
-            tracing::warn!(%error, "cannot remove this process from the directory of this host");
+            tracing::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
         }
         self.dir.leave();
     }
@@ -195,10 +196,7 @@ fn gate(
         false => Of::Process(Arc::clone(host)),
     };
     // Cannot fail, because the check of the configuration has parsed the rules.
-    let access = config
-        .access
-        .rules()
-        .map_err(|error| OpenError::Access(error.to_string()))?;
+    let access = config.access.rules().map_err(OpenError::Access)?;
     Ok(access.map(|access| Arc::new(RulesGate::new(access, of)) as Arc<dyn AccessGate>))
 }
 
@@ -287,7 +285,7 @@ fn transports(
                 // Cannot happen: the check of the configuration demands keys for QUIC.
                 None => continue,
             },
-            // One configuration serves all processes of a robot, with whatever features they were built.
+            // One configuration serves all processes of a robot; their features may differ.
             other => {
                 tracing::debug!(kind = %other, "this program was built without a transport");
                 continue;
@@ -319,7 +317,8 @@ fn shm(
             incarnation,
         )
     };
-    let transport = ShmTransport::new(config, handle.clone()).map_err(|error| error.to_string())?;
+    let transport = ShmTransport::new(config, handle.clone());
+    let transport = transport.map_err(|error| ErrorChain(&error).to_string())?;
     let transport = Arc::new(transport);
     maintenance.shm = Some(Arc::downgrade(&transport));
     tidy(handle, maintenance, &transport, ShmTransport::tidy);
@@ -373,15 +372,17 @@ fn tcp(
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{TcpConfig, TcpTransport};
-    let config = TcpConfig {
-        listen: listen(&config.transport.tcp.listen, role),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: stream_limits(config),
-        processes: config.transport.tcp.processes,
-        #[cfg(feature = "secure")]
-        security: role.security.clone(),
-    };
-    Ok(Arc::new(TcpTransport::new(config, handle.clone())))
+    let mut tcp = TcpConfig::new(
+        listen(&config.transport.tcp.listen, role),
+        identity(config, role, dir, incarnation)?,
+    );
+    tcp.limits = stream_limits(config);
+    tcp.processes = config.transport.tcp.processes;
+    #[cfg(feature = "secure")]
+    {
+        tcp.security = role.security.clone();
+    }
+    Ok(Arc::new(TcpTransport::new(tcp, handle.clone())))
 }
 
 #[cfg(feature = "net")]
@@ -466,7 +467,7 @@ fn identity(
         domain: config.domain.clone(),
         host: dir
             .host_id()
-            .map_err(|error| format!("cannot identify this host: {error}"))?,
+            .map_err(|error| format!("cannot identify this host: {}", ErrorChain(&error)))?,
     })
 }
 

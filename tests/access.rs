@@ -3,38 +3,33 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome,
-    Performative, TransportErrorKind,
+    Agent, AgentId, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome, Performative,
+    TransportErrorKind,
 };
 use fipa_mts::letter_for;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
     Transport as _, Verdict,
 };
-use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
+use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 
 /// Opens two memberships in a new domain: one without rules, and one with these rules.
 async fn host(kind: Kind, rules: &str) -> (Domain, Domain) {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let mark = support::mark();
     let config = |more: &[&str]| {
         let mut set = vec![
-            format!("domain=acc-{}-{number}", std::process::id()),
+            format!("domain=acc-{mark}"),
             format!("mts.transports={kind}"),
             "transport.tcp.processes=true".to_owned(),
         ];
         set.extend(more.iter().map(|it| (*it).to_owned()));
-        let sources = Sources {
-            set,
-            ..Sources::default()
-        };
-        Config::load(&sources).unwrap()
+        support::load(set)
     };
     let lax = Domain::open(&config(&[])).await.unwrap();
     (lax, Domain::open(&config(&[rules])).await.unwrap())
@@ -169,19 +164,14 @@ impl Sink for StoredConclusion {
 /// Sends a forged letter to an agent of a process over TCP, with the name and incarnation of the
 /// gateway. Returns the answer of that process.
 async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
-    let config = TcpConfig {
-        processes: true,
-        listen: Vec::new(),
-        identity: Identity {
-            name: gateway.name().to_owned(),
-            incarnation: gateway.incarnation(),
-            domain: "any".to_owned(),
-            host: "any".to_owned(),
-        },
-        limits: Limits::default(),
-        #[cfg(feature = "secure")]
-        security: None,
+    let identity = Identity {
+        name: gateway.name().to_owned(),
+        incarnation: gateway.incarnation(),
+        domain: "any".to_owned(),
+        host: "any".to_owned(),
     };
+    let mut config = TcpConfig::new(Vec::new(), identity);
+    config.processes = true;
     let transport = TcpTransport::new(config, tokio::runtime::Handle::current());
     let stored = Arc::new(StoredConclusion::default());
     transport.listen(stored.clone()).unwrap();
@@ -223,11 +213,7 @@ async fn a_forged_name_of_the_gateway_is_refused_over_tcp() {
     let config = |more: &[&str]| {
         let set = [&*domain, "discovery.mdns=false", "mts.name=door-mts"];
         let set = set.iter().chain(more).map(|it| (*it).to_owned());
-        let sources = Sources {
-            set: set.collect(),
-            ..Sources::default()
-        };
-        Config::load(&sources).unwrap()
+        support::load(set)
     };
     let gateway = Gateway::open(&config(&[])).await.unwrap();
     let rules = config(&[

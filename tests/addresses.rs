@@ -10,7 +10,7 @@ use fipa_mts::core::{CoreConfig, Submission};
 use fipa_mts::{Mts, RuntimeConfig, letter_for};
 use fipa_sds::{Directory as _, MemoryDirectory, Registration};
 use fipa_transport::{Incarnation, Location, Transport};
-use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
+use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 use tokio::net::TcpSocket;
 use tokio::runtime::Handle;
 
@@ -22,22 +22,15 @@ const ARM: Incarnation = Incarnation::from_u64(0xa53);
 fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
     let incarnation = Incarnation::random();
     let patient = Duration::from_secs(60);
-    let config = TcpConfig {
-        processes: true,
-        listen: vec!["127.0.0.1:0".to_owned()],
-        identity: Identity {
-            name: name.into(),
-            incarnation,
-            domain: "addresses".into(),
-            host: name.into(),
-        },
-        limits: Limits {
-            connect_timeout: patient,
-            ..Limits::default()
-        },
-        #[cfg(feature = "secure")]
-        security: None,
+    let identity = Identity {
+        name: name.into(),
+        incarnation,
+        domain: "addresses".into(),
+        host: name.into(),
     };
+    let mut config = TcpConfig::new(vec!["127.0.0.1:0".to_owned()], identity);
+    config.processes = true;
+    config.limits.connect_timeout = patient;
     let transport = Arc::new(TcpTransport::new(config, Handle::current()));
     let directory = Arc::new(MemoryDirectory::new(fipa_sds::Mts::new(name, incarnation)));
     let started = Mts::start(

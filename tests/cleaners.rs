@@ -3,13 +3,15 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 #![allow(clippy::print_stderr, reason = "a skipped test says so")]
 
+mod support;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use fipa::blocking::{Agent, Domain};
-use fipa::config::Sources;
 use fipa::{AgentId, Config, Performative};
+use fipa_testbed::ignored_test;
 
 const WATCHDOG: Duration = Duration::from_secs(60);
 
@@ -18,8 +20,7 @@ const LENGTHS: [usize; 2] = [10, 100_000];
 
 /// Runs one of the ignored tests in a process of its own, with this runtime directory.
 fn with_runtime_dir(name: &str, runtime_dir: &Path) {
-    let status = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", name, "--ignored", "--nocapture"])
+    let status = ignored_test(name)
         .env("FIPA_RUNTIME_DIR", runtime_dir)
         .status()
         .unwrap();
@@ -32,16 +33,11 @@ fn runtime_dir() -> PathBuf {
 }
 
 fn config(transports: &str) -> Config {
-    let set = vec![
+    support::load([
         format!("domain=cleaned-{}", std::process::id()),
         format!("mts.transports={transports}"),
         "mts.deadline=2s".to_owned(),
-    ];
-    Config::load(&Sources {
-        set,
-        ..Sources::default()
-    })
-    .unwrap()
+    ])
 }
 
 fn is_delivered(from: &Agent, to: &Agent, len: usize) -> bool {

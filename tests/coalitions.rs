@@ -2,16 +2,19 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::time::{Duration, Instant};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::{
     Agent, AgentId, Change, Coalition, CoalitionError, Config, Deliveries, Domain, Entry,
     FailureReason, Gateway, Kind, Members, Outcome, Performative, RegisterOptions, Role,
 };
+use fipa_testbed::until_async;
+use support::config;
 
 struct Host {
     gateway: Gateway,
@@ -21,14 +24,7 @@ struct Host {
 
 impl Host {
     async fn start(peer: Option<&Self>) -> Self {
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let mark = format!("{}-{number}", std::process::id());
-        let mut set = vec![
-            format!("domain=coalitions-{mark}"),
-            format!("mts.name=gateway-{mark}"),
-            "discovery.mdns=false".to_owned(),
-        ];
+        let mut set = Vec::new();
         if let Some(peer) = peer {
             let mut locations = peer.gateway.locations().into_iter();
             let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
@@ -37,11 +33,7 @@ impl Host {
                 "discovery.static={{ peer = [\"tcp://{address}\"] }}"
             ));
         }
-        let sources = Sources {
-            set,
-            ..Sources::default()
-        };
-        let config = Config::load(&sources).unwrap();
+        let config = config(&set.iter().map(String::as_str).collect::<Vec<_>>());
         Self {
             gateway: Gateway::open(&config).await.unwrap(),
             domain: Domain::open(&config).await.unwrap(),
@@ -59,18 +51,10 @@ impl Host {
 
     async fn until_known(&self, names: &[&str]) {
         let directory = self.domain.directory();
-        until(&format!("{names:?} are known"), || {
+        until_async(&format!("{names:?} are known"), || {
             names.iter().all(|name| directory.known(name).is_some())
         })
         .await;
-    }
-}
-
-async fn until(what: &str, condition: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !condition() {
-        assert!(started.elapsed() < Duration::from_secs(60), "never: {what}");
-        tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
 
@@ -265,7 +249,7 @@ async fn a_merger_or_split_is_atomic_for_watchers() {
     far.until_known(&["whole"]).await;
     let over = Arc::new(AtomicBool::new(false));
     let beside = Domain::open(&near.config).await.unwrap();
-    until("it is known beside", || {
+    until_async("it is known beside", || {
         beside.directory().lookup("whole").is_some()
     })
     .await;

@@ -3,45 +3,17 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::collections::HashSet;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Message, Outcome,
-    Performative, RegisterError,
+    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
+    RegisterError,
 };
-
-/// Makes a configuration for a domain that no other test uses.
-fn config(set: &[&str]) -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let mut all = vec![
-        format!("domain=test-{}-{number}", std::process::id()),
-        "discovery.mdns=false".to_owned(),
-    ];
-    all.extend(set.iter().map(|setting| (*setting).to_owned()));
-    Config::load(&Sources {
-        set: all,
-        ..Sources::default()
-    })
-    .unwrap()
-}
-
-/// Opens two memberships in one domain, which represent two processes.
-async fn two(config: &Config) -> (Domain, Domain) {
-    let member = || async { Domain::open(config).await.unwrap() };
-    (member().await, member().await)
-}
-
-fn inform(from: &Agent, to: &str, content: impl Into<Vec<u8>>) -> Message {
-    from.message(Performative::Inform)
-        .receiver(AgentId::new(to).unwrap())
-        .content(content.into())
-        .build()
-        .unwrap()
-}
+use support::{config, inform, two};
 
 fn only(deliveries: &Deliveries) -> &Outcome {
     assert_eq!(deliveries.0.len(), 1, "{deliveries}");

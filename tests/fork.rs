@@ -6,11 +6,12 @@
     reason = "the child has no other way to report a failure"
 )]
 
+mod support;
+
 use std::process::Command;
 use std::time::Duration;
 
 use fipa::blocking::{Agent, Domain};
-use fipa::config::Sources;
 use fipa::{
     AgentId, Config, Forked, Incoming, Message, Performative, ReceiveError, RegisterError,
     SendError,
@@ -25,16 +26,11 @@ static CONTENT: [u8; 100_000] = [7; 100_000];
 const PASSED: i32 = 7;
 
 fn config(domain: &str) -> Config {
-    let set = vec![
+    support::load([
         format!("domain={domain}"),
         "mts.transports=shm,unix,tcp".to_owned(),
         "mts.deadline=20s".to_owned(),
-    ];
-    Config::load(&Sources {
-        set,
-        ..Sources::default()
-    })
-    .unwrap()
+    ])
 }
 
 /// Runs one of the ignored tests in a process of its own, because a child has only the thread

@@ -3,7 +3,8 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use fipa::config::Sources;
+mod support;
+
 use fipa::{AgentId, Config, Domain, Kind, Outcome, Performative};
 
 #[test]
@@ -26,15 +27,11 @@ fn inside_letters_without_space_take_the_next_route() {
 /// Makes a configuration for a domain with this random name, because process numbers repeat in
 /// namespaces.
 fn config(name: u64, transports: &str) -> Config {
-    let config = Config::load(&Sources {
-        set: vec![
-            format!("domain=cramped-{name:x}"),
-            "discovery.mdns=false".into(),
-            format!("mts.transports={transports}"),
-        ],
-        ..Sources::default()
-    });
-    config.unwrap()
+    support::load([
+        format!("domain=cramped-{name:x}"),
+        "discovery.mdns=false".to_owned(),
+        format!("mts.transports={transports}"),
+    ])
 }
 
 async fn large_contents() {

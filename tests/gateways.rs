@@ -3,16 +3,17 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use fipa::config::Sources;
 use fipa::routes::{self, Standing};
 use fipa::{
-    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Message, OpenError,
+    Agent, Config, Deliveries, Domain, ErrorChain, FailureReason, Gateway, Kind, OpenError,
     Outcome, Performative, Query, TransportErrorKind,
 };
+use support::inform;
 
 /// A simulated host with a domain and names that no other test uses.
 struct Host {
@@ -23,9 +24,7 @@ struct Host {
 
 impl Host {
     fn new(set: &[&str]) -> Self {
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let mark = format!("{}-{number}", std::process::id());
+        let mark = support::mark();
         let mut all = vec![
             format!("domain=gw-{mark}"),
             format!("mts.name=gateway-{mark}"),
@@ -44,11 +43,7 @@ impl Host {
     /// Returns its configuration with further settings.
     fn configured(&self, set: &[&str]) -> Config {
         let set = set.iter().map(|setting| (*setting).to_owned());
-        Config::load(&Sources {
-            set: self.set.iter().cloned().chain(set).collect(),
-            ..Sources::default()
-        })
-        .unwrap()
+        support::load(self.set.iter().cloned().chain(set))
     }
 
     /// Starts the gateway of the host and a process on it.
@@ -82,14 +77,6 @@ async fn forgotten(domain: &Domain, name: &str) {
         );
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-}
-
-fn inform(from: &Agent, to: &str, content: &str) -> Message {
-    from.message(Performative::Inform)
-        .receiver(AgentId::new(to).unwrap())
-        .content(content.to_owned())
-        .build()
-        .unwrap()
 }
 
 fn via(deliveries: &Deliveries) -> Option<Kind> {
@@ -152,7 +139,7 @@ async fn hosts_discover_each_other_and_exchange_letters() {
 
     for number in 0..20 {
         let sent = rover
-            .send(inform(&rover, arm.name(), &number.to_string()))
+            .send(inform(&rover, arm.name(), number.to_string()))
             .await
             .unwrap();
         assert_eq!(via(&sent), Some(Kind::Tcp));
@@ -274,7 +261,8 @@ async fn a_second_gateway_of_a_domain_or_on_a_port_is_refused() {
     let other = Host::new(&["discovery.mdns=false", &taken]);
     match Gateway::open(&other.config).await {
         Err(error @ OpenError::Listen { .. }) => {
-            assert!(error.to_string().contains(location.address()), "{error}");
+            let error = ErrorChain(&error).to_string();
+            assert!(error.contains(location.address()), "{error}");
         }
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two on one port"),
@@ -377,7 +365,7 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
 /// Sends numbered letters, two at a time, and returns their outcomes.
 async fn numbered(from: Arc<Agent>, to: String, numbers: std::ops::Range<u32>) -> Vec<Deliveries> {
     let sending = |number: u32| {
-        let message = inform(&from, &to, &number.to_string());
+        let message = inform(&from, &to, number.to_string());
         let from = Arc::clone(&from);
         async move { from.send(message).await.unwrap() }
     };

@@ -4,15 +4,16 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::sync::atomic::{AtomicU32, Ordering};
+mod support;
+
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, Envelope, EnvelopeParams, FailureReason, Gateway, Kind, Letter,
+    Agent, AgentId, Domain, Envelope, EnvelopeParams, FailureReason, Gateway, Kind, Letter,
     Message, Outcome, Performative,
 };
 use fipa_acl::{Dialect, Representation};
+use support::config;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
@@ -42,23 +43,10 @@ impl Host {
 
     /// Starts a host with further settings.
     async fn with(name: &str, understands: &str, settings: &[&str]) -> Self {
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let mark = format!("{}-{number}", std::process::id());
         let peer = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let at = peer.local_addr().unwrap();
-        let mut set = vec![
-            format!("domain=old-{mark}"),
-            format!("mts.name=gateway-{mark}"),
-            "discovery.mdns=false".to_owned(),
-            format!("discovery.static={{ \"{name}\" = [\"tcp://{at};{understands}\"] }}"),
-        ];
-        set.extend(settings.iter().map(|it| (*it).to_owned()));
-        let config = Config::load(&Sources {
-            set,
-            ..Sources::default()
-        })
-        .unwrap();
+        let peers = format!("discovery.static={{ \"{name}\" = [\"tcp://{at};{understands}\"] }}");
+        let config = config(&[&[peers.as_str()], settings].concat());
         let gateway = Gateway::open(&config).await.unwrap();
         let domain = Domain::open(&config).await.unwrap();
         let known = async {

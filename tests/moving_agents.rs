@@ -3,17 +3,19 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, FailureReason, Gateway, Incoming, Kind, Outcome, Performative,
+    Agent, AgentId, Domain, FailureReason, Gateway, Incoming, Kind, Outcome, Performative,
     RegisterError,
 };
 use parking_lot::Mutex;
+use support::config;
 use tokio::sync::Semaphore;
 
 const LETTERS: usize = 1000;
@@ -31,12 +33,6 @@ struct Host {
 impl Host {
     /// Starts a simulated host, with names and shared memory of its own, that knows these peers.
     async fn start(peers: &[&Self]) -> Self {
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        let mark = format!(
-            "{}-{}",
-            std::process::id(),
-            NEXT.fetch_add(1, Ordering::Relaxed)
-        );
         let peers: Vec<String> = peers
             .iter()
             .map(|peer| {
@@ -47,17 +43,7 @@ impl Host {
                 )
             })
             .collect();
-        let set = vec![
-            format!("domain=moves-{mark}"),
-            format!("mts.name=gateway-{mark}"),
-            "discovery.mdns=false".to_owned(),
-            format!("discovery.static={{ {} }}", peers.join(", ")),
-        ];
-        let sources = Sources {
-            set,
-            ..Sources::default()
-        };
-        let config = Config::load(&sources).unwrap();
+        let config = config(&[&format!("discovery.static={{ {} }}", peers.join(", "))]);
         Self {
             gateway: Gateway::open(&config).await.unwrap(),
             domain: Domain::open(&config).await.unwrap(),

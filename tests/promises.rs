@@ -21,6 +21,7 @@ use fastrand::Rng;
 use fipa::{AgentId, FailureReason, Kind, Letter, Message, Outcome, Performative};
 use fipa_mts::core::Submission;
 use fipa_mts::{AccessGate, Sending, letter_for};
+use fipa_testbed::until_async;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
     Transport, Verdict,
@@ -238,14 +239,6 @@ async fn note(
     records.lock()[stream].note(number, draft, outcome);
 }
 
-async fn until(what: &str, condition: impl Fn() -> bool) {
-    let begun = Instant::now();
-    while !condition() {
-        assert!(begun.elapsed() < WATCHDOG, "never: {what}");
-        sleep(Duration::from_millis(2)).await;
-    }
-}
-
 async fn outcome(sending: Sending) -> Outcome {
     let outcomes = timeout(WATCHDOG, sending.outcomes()).await.unwrap();
     let [(_, outcome)] = <[_; 1]>::try_from(outcomes).unwrap();
@@ -296,7 +289,7 @@ async fn run(seed: u64) -> String {
         for record in &mut *records.lock() {
             record.in_a_row = 0;
         }
-        until("letters arrive", || {
+        until_async("letters arrive", || {
             let ended = sending.iter().any(|it| it.is_finished());
             assert!(!ended, "a sender has failed; see above");
             let records = records.lock();
@@ -313,7 +306,7 @@ async fn run(seed: u64) -> String {
     };
     let goes_by = async |kind: Kind| {
         let before = went_by(kind);
-        until(&format!("letters go by {kind}"), || {
+        until_async(&format!("letters go by {kind}"), || {
             went_by(kind) > before + IN_A_ROW
         })
         .await;
@@ -361,7 +354,7 @@ async fn run(seed: u64) -> String {
     for sending in sending {
         timeout(WATCHDOG, sending).await.unwrap().unwrap();
     }
-    until("the delivered letters are received", || {
+    until_async("the delivered letters are received", || {
         records.lock().iter().all(StreamRecord::is_taken)
     })
     .await;
@@ -504,13 +497,10 @@ impl RepeatingPeer {
                 Arc::new(QuicTransport::new(config, Handle::current()))
             }
             _ => {
-                let config = TcpConfig {
-                    listen,
-                    identity,
-                    limits,
-                    processes: true,
-                    security: Some(security),
-                };
+                let mut config = TcpConfig::new(listen, identity);
+                config.limits = limits;
+                config.processes = true;
+                config.security = Some(security);
                 Arc::new(TcpTransport::new(config, Handle::current()))
             }
         };
@@ -540,7 +530,7 @@ impl RepeatingPeer {
         self.transport
             .dispatch(attempt, &to.at(kind), parcel)
             .unwrap();
-        until("an answer", || {
+        until_async("an answer", || {
             self.conclusions.0.lock().contains_key(&attempt)
         })
         .await;

@@ -3,12 +3,14 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::io::{BufRead, BufReader, Read, Write};
-use std::process::{Child, Command, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use fipa::config::Sources;
 use fipa::{Config, Domain, Matcher, Query};
+use fipa_testbed::{ChildGuard, ignored_test};
 
 const PROCESSES: usize = 50;
 const AGENTS: usize = 20;
@@ -22,12 +24,7 @@ const DOMAIN: &str = "FIPA_SCALE_DOMAIN";
 const NUMBER: &str = "FIPA_SCALE_NUMBER";
 
 fn config(domain: &str) -> Config {
-    let set = [&format!("domain={domain}"), "discovery.mdns=false"];
-    Config::load(&Sources {
-        set: set.map(|setting| (*setting).to_owned()).to_vec(),
-        ..Sources::default()
-    })
-    .unwrap()
+    support::load([&format!("domain={domain}"), "discovery.mdns=false"])
 }
 
 /// Registers agents, prints `ready`, and leaves when its input ends.
@@ -70,40 +67,26 @@ fn private_memory(pid: u32) -> u64 {
 }
 
 struct Process {
-    child: Child,
+    child: ChildGuard,
     /// Private memory before it joined the domain, in bytes.
     before: u64,
 }
 
-impl Drop for Process {
-    fn drop(&mut self) {
-        // The process has ended already, or the test has failed.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
 fn start(domain: &str, directory: &std::path::Path) -> Vec<Process> {
-    let spawned: Vec<Child> = (0..PROCESSES)
+    let spawned: Vec<ChildGuard> = (0..PROCESSES)
         .map(|number| {
-            Command::new(std::env::current_exe().unwrap())
-                .args([
-                    "--ignored",
-                    "--exact",
-                    "--nocapture",
-                    "a_process_of_its_own",
-                ])
+            let mut command = ignored_test("a_process_of_its_own");
+            command
                 .env(DOMAIN, domain)
                 .env(NUMBER, number.to_string())
                 .env("FIPA_RUNTIME_DIR", directory)
                 .stdin(Stdio::piped())
-                .stdout(Stdio::piped())
-                .spawn()
-                .unwrap()
+                .stdout(Stdio::piped());
+            ChildGuard::start(&mut command)
         })
         .collect();
-    let ready = |mut child: Child| {
-        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let ready = |mut child: ChildGuard| {
+        let lines = BufReader::new(child.child().stdout.take().unwrap()).lines();
         let mut lines = lines.map_while(Result::ok);
         let before = lines.find_map(|line| line.split_once("ready ")?.1.parse().ok());
         let before = before.expect("the process prints that it is ready");
@@ -124,13 +107,7 @@ fn a_thousand_agents_in_fifty_processes() {
     let registered = began.elapsed();
 
     // Another process looks up all agents.
-    let lookup = Command::new(std::env::current_exe().unwrap())
-        .args([
-            "--ignored",
-            "--exact",
-            "--nocapture",
-            "a_process_that_looks_up_all_agents",
-        ])
+    let lookup = ignored_test("a_process_that_looks_up_all_agents")
         .env(DOMAIN, &domain)
         .env("FIPA_RUNTIME_DIR", &run)
         .output()
@@ -173,8 +150,8 @@ fn a_thousand_agents_in_fifty_processes() {
     );
 
     for process in &mut processes {
-        drop(process.child.stdin.take());
-        assert!(process.child.wait().unwrap().success());
+        drop(process.child.child().stdin.take());
+        assert!(process.child.wait().success());
     }
     assert_eq!(shared().count(), 0);
 }

@@ -2,30 +2,14 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::{Duration, Instant};
+mod support;
 
-use fipa::config::Sources;
-use fipa::{
-    AgentId, Config, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative,
-};
+use std::time::Duration;
+
+use fipa::{AgentId, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative};
+use fipa_testbed::until_async;
+use support::config;
 use tokio::io::AsyncReadExt;
-
-fn config(set: &[String]) -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let mark = format!("{}-{number}", std::process::id());
-    let own = [
-        format!("domain=static-{mark}"),
-        format!("mts.name=gateway-{mark}"),
-        "discovery.mdns=false".to_owned(),
-    ];
-    Config::load(&Sources {
-        set: own.iter().chain(set).cloned().collect(),
-        ..Sources::default()
-    })
-    .unwrap()
-}
 
 fn address(gateway: &Gateway) -> String {
     let mut locations = gateway.locations().into_iter();
@@ -41,45 +25,37 @@ fn knowing(name: &str, addresses: &[&str]) -> String {
     )
 }
 
-async fn until(what: &str, condition: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !condition() {
-        assert!(started.elapsed() < Duration::from_secs(60), "never: {what}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn a_static_peer_is_connected_before_any_letter_and_again_after_its_restart() {
     let far_config = config(&[]);
     let far = Gateway::open(&far_config).await.unwrap();
     let at = address(&far);
     // No process listens on the first address.
-    let near = config(&[knowing("far", &["127.0.0.1:9", &at])]);
+    let near = config(&[&knowing("far", &["127.0.0.1:9", &at])]);
     let near = Gateway::open(&near).await.unwrap();
     let far_is = |neighbours: Vec<Neighbour>, incarnation| {
         let mut all = neighbours.into_iter();
         all.any(|it| it.entry.incarnation == incarnation && it.peer.as_deref() == Some("far"))
     };
     let first_incarnation = far.incarnation();
-    until("the far gateway is a neighbor", || {
+    until_async("the far gateway is a neighbor", || {
         far_is(near.neighbours(), first_incarnation)
     })
     .await;
     // It accepts gateways that are not in its configuration.
-    until("the near gateway is a neighbor", || {
+    until_async("the near gateway is a neighbor", || {
         let mut all = far.neighbours().into_iter();
         all.any(|it| it.entry.incarnation == near.incarnation())
     })
     .await;
     far.close().await;
-    until("the connection has ended", || near.neighbours().is_empty()).await;
+    until_async("the connection has ended", || near.neighbours().is_empty()).await;
     let mut again = far_config.clone();
     again.transport.tcp.listen = vec![at];
     let far = Gateway::open(&again).await.unwrap();
     let second_incarnation = far.incarnation();
     assert_ne!(first_incarnation, second_incarnation);
-    until("its next incarnation is a neighbor", || {
+    until_async("its next incarnation is a neighbor", || {
         far_is(near.neighbours(), second_incarnation)
     })
     .await;
@@ -119,13 +95,13 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
     let far_host = Domain::open(&far_config).await.unwrap();
     let arm = far_host.register("arm").unwrap();
     // Only one of them knows the other's address.
-    let near_config = config(&[knowing("far", &[&address(&far)])]);
+    let near_config = config(&[&knowing("far", &[&address(&far)])]);
     let near = Gateway::open(&near_config).await.unwrap();
     let near_host = Domain::open(&near_config).await.unwrap();
     let rover = near_host.register("rover").unwrap();
 
-    until("the arm is known", || seen(&near_host, "arm").is_some()).await;
-    until("the rover is known", || seen(&far_host, "rover").is_some()).await;
+    until_async("the arm is known", || seen(&near_host, "arm").is_some()).await;
+    until_async("the rover is known", || seen(&far_host, "rover").is_some()).await;
     let entry = near.directory().known("arm").unwrap();
     assert_eq!(entry.source, fipa::Source::Exchange);
     assert_eq!(entry.mts.incarnation, far.incarnation());
@@ -144,12 +120,12 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
 
     // Changes are exchanged.
     let leg = far_host.register("leg").unwrap();
-    until("the leg is known", || seen(&near_host, "leg").is_some()).await;
+    until_async("the leg is known", || seen(&near_host, "leg").is_some()).await;
     drop(leg);
-    until("the leg is gone", || seen(&near_host, "leg").is_none()).await;
+    until_async("the leg is gone", || seen(&near_host, "leg").is_none()).await;
     // The entries are removed with their gateway.
     far.close().await;
-    until("the arm is gone", || seen(&near_host, "arm").is_none()).await;
+    until_async("the arm is gone", || seen(&near_host, "arm").is_none()).await;
     assert!(seen(&near_host, "rover").is_none());
     near.close().await;
 }
@@ -166,7 +142,7 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     tokio::time::sleep(Duration::from_millis(5)).await;
     let later = near_host.register("arm").unwrap();
     let mut knows_both = near_config.clone();
-    knows_both.discovery = config(&[knowing("far", &[&address(&far)])]).discovery;
+    knows_both.discovery = config(&[&knowing("far", &[&address(&far)])]).discovery;
     let near = Gateway::open(&knows_both).await.unwrap();
 
     let failure = later.receive().await.unwrap().message;
@@ -176,17 +152,17 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     assert!(content.contains("registered earlier"), "{content}");
     // A third host does not see the later registration.
     let mut watcher = third_config.clone();
-    watcher.discovery = config(&[knowing("near", &[&address(&near)])]).discovery;
+    watcher.discovery = config(&[&knowing("near", &[&address(&near)])]).discovery;
     let third = Gateway::open(&watcher).await.unwrap();
     let here = near_host.register("only here").unwrap();
-    until("the third host has the directory", || {
+    until_async("the third host has the directory", || {
         third.directory().known("only here").is_some()
     })
     .await;
     assert!(third.directory().known("arm").is_none());
     // After the earlier agent leaves, the name is free.
     drop(earlier);
-    until("the later has the name", || {
+    until_async("the later has the name", || {
         third.directory().known("arm").is_some()
     })
     .await;
@@ -198,11 +174,11 @@ async fn a_static_legacy_peer_gets_its_letters_in_its_dialect() {
     // It reads one letter per connection, to the end of the stream.
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = format!("{};fipa-services", listener.local_addr().unwrap());
-    let config = config(&[knowing("old_arm", &[&at])]);
+    let config = config(&[&knowing("old_arm", &[&at])]);
     let gateway = Gateway::open(&config).await.unwrap();
     let host = Domain::open(&config).await.unwrap();
     let rover = host.register("rover").unwrap();
-    until("the legacy peer is known", || {
+    until_async("the legacy peer is known", || {
         host.directory().lookup("old_arm").is_some()
     })
     .await;

@@ -3,14 +3,13 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use fipa::config::Sources;
-use fipa::{
-    Agent, AgentId, Config, Domain, FailureReason, Gateway, Kind, Message, Outcome, Performative,
-};
+use fipa::{Agent, AgentId, Domain, FailureReason, Gateway, Kind, Message, Outcome, Performative};
+use support::config;
 
 /// A simulated host: a gateway and one process.
 struct Host {
@@ -20,20 +19,8 @@ struct Host {
 
 impl Host {
     async fn open(more: &[&str]) -> Self {
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let domain = format!("streams-{}-{number}", std::process::id());
-        let set = [
-            "discovery.mdns=false",
-            "security.insecure=true",
-            "mts.deadline=60s",
-        ];
-        let set = set.iter().chain(more).map(|it| (*it).to_owned());
-        let sources = Sources {
-            set: set.chain([format!("domain={domain}")]).collect(),
-            ..Sources::default()
-        };
-        let config = Config::load(&sources).unwrap();
+        let set = ["security.insecure=true", "mts.deadline=60s"];
+        let config = config(&[&set, more].concat());
         Self {
             gateway: Gateway::open(&config).await.unwrap(),
             domain: Domain::open(&config).await.unwrap(),

@@ -2,42 +2,22 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::watch::{Event, Fate, Passage, WatchOptions, Watcher};
 use fipa::{
     Agent, AgentId, Config, Domain, FailureReason, Gateway, Kind, Message, Outcome, Performative,
 };
 use rustix::net::{AddressFamily, SendFlags, SocketAddrUnix, SocketType};
+use support::config;
 
 /// Ends a test that hangs.
 const WATCHDOG: Duration = Duration::from_secs(60);
-
-/// Makes a configuration for a domain that no other test uses.
-fn config() -> Config {
-    config_with(&[])
-}
-
-fn config_with(set: &[String]) -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let mark = format!("watch-{}-{number}", std::process::id());
-    let own = [
-        format!("domain={mark}"),
-        format!("mts.name=mts-{mark}"),
-        "discovery.mdns=false".to_owned(),
-    ];
-    Config::load(&Sources {
-        set: own.iter().chain(set).cloned().collect(),
-        ..Sources::default()
-    })
-    .unwrap()
-}
 
 /// Returns the directory with the entries of the domain.
 fn directory(config: &Config) -> PathBuf {
@@ -97,7 +77,7 @@ async fn until_seen(watcher: &mut Watcher, from: &Agent, to: &str) {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn each_letter_yields_one_event_with_its_outcome() {
-    let config = config();
+    let config = config(&[]);
     let (here, there) = (
         Domain::open(&config).await.unwrap(),
         Domain::open(&config).await.unwrap(),
@@ -170,7 +150,7 @@ async fn each_letter_yields_one_event_with_its_outcome() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn only_a_watcher_that_requests_content_gets_it() {
-    let config = config();
+    let config = config(&[]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, _arm) = (
         domain.register("rover").unwrap(),
@@ -204,7 +184,7 @@ async fn only_a_watcher_that_requests_content_gets_it() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_dropped_watcher_removes_its_files() {
-    let config = config();
+    let config = config(&[]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
         domain.register("rover").unwrap(),
@@ -231,7 +211,7 @@ async fn a_dropped_watcher_removes_its_files() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_watcher_that_does_not_read_delays_no_agent_and_gets_the_count_of_lost_records() {
     const LETTERS: u64 = 12_000;
-    let config = config();
+    let config = config(&[]);
     let (here, there) = (
         Domain::open(&config).await.unwrap(),
         Domain::open(&config).await.unwrap(),
@@ -292,7 +272,7 @@ async fn a_watcher_that_does_not_read_delays_no_agent_and_gets_the_count_of_lost
 
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_records_are_refused_without_effect_on_others() {
-    let config = config();
+    let config = config(&[]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, _arm) = (
         domain.register("rover").unwrap(),
@@ -328,7 +308,7 @@ async fn invalid_records_are_refused_without_effect_on_others() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
-    let config = config();
+    let config = config(&[]);
     let there = Domain::open(&config).await.unwrap();
     let arm = there.register("arm").unwrap();
     let mut watcher = Watcher::open(&config, WatchOptions::default())
@@ -375,7 +355,7 @@ async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
 /// Starts a host with a gateway that knows the gateway at this address, and a watcher.
 async fn watched(peer: Option<&str>) -> (Gateway, Domain, Watcher) {
     let known = peer.map(|address| format!("discovery.static={{ far = [\"tcp://{address}\"] }}"));
-    let config = config_with(known.as_slice());
+    let config = config(known.as_deref().as_slice());
     let gateway = Gateway::open(&config).await.unwrap();
     let domain = Domain::open(&config).await.unwrap();
     let watcher = Watcher::open(&config, WatchOptions::default()).await;

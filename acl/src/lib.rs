@@ -43,6 +43,7 @@ mod codec;
 mod dialect;
 mod envelope;
 mod error;
+mod error_chain;
 mod escape;
 mod explain;
 #[cfg(feature = "json")]
@@ -66,6 +67,7 @@ pub use envelope::{
     Envelope, EnvelopeParams, EnvelopeView, Received, ReceiverNames, StampView, Stamps,
 };
 pub use error::{DecodeError, EncodeError, Problem};
+pub use error_chain::ErrorChain;
 pub use escape::{escape, is_unprintable};
 pub use explain::{Explanation, Span, explain};
 pub use letter::{Letter, Payload};

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
-use fipa::{Agent, Config, Directory, Domain, Gateway, Reach};
+use fipa::{Agent, Config, DirectoryView, Domain, Gateway, Reach};
 use fipa_testbed::{Host, Network};
 use tokio::runtime::{Builder, Runtime};
 
@@ -121,7 +121,7 @@ impl Robot {
 
     /// The gateway, and the processes of its host.
     fn sees_all(&self) -> bool {
-        let remote = |directory: &dyn Directory| {
+        let remote = |directory: DirectoryView<'_>| {
             directory.refresh();
             let entries = directory.entries();
             let remote = entries.iter().filter(|it| it.reach != Reach::Local);

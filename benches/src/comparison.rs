@@ -150,7 +150,7 @@ impl Comparison {
                     _ => {}
                 }
             }
-            // Measured whatever is configured, because the measurement makes keys of its own.
+            // Measured with any configuration, because the measurement makes keys of its own.
             add(Mechanism::Secured(Kind::Tcp), Wait::Block);
             add(Mechanism::Secured(Kind::Quic), Wait::Block);
         }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use fipa::ErrorChain;
 use thiserror::Error;
 
 /// A measurement that could not be made or shown.
@@ -49,7 +50,12 @@ pub enum BenchError {
     },
 }
 
-/// A process that could not play its part in a measurement.
+/// The failure of a process of a measurement.
 #[derive(Debug, Error)]
 #[error("{0}")]
 pub struct PartError(pub(crate) String);
+
+/// Returns the text of an error of `fipa` with its causes.
+pub(crate) fn chain_text(error: impl std::error::Error + 'static) -> String {
+    ErrorChain(&error).to_string()
+}

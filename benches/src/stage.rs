@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
+use fipa::ErrorChain;
 use fipa::keys::{Keys, KeysError, VALID};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
@@ -71,7 +72,7 @@ impl Stage {
     /// Makes keys for the gateways of these domains, which trust each other. Returns the setting with
     /// the keys for each.
     pub(super) fn keys(&self, domains: &[String]) -> Result<Vec<String>, String> {
-        let to_text = |error: KeysError| error.to_string();
+        let to_text = |error: KeysError| ErrorChain(&error).to_string();
         let of = |domain: &String| Keys::at(self.place.join(format!("keys-{domain}")));
         let all: Vec<Keys> = domains.iter().map(of).collect();
         let mut certificates = Vec::new();

@@ -5,7 +5,9 @@ use std::io::{self, IsTerminal};
 use std::pin::pin;
 use std::time::Duration;
 
-use fipa::{Agent, Config, Domain, ListenError, OpenError, RegisterError, RegisterOptions};
+use fipa::{
+    Agent, Config, Domain, ErrorChain, ListenError, OpenError, RegisterError, RegisterOptions,
+};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::options;
@@ -142,24 +144,24 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
                 "use an address of this machine and a port that this user may open"
             };
             Failure::failed(
-                source.to_string(),
+                ErrorChain(&source).to_string(),
                 format!("transport.{kind}.listen of the configuration"),
                 advice,
             )
         }
         OpenError::Keys(_) => Failure::failed(
-            error.to_string(),
+            ErrorChain(&error).to_string(),
             format!("mts.name {:?}", config.mts.name),
             "run `fipa doctor`; keys belong to one gateway: use its name (--set mts.name=NAME), or make \
              new keys in an empty directory (`fipa keys init --dir DIRECTORY`)",
         ),
         OpenError::NoTransport(_) => Failure::failed(
-            error.to_string(),
+            ErrorChain(&error).to_string(),
             domain,
             "check mts.transports (`fipa config show`); the message above has the reason for each",
         ),
         other => Failure::failed(
-            other.to_string(),
+            ErrorChain(&other).to_string(),
             domain,
             "check whether this user can write to $FIPA_RUNTIME_DIR, or to /tmp/fipa-<user id> when it is \
              not set: the processes of a domain meet there",
@@ -191,12 +193,12 @@ pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) 
             "choose another name, or stop that agent (`fipa agents` shows its locations)",
         ),
         RegisterError::Invalid(error) => Failure::wrong_usage(
-            format!("cannot register the name {name:?}: {error}"),
+            format!("cannot register the name {name:?}: {}", ErrorChain(&error)),
             "the command line",
             "use a name within these limits",
         ),
         other => Failure::failed(
-            other.to_string(),
+            ErrorChain(&other).to_string(),
             domain,
             "`fipa agents` lists the registered agents; stop those that are not needed",
         ),

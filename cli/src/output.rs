@@ -41,12 +41,6 @@ pub(crate) fn bytes(bytes: &[u8]) -> Result<(), Failure> {
     bytes_if_read(bytes).map(drop)
 }
 
-/// Prints a text with its own final newline. Returns whether the output still has a reader, so that
-/// a command that prints continuously can end together with its reader.
-pub(crate) fn text_if_read(text: &str) -> Result<bool, Failure> {
-    bytes_if_read(text.as_bytes())
-}
-
 /// Watches standard output for the loss of its reader, as after `| head`. Where the kernel cannot
 /// report that, it is never detected.
 pub(crate) struct Reader(oneshot::Receiver<()>);
@@ -68,7 +62,7 @@ impl Reader {
         Self(reader)
     }
 
-    /// Returns when the output has no reader any more. Safe to cancel.
+    /// Returns when the output has no reader left. Safe to cancel.
     pub(crate) async fn gone(&mut self) {
         if (&mut self.0).await.is_err() {
             std::future::pending().await
@@ -76,7 +70,9 @@ impl Reader {
     }
 }
 
-fn bytes_if_read(bytes: &[u8]) -> Result<bool, Failure> {
+/// Prints bytes unchanged. Returns whether the output still has a reader, so that a command that
+/// prints continuously can end together with its reader.
+pub(crate) fn bytes_if_read(bytes: &[u8]) -> Result<bool, Failure> {
     let mut stdout = io::stdout().lock();
     let written = stdout.write_all(bytes).and_then(|()| stdout.flush());
     match written {

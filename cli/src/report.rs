@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
+use fipa::ErrorChain;
 use fipa::config::{ConfigError, Mistake};
 
 use crate::output;
@@ -117,7 +118,7 @@ impl From<ConfigError> for Failure {
                 mistakes.into_iter().map(ErrorReport::from).collect()
             }
             other => vec![ErrorReport {
-                problem: other.to_string(),
+                problem: ErrorChain(&other).to_string(),
                 place: None,
                 help: "give another file with --config or $FIPA_CONFIG, or use neither".to_owned(),
             }],

@@ -19,12 +19,12 @@ mod siege;
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::keys::Keys;
-use fipa_testbed::frame;
+use fipa_testbed::{ChildGuard, frame, ignored_test};
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};
 use siege::hostile::{self, AT_KEYS, IN_THE_CLEAR, Means};
@@ -39,25 +39,19 @@ const ORDERS: &str = "FIPA_SIEGE_AT";
 const INITIALS: usize = 300;
 
 /// The hostile peers, in a separate process so that their CPU time is measured separately.
-struct Hostile(Child);
+struct Hostile(ChildGuard);
 
 impl Hostile {
     fn start(to: Option<(SocketAddr, SocketAddr)>, secured: bool, place: &Path) -> Self {
         let at = to.map_or("sink".to_owned(), |(tcp, datagrams)| {
             format!("{tcp} {datagrams}")
         });
-        let mut command = Command::new(std::env::current_exe().unwrap());
+        let mut command = ignored_test("inside_hostile_peers");
         command
-            .args([
-                "--exact",
-                "inside_hostile_peers",
-                "--ignored",
-                "--nocapture",
-            ])
             .env(ORDERS, format!("{secured} {} {at}", place.display()))
             .stdout(Stdio::piped());
-        let mut child = command.spawn().unwrap();
-        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut child = ChildGuard::start(&mut command);
+        let lines = BufReader::new(child.child().stdout.take().unwrap()).lines();
         let mut lines = lines.map_while(Result::ok);
         assert!(
             lines.any(|line| line.contains("READY")),
@@ -66,14 +60,6 @@ impl Hostile {
         // Reads further output, so that the process does not block.
         std::thread::spawn(move || lines.for_each(drop));
         Self(child)
-    }
-}
-
-impl Drop for Hostile {
-    fn drop(&mut self) {
-        // The process may have ended already.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 

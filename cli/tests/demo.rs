@@ -3,9 +3,10 @@
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::io::{BufRead, BufReader, Read};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 
+use fipa_testbed::ChildGuard;
 use serde_json::Value;
 
 /// Demos use mDNS on loopback and the same agent names, so two demos at a time would find each other's
@@ -69,13 +70,10 @@ fn every_step_passes() {
 #[test]
 fn an_interrupted_demo_leaves_no_files_and_processes() {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
-    let mut child: Child = demo(&[])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let mut command = demo(&[]);
+    let mut child = ChildGuard::start(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
     let pid = child.id();
-    let mut output = BufReader::new(child.stdout.take().unwrap());
+    let mut output = BufReader::new(child.child().stdout.take().unwrap());
     let mut line = String::new();
     while !line.contains("arm_2") {
         line.clear();
@@ -85,15 +83,12 @@ fn an_interrupted_demo_leaves_no_files_and_processes() {
         );
     }
     assert!(processes(pid) > 2);
-    let interrupted = Command::new("kill")
-        .args(["-INT", &pid.to_string()])
-        .status()
-        .unwrap();
-    assert!(interrupted.success());
-    let status = child.wait().unwrap();
+    child.signal("-INT");
+    let status = child.wait();
     assert_eq!(status.code(), Some(1));
     let mut errors = String::new();
     child
+        .child()
         .stderr
         .take()
         .unwrap()

@@ -20,9 +20,10 @@ use std::time::{Duration, Instant};
 use fastrand::Rng;
 use fipa::Incarnation;
 use fipa::keys::Keys;
+use fipa_testbed::until;
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};
-use siege::{Gateway, Pair, Usage, percentiles, until};
+use siege::{Gateway, Pair, Usage, percentiles};
 use tempfile::TempDir;
 
 /// Concurrent conversations.

@@ -11,10 +11,8 @@ use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
 use fipa::{Agent, AgentId, Config, Domain, Incarnation, Performative, Role};
-use fipa_testbed::{Host, Network, PacketRepeater, Running, enter, isolated};
+use fipa_testbed::{ChildGuard, Host, Network, PacketRepeater, enter, isolated, until};
 use tokio::runtime::{Builder, Runtime};
-
-const WATCHDOG: Duration = Duration::from_secs(90);
 
 #[test]
 fn processes_agree_after_every_link_repair() {
@@ -92,7 +90,7 @@ fn inside_processes_agree_after_every_link_repair() {
 /// A host with a gateway process and agents that are registered and deregistered.
 struct Robot {
     name: String,
-    gateway: Option<Running>,
+    gateway: Option<ChildGuard>,
     domain: Domain,
     agents: BTreeMap<String, Agent>,
     writer: Agent,
@@ -113,7 +111,7 @@ impl Robot {
         for setting in &set {
             up.args(["--set", setting]);
         }
-        let (gateway, _ready) = Running::until_ready(up.arg("up"));
+        let (gateway, _ready) = ChildGuard::until_ready(up.arg("up"));
         let runtime = Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
@@ -196,12 +194,4 @@ fn agree(robots: &[Robot]) {
     until("all hosts agree", || {
         robots.iter().all(|robot| robot.view() == all)
     });
-}
-
-fn until(what: &str, condition: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !condition() {
-        assert!(started.elapsed() < WATCHDOG, "timed out: {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
 }

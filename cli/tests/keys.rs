@@ -5,9 +5,9 @@
 mod common;
 
 use std::process::Command;
-use std::time::{Duration, Instant};
 
 use common::{Host, Running};
+use fipa_testbed::until;
 use serde_json::{Value, json};
 
 /// A host with keys.
@@ -75,14 +75,6 @@ impl KeyedHost {
             .host
             .run(&["send", "--to", agent, "--content", "hello"]);
         sent.code == Some(0)
-    }
-}
-
-fn until(what: &str, condition: impl Fn() -> bool) {
-    let begun = Instant::now();
-    while !condition() {
-        assert!(begun.elapsed() < Duration::from_secs(60), "{what}");
-        std::thread::sleep(Duration::from_millis(20));
     }
 }
 

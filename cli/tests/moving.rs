@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use fipa::config::Sources;
 use fipa::keys::{Keys, VALID};
 use fipa::{Agent, AgentId, Config, Deliveries, Domain, Entry, Incarnation, Outcome, Performative};
-use fipa_testbed::{Host, Network, Running, enter, isolated};
+use fipa_testbed::{ChildGuard, Host, Network, enter, isolated};
 use serde_json::Value;
 use tempfile::TempDir;
 use tokio::runtime::Runtime;
@@ -240,7 +240,7 @@ enum Discovery {
 struct Robot {
     name: String,
     settings: Vec<String>,
-    _gateway: Running,
+    _gateway: ChildGuard,
     runtime: Runtime,
     agent: Arc<Agent>,
     _keys: Arc<TempDir>,
@@ -339,7 +339,7 @@ impl Robot {
         if std::env::var_os("FIPA_TEST_LOG").is_some() {
             up.arg("-v");
         }
-        let mut gateway = Running::start(up.stdin(Stdio::null()).stdout(Stdio::piped()));
+        let mut gateway = ChildGuard::start(up.stdin(Stdio::null()).stdout(Stdio::piped()));
         let mut ready = String::new();
         let stdout = gateway.child().stdout.take().unwrap();
         BufReader::new(stdout).read_line(&mut ready).unwrap();

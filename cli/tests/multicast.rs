@@ -6,7 +6,7 @@
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use fipa_testbed::{Host, Network, Running, enter, isolated};
+use fipa_testbed::{ChildGuard, Host, Network, enter, isolated};
 use serde_json::Value;
 
 #[test]
@@ -30,10 +30,10 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
     assert!(found.contains("no other host answered"), "{found}");
 
     let mut up = fipa(there, "there");
-    let _gateway = Running::until_ready(up.arg("up"));
+    let _gateway = ChildGuard::until_ready(up.arg("up"));
     // A gateway without agents has no records with which it could answer.
     let mut echo = fipa(there, "there");
-    let _agent = Running::until_ready(echo.args(["echo", "parrot"]));
+    let _agent = ChildGuard::until_ready(echo.args(["echo", "parrot"]));
     let deadline = Instant::now() + Duration::from_secs(60);
     let found = loop {
         let (verdict, found) = multicast(here);

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use fipa_testbed::{Host, Network, Running, enter, isolated};
+use fipa_testbed::{ChildGuard, Host, Network, enter, isolated};
 
 const README: &str = include_str!("../../README.md");
 
@@ -109,9 +109,9 @@ fn inside_two_hosts_are_secured() {
         crex.run(theirs);
     }
     let gateways = [(rover, *last), (crex, swapped[before.len()].as_str())];
-    let _gateways =
-        gateways.map(|(user, line)| Running::until_ready(&mut user.shell(&format!("exec {line}"))));
-    let _arm = Running::until_ready(&mut crex.shell("exec fipa echo arm_1"));
+    let _gateways = gateways
+        .map(|(user, line)| ChildGuard::until_ready(&mut user.shell(&format!("exec {line}"))));
+    let _arm = ChildGuard::until_ready(&mut crex.shell("exec fipa echo arm_1"));
     let begun = Instant::now();
     loop {
         let sent = rover

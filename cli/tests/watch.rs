@@ -277,14 +277,7 @@ fn the_text_output_has_lines_and_a_summary() {
         assert!(line.contains(part), "{line}");
     }
     assert!(!line.contains('\u{1b}'), "no color without a terminal");
-    let pid = watching.pid();
-    assert!(
-        Command::new("kill")
-            .args(["-INT", &pid])
-            .status()
-            .unwrap()
-            .success()
-    );
+    watching.send_signal("-INT");
     assert_eq!(watching.line(), "");
     let summary = watching.line();
     assert!(

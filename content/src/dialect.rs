@@ -4,7 +4,7 @@ use std::fmt;
 
 /// The reader that SL text is written for, or the writer that it comes from.
 ///
-/// Reading accepts the notations of both, whatever the dialect, with one exception:
+/// In each dialect, reading accepts the notations of both, with one exception:
 /// a byte-length encoded string (`#4"…`) is text or raw bytes in the standard, and Base64 in JADE.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 #[non_exhaustive]

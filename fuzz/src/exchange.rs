@@ -41,7 +41,7 @@ fn agent(name: &str, incarnation: u64, gateway: Incarnation) -> Arc<Entry> {
     })
 }
 
-/// Runs a gateway with the letters and events of its neighbors that the bytes encode.
+/// Decodes the bytes into letters and events of neighbors, and runs a gateway with them.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let mut now = Instant::now();

@@ -39,7 +39,8 @@ impl Verdict<'_> {
 pub struct Accepted<'m> {
     /// Name of the protocol.
     pub protocol: &'m str,
-    /// New state with the participant of the message, or with the first of several.
+    /// State after the message, toward the participant that sent or received it. For a message to
+    /// several participants, the state toward the first.
     pub state: &'m str,
     /// Whether the state is one of the protocol's own. Other states are common to all protocols:
     /// `not-understood`, `cancelling`, `cancelled`, `undelivered`, `elsewhere`.

@@ -396,7 +396,7 @@ fn every_performative_is_checked_in_every_state() {
                     let opened_by_other = state == "0" && side == '<';
                     let verdict = walk.say(side, act);
                     if opened_by_other && walk_begins(table, act) {
-                        // The sender of the first message is the initiator, whatever its name is.
+                        // The sender of the first message is the initiator; its name does not matter.
                         assert!(verdict.is_accepted());
                         continue;
                     }

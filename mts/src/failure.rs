@@ -138,8 +138,8 @@ impl<'a> Failure<'a> {
     }
 }
 
-/// The sender of a message, with the addresses in the message or, without any, those in the
-/// envelope.
+/// Returns the sender of a message. If the message has no addresses of the sender, the addresses in
+/// the envelope are used.
 pub(crate) fn sender_of(message: &Message, letter: &Letter) -> Option<AgentId> {
     let sender = message.sender()?;
     if sender.addresses().is_empty()

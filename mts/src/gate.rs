@@ -1,10 +1,10 @@
 //! The access gate: decides which letters are accepted.
 
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::IpAddr;
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_transport::{Hop, Incarnation, Kind, Principal};
+use fipa_transport::{Hop, Incarnation, Kind, Principal, quota_address};
 
 /// The link on which a letter arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,7 +19,7 @@ pub struct Link {
 }
 
 /// The party at the other end of a link, as far as the link proves it. Quotas count letters by
-/// their source, whatever names the letters have.
+/// source, and ignore the names in the letters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Source {
     /// The service with this incarnation in a process of this user on this host.
@@ -43,7 +43,7 @@ impl Source {
                 let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
                 let host = host.trim_matches(['[', ']']);
                 let host = host.split_once('%').map_or(host, |(host, _)| host);
-                Self::Address(host.parse().ok().map(network_of))
+                Self::Address(host.parse().ok().map(quota_address))
             }
         }
     }
@@ -51,19 +51,7 @@ impl Source {
     /// Returns the source of unproved letters from this address.
     #[must_use]
     pub fn at(address: IpAddr) -> Self {
-        Self::Address(Some(network_of(address)))
-    }
-}
-
-/// The address that represents all addresses of a host.
-fn network_of(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        ip if ip.is_loopback() => IpAddr::V4(Ipv4Addr::LOCALHOST),
-        IpAddr::V6(v6) if !v6.is_unicast_link_local() => {
-            let network = u128::from(v6) & !u128::from(u64::MAX);
-            IpAddr::V6(network.into())
-        }
-        ip => ip,
+        Self::Address(Some(quota_address(address)))
     }
 }
 

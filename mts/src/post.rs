@@ -12,10 +12,10 @@ use fipa_acl::{
 #[non_exhaustive]
 pub enum PostError {
     /// The time is beyond the range of an envelope.
-    #[error("cannot date the envelope: {0}")]
+    #[error("cannot date the envelope")]
     Time(#[from] TimeError),
     /// The message or its envelope cannot be encoded.
-    #[error("cannot encode the letter: {0}")]
+    #[error("cannot encode the letter")]
     Encode(#[from] EncodeError),
 }
 

@@ -10,6 +10,7 @@
 mod loans;
 mod receiving;
 
+use std::fmt;
 use std::future::Future;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
@@ -49,6 +50,15 @@ pub struct RuntimeConfig {
     pub gate: Option<Arc<dyn AccessGate>>,
 }
 
+impl fmt::Debug for RuntimeConfig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RuntimeConfig")
+            .field("spin", &self.spin)
+            .field("unframed_deadline", &self.unframed_deadline)
+            .finish_non_exhaustive()
+    }
+}
+
 /// Receives news about other hosts: services with an open connection, and agents that are in no
 /// directory.
 pub trait Contacts: Send + Sync {
@@ -82,6 +92,15 @@ pub trait Tap: Send + Sync {
 #[derive(Clone)]
 pub struct Mts {
     shared: Arc<ServiceHandle>,
+}
+
+impl fmt::Debug for Mts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let kinds = self.shared.transports.iter().map(|one| one.kind());
+        f.debug_struct("Mts")
+            .field("transports", &kinds.collect::<Vec<_>>())
+            .finish_non_exhaustive()
+    }
 }
 
 /// The service as its users hold it. Dropping the last of them closes the transports.
@@ -178,6 +197,7 @@ impl Slot {
 }
 
 /// A service that has started, and the transports that failed.
+#[derive(Debug)]
 pub struct Started {
     /// The service.
     pub mts: Mts,
@@ -658,6 +678,12 @@ fn no_such_transport(kind: Kind) -> TransportError {
 pub struct Sending {
     shared: Arc<ServiceHandle>,
     slot: Arc<Slot>,
+}
+
+impl fmt::Debug for Sending {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Sending").finish_non_exhaustive()
+    }
 }
 
 impl Sending {

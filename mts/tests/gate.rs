@@ -100,7 +100,7 @@ fn the_gate_is_called_once_per_letter_and_only_when_there_is_room() {
     assert_eq!(arrive(ARM, "arm", 2), accepted);
     assert_eq!(arrive(ARM, "arm", 3), Verdict::Now(Answer::Busy));
     assert_eq!(*gate.0.lock(), ["arm", "arm"]);
-    // The registration is that of `brake`, whatever name the parcel has.
+    // The registration is that of `brake`; the name in the parcel does not matter.
     assert_eq!(arrive(BRAKE, "arm", 1), refused());
     assert_eq!(core.waiting(BRAKE), 0);
     assert_eq!(core.waiting(ARM), 2);

@@ -127,7 +127,7 @@ pub enum MembersError {
     )]
     TooMany,
     /// The name of a member is not valid.
-    #[error("member: {0}")]
+    #[error("the name of a member is not valid")]
     Name(#[from] NameError),
     /// The leader is not a member.
     #[error("the leader {0:?} is not a member; add it to the members")]

@@ -139,7 +139,7 @@ pub enum RegisterError {
         holder: Arc<Entry>,
     },
     /// The registration is not valid.
-    #[error("cannot register: {0}")]
+    #[error("cannot register")]
     Invalid(#[from] EntryError),
     /// The registration to be removed in the same update was not made here.
     #[error("no agent {0:?} of this incarnation is registered here")]
@@ -157,8 +157,8 @@ pub enum RegisterError {
     #[error(transparent)]
     Forked(#[from] Forked),
     /// The back end could not be written.
-    #[error("cannot register in the directory: {0}")]
-    Failed(Arc<dyn std::error::Error + Send + Sync>),
+    #[error("cannot register in the directory")]
+    Failed(#[source] Arc<dyn std::error::Error + Send + Sync>),
 }
 
 /// Error of [`Directory::deregister`].
@@ -178,8 +178,8 @@ pub enum DeregisterError {
     #[error(transparent)]
     Forked(#[from] Forked),
     /// The back end could not be written.
-    #[error("cannot deregister from the directory: {0}")]
-    Failed(Arc<dyn std::error::Error + Send + Sync>),
+    #[error("cannot deregister from the directory")]
+    Failed(#[source] Arc<dyn std::error::Error + Send + Sync>),
 }
 
 fn since(holder: &Entry) -> String {

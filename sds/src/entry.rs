@@ -235,7 +235,7 @@ pub enum EntryError {
     #[error(transparent)]
     Name(#[from] NameError),
     /// The name of the message transport service is not valid.
-    #[error("message transport service: {0}")]
+    #[error("the name of the message transport service is not valid")]
     MtsName(#[source] NameError),
     /// A text is too long.
     #[error("the {field} has {len} bytes; at most {max} are allowed")]

@@ -9,9 +9,9 @@
 
 mod common;
 
-use common::{eventually, registration};
+use common::registration;
 use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source};
-use fipa_testbed::{Avahi, Network};
+use fipa_testbed::{Avahi, Network, until_some_async};
 use fipa_transport::{Incarnation, Location};
 
 const SERVICE_TYPE: &str = "_fipa_service_directory._udp";
@@ -65,8 +65,8 @@ async fn all_interfaces_include_loopback() {
     let (everywhere, loopback) = (open(&[]), open(&["lo"]));
     loopback.register(registration("leg")).unwrap();
     everywhere.register(registration("foot")).unwrap();
-    eventually("heard on loopback", || everywhere.lookup("leg")).await;
-    eventually("said on loopback", || loopback.lookup("foot")).await;
+    until_some_async("heard on loopback", || everywhere.lookup("leg")).await;
+    until_some_async("said on loopback", || loopback.lookup("foot")).await;
 }
 
 /// The line of `avahi-browse` about a resolved record that contains all of these parts.
@@ -85,7 +85,7 @@ async fn we_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
         "tcp://10.99.0.1:7788".parse().unwrap(),
     ];
     directory.register(agent.clone()).unwrap();
-    let line = eventually("avahi-browse shows the agent", || {
+    let line = until_some_async("avahi-browse shows the agent", || {
         browsed(avahi, &[r"arm\063left"])
     })
     .await;
@@ -102,14 +102,14 @@ async fn we_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
 
     agent.description = "turned".to_owned();
     directory.register(agent.clone()).unwrap();
-    eventually("avahi-browse shows the change", || {
+    until_some_async("avahi-browse shows the change", || {
         browsed(avahi, &[r"arm\063left", "\"DESCRIPTION=turned\""])
     })
     .await;
 
     // Avahi also processes a goodbye.
     directory.deregister("arm.left", agent.incarnation).unwrap();
-    eventually("avahi-browse no longer shows it", || {
+    until_some_async("avahi-browse no longer shows it", || {
         let lines = avahi.browse(SERVICE_TYPE);
         let gone = !lines.iter().any(|line| line.contains("arm"));
         gone.then_some(())
@@ -132,7 +132,7 @@ async fn peers_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
         ],
     );
     let name = "echo@192.0.2.2:1099/JADE";
-    let found = eventually("the peer", || directory.lookup(name)).await;
+    let found = until_some_async("the peer", || directory.lookup(name)).await;
     assert_eq!(found.agent_type, "echo agent");
     assert_eq!(found.description, "answers");
     assert_eq!(found.source, Source::Mdns);
@@ -169,7 +169,7 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     let strings: Vec<&str> = strings.iter().map(String::as_str).collect();
     let peer = avahi.publish("crane", SERVICE_TYPE, 0, &strings);
 
-    let found = eventually("all of the peer's locations", || {
+    let found = until_some_async("all of the peer's locations", || {
         let found = directory.lookup("crane")?;
         assert!(
             found
@@ -189,7 +189,7 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     assert_eq!(found.agent_type, "crane");
     drop(peer);
     gone(directory, "crane").await;
-    // It joined once and left once, whatever arrived of it in between.
+    // It joined once and left once, regardless of what arrived in between.
     let mut told = Vec::new();
     while let Some(change) = watch.try_next() {
         told.push(change);
@@ -217,7 +217,7 @@ async fn records_with_little_in_them_are_read(directory: &MdnsDirectory, avahi: 
         ),
         avahi.publish("bare", SERVICE_TYPE, 0, &[]),
     ];
-    let twice = eventually("both locations", || {
+    let twice = until_some_async("both locations", || {
         directory
             .lookup("twice")
             .filter(|found| found.locations.len() == 2)
@@ -225,7 +225,7 @@ async fn records_with_little_in_them_are_read(directory: &MdnsDirectory, avahi: 
     .await;
     assert_eq!(twice.agent_type, "t");
     assert_eq!(twice.locations[0].address(), "10.99.0.2:7001");
-    let bare = eventually("a record without keys", || directory.lookup("bare")).await;
+    let bare = until_some_async("a record without keys", || directory.lookup("bare")).await;
     assert_eq!((bare.locations.len(), &*bare.agent_type), (0, ""));
     drop(peers);
     gone(directory, "twice").await;
@@ -237,12 +237,12 @@ async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     // The own registration first: Avahi renames the peer.
     let ours = registration("lift");
     directory.register(ours.clone()).unwrap();
-    eventually("avahi-browse shows ours", || {
+    until_some_async("avahi-browse shows ours", || {
         browsed(avahi, &["lift", "fipa-name"])
     })
     .await;
     let peer = avahi.publish("lift", SERVICE_TYPE, 0, &["TYPE=theirs"]);
-    let found = eventually("the peer by its new name", || directory.lookup("lift #2")).await;
+    let found = until_some_async("the peer by its new name", || directory.lookup("lift #2")).await;
     assert_eq!(found.agent_type, "theirs");
     assert!(browsed(avahi, &["lift;", "fipa-name=lift"]).is_some());
     assert_eq!(directory.status().announced, 1);
@@ -254,7 +254,7 @@ async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     // withdraws its registration.
     let strings = ["TYPE=theirs", "TIMESTAMP=20200101-00:00:00:000000"];
     let _peer = avahi.publish("winch", SERVICE_TYPE, 0, &strings);
-    let holder = eventually("the peer", || directory.lookup("winch")).await;
+    let holder = until_some_async("the peer", || directory.lookup("winch")).await;
     match directory.register(registration("winch")) {
         Err(RegisterError::AlreadyRegistered { holder: told }) => assert_eq!(told, holder),
         other => panic!("{other:?}"),
@@ -265,19 +265,19 @@ async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     let told = tokio::time::timeout(common::WATCHDOG, withdrawals.recv()).await;
     let told = told.expect("the later registration is withdrawn").unwrap();
     assert_eq!(told.holder.agent_type, "theirs");
-    eventually("the peer's is the only record", || {
+    until_some_async("the peer's is the only record", || {
         let lines = avahi.browse(SERVICE_TYPE);
         let resolved = lines.iter().filter(|line| line.starts_with('='));
         let winches: Vec<_> = resolved.filter(|line| line.contains("winch")).collect();
         (winches.len() == 1 && winches[0].contains("theirs")).then_some(())
     })
     .await;
-    let seen = eventually("the newcomer sees the peer", || newcomer.lookup("winch")).await;
+    let seen = until_some_async("the newcomer sees the peer", || newcomer.lookup("winch")).await;
     assert_eq!(seen.agent_type, "theirs");
 }
 
 async fn gone(directory: &MdnsDirectory, name: &str) {
-    eventually(&format!("{name:?} has left"), || {
+    until_some_async(&format!("{name:?} has left"), || {
         directory.lookup(name).is_none().then_some(())
     })
     .await;

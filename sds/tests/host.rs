@@ -9,13 +9,14 @@ use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
-use common::{conforms, eventually, next, registration};
+use common::{conforms, next, registration};
 use fipa_sds::{
     Change, Directory, Entry, HostConfig, HostDirectory, HostError, Mts, Reach, RegisterError,
     Role, Source,
 };
+use fipa_testbed::{ChildGuard, until_some_async};
 use fipa_transport::Incarnation;
 
 fn config(dir: &Path) -> HostConfig {
@@ -45,7 +46,7 @@ fn fresh_dir() -> (tempfile::TempDir, PathBuf) {
 
 /// Another process of the domain: this test binary again, running only [`child_process`].
 struct Process {
-    child: Child,
+    child: ChildGuard,
     commands: ChildStdin,
     answers: BufReader<ChildStdout>,
 }
@@ -90,16 +91,15 @@ impl Process {
     }
 
     fn run(mut command: Command, dir: &Path) -> Self {
-        let mut child = command
+        command
             .args(["--exact", "child_process", "--ignored", "--nocapture", "-q"])
             .env(DIR_VARIABLE, dir)
             .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
+            .stdout(Stdio::piped());
+        let mut child = ChildGuard::start(&mut command);
         Self {
-            commands: child.stdin.take().unwrap(),
-            answers: BufReader::new(child.stdout.take().unwrap()),
+            commands: child.child().stdin.take().unwrap(),
+            answers: BufReader::new(child.child().stdout.take().unwrap()),
             child,
         }
     }
@@ -127,15 +127,7 @@ impl Process {
     }
 
     fn kill(&mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.child.kill();
     }
 }
 
@@ -184,8 +176,9 @@ fn child_process() {
             }
             "connect" => {
                 let sockets = directory.sockets();
-                let found =
-                    runtime.block_on(eventually("a socket", || sockets.borrow().first().copied()));
+                let found = runtime.block_on(until_some_async("a socket", || {
+                    sockets.borrow().first().copied()
+                }));
                 connected = Some(directory.connect(found).unwrap());
                 "ok".to_owned()
             }
@@ -193,7 +186,7 @@ fn child_process() {
                 use rustix::net::{RecvFlags, recv};
                 let mut buffer = [0; 8];
                 let socket = connected.as_ref().unwrap();
-                let (_, len) = runtime.block_on(eventually("a word", || {
+                let (_, len) = runtime.block_on(until_some_async("a word", || {
                     recv(socket, &mut buffer, RecvFlags::empty()).ok()
                 }));
                 String::from_utf8(buffer[..len].to_vec()).unwrap()
@@ -302,13 +295,13 @@ async fn a_killed_process_loses_its_names_at_once() {
     while witness.ask("lookup leg") == "true" {}
     assert_eq!(witness.ask("register arm"), "ok");
     // Two processes, two lock files; and the entries of the one with a registration.
-    eventually("its files are removed", || {
+    until_some_async("its files are removed", || {
         (files(&dir).len() == 4).then_some(())
     })
     .await;
 
     witness.kill();
-    eventually("the other's files are removed", || {
+    until_some_async("the other's files are removed", || {
         (files(&dir).len() == 2).then_some(())
     })
     .await;
@@ -381,7 +374,7 @@ async fn without_inotify_the_directory_is_polled() {
         while polling.ask(&format!("sees agent_{number}")) == "true" {}
     }
     // The files of dead processes are removed: the lock, and two files of the process itself.
-    eventually("their files are removed", || {
+    until_some_async("their files are removed", || {
         (files(&dir).len() == 3).then_some(())
     })
     .await;
@@ -519,12 +512,12 @@ async fn planted_files_are_rejected_and_links_not_followed() {
     for bytes in nonsense {
         assert_ne!(bytes, good);
         plant(&bytes);
-        eventually(&format!("refused: {bytes:.200}"), || {
+        until_some_async(&format!("refused: {bytes:.200}"), || {
             here.known("arm").is_none().then_some(())
         })
         .await;
         plant(&good);
-        eventually("believed", || here.known("arm")).await;
+        until_some_async("believed", || here.known("arm")).await;
     }
 
     // A pipe, and a symbolic link.
@@ -597,7 +590,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         other => panic!("{other:?}"),
     }
 
-    // Agents of this host precede those of the network, whatever time of registration those state.
+    // Agents of this host precede those of the network, even if those state an earlier time.
     let local = here.register(registration("arm")).unwrap();
     let impostor = Entry {
         name: "arm".into(),
@@ -606,7 +599,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
     gateway.publish_remote(vec![impostor]).unwrap();
     let third = open(&dir);
     assert_eq!(third.lookup("arm").unwrap().incarnation, local.incarnation);
-    eventually("camera is withdrawn", || {
+    until_some_async("camera is withdrawn", || {
         here.lookup("camera").is_none().then_some(())
     })
     .await;
@@ -714,7 +707,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
         for directory in [&one, &two] {
             assert!(directory.is_there().unwrap(), "{way}");
             for name in ["arm", "leg"] {
-                eventually(name, || directory.lookup(name).map(|_| ())).await;
+                until_some_async(name, || directory.lookup(name).map(|_| ())).await;
             }
         }
         let newcomer = open(&dir);
@@ -727,7 +720,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
         assert_eq!(victim.ask("register foot"), "ok");
         assert!(one.lookup("foot").is_some());
         victim.kill();
-        eventually("its end is noticed", || {
+        until_some_async("its end is noticed", || {
             one.known("foot").is_none().then_some(())
         })
         .await;

@@ -8,8 +8,9 @@ mod common;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};
 
-use common::{eventually, registration};
+use common::registration;
 use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts};
+use fipa_testbed::until_some_async;
 use fipa_transport::Incarnation;
 use simple_dns::rdata::{A, PTR, RData, SRV, TXT};
 use simple_dns::{CLASS, CharacterString, Label, Name, Packet, PacketFlag, ResourceRecord};
@@ -98,7 +99,7 @@ async fn malformed_records_do_not_affect_other_agents() {
     let port = free_port();
     let (victim, honest) = (open(port, "victim"), open(port, "honest"));
     honest.register(registration("before")).unwrap();
-    eventually("found before the attack", || victim.lookup("before")).await;
+    until_some_async("found before the attack", || victim.lookup("before")).await;
     let attacker = Attacker::new(port);
     let long = [b'x'; 250];
     let endless: Vec<&[u8]> = (0..30).map(|_| &long[..]).collect();
@@ -142,8 +143,8 @@ async fn malformed_records_do_not_affect_other_agents() {
         attacker.send(&packet.build_bytes_vec_compressed().unwrap());
     }
     honest.register(registration("arm")).unwrap();
-    eventually("the honest agent", || victim.lookup("arm")).await;
-    eventually("the liar and the future are refused", || {
+    until_some_async("the honest agent", || victim.lookup("arm")).await;
+    until_some_async("the liar and the future are refused", || {
         (victim.status().refused >= 2).then_some(())
     })
     .await;
@@ -168,15 +169,15 @@ async fn a_legacy_peer_that_vanished_is_removed_after_verification() {
     let port = free_port();
     let (directory, other) = (open(port, "directory"), open(port, "other"));
     other.register(registration("before")).unwrap();
-    eventually("it listens", || directory.lookup("before")).await;
+    until_some_async("it listens", || directory.lookup("before")).await;
     let peer = Attacker::new(port);
     for label in ["used", "unused"] {
         peer.announce(label.as_bytes(), &[b"TYPE=x"]);
-        eventually("the peer's agent", || directory.lookup(label)).await;
+        until_some_async("the peer's agent", || directory.lookup(label)).await;
     }
     directory.verify("used");
     let is_gone = || directory.lookup("used").is_none().then_some(());
-    eventually("the unanswered record is removed", is_gone).await;
+    until_some_async("the unanswered record is removed", is_gone).await;
     assert!(directory.lookup("unused").is_some());
 }
 
@@ -185,7 +186,7 @@ async fn a_flood_of_records_is_bounded_and_others_are_found() {
     let port = free_port();
     let (victim, honest) = (open(port, "victim"), open(port, "honest"));
     honest.register(registration("before")).unwrap();
-    eventually("found before the flood", || victim.lookup("before")).await;
+    until_some_async("found before the flood", || victim.lookup("before")).await;
     let attacker = Attacker::new(port);
     let (before, started) = (memory(), Instant::now());
     let flood = std::env::var("FIPA_FLOOD").ok();
@@ -226,8 +227,8 @@ async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
     let (victim, honest) = (open(port, "victim"), open(port, "honest"));
     let entry = honest.register(registration("honest")).unwrap();
     victim.register(registration("victim")).unwrap();
-    eventually("the honest agent", || victim.lookup("honest")).await;
-    eventually("the victim's agent", || honest.lookup("victim")).await;
+    until_some_async("the honest agent", || victim.lookup("honest")).await;
+    until_some_async("the victim's agent", || honest.lookup("victim")).await;
     let (mut seen_by_victim, mut seen_by_honest) = (victim.watch(), honest.watch());
     let attacker = Attacker::new(port);
     let before = memory();
@@ -246,7 +247,7 @@ async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
         }
         packet.build_bytes_vec_compressed().unwrap()
     };
-    // Until the limit is reached in both, whatever was lost. `FIPA_FLOOD` sets a higher number of
+    // Until both have reached the limit; packets may be lost. `FIPA_FLOOD` sets a higher number of
     // packets.
     let flood = std::env::var("FIPA_FLOOD").map_or(0, |flood| flood.parse().unwrap());
     let mut sent = 0;
@@ -268,16 +269,16 @@ async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
     );
     flooded.expect("the library is restarted");
     assert!(u64::from(sent) * 250 > MdnsDirectory::MAX_CACHED);
-    eventually("the flood is reported", || {
+    until_some_async("the flood is reported", || {
         let why = victim.status().last_error?;
         why.contains("floods the network").then_some(())
     })
     .await;
     // A registration while the library is stopped, and one after that, are found.
     honest.register(registration("during")).unwrap();
-    eventually("registered during the flood", || victim.lookup("during")).await;
+    until_some_async("registered during the flood", || victim.lookup("during")).await;
     victim.register(registration("after")).unwrap();
-    eventually("registered after the flood", || honest.lookup("after")).await;
+    until_some_async("registered after the flood", || honest.lookup("after")).await;
     for watch in [&mut seen_by_victim, &mut seen_by_honest] {
         while let Some(change) = watch.try_next() {
             assert!(!matches!(change, Change::Left(_)), "{change:?}");
@@ -285,7 +286,7 @@ async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
     }
     // The new library announces the earlier registrations, and can withdraw them.
     honest.deregister("honest", entry.incarnation).unwrap();
-    eventually("left after the flood", || {
+    until_some_async("left after the flood", || {
         victim.lookup("honest").is_none().then_some(())
     })
     .await;

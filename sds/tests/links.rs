@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use common::registration;
 use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts, Withdrawal};
-use fipa_testbed::{Host, Network};
+use fipa_testbed::{Host, Network, until};
 use fipa_transport::Incarnation;
 use tokio::runtime::Runtime;
 use tokio::sync::broadcast::Receiver;
@@ -190,14 +190,6 @@ fn agree(members: &mut [Member]) {
             started.elapsed() < common::WATCHDOG,
             "they do not agree: {views:#?}"
         );
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
-fn until(what: &str, condition: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !condition() {
-        assert!(started.elapsed() < common::WATCHDOG, "never: {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }

@@ -9,11 +9,11 @@ use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, UNIX_EPOCH};
 
-use common::{conforms, eventually, next, registration};
+use common::{conforms, next, registration};
 use fipa_sds::{
     Change, Directory, MdnsConfig, MdnsDirectory, Members, Mts, Reach, RegisterError, Role, Source,
 };
-use fipa_testbed::{PacketRepeater, Running};
+use fipa_testbed::{ChildGuard, PacketRepeater, until_some_async};
 use fipa_transport::{Incarnation, Location};
 
 /// An unused port, so that tests do not receive each other's packets.
@@ -47,8 +47,8 @@ async fn entries_are_marked_and_ones_own_are_not_read_back() {
     let (one, two) = (open(port, "one"), open(port, "two"));
     one.register(registration("arm")).unwrap();
     two.register(registration("leg")).unwrap();
-    let arm = eventually("arm", || two.lookup("arm")).await;
-    let leg = eventually("leg", || one.lookup("leg")).await;
+    let arm = until_some_async("arm", || two.lookup("arm")).await;
+    let leg = until_some_async("leg", || one.lookup("leg")).await;
     assert_eq!(leg.source, Source::Mdns);
     assert_eq!(&*leg.mts.name, "two");
     let gateway = leg.mts.incarnation;
@@ -103,7 +103,7 @@ async fn conflict(first: u64, second: u64) {
     let told = told.await.expect("the withdrawal is reported").unwrap();
     assert_eq!(told.withdrawn.incarnation, loser.incarnation);
     assert_eq!(told.holder.incarnation, winner.incarnation);
-    eventually("one record is left, and it is the earlier's", || {
+    until_some_async("one record is left, and it is the earlier's", || {
         let entries = witness.entries();
         let holder = entries.first()?;
         (witness.status().known == 1 && holder.incarnation == winner.incarnation).then_some(())
@@ -130,7 +130,7 @@ async fn different_names_may_share_a_label() {
     // The same label on the network, where case does not matter.
     one.register(registration("Arm")).unwrap();
     two.register(registration("aRM")).unwrap();
-    eventually("both", || one.lookup("aRM").zip(two.lookup("Arm"))).await;
+    until_some_async("both", || one.lookup("aRM").zip(two.lookup("Arm"))).await;
     assert_eq!((one.status().known, two.status().known), (1, 1));
     assert_eq!((one.status().announced, two.status().announced), (1, 1));
 }
@@ -203,7 +203,7 @@ async fn large_entries_are_announced_and_too_large_ones_refused() {
         |len: usize| -> Location { format!("quic://{}", "y".repeat(len)).parse().unwrap() };
     large.locations = (0..8).map(|_| location(400)).collect();
     one.register(large.clone()).unwrap();
-    let found = eventually("large", || two.lookup("large")).await;
+    let found = until_some_async("large", || two.lookup("large")).await;
     assert_eq!(found.locations, large.locations);
     assert_eq!(found.description, large.description);
 
@@ -231,7 +231,7 @@ async fn a_gateway_that_vanished_is_noticed_by_verification() {
     repeater.start();
     assert!(two.lookup("Arm").is_some());
     two.verify("Arm");
-    eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;
+    until_some_async("gone", || two.lookup("Arm").is_none().then_some(())).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -241,18 +241,18 @@ async fn a_gateway_that_vanished_is_noticed_by_its_silence() {
     let (peer, _) = announcing(port, &two).await;
     drop(peer);
     // No query is sent for it, and its record is valid for two minutes.
-    eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;
+    until_some_async("gone", || two.lookup("Arm").is_none().then_some(())).await;
 }
 
 /// A process that announces an agent, has been found, and ends without a goodbye when dropped; and
 /// the label of its beacons.
-async fn announcing(port: u16, by: &MdnsDirectory) -> (Running, String) {
+async fn announcing(port: u16, by: &MdnsDirectory) -> (ChildGuard, String) {
     let mut process = std::process::Command::new(std::env::current_exe().unwrap());
     let process = process
         .args(["--exact", "announcing_process", "--ignored", "-q"])
         .env("FIPA_SDS_TEST_PORT", port.to_string());
-    let peer = Running::start(process);
-    let found = eventually("the other process", || by.lookup("Arm")).await;
+    let peer = ChildGuard::start(process);
+    let found = until_some_async("the other process", || by.lookup("Arm")).await;
     assert_eq!(&*found.mts.name, "elsewhere");
     (peer, format!("{}\x0d_fipa_gateway", found.mts.incarnation))
 }

@@ -138,7 +138,7 @@ fn contacts() -> (Instant, ContactDirectory) {
     (now, contacts)
 }
 
-/// A gateway of its own sends each of the agents.
+/// Returns an exchange in which each agent was sent by a different gateway.
 fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
     let (now, mut exchange) = (Instant::now(), Exchange::new(0));
     let gateways: Vec<_> = (1..=3)

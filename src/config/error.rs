@@ -12,7 +12,7 @@ use serde::{Serialize, Serializer};
 #[non_exhaustive]
 pub enum ConfigError {
     /// A file cannot be read.
-    #[error("cannot read the configuration {} ({named_by}): {source}", shown(.path))]
+    #[error("cannot read the configuration {} ({named_by})", shown(.path))]
     Read {
         /// The file.
         path: PathBuf,

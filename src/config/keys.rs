@@ -5,12 +5,13 @@
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::ops::Range;
+use std::str::FromStr;
 use std::time::Duration;
 
 use bytesize::ByteSize;
 use fipa_acl::is_unprintable;
 use fipa_sds::is_pattern;
-use fipa_transport::{Kind, Location, LocationError};
+use fipa_transport::{Kind, LocationError};
 use toml_edit::Value as Toml;
 
 use super::effective::Value;
@@ -202,7 +203,7 @@ pub(super) const KEYS: &[Key] = &[
         path: &["security", "legacy_peers"],
         shape: Shape::List,
         expected: r#"a list of addresses such as ["10.0.0.9"]"#,
-        write: |config, value| items(value, ip).map(|all| config.security.legacy_peers = all),
+        write: |config, value| items(value, parsed).map(|all| config.security.legacy_peers = all),
         read: |config| Value::list(&config.security.legacy_peers),
     },
     Key {
@@ -281,7 +282,7 @@ pub(super) const MAPS: &[Map] = &[
         path: &["discovery", "static"],
         expected: r#"a list of locations such as ["tcp://10.0.0.2:7788"]"#,
         write: |config, name, value| {
-            let locations = items(value, location)?;
+            let locations = items(value, parsed)?;
             let name = name.to_owned();
             config.discovery.peers.push(Peer { name, locations });
             Ok(())
@@ -447,7 +448,11 @@ fn kinds(value: &Toml) -> Result<Vec<Kind>, InvalidValue> {
     })
 }
 
-fn location(value: &Toml) -> Result<Location, InvalidValue> {
+/// Parses a text.
+fn parsed<T>(value: &Toml) -> Result<T, InvalidValue>
+where
+    T: FromStr<Err: std::fmt::Display>,
+{
     let text = value
         .as_str()
         .ok_or_else(|| InvalidValue::kind_of_value(value))?;
@@ -493,14 +498,6 @@ pub(super) fn is_interface_name(text: &str) -> bool {
         && !text
             .chars()
             .any(|c| c.is_whitespace() || c.is_control() || matches!(c, '/' | ':'))
-}
-
-fn ip(value: &Toml) -> Result<IpAddr, InvalidValue> {
-    let text = value
-        .as_str()
-        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
-    text.parse()
-        .map_err(|error| InvalidValue::new(value, error))
 }
 
 fn interface(value: &Toml) -> Result<Interface, InvalidValue> {

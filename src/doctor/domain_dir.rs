@@ -1,5 +1,7 @@
 //! Checks the directory of the domain.
 
+use fipa_acl::ErrorChain;
+
 use super::{Area, Check, Verdict};
 use crate::Config;
 use crate::domain_dir::DomainDir;
@@ -25,7 +27,7 @@ fn directory(dir: &DomainDir) -> Check {
         Err(error) => AREA.problem(
             CHECK,
             Verdict::Bad,
-            error.to_string(),
+            ErrorChain(&error).to_string(),
             "repair it; until then no process can join the domain",
         ),
     }

@@ -1,5 +1,7 @@
 //! Checks the locations at which other hosts reach the gateway.
 
+use fipa_acl::ErrorChain;
+
 use super::{Area, Check, Verdict};
 use crate::{Config, Kind};
 
@@ -26,7 +28,10 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
                 checks.push(AREA.problem(
                     LOCATIONS,
                     Verdict::Bad,
-                    format!("transport.{kind}.listen cannot be used: {error}"),
+                    format!(
+                        "transport.{kind}.listen cannot be used: {}",
+                        ErrorChain(&error)
+                    ),
                     "use an address of this host; `ip address` lists them",
                 ));
                 return;

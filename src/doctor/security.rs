@@ -38,6 +38,8 @@ fn keys(_config: &Config, checks: &mut Vec<Check>) {
 
 #[cfg(feature = "secure")]
 fn keys(config: &Config, checks: &mut Vec<Check>) {
+    use fipa_acl::ErrorChain;
+
     use crate::keys::{Certificate, Holding, Keys, KeysError};
 
     let keys = Keys::at(&config.security.keys);
@@ -50,7 +52,7 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
                 }
                 _ => "check the directory in security.keys; `fipa keys list` shows its contents",
             };
-            checks.push(AREA.problem(KEYS, Verdict::Bad, error.to_string(), advice));
+            checks.push(AREA.problem(KEYS, Verdict::Bad, ErrorChain(&error).to_string(), advice));
             return;
         }
     };

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use bytesize::ByteSize;
+use fipa_acl::ErrorChain;
 use fipa_transport::Incarnation;
 use fipa_transport_shm::{Inspection, ShmConfig, inspect};
 use rustix::fs::inotify;
@@ -47,7 +48,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         Err(error) => checks.push(AREA.problem(
             "/dev/shm",
             Verdict::Bad,
-            error.to_string(),
+            ErrorChain(&error).to_string(),
             "mount it (mount -t tmpfs tmpfs /dev/shm), or remove shm from mts.transports",
         )),
     }
@@ -184,7 +185,7 @@ fn removes(root: &Path) -> bool {
         let found = std::fs::read_dir(directory).into_iter().flatten().flatten();
         later.extend(found.map(|file| file.path()));
     }
-    // Drop-ins are applied in the order of their names, whatever their directory.
+    // Drop-ins of all directories are applied in the order of their file names.
     later.sort_by_key(|path| path.file_name().map(ToOwned::to_owned));
     files.extend(later);
     let texts = files

@@ -8,7 +8,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
@@ -76,7 +76,11 @@ impl Exchanging {
             .handle_letter(Instant::now(), from, content);
         match taken {
             Ok(()) => self.wake.notify_one(),
-            Err(error) => tracing::info!(%error, "rejected an exchange letter of a gateway"),
+            Err(error) => {
+                // The text of a malformed letter may be part of the error.
+                let error = ErrorChain(&error).to_string();
+                tracing::info!(error = %escape(&error), "rejected an exchange letter of a gateway");
+            }
         }
     }
 
@@ -417,7 +421,9 @@ impl Means {
         let letter = Some(message).and_then(|message| {
             let letter = letter_for(message, SystemTime::now());
             letter
-                .inspect_err(|error| tracing::warn!(%error, "cannot encode a letter"))
+                .inspect_err(
+                    |error| tracing::warn!(error = %ErrorChain(error), "cannot encode a letter"),
+                )
                 .ok()
         })?;
         let submission = Submission {

@@ -10,7 +10,7 @@ use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query};
@@ -177,7 +177,9 @@ impl GatewayAgent {
                 // The outcome is not awaited: a requester that gets no answer asks again.
                 drop(self.service.mts.send_to(submission, to));
             }
-            Err(error) => tracing::warn!(%error, "cannot encode a letter of the gateway"),
+            Err(error) => {
+                tracing::warn!(error = %ErrorChain(&error), "cannot encode a letter of the gateway")
+            }
         }
     }
 }

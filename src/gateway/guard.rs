@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use fipa_acl::ErrorChain;
 use fipa_transport_net::secure::{Credentials, Rules, Security};
 
 use crate::config;
@@ -52,14 +53,14 @@ impl Guard {
         let keys = Keys::at(&config.keys);
         let seen = keys.stamp();
         let credentials = keys.credentials_of(name);
-        let credentials = credentials.map_err(|error| OpenError::Keys(error.to_string()))?;
+        let credentials = credentials.map_err(OpenError::Keys)?;
         warn_about_expiry(&credentials);
         let rules = Rules {
             loopback: config.loopback,
             legacy_peers: config.legacy_peers.clone(),
         };
         let security = Security::new(credentials, rules);
-        let security = security.map_err(|error| OpenError::Keys(error.to_string()))?;
+        let security = security.map_err(|error| OpenError::Keys(error.into()))?;
         Ok(Some(Self {
             keys,
             name: name.to_owned(),
@@ -101,15 +102,15 @@ impl Guard {
         self.fresh = now.is_fresh();
         let used = self.keys.credentials_of(&self.name);
         let used = used
-            .map_err(|error| error.to_string())
             .and_then(|credentials| {
                 let count = credentials.trusted.len();
                 if changed {
                     warn_about_expiry(&credentials);
                 }
                 let replaced = self.security.replace(credentials);
-                replaced.map(|()| count).map_err(|error| error.to_string())
-            });
+                Ok(replaced.map(|()| count)?)
+            })
+            .map_err(|error| ErrorChain(&error).to_string());
         self.seen = now;
         match used {
             Ok(count) => {
@@ -144,7 +145,8 @@ impl Guard {
             ),
             Err(kept) => tracing::error!(
                 "cannot use the changed keys: {error}; cannot restrict trust to the readable \
-                 certificates: {kept}"
+                 certificates: {}",
+                ErrorChain(&kept)
             ),
         }
     }

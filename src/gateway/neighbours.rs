@@ -9,7 +9,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::escape;
+use fipa_acl::{ErrorChain, escape};
 use fipa_mts::core::Peer;
 use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
@@ -130,7 +130,7 @@ impl Neighbours {
         }
         let neighbour = state.neighbour(peer, before);
         if let Err(error) = neighbour.entry.check() {
-            tracing::info!(%error, at = %peer.hop.location, "ignored a gateway with an invalid entry");
+            tracing::info!(error = %ErrorChain(&error), at = %peer.hop.location, "ignored a gateway with an invalid entry");
             return;
         }
         let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));

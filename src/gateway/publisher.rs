@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
+use fipa_acl::ErrorChain;
 use fipa_sds::{
     ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, Registration, Role,
 };
@@ -61,7 +62,7 @@ impl Publisher {
                 },
             });
         if let Err(error) = self.host.publish_remote(through_here.collect()) {
-            tracing::warn!(%error, "cannot publish the agents of other hosts on this host");
+            tracing::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
         }
     }
 }
@@ -220,7 +221,7 @@ impl PublishTask {
         let updated = network.update(&leaving, registrations.collect());
         for ((name, _), left) in leaving.iter().zip(updated.left) {
             if let Err(error) = left {
-                tracing::debug!(%name, %error, "cannot withdraw an announcement");
+                tracing::debug!(%name, error = %ErrorChain(&error), "cannot withdraw an announcement");
             }
         }
         for ((name, entry), joined) in joining.into_iter().zip(updated.joined) {
@@ -235,11 +236,11 @@ impl PublishTask {
                     if let Some(was) = was
                         && let Err(error) = network.deregister(name, was.incarnation)
                     {
-                        tracing::debug!(%name, %error, "cannot withdraw an announcement");
+                        tracing::debug!(%name, error = %ErrorChain(&error), "cannot withdraw an announcement");
                     }
                     let before = self.refused.insert(Arc::clone(name), entry.incarnation);
                     if before != Some(entry.incarnation) {
-                        tracing::warn!(%name, %error, "cannot announce an agent to other hosts");
+                        tracing::warn!(%name, error = %ErrorChain(&error), "cannot announce an agent to other hosts");
                     }
                 }
             }

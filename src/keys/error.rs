@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use fipa_acl::escape;
-use fipa_transport_net::secure::{CertificateError, Fingerprint};
+use fipa_transport_net::secure::{CertificateError, CredentialsError, Fingerprint};
 
 /// The error of an operation on [`Keys`](super::Keys).
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum KeysError {
     /// A file or directory cannot be used.
-    #[error("{}: {source}", shown(path))]
+    #[error("cannot use {}", shown(path))]
     Io {
         /// The file or directory.
         path: PathBuf,
@@ -96,8 +96,11 @@ pub enum KeysError {
         found: usize,
     },
     /// A key or certificate cannot be made.
-    #[error("cannot make a key: {0}")]
-    Make(String),
+    #[error("cannot make a key")]
+    Make(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// The private key and the certificate cannot be used together.
+    #[error(transparent)]
+    Credentials(#[from] CredentialsError),
 }
 
 /// Escapes a path for terminals and logs.

@@ -223,7 +223,7 @@ impl<'a> Auction<'a> {
         Ok(rejections)
     }
 
-    /// Removes bidders that cannot be called any more.
+    /// Removes bidders that can no longer be called.
     fn lose<'n>(&mut self, names: impl Iterator<Item = &'n str>) {
         for name in names {
             self.bidders.retain(|bidder| bidder.name() != name);

@@ -84,7 +84,7 @@ pub(super) struct Interpreted {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Meaning {
     pub(super) state: DialogueState,
-    /// Whether its sender can send nothing more in the conversation.
+    /// Whether it is the last message that its sender may send in the conversation.
     pub(super) over: bool,
     /// Whether it answers a message that a later one has replaced, and so has no effect.
     pub(super) void: bool,

@@ -256,7 +256,7 @@ impl Task<'_> {
     }
 
     /// Waits, as a broker, for the next answer to a message that was passed on. Returns `None` if no
-    /// agent can answer any more.
+    /// further agent can answer.
     ///
     /// # Errors
     /// If no answer arrives within `patience`, or the initiator cancels.

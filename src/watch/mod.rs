@@ -19,6 +19,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fipa_acl::ErrorChain;
 use fipa_mts::watch::Joiner;
 use fipa_mts::watch::record::{MAX_CONTENT, Wish};
 pub use fipa_mts::watch::{Event, Fate, Passage, RecordError};
@@ -31,6 +32,7 @@ use self::listener::ProcessEvent;
 pub(crate) use self::watchers::Watchers;
 use crate::Config;
 use crate::dir_maintenance::DirMaintenance;
+use crate::directory_view::DirectoryView;
 use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
 use crate::host_directory;
@@ -173,8 +175,8 @@ impl Watcher {
     /// Returns the directory: the agents of this host and, if a gateway is running, the agents that it
     /// has discovered on other hosts.
     #[must_use]
-    pub fn directory(&self) -> &dyn Directory {
-        &*self.host
+    pub fn directory(&self) -> DirectoryView<'_> {
+        DirectoryView::of(&*self.host)
     }
 }
 
@@ -200,7 +202,7 @@ impl Drop for Watcher {
 
 fn leave(host: &HostDirectory, dir: &DomainDir) {
     if let Err(error) = host.close() {
-        tracing::warn!(%error, "cannot remove this process from the directory of this host");
+        tracing::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
     }
     dir.leave();
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::{Host, Running};
+use crate::{ChildGuard, Host};
 
 /// Timeout of `avahi-browse`, in seconds: it takes one second, or never ends.
 const BROWSE_TIMEOUT: &str = "10";
@@ -24,8 +24,8 @@ const BUS_CONFIG: &str = r#"<!DOCTYPE busconfig PUBLIC
 #[derive(Debug)]
 pub struct Avahi<'a> {
     host: &'a Host,
-    _daemon: Running,
-    _bus: Running,
+    _daemon: ChildGuard,
+    _bus: ChildGuard,
 }
 
 impl<'a> Avahi<'a> {
@@ -49,12 +49,12 @@ impl<'a> Avahi<'a> {
         std::fs::write("/run/avahi.conf", settings).unwrap();
         let mut command = host.command("dbus-daemon");
         command.args(["--config-file=/run/bus.conf", "--nofork"]);
-        let mut bus = Running::start(&mut command);
+        let mut bus = ChildGuard::start(&mut command);
         until("the bus", &mut bus, || Path::new(BUS).exists());
         let mut command = with_bus(host.command("avahi-daemon"));
         command.args(["--no-drop-root", "--no-chroot", "--no-rlimits"]);
         command.arg("--file=/run/avahi.conf");
-        let mut daemon = Running::start(&mut command);
+        let mut daemon = ChildGuard::start(&mut command);
         until("Avahi", &mut daemon, || {
             let check = host.command("avahi-daemon").arg("--check").status();
             check.unwrap().success()
@@ -71,10 +71,10 @@ impl<'a> Avahi<'a> {
     /// # Panics
     /// If `avahi-publish` cannot be run.
     #[must_use]
-    pub fn publish(&self, label: &str, service_type: &str, port: u16, txt: &[&str]) -> Running {
+    pub fn publish(&self, label: &str, service_type: &str, port: u16, txt: &[&str]) -> ChildGuard {
         let mut command = with_bus(self.host.command("avahi-publish"));
         command.args(["-s", label, service_type, &port.to_string()]);
-        Running::start(command.args(txt).stdout(Stdio::null()))
+        ChildGuard::start(command.args(txt).stdout(Stdio::null()))
     }
 
     /// Returns the output lines of `avahi-browse` for a service type. The line of a resolved service begins
@@ -109,7 +109,7 @@ fn with_bus(mut command: Command) -> Command {
     command
 }
 
-fn until(what: &str, process: &mut Running, condition: impl Fn() -> bool) {
+fn until(what: &str, process: &mut ChildGuard, condition: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(60);
     while !condition() {
         if let Some(status) = process.ended() {

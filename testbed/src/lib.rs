@@ -1,5 +1,6 @@
-//! Networks for tests: hosts in network namespaces, their links, and the real Avahi. Also frames of
-//! peers that do not use `fipa`.
+//! Support for tests: processes that end with their test ([`ChildGuard`]), waiting for conditions
+//! ([`until`]), and networks: hosts in network namespaces, their links, and the real Avahi. Also
+//! frames of peers that do not use `fipa`.
 //!
 //! A test that needs a network consists of two functions. The test function calls [`isolated`], which
 //! runs the second, ignored test function in a process with new namespaces (network, mounts,
@@ -32,21 +33,23 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr)]
 
 mod avahi;
+mod child;
 mod network;
 mod packet_repeater;
 mod peer;
+mod wait;
 
-use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::path::PathBuf;
-use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
-use std::thread::JoinHandle;
+use std::process::Command;
 
 pub use avahi::Avahi;
+pub use child::{ChildGuard, ignored_test, send_signal};
 pub use network::{Host, Network};
 pub use packet_repeater::PacketRepeater;
 #[cfg(feature = "tls")]
 pub use peer::AnyPeer;
 pub use peer::{frame, frame_header};
+pub use wait::{until, until_async, until_some, until_some_async};
 
 /// Environment variable with the directory of the test, for the process in the namespaces.
 const INSIDE: &str = "FIPA_TESTBED_INSIDE";
@@ -140,84 +143,6 @@ fn find(tool: &str) -> Option<PathBuf> {
     dirs.map(|dir| dir.join(tool)).find(|file| file.is_file())
 }
 
-/// A process that is killed on drop.
-#[derive(Debug)]
-pub struct Running(Child);
-
-impl Running {
-    /// Starts the command.
-    ///
-    /// # Panics
-    /// If the command cannot be started.
-    pub fn start(command: &mut Command) -> Self {
-        let started = command.spawn();
-        Self(started.unwrap_or_else(|error| panic!("{command:?}: {error}")))
-    }
-
-    /// Starts the command, waits for the first line of its output, and returns that line. Its standard
-    /// error becomes part of the panic message, or is printed if `FIPA_TEST_LOG` is set.
-    ///
-    /// # Panics
-    /// If the command cannot be started, or ends before it prints a line. The message has its status and
-    /// its standard error.
-    pub fn until_ready(command: &mut Command) -> (Self, String) {
-        let shows_errors = std::env::var_os("FIPA_TEST_LOG").is_some();
-        command.stdout(Stdio::piped()).stderr(match shows_errors {
-            true => Stdio::inherit(),
-            false => Stdio::piped(),
-        });
-        let mut running = Self::start(command);
-        let errors = running.0.stderr.take().map(collect_last);
-        let mut stdout = BufReader::new(running.0.stdout.take().unwrap());
-        let mut ready = String::new();
-        stdout.read_line(&mut ready).unwrap();
-        if ready.is_empty() {
-            let status = running.0.wait().unwrap();
-            let errors = errors.map(|errors| errors.join().unwrap());
-            let errors = errors.unwrap_or_default();
-            panic!("{command:?} ended ({status}) before it was ready: {errors}");
-        }
-        // A full pipe would block the process, and a closed one would end it.
-        std::thread::spawn(move || io::copy(&mut stdout, &mut io::sink()));
-        (running, ready)
-    }
-
-    /// Returns the status of the process if it has ended.
-    ///
-    /// # Panics
-    /// If the kernel does not return the status.
-    pub fn ended(&mut self) -> Option<ExitStatus> {
-        self.0.try_wait().unwrap()
-    }
-
-    /// The process.
-    pub fn child(&mut self) -> &mut Child {
-        &mut self.0
-    }
-}
-
-/// Reads to the end and returns the last 8 KiB.
-fn collect_last(mut from: ChildStderr) -> JoinHandle<String> {
-    const KEPT: usize = 8 << 10;
-    std::thread::spawn(move || {
-        let mut kept = Vec::new();
-        let mut part = [0; 1024];
-        while let Ok(read @ 1..) = from.read(&mut part) {
-            kept.extend(part.iter().take(read));
-            kept.drain(..kept.len().saturating_sub(KEPT));
-        }
-        String::from_utf8_lossy(&kept).into_owned()
-    })
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        // The process may have ended already.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -241,21 +166,5 @@ mod tests {
         let runtime_dir = PathBuf::from(std::env::var_os(RUNTIME_DIR).unwrap());
         assert!(runtime_dir.starts_with(directory()));
         assert!(!outside.exists(), "the directory is shared");
-    }
-
-    #[test]
-    #[should_panic(expected = "before it was ready: no such luck")]
-    fn a_process_that_cannot_start_fails_the_test_with_its_error() {
-        let mut command = Command::new("sh");
-        Running::until_ready(command.args(["-c", "echo no such luck >&2; exit 3"]));
-    }
-
-    #[test]
-    fn a_process_is_ready_when_it_prints_its_first_line() {
-        let mut command = Command::new("sh");
-        command.args(["-c", "echo here I am; exec cat /dev/zero"]);
-        let (mut running, ready) = Running::until_ready(&mut command);
-        assert_eq!(ready, "here I am\n");
-        assert!(running.ended().is_none());
     }
 }

@@ -14,6 +14,7 @@ const WATCHDOG: Duration = Duration::from_secs(60);
 
 /// Repeats a multicast DNS packet until it is dropped. To hosts that only listen, the sender of the
 /// packet seems to be running.
+#[derive(Debug)]
 pub struct PacketRepeater {
     socket: UdpSocket,
     group: SocketAddr,

@@ -4,11 +4,12 @@
 use std::collections::{BTreeSet, HashMap};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::Stdio;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use fipa_testbed::{ChildGuard, ignored_test};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::process::{ROLE, Role};
@@ -80,7 +81,7 @@ impl LetterLog {
 pub(crate) struct TestProcess {
     pub(crate) tag: u32,
     pub(crate) name: String,
-    child: Child,
+    child: ChildGuard,
     output: Arc<Mutex<Vec<String>>>,
 }
 
@@ -122,7 +123,7 @@ impl TestProcess {
     }
 
     pub(crate) fn command(&mut self, line: &str) {
-        writeln!(self.child.stdin.as_mut().unwrap(), "{line}").unwrap();
+        writeln!(self.child.child().stdin.as_mut().unwrap(), "{line}").unwrap();
     }
 
     /// Quits the process in an orderly way.
@@ -131,7 +132,7 @@ impl TestProcess {
         let mut ended = None;
         wait_for(
             || {
-                ended = self.child.try_wait().unwrap();
+                ended = self.child.ended();
                 ended.is_some()
             },
             || format!("timed out waiting for {} ({}) to quit", self.name, self.tag),
@@ -141,14 +142,6 @@ impl TestProcess {
             "{} ended with {ended:?}",
             self.name
         );
-    }
-}
-
-impl Drop for TestProcess {
-    fn drop(&mut self) {
-        // Fails if the process has ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -281,16 +274,15 @@ impl Cluster {
             to: to.to_owned(),
             settings,
         };
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--ignored", "--exact", "--nocapture", "process_entry"])
+        let mut command = ignored_test("process_entry");
+        command
             .env(ROLE, role.to_words())
             .env("FIPA_RUNTIME_DIR", self.directory.path().join("run"))
             .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
+            .stdout(Stdio::piped());
+        let mut child = ChildGuard::start(&mut command);
         let output = Arc::new(Mutex::new(Vec::new()));
-        let lines = BufReader::new(child.stdout.take().unwrap());
+        let lines = BufReader::new(child.child().stdout.take().unwrap());
         let (log, lines_seen) = (self.log.clone(), output.clone());
         std::thread::spawn(move || {
             let mut lines = lines;
@@ -316,8 +308,7 @@ impl Cluster {
 
     /// Sends SIGKILL and waits for the end.
     pub(crate) fn kill(&mut self, mut process: TestProcess) {
-        process.child.kill().unwrap();
-        process.child.wait().unwrap();
+        process.child.kill();
         self.kills += 1;
     }
 

@@ -204,7 +204,7 @@ fn gateway_with_custody(cluster: &mut Cluster, random: &mut Rng) {
     let receiver = cluster.start_remote("take");
     let at = far_gateway.output_after("at");
     let gateway = cluster.start_gateway_to(&at);
-    // The end of the custody concludes these letters, with whatever outcome.
+    // The end of the custody concludes these letters, with any outcome.
     cluster.wait_until_reached(&receiver.name);
     far_gateway.signal(Signal::STOP);
     let custody = cluster.send_from_pulse(&receiver.name, 12, 5000);

@@ -10,17 +10,17 @@
 mod blocking;
 mod proxies;
 mod selling;
+#[path = "../support/mod.rs"]
+mod support;
 mod verdicts;
 
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::monitor::ViolationKind;
 use fipa::protocol::{Decision, DialogueError, Reply, Task};
 use fipa::{
-    Agent, AgentId, Config, Domain, Incoming, Message, MessageBuilder, OpenError, Performative,
-    ReceiveError, SendError,
+    Agent, AgentId, Config, Domain, ErrorChain, Incoming, Message, MessageBuilder, OpenError,
+    Performative, ReceiveError, SendError,
 };
 
 /// Time limit of all calls, which a passing test does not reach.
@@ -34,25 +34,11 @@ async fn next_message(agent: &Agent) -> Result<Incoming, ReceiveError> {
 
 /// Makes a configuration for a domain that no other test uses.
 fn config(set: &[&str]) -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let mut all = vec![
-        format!("domain=protocols-{}-{number}", std::process::id()),
-        "discovery.mdns=false".to_owned(),
-        "mts.deadline=2min".to_owned(),
-    ];
-    all.extend(set.iter().map(|setting| (*setting).to_owned()));
-    Config::load(&Sources {
-        set: all,
-        ..Sources::default()
-    })
-    .unwrap()
+    support::config(&[&["mts.deadline=2min"], set].concat())
 }
 
 async fn two(set: &[&str]) -> (Domain, Domain) {
-    let config = config(set);
-    let member = || async { Domain::open(&config).await.unwrap() };
-    (member().await, member().await)
+    support::two(&config(set)).await
 }
 
 /// Registers a rover, and an arm of another process.
@@ -173,7 +159,7 @@ async fn missing_and_invalid_answers_are_errors() {
         Err(DialogueError::TimedOut)
     ));
     let first = next_message(&arm).await.unwrap().message;
-    // No call leads the conversation any more, so its message goes to `receive`.
+    // No call leads the conversation, so its message goes to `receive`.
     let late = arm.reply(&first, Performative::Agree).build().unwrap();
     assert!(arm.send(late).await.unwrap().all_succeeded());
     let late = next_message(&rover).await.unwrap().message;
@@ -502,11 +488,10 @@ async fn protocols_of_the_configuration_are_read_and_checked() {
     std::fs::write(&file, own.replace("target=\"3\"", "target=\"4\"")).unwrap();
     let error = Domain::open(&config(&[&set])).await.err().unwrap();
     assert!(matches!(error, OpenError::Protocol(_)));
+    let text = ErrorChain(&error).to_string();
     assert!(
-        error
-            .to_string()
-            .contains("handover.scxml:3: there is no state \"4\""),
-        "{error}"
+        text.contains("handover.scxml:3: there is no state \"4\""),
+        "{text}"
     );
     std::fs::remove_file(&file).unwrap();
     let error = Domain::open(&config(&[&set])).await.err().unwrap();

@@ -71,7 +71,7 @@ async fn four_verdicts_for_a_request_and_its_inform() {
     next_message(&rover).await.unwrap();
     assert_eq!(given("counted"), 4);
 
-    // Calls that lead a conversation check its messages themselves, whatever `monitor.check` is. The
+    // Calls that lead a conversation check its messages themselves, with any `monitor.check`. The
     // checks of `monitor.check` stay at one per side and message.
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();

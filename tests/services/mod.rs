@@ -156,14 +156,13 @@ impl TestService {
             Arc::new(UnixTransport::new(config, handle.clone()))
         });
         let tcp = has(Kind::Tcp).then(|| {
-            let config = TcpConfig {
-                listen: listen.clone(),
-                identity: identity.clone(),
-                limits: limits.clone(),
-                processes: true,
-                #[cfg(feature = "secure")]
-                security: security.clone(),
-            };
+            let mut config = TcpConfig::new(listen.clone(), identity.clone());
+            config.limits = limits.clone();
+            config.processes = true;
+            #[cfg(feature = "secure")]
+            {
+                config.security = security.clone();
+            }
             Arc::new(TcpTransport::new(config, handle.clone()))
         });
         let udp = has(Kind::Udp).then(|| {

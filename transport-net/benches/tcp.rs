@@ -19,7 +19,7 @@ use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
     Parcel, Sink, Stream, Transport, Verdict,
 };
-use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
+use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -67,19 +67,15 @@ fn endpoint(runtime: &Runtime) -> Party {
 }
 
 fn config() -> TcpConfig {
-    TcpConfig {
-        processes: true,
-        listen: vec!["127.0.0.1:0".into()],
-        identity: Identity {
-            name: "bench".into(),
-            incarnation: Incarnation::random(),
-            domain: "bench".into(),
-            host: "here".into(),
-        },
-        limits: Limits::default(),
-        #[cfg(feature = "secure")]
-        security: None,
-    }
+    let identity = Identity {
+        name: "bench".into(),
+        incarnation: Incarnation::random(),
+        domain: "bench".into(),
+        host: "here".into(),
+    };
+    let mut config = TcpConfig::new(vec!["127.0.0.1:0".into()], identity);
+    config.processes = true;
+    config
 }
 
 /// Two endpoints that trust each other.
@@ -87,11 +83,8 @@ fn config() -> TcpConfig {
 fn secured(client: &Runtime, server: &Runtime) -> (Party, Party) {
     let host = certificates::Host::new("bench", &[]);
     let [near, far] = [client, server].map(|runtime| {
-        let security = Some(host.security(&[&host]));
-        let config = TcpConfig {
-            security,
-            ..config()
-        };
+        let mut config = config();
+        config.security = Some(host.security(&[&host]));
         listening(Arc::new(TcpTransport::new(
             config,
             runtime.handle().clone(),

@@ -16,8 +16,8 @@ use common::intruder::{
     ONLY_13, PROTOCOL, ROGUE, Versions, client, greet_quic, greet_tls, hear_tls, listen_quic, quic,
     server,
 };
-use common::{NAME, Party, Recorder, config, hello_of, parcel, quic_config, until};
-use fipa_testbed::frame;
+use common::{NAME, Party, Recorder, config, hello_of, parcel, quic_config};
+use fipa_testbed::{frame, until_some};
 use fipa_transport::{Conclusion, Kind, Location, Transport, TransportErrorKind};
 use fipa_transport_net::{QuicTransport, TcpTransport};
 use rustls::version::TLS12;
@@ -84,7 +84,7 @@ fn a_peer_that_meets_all_requirements_is_admitted() {
     assert!(greeted.starts_with(b"fipa"));
     let greeted = greet_quic(quic(own, PROTOCOL, VERSION), to.quic_at()).unwrap();
     assert!(greeted.starts_with(b"fipa"));
-    until("his letter", || (to.tcp.arrivals() == 1).then_some(()));
+    until_some("his letter", || (to.tcp.arrivals() == 1).then_some(()));
 }
 
 #[test]
@@ -114,7 +114,7 @@ fn a_peer_without_a_certificate_or_its_key_is_refused() {
         greet_quic(config, to.quic_at()).unwrap_err();
     }
     to.assert_nothing_came();
-    until("all of it was counted", || {
+    until_some("all of it was counted", || {
         let (tcp, quic) = (to.tcp.transport.counters(), to.quic.transport.counters());
         (tcp.refused_unproved == 2 && quic.refused_unproved == 2).then_some(())
     });

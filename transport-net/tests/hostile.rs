@@ -11,9 +11,9 @@ use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use common::{Party, accepted, config, parcel, rogue_hello, until, written};
+use common::{Party, accepted, config, parcel, rogue_hello, written};
 use fipa_acl::Envelope;
-use fipa_testbed::frame_header;
+use fipa_testbed::{frame_header, until_some};
 use fipa_transport::{
     Conclusion, Kind, Location, Parcel, Transport as _, TransportErrorKind, Verdict,
 };
@@ -58,7 +58,7 @@ fn assert_shut_out(stream: &mut TcpStream) {
 }
 
 fn counted(party: &Party, what: impl Fn(&Counters) -> u64, expected: u64) {
-    until("a counter", || {
+    until_some("a counter", || {
         (what(&party.transport.counters()) == expected).then_some(())
     });
 }
@@ -89,7 +89,7 @@ fn arrives_in_the_standard_dialect(recorded: &[u8]) {
         stream.shutdown(Shutdown::Write).unwrap();
         counted(&party, |c| c.unframed_in, number as u64 + 1);
     }
-    let record = until("both letters", || {
+    let record = until_some("both letters", || {
         let record = party.sink.record.lock();
         (record.unframed.len() == 2).then_some(record)
     });
@@ -204,7 +204,7 @@ fn a_thousand_silent_connections_hold_few_descriptors_and_block_no_peer() {
     Party::new().assert_reaches(1, &party);
     // The honest peer has evicted one more, unless it came and went before the last silent ones
     // lost their turn.
-    until("those that are too many are pushed out", || {
+    until_some("those that are too many are pushed out", || {
         (party.transport.counters().refused_crowd >= 1000 - max).then_some(())
     });
 }
@@ -321,7 +321,7 @@ fn a_peer_that_resets_during_the_goodbye_blocks_nothing() {
     }
     // Closing with unread bytes sends a reset.
     drop(peer);
-    until("every task has ended", || {
+    until_some("every task has ended", || {
         (party.runtime.metrics().num_alive_tasks() == 0).then_some(())
     });
 }
@@ -375,7 +375,7 @@ fn memory_for_announced_content_is_bounded_without_effect_on_others() {
         })
         .collect();
     counted(&party, |c| c.connections, 5);
-    until("two places", || (party.lent().0 == 2 * EACH).then_some(()));
+    until_some("two places", || (party.lent().0 == 2 * EACH).then_some(()));
     // A peer that really sends gets memory too, or is served without it.
     let honest = Party::new();
     for (attempt, len) in [(1, 1 << 20), (2, EACH), (3, 100)] {
@@ -389,7 +389,7 @@ fn memory_for_announced_content_is_bounded_without_effect_on_others() {
     assert_eq!((counters.placed, counters.parcels_in), (1, 3));
     // A connection that ends releases its memory.
     drop(rogues);
-    until("no place", || (party.lent().0 == 0).then_some(()));
+    until_some("no place", || (party.lent().0 == 0).then_some(()));
 }
 
 /// A peer that sends a hello, announces a letter of `len` bytes, sends half of it, and then just
@@ -425,7 +425,7 @@ fn half_letters_stay_within_the_memory_budget_and_block_no_peer() {
         .map(|n| sends_half(&party, n, EACH, 5000))
         .collect();
     counted(&party, |c| c.connections, 32);
-    until("two letters", || (party.lent().0 == 2 * EACH).then_some(()));
+    until_some("two letters", || (party.lent().0 == 2 * EACH).then_some(()));
     let honest = Party::new();
     for attempt in 1..=3 {
         let sent = parcel(attempt, vec![attempt as u8; EACH]);
@@ -453,7 +453,7 @@ fn a_connection_that_is_not_read_for_lack_of_memory_stays_open() {
     small.limits.stall_timeout = Duration::from_millis(1500);
     let party = Party::lending(small);
     let rogue = sends_half(&party, 77, 1 << 20, 500);
-    until("its letter", || (party.lent().0 == 1 << 20).then_some(()));
+    until_some("its letter", || (party.lent().0 == 1 << 20).then_some(()));
     let honest = Party::with(lively());
     let sent = parcel(1, vec![1; 1 << 20]);
     honest.send(1, party.location(), sent).unwrap();
@@ -479,7 +479,7 @@ fn the_address_of_a_third_party_in_a_hello_is_never_dialed() {
     stream
         .write_all(&frame(1, &parcel(1, "answer there")))
         .unwrap();
-    let back = until("its letter", || {
+    let back = until_some("its letter", || {
         let record = party.sink.record.lock();
         Some(record.arrivals.first()?.1.location.clone())
     });
@@ -540,7 +540,7 @@ fn a_service_that_moved_is_admitted_when_its_older_connection_does_not_respond()
         let mut said = hello(77);
         said.extend(frame(1, &parcel(1, "I am here now")));
         moved.write_all(&said).unwrap();
-        until("its letter", || {
+        until_some("its letter", || {
             (party.arrivals() as u64 == arrivals).then_some(())
         });
         assert_shut_out(&mut older);

@@ -14,10 +14,11 @@ use std::thread;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, config, letter_parcel, until};
+use common::{Party, config, letter_parcel};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
+use fipa_testbed::until_some;
 use fipa_transport::{
     AttemptId, Conclusion, Kind, Location, Parcel, Signature, Transport, TransportErrorKind,
 };
@@ -121,7 +122,7 @@ fn jade_gets_xml_and_a_string_message_and_can_answer() {
     let mut answer = TcpStream::connect(here.strip_prefix("tcp://").unwrap()).unwrap();
     answer.write_all(&bytes).unwrap();
     drop(answer);
-    until("the answer", || {
+    until_some("the answer", || {
         (party.sink.record.lock().unframed.len() == 1).then_some(())
     });
 }

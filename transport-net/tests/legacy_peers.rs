@@ -13,8 +13,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, Threads, config, runtime, until};
+use common::{Party, Threads, config, runtime};
 use fipa_acl::{Dialect, Envelope, Letter, Message, Performative, Representation};
+use fipa_testbed::until_some;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Sink, Transport as _, Verdict,
 };
@@ -172,7 +173,7 @@ fn a_burst_arrives_whole_and_in_the_order_of_its_connections() {
     for number in 0..1000 {
         gateway.send(HERE, number);
     }
-    let arrived = until("all letters", || {
+    let arrived = until_some("all letters", || {
         let arrived = gateway.sink.of(HERE);
         (arrived.len() + gateway.refused_crowd() as usize >= 1000).then_some(arrived)
     });
@@ -189,7 +190,7 @@ fn letters_of_any_length_arrive_in_the_order_of_their_connections() {
         stream.write_all(&letter(number, long)).unwrap();
     }
     gateway.sink.release();
-    until("all letters", || {
+    until_some("all letters", || {
         (gateway.sink.of(HERE).len() == 200).then_some(())
     });
     assert_eq!(gateway.sink.of(HERE), numbers(0..200));
@@ -217,13 +218,13 @@ fn inside_letters_that_wait_for_a_busy_gateway_are_all_read_later() {
     for number in 0..100 {
         gateway.send(ELSEWHERE, number);
     }
-    until("the letters of the other address", || {
+    until_some("the letters of the other address", || {
         (gateway.sink.of(ELSEWHERE).len() == 100).then_some(())
     });
     assert_eq!(gateway.sink.of(ELSEWHERE), numbers(0..100));
     assert!(gateway.sink.of(HERE).is_empty());
     gateway.sink.release();
-    until("the letters that waited", || {
+    until_some("the letters that waited", || {
         (gateway.sink.of(HERE).len() == 500).then_some(())
     });
     assert_eq!(gateway.sink.of(HERE), numbers(0..500));
@@ -258,16 +259,16 @@ fn inside_beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_i
         let told = told.unwrap_err().kind();
         let reset = [ErrorKind::ConnectionReset, ErrorKind::BrokenPipe];
         assert!(reset.contains(&told), "{told}");
-        until("the count", || {
+        until_some("the count", || {
             (gateway.refused_crowd() == number).then_some(())
         });
     }
     gateway.send(ELSEWHERE, 1);
-    until("a letter of another address", || {
+    until_some("a letter of another address", || {
         (gateway.sink.of(ELSEWHERE) == [1]).then_some(())
     });
     gateway.sink.release();
-    until("the letters that waited", || {
+    until_some("the letters that waited", || {
         (gateway.sink.of(HERE).len() as u64 == room).then_some(())
     });
     assert_eq!(gateway.sink.of(HERE), numbers(0..room));
@@ -283,18 +284,18 @@ fn letters_do_not_wait_for_connections_that_say_nothing() {
     for number in 0..3 {
         gateway.send(HERE, number);
     }
-    until("the letters behind them", || {
+    until_some("the letters behind them", || {
         (gateway.sink.of(HERE).len() == 3).then_some(())
     });
     // Those that speak after all are read.
     silent[7].write_all(&letter(3, 0)).unwrap();
     silent[7].shutdown(Shutdown::Write).unwrap();
-    until("a late letter", || {
+    until_some("a late letter", || {
         (gateway.sink.of(HERE).len() == 4).then_some(())
     });
     half.write_all(&letter(4, 0)[50..]).unwrap();
     drop(half);
-    until("the letter that stopped half way", || {
+    until_some("the letter that stopped half way", || {
         (gateway.sink.of(HERE).len() == 5).then_some(())
     });
     assert_eq!(gateway.sink.of(HERE), numbers(0..5));
@@ -317,7 +318,7 @@ fn half_letters_stop_neither_their_address_nor_framed_peers() {
     let to = fipa_transport::Location::new(Kind::Tcp, &to).unwrap();
     framed.send(1, &to, common::parcel(1, "x")).unwrap();
     assert_eq!(framed.conclusion(1), common::accepted());
-    until("the letter behind them", || {
+    until_some("the letter behind them", || {
         (gateway.sink.of(HERE) == [1]).then_some(())
     });
 }

@@ -13,7 +13,8 @@ use std::sync::atomic::{AtomicBool, AtomicU16, Ordering};
 use std::time::Duration;
 
 use common::certificates::Host;
-use common::{NAME, Party, Recorder, accepted, parcel, quic_config, until};
+use common::{NAME, Party, Recorder, accepted, parcel, quic_config};
+use fipa_testbed::until_some;
 use fipa_transport::{Conclusion, Kind, Location, TransportErrorKind};
 use fipa_transport_net::{QuicConfig, QuicTransport};
 
@@ -91,7 +92,7 @@ impl Relay {
     fn relocate(&self) {
         let before = self.seen.load(Ordering::SeqCst);
         self.moves.store(true, Ordering::SeqCst);
-        until("another address", || {
+        until_some("another address", || {
             (self.seen.load(Ordering::SeqCst) != before).then_some(())
         });
     }
@@ -203,7 +204,7 @@ fn an_unfinished_handshake_is_dropped() {
         trap.send_to(&packet[..len], at).unwrap();
         silent.push((trap, caller));
     }
-    until("they are let go", || {
+    until_some("they are let go", || {
         (to.transport.counters().refused_unproved >= 2).then_some(())
     });
     let honest = party(quic_config(&["127.0.0.1:0"], rover.security(&[&crex])));

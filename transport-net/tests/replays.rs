@@ -16,7 +16,8 @@ use std::time::Duration;
 
 use common::certificates::Host;
 use common::intruder::{ONLY_13, PROTOCOL, ROGUE, client, hello_and_letter, quic};
-use common::{NAME, Party, Recorder, accepted, config, parcel, quic_config, until};
+use common::{NAME, Party, Recorder, accepted, config, parcel, quic_config};
+use fipa_testbed::until_some;
 use fipa_transport::{Conclusion, Kind, Location};
 use fipa_transport_net::secure::Security;
 use fipa_transport_net::{QuicTransport, TcpTransport};
@@ -105,7 +106,7 @@ fn a_replayed_tls_connection_delivers_nothing() {
         let _ = again.shutdown(Shutdown::Write);
         let _ = again.read_to_end(&mut Vec::new());
     }
-    until("each was refused", || {
+    until_some("each was refused", || {
         (to.transport.counters().refused_unproved == 3).then_some(())
     });
     assert_eq!(to.arrivals() as u64, LETTERS);
@@ -215,7 +216,7 @@ fn replayed_quic_datagrams_deliver_nothing() {
     assert_eq!(from.transport.counters().dialled, 1);
     // when it is over,
     fipa_transport::Transport::close(&from.transport);
-    until("the connection is over", || {
+    until_some("the connection is over", || {
         (to.transport.counters().connections == 0).then_some(())
     });
     repeater.repeat(&behind);

@@ -13,10 +13,11 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use common::certificates::Host;
-use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
+use common::{NAME, Party, accepted, config, letter_parcel, parcel};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
+use fipa_testbed::until_some;
 use fipa_transport::{Answer, Conclusion, FailureReason, Mandate, Transport, TransportErrorKind};
 use fipa_transport_net::secure::{Rules, Security};
 use fipa_transport_net::{Counters, Limits, TcpTransport};
@@ -170,7 +171,7 @@ fn untrusted_peers_are_refused_on_either_side<T: Proving>() {
         told.contains("does not trust the peer: run `fipa keys trust`"),
         "{told}"
     );
-    until("it was counted", || {
+    until_some("it was counted", || {
         (to.transport.counters().refused_unproved >= 2).then_some(())
     });
 }
@@ -297,10 +298,10 @@ fn withdrawn_trust_ends_the_connection<T: Proving>() {
     let from = T::party(rover.security(&[&crex]));
     from.assert_reaches(1, &to);
     security.replace(crex.credentials(&[])).unwrap();
-    until("the connection ends", || {
+    until_some("the connection ends", || {
         (to.transport.counters().connections == 0).then_some(())
     });
-    until("the other side has noticed", || {
+    until_some("the other side has noticed", || {
         (from.transport.counters().connections == 0).then_some(())
     });
     from.send(2, to.location(), parcel(2, "again")).unwrap();
@@ -321,11 +322,11 @@ fn an_expired_certificate_ends_the_connection<T: Proving>() {
     );
     let (from, to) = friends::<T>(&rover, &crex);
     from.assert_reaches(1, &to);
-    until("the connection ends", || {
+    until_some("the connection ends", || {
         (to.transport.counters().connections == 0).then_some(())
     });
     assert!(SystemTime::now() > ends, "not before it expires");
-    until("the other side has noticed", || {
+    until_some("the other side has noticed", || {
         (from.transport.counters().connections == 0).then_some(())
     });
     from.send(2, to.location(), parcel(2, "again")).unwrap();
@@ -396,7 +397,7 @@ fn throw(to: &Party) {
 fn a_legacy_peer_may_be_an_exception_and_is_nothing_more() {
     let to = party(with_an_exception());
     throw(&to);
-    until("its letter", || {
+    until_some("its letter", || {
         (to.sink.record.lock().unframed.len() == 1).then_some(())
     });
     assert_refused(&Party::new(), &to);
@@ -409,7 +410,7 @@ fn a_legacy_peer_beyond_its_rate_limit_is_read_later() {
     for _ in 0..6 {
         throw(&to);
     }
-    until("its letters", || {
+    until_some("its letters", || {
         (to.sink.record.lock().unframed.len() == 6).then_some(())
     });
     // Two at once, and two more per second; no pause is longer than a second.
@@ -451,7 +452,7 @@ fn a_restarted_gateway_replaces_its_older_connection_at_once<T: Proving>() {
     after.assert_reaches(1, &there);
     assert_eq!(there.transport.counters().connections, 1);
     assert_eq!(there.transport.counters().refused_crowd, 0);
-    until("the older one is over", || {
+    until_some("the older one is over", || {
         (before.transport.counters().connections == 0).then_some(())
     });
 }
@@ -473,11 +474,10 @@ fn connections_of_a_local_user_do_not_keep_out_peers_with_keys() {
         max_unread_per_address: 32,
         ..config(&[]).limits
     };
-    let there = Party::with(fipa_transport_net::TcpConfig {
-        security: Some(security),
-        limits: limits.clone(),
-        ..config(&["127.0.0.1:0"])
-    });
+    let mut secured = config(&["127.0.0.1:0"]);
+    secured.security = Some(security);
+    secured.limits = limits.clone();
+    let there = Party::with(secured);
     let address = there.location().address();
     let connect = |said: &[u8]| {
         let mut stream = TcpStream::connect(address).unwrap();
@@ -489,7 +489,7 @@ fn connections_of_a_local_user_do_not_keep_out_peers_with_keys() {
         .map(|n| connect(&fipa_testbed::frame(1, 1, &common::rogue_hello(n))))
         .collect();
     let half = limits.max_connections as u64 / 2;
-    until("each has a place or none", || {
+    until_some("each has a place or none", || {
         let counters = there.transport.counters();
         (counters.connections == half && counters.refused_crowd >= half).then_some(())
     });

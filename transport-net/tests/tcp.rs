@@ -10,8 +10,9 @@ use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, accepted, config, letter_parcel, parcel, until};
+use common::{Party, accepted, config, letter_parcel, parcel};
 use fipa_acl::Letter;
+use fipa_testbed::until_some;
 use fipa_transport::{
     Answer, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport,
     TransportErrorKind, Verdict,
@@ -25,7 +26,7 @@ fn late_answers_may_come_in_any_order() {
     for attempt in 0..100 {
         a.send(attempt, b.location(), parcel(attempt, "x")).unwrap();
     }
-    until("all arrivals", || (b.arrivals() == 100).then_some(()));
+    until_some("all arrivals", || (b.arrivals() == 100).then_some(()));
     let tickets: Vec<_> = {
         let record = b.sink.record.lock();
         let order: Vec<u64> = record.arrivals.iter().map(|(p, ..)| p.sequence).collect();
@@ -118,12 +119,12 @@ fn a_restarted_peer_has_another_incarnation_and_is_reachable_again() {
     let old = b.location().clone();
     let address = old.address().to_owned();
     drop(b);
-    until("the port to be free", || {
+    until_some("the port to be free", || {
         std::net::TcpListener::bind(&address).ok()
     });
     let b = Party::with(config(&[&address]));
     assert_eq!(b.location().address(), address);
-    let fault = until("the old connection to be gone", || {
+    let fault = until_some("the old connection to be gone", || {
         static ATTEMPT: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(100);
         let attempt = ATTEMPT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         a.send(attempt, &old, parcel(1, "to the old one")).ok()?;
@@ -155,7 +156,7 @@ fn an_idle_connection_closes_and_opens_again() {
     let (a, b) = (Party::with(impatient), Party::new());
     for attempt in 0..3 {
         a.assert_reaches(attempt, &b);
-        until("the connection to close", || {
+        until_some("the connection to close", || {
             let open = |party: &Party| party.transport.counters().connections;
             (open(&a) == 0 && open(&b) == 0).then_some(())
         });
@@ -172,7 +173,7 @@ fn a_connection_kept_open_by_an_unanswered_letter_is_kept_alive() {
     let a = Party::with(lively);
     let b = Party::judging(config(&["127.0.0.1:0"]), Verdict::Later);
     a.send(1, b.location(), parcel(1, "x")).unwrap();
-    until("the arrival", || (b.arrivals() == 1).then_some(()));
+    until_some("the arrival", || (b.arrivals() == 1).then_some(()));
     // Several times the time after which a silent peer is given up.
     std::thread::sleep(Duration::from_millis(1200));
     let ticket = b.sink.record.lock().arrivals[0].2;

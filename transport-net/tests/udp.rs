@@ -10,7 +10,8 @@ use std::net::UdpSocket;
 use std::sync::Arc;
 use std::time::Duration;
 
-use common::{Recorder, accepted, parcel, rogue_hello, runtime, udp_config, until, written};
+use common::{Recorder, accepted, parcel, rogue_hello, runtime, udp_config, written};
+use fipa_testbed::until_some;
 use fipa_transport::{AttemptId, Conclusion, Kind, Location, Sink, Transport, TransportErrorKind};
 use fipa_transport_net::{UdpConfig, UdpTransport};
 
@@ -42,7 +43,7 @@ impl Party {
     }
 
     fn conclusion(&self, attempt: u64) -> Conclusion {
-        until("a conclusion", || {
+        until_some("a conclusion", || {
             let record = self.sink.record.lock();
             record.concluded.get(&AttemptId(attempt))?.first().cloned()
         })
@@ -179,7 +180,7 @@ fn a_malformed_packet_after_the_handshake_ends_only_its_connection() {
     for (refused, frames) in (1..).zip(&nonsense) {
         let (socket, number) = introduced(&far, refused);
         socket.send(&packet(number, 1, frames)).unwrap();
-        until("an end", || {
+        until_some("an end", || {
             let counters = far.transport.counters();
             let ended = counters.refused_nonsense == refused && counters.connections == 1;
             ended.then_some(())

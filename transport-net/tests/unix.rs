@@ -14,7 +14,8 @@ use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use common::{Party, Recorder, accepted, parcel, unix_config, until};
+use common::{Party, Recorder, accepted, parcel, unix_config};
+use fipa_testbed::until_some;
 use fipa_transport::{
     Conclusion, Incarnation, Kind, ListenError, Location, Transport, TransportErrorKind,
 };
@@ -145,7 +146,7 @@ fn sockets_of_dead_processes_are_removed_and_those_of_others_are_not() {
     drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
     fs::write(directory.join("notes"), "not a socket of fipa").unwrap();
     a.transport.tidy();
-    until("the dead socket to go", || (!dead.exists()).then_some(()));
+    until_some("the dead socket to go", || (!dead.exists()).then_some(()));
     assert!(directory.join("notes").exists());
     drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
     // A starting process does the same.
@@ -207,7 +208,7 @@ fn the_end_of_the_other_side_is_reported_without_an_invented_answer() {
     a.assert_reaches(1, &b);
     let gone = b.location().clone();
     drop(b);
-    until("the connection to end", || {
+    until_some("the connection to end", || {
         (a.transport.counters().connections == 0).then_some(())
     });
     a.send(2, &gone, parcel(2, "x")).unwrap();

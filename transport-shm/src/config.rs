@@ -161,7 +161,7 @@ pub enum ShmError {
     },
     /// The shared memory file system became full while the endpoint was opened.
     #[error(
-        "{path} is full: cannot allocate {needed} more bytes ({source}); enlarge it \
+        "{path} is full: cannot allocate {needed} more bytes; enlarge it \
          (mount -o remount,size=512M {path}; for containers --shm-size=512m) or remove the transport \"shm\""
     )]
     Full {
@@ -173,7 +173,7 @@ pub enum ShmError {
         source: std::io::Error,
     },
     /// An operation on a file or directory failed.
-    #[error("{what} {path}: {source}")]
+    #[error("{what} {path}")]
     File {
         /// The failed operation, such as `cannot lock`.
         what: &'static str,
@@ -205,7 +205,7 @@ pub enum ShmError {
     /// An iceoryx2 operation failed.
     #[error(
         "{what}: {reason} (shared memory prefix {prefix:?}); the limit of open files may be too low: \
-         an endpoint needs about 20, and about 10 more for each process it talks to"
+         an endpoint needs about 20, and about 10 more for each connected process"
     )]
     Iceoryx {
         /// The failed operation, such as `cannot create a node`.

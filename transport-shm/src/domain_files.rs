@@ -40,7 +40,7 @@ pub struct Cleaned {
 }
 
 /// Removes the files of killed processes of a domain. For tools: an endpoint does this by itself
-/// when it starts, when it closes, and when a process that it talks to ends.
+/// when it starts, when it closes, and when a connected process ends.
 ///
 /// Blocks until all living processes have polled their mailboxes, at most a second. The
 /// configuration's incarnation is not used, but must be known.
@@ -445,7 +445,7 @@ impl DomainFiles {
         }
     }
 
-    /// Removes connections of ports that no process has any more. iceoryx2 0.10 leaves one if a
+    /// Removes connections of ports that no process has. iceoryx2 0.10 leaves one if a
     /// process is killed between creating its file and recording its own end: then neither end is
     /// the last to close. The caller must hold the lock, under which no process creates a port. A
     /// port is tagged before it connects, and as long as it exists.

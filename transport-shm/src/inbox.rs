@@ -298,7 +298,7 @@ impl Inbox {
             .read(sender, reference, len)
             .map_err(|e| match e {
                 ReadError::Gone => {
-                    let detail = "the content of the letter does not exist any more";
+                    let detail = "the content of the letter no longer exists";
                     Answer::failed(FailureReason::Refused, detail)
                 }
                 ReadError::NoRoom => Answer::Busy,

@@ -369,7 +369,7 @@ impl Outbox {
 
     /// Sends loaned memory. Returns `false` if iceoryx2 unexpectedly refuses, which takes the
     /// memory back. The application and other processes may still read it, so the outbox is then
-    /// retired and loans nothing any more. Hence the memory is not overwritten, no larger segment
+    /// retired and loans nothing. Hence the memory is not overwritten, no larger segment
     /// replaces its segment (which is the current one, as the caller has checked), and the loan
     /// keeps the outbox and so the segment.
     fn send_loan(

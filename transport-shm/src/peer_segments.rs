@@ -17,7 +17,7 @@ const MAX_OPEN: usize = 32;
 /// The error of reading content in a segment.
 #[derive(Debug)]
 pub(crate) enum ReadError {
-    /// The content does not exist any more: the sender has abandoned the letter.
+    /// The content no longer exists: the sender has abandoned the letter.
     Gone,
     /// This process has no memory or descriptors for it now.
     NoRoom,
@@ -42,7 +42,7 @@ struct PeerSegment {
 /// lock.
 struct ReadState {
     readers: usize,
-    /// `None` if the segment is not fully allocated any more.
+    /// `None` if the segment is no longer fully allocated.
     generation: Option<u64>,
 }
 

@@ -75,7 +75,7 @@ impl ShmTransport {
     }
 
     /// Starts a cleanup in the background if the domain contains files of dead processes. Not
-    /// needed for processes that this one talks to: the kernel notifies this process of their end.
+    /// needed for connected processes: the kernel notifies this process of their end.
     pub fn tidy(&self) {
         self.endpoint.load().start_cleanup();
     }

@@ -12,7 +12,8 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{RecordingSink, TestDomain, attempt, parcel, wait_for};
+use common::{RecordingSink, TestDomain, attempt, parcel};
+use fipa_testbed::until;
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 
@@ -23,7 +24,7 @@ fn closing_removes_all_files() {
     let (other, got) = domain.listening();
     one.dispatch(attempt(), &other.location(), parcel(vec![1; 9000].into()))
         .unwrap();
-    wait_for("answer", || sink.conclusions() == 1);
+    until("answer", || sink.conclusions() == 1);
     assert!(!domain.files().is_empty());
     // Content that is held keeps its memory and files.
     got.arrived.lock().unwrap().clear();
@@ -62,12 +63,12 @@ fn many_threads_drive_one_endpoint() {
             let mut parcel = parcel(Bytes::new());
             parcel.sequence = number + 1;
             // The window is full at times.
-            wait_for("room", || {
+            until("room", || {
                 one.dispatch(attempt(), &other.location(), parcel.clone())
                     .is_ok()
             });
         }
-        wait_for("answers", || sink.conclusions() == 2000);
+        until("answers", || sink.conclusions() == 2000);
         done.store(true, Ordering::Relaxed);
     });
     let arrived = got.arrived.lock().unwrap();
@@ -106,7 +107,7 @@ fn peers_are_bounded_and_the_least_recently_used_is_closed() {
                 parcel(vec![3; 2000].into()),
             )
             .unwrap();
-        wait_for("answer", || sink.conclusions() == sent + 1);
+        until("answer", || sink.conclusions() == sent + 1);
     }
     for (_, got) in &receivers {
         assert_eq!(got.arrivals(), 2);
@@ -158,7 +159,7 @@ fn a_failed_open_neither_blocks_nor_affects_other_endpoints() {
     other
         .dispatch(attempt(), &one.location(), parcel(Bytes::new()))
         .unwrap();
-    wait_for("answer", || sink.conclusions() == 1);
+    until("answer", || sink.conclusions() == 1);
 }
 
 #[test]
@@ -207,7 +208,7 @@ fn a_waiter_for_a_removed_directorys_lock_does_not_clean_up_the_new_directory() 
         let open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
         open.filter(|file| file == directory).count() == 2
     };
-    wait_for("the waiting process", || is_open(&root));
+    until("the waiting process", || is_open(&root));
     // Another process starts and has created this directory so far.
     std::fs::remove_dir(&root).unwrap();
     std::fs::create_dir(&root).unwrap();
@@ -216,7 +217,7 @@ fn a_waiter_for_a_removed_directorys_lock_does_not_clean_up_the_new_directory() 
     let nodes = root.join("nodes");
     std::fs::create_dir(&nodes).unwrap();
     drop(previous);
-    wait_for("the end of the wait", || {
+    until("the end of the wait", || {
         waiting.is_finished() || is_open(&root)
     });
     assert!(nodes.exists());
@@ -228,7 +229,7 @@ fn a_waiter_for_a_removed_directorys_lock_does_not_clean_up_the_new_directory() 
 
 /// Sends letters until one is accepted. Earlier ones fail if a process has not rejoined yet.
 fn send_until_accepted(from: (&ShmTransport, &RecordingSink), to: &ShmTransport) {
-    wait_for("an accepted letter", || {
+    until("an accepted letter", || {
         let one = attempt();
         let content = Bytes::from(vec![3; 9000]);
         if from
@@ -238,7 +239,7 @@ fn send_until_accepted(from: (&ShmTransport, &RecordingSink), to: &ShmTransport)
         {
             return false;
         }
-        wait_for("conclusion", || from.1.conclusion_of(one).is_some());
+        until("conclusion", || from.1.conclusion_of(one).is_some());
         matches!(
             from.1.conclusion_of(one),
             Some(Conclusion::Answered(Answer::Accepted))

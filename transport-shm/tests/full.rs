@@ -16,13 +16,14 @@ mod common;
 use std::fs::File;
 use std::io::Read;
 use std::os::unix::process::ExitStatusExt;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use common::{FRONT, RecordingSink, TestDomain, attempt, location_of, parcel, wait_for};
+use common::{FRONT, RecordingSink, TestDomain, attempt, location_of, parcel};
 use fastrand::Rng;
+use fipa_testbed::{ignored_test, until};
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 use rustix::fs::{FallocateFlags, fallocate, statvfs};
@@ -67,7 +68,7 @@ fn inside_a_full_file_system_ends_no_process() {
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    wait_for("the end of the processes", || {
+    until("the end of the processes", || {
         running.retain_mut(|child| !sum.has_ended(child));
         running.is_empty()
     });
@@ -89,7 +90,7 @@ fn inside_a_full_file_system_ends_no_process() {
     sender
         .dispatch(one, &receiver.location(), parcel(content))
         .unwrap();
-    wait_for("answer", || sink.conclusion_of(one).is_some());
+    until("answer", || sink.conclusion_of(one).is_some());
     let accepted = Some(Conclusion::Answered(Answer::Accepted));
     assert_eq!(sink.conclusion_of(one), accepted);
     drop((sender, receiver, _got));
@@ -150,8 +151,7 @@ impl Sum {
 
 fn start(domain: &TestDomain, seed: u64) -> Child {
     let config = domain.config();
-    Command::new(std::env::current_exe().unwrap())
-        .args(["--ignored", "--exact", "--nocapture", "process_entry"])
+    ignored_test("process_entry")
         .env(
             ROLE,
             format!("{} {} {seed}", config.root.display(), config.prefix),

@@ -7,7 +7,8 @@ mod common;
 use std::sync::{Arc, Barrier};
 
 use bytes::Bytes;
-use common::{FRONT, RecordingSink, TestDomain, attempt, parcel, wait_for};
+use common::{FRONT, RecordingSink, TestDomain, attempt, parcel};
+use fipa_testbed::until;
 use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
 use fipa_transport_shm::ShmTransport;
 
@@ -36,7 +37,7 @@ fn send(from: &ShmTransport, sink: &RecordingSink, to: &ShmTransport, content: &
     let one = attempt();
     from.dispatch(one, &to.location(), parcel(content.clone()))
         .unwrap();
-    wait_for("answer", || sink.conclusion_of(one).is_some());
+    until("answer", || sink.conclusion_of(one).is_some());
     let accepted = Some(Conclusion::Answered(Answer::Accepted));
     assert_eq!(sink.conclusion_of(one), accepted);
 }
@@ -117,7 +118,7 @@ fn large_content_is_released_when_the_last_reader_stops() {
     assert!(blocks * 512 >= 8 << 20);
     assert_eq!(got.content(0), vec![5; 8 << 20]);
     got.arrived.lock().unwrap().clear();
-    wait_for("room", || segments(&domain) == (0, 0));
+    until("room", || segments(&domain) == (0, 0));
     // A shorter segment stays for the next content.
     send(&sender, &sink, &receiver, &content(&sender, 100_000, 1));
     got.arrived.lock().unwrap().clear();

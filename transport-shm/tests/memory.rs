@@ -5,7 +5,8 @@
 mod common;
 
 use bytes::Bytes;
-use common::{FRONT, TestDomain, attempt, mapping_of, parcel, wait_for};
+use common::{FRONT, TestDomain, attempt, mapping_of, parcel};
+use fipa_testbed::until;
 use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
 
 fn pattern(len: usize) -> Bytes {
@@ -39,7 +40,7 @@ fn loaned_content_is_never_copied() {
         sender
             .dispatch(attempt(), &receiver.location(), parcel(content.clone()))
             .unwrap();
-        wait_for("letter", || got.arrivals() == number + 1);
+        until("letter", || got.arrivals() == number + 1);
         let received = got.content(number);
         assert_eq!(received, pattern(len));
         // The same bytes of the same file, mapped a second time, and not a copy.
@@ -47,7 +48,7 @@ fn loaned_content_is_never_copied() {
         assert_eq!(mapping_of(&received), from);
         assert_eq!(received.as_ptr() as usize % 8, 0);
     }
-    wait_for("answers", || sent.conclusions() == 3);
+    until("answers", || sent.conclusions() == 3);
     assert_eq!(sender.counters().loans_sent, 3);
     assert_eq!(sender.counters().loans_copied, 0);
     assert_eq!(receiver.counters().in_place, 3);
@@ -71,10 +72,10 @@ fn loaned_content_can_be_sent_again_and_to_another_receiver() {
             .dispatch(attempt(), &to.location(), parcel(content.clone()))
             .unwrap();
     }
-    wait_for("letters", || {
+    until("letters", || {
         got_first.arrivals() == 2 && got_second.arrivals() == 1
     });
-    wait_for("answers", || sent.conclusions() == 3);
+    until("answers", || sent.conclusions() == 3);
     for received in [
         got_first.content(0),
         got_first.content(1),
@@ -100,7 +101,7 @@ fn a_letter_with_a_longer_front_than_announced_is_copied() {
     sender
         .dispatch(attempt(), &receiver.location(), parcel(loan.freeze()))
         .unwrap();
-    wait_for("letter", || got.arrivals() == 1);
+    until("letter", || got.arrivals() == 1);
     assert_eq!(got.content(0), pattern(5000));
     assert_eq!(sender.counters().loans_copied, 1);
 }
@@ -124,7 +125,7 @@ fn a_loan_outlives_larger_ones_and_its_transport() {
     sender
         .dispatch(attempt(), &receiver.location(), parcel(small.clone()))
         .unwrap();
-    wait_for("letter", || got.arrivals() == 1);
+    until("letter", || got.arrivals() == 1);
     assert_eq!(got.content(0), pattern(2000));
     drop(large);
     sender.close();
@@ -150,7 +151,7 @@ fn loans_are_bounded_and_leave_room_for_letters() {
     sender
         .dispatch(attempt(), &to, parcel(Bytes::new()))
         .unwrap();
-    wait_for("answer", || sent.conclusions() == 1);
+    until("answer", || sent.conclusions() == 1);
     drop(loans);
     assert!(sender.loan(&to, FRONT, 100, 1).is_ok());
 }
@@ -169,7 +170,7 @@ fn held_content_is_bounded_and_then_copied() {
         sender
             .dispatch(one, &to, parcel(pattern(3000 + number)))
             .unwrap();
-        wait_for("answer", || sent.conclusion_of(one).is_some());
+        until("answer", || sent.conclusion_of(one).is_some());
         assert_eq!(
             sent.conclusion_of(one),
             Some(Conclusion::Answered(Answer::Accepted))
@@ -188,7 +189,7 @@ fn held_content_is_bounded_and_then_copied() {
     sender
         .dispatch(attempt(), &to, parcel(pattern(3000)))
         .unwrap();
-    wait_for("letter", || got.arrivals() == 1);
+    until("letter", || got.arrivals() == 1);
     assert_eq!(receiver.counters().in_place, 6);
 }
 
@@ -205,7 +206,7 @@ fn one_slot_of_each_sender_stays_free() {
         sender
             .dispatch(one, &receiver.location(), parcel(pattern(2000)))
             .unwrap();
-        wait_for("answer", || sent.conclusion_of(one).is_some());
+        until("answer", || sent.conclusion_of(one).is_some());
     }
     let counters = receiver.counters();
     assert_eq!((counters.in_place, counters.copied_full), (3, 9));
@@ -219,7 +220,7 @@ fn small_content_is_copied_and_holds_no_slot() {
     sender
         .dispatch(attempt(), &receiver.location(), parcel(pattern(10)))
         .unwrap();
-    wait_for("letter", || got.arrivals() == 1);
+    until("letter", || got.arrivals() == 1);
     assert_eq!(got.content(0), pattern(10));
     let counters = receiver.counters();
     assert_eq!((counters.copied_small, counters.borrowed), (1, 0));
@@ -244,7 +245,7 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
             Ok(()) => taken += 1,
             Err(e) => break e,
         }
-        wait_for("answer", || sent.conclusions() == taken);
+        until("answer", || sent.conclusions() == taken);
         assert!(taken < 10);
     };
     assert!(taken > 2, "{taken}");
@@ -253,7 +254,7 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
     sender
         .dispatch(attempt(), &to, parcel(pattern(500)))
         .unwrap();
-    wait_for("answer", || sent.conclusions() == taken + 1);
+    until("answer", || sent.conclusions() == taken + 1);
 }
 
 #[test]
@@ -264,7 +265,7 @@ fn content_outlives_both_transports() {
     sender
         .dispatch(attempt(), &receiver.location(), parcel(pattern(100_000)))
         .unwrap();
-    wait_for("letter", || got.arrivals() == 1);
+    until("letter", || got.arrivals() == 1);
     let content = got.content(0);
     got.arrived.lock().unwrap().clear();
     assert!(mapping_of(&content).path.is_some());

@@ -8,11 +8,12 @@ mod common;
 
 use std::io::{BufRead, BufReader};
 use std::os::fd::AsRawFd;
-use std::process::{Child, Command, Stdio};
+use std::process::Stdio;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use common::{TestDomain, attempt, location_of, mapping_of, parcel, wait_for};
+use common::{TestDomain, attempt, location_of, mapping_of, parcel};
+use fipa_testbed::{ChildGuard, ignored_test, until};
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -21,7 +22,7 @@ const ROLE: &str = "FIPA_SHM_TEST_ROLE";
 
 /// A child process, killed at the end.
 struct Process {
-    child: Child,
+    child: ChildGuard,
     incarnation: Incarnation,
 }
 
@@ -31,9 +32,8 @@ impl Process {
     /// several receivers; `clean` cleans up and ends.
     fn start(domain: &TestDomain, role: &str, to: Incarnation) -> Self {
         let config = domain.config();
-        let child = Command::new(std::env::current_exe().unwrap())
-            .args(["--ignored", "--exact", "--nocapture"])
-            .arg("process_entry")
+        let mut command = ignored_test("process_entry");
+        command
             .env(
                 ROLE,
                 format!(
@@ -46,41 +46,28 @@ impl Process {
             .stdout(match role {
                 "tell" => Stdio::piped(),
                 _ => Stdio::null(),
-            })
-            .spawn()
-            .unwrap();
+            });
         Self {
-            child,
+            child: ChildGuard::start(&mut command),
             incarnation: config.incarnation,
         }
     }
 
     fn signal(&self, signal: &str) {
-        let pid = self.child.id().to_string();
-        let done = Command::new("kill").args([signal, &pid]).status().unwrap();
-        assert!(done.success());
+        self.child.signal(signal);
     }
 
     /// Sends SIGKILL and waits for the end.
     fn kill(&mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
+        self.child.kill();
     }
 
     /// Waits until the process can be reached.
     fn wait_until_up(&self, from: &ShmTransport) {
         let to = location_of(self.incarnation);
-        wait_for("process", || {
+        until("process", || {
             from.dispatch(attempt(), &to, parcel(Bytes::new())).is_ok()
         });
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        // Fails if it has been killed already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -177,8 +164,8 @@ fn receivers_in_two_processes_read_the_same_memory() {
         let to = location_of(receiver.incarnation);
         let one = attempt();
         sender.dispatch(one, &to, parcel(content.clone())).unwrap();
-        wait_for("answer", || sent.conclusion_of(one).is_some());
-        let lines = BufReader::new(receiver.child.stdout.take().unwrap()).lines();
+        until("answer", || sent.conclusion_of(one).is_some());
+        let lines = BufReader::new(receiver.child.child().stdout.take().unwrap()).lines();
         let mut lines = lines.map_while(Result::ok);
         let reported = lines.find(|line| line.starts_with("POSITION"));
         assert_eq!(reported, Some(expected.clone()));
@@ -201,11 +188,11 @@ fn shared_content_of_a_killed_sender_stays_while_it_is_read() {
     let (receiver, got) = domain.listening();
     let own = receiver.location().incarnation();
     let mut sender = Process::start(&domain, "many", own);
-    wait_for("letters", || got.arrivals() >= 8);
+    until("letters", || got.arrivals() >= 8);
     sender.kill();
-    wait_for("the detected end", || receiver.counters().peers_gone == 1);
+    until("the detected end", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
-    wait_for("removal", || {
+    until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     for number in 0..got.arrivals() {
@@ -213,7 +200,7 @@ fn shared_content_of_a_killed_sender_stays_while_it_is_read() {
     }
     got.arrived.lock().unwrap().clear();
     assert_eq!(receiver.counters().borrowed, 0);
-    wait_for("the end of the mapping", || {
+    until("the end of the mapping", || {
         let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
         !maps.contains(&format!("{dead}."))
     });
@@ -227,7 +214,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
     let (sender, sent) = domain.listening();
     let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
     receiver.wait_until_up(&sender);
-    wait_for("answer", || sent.conclusions() == 1);
+    until("answer", || sent.conclusions() == 1);
     let to = location_of(receiver.incarnation);
 
     receiver.signal("-STOP");
@@ -238,7 +225,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
             .unwrap();
     }
     receiver.kill();
-    wait_for("conclusions", || sent.conclusions() == 6);
+    until("conclusions", || sent.conclusions() == 6);
     for one in &attempts {
         match sent.conclusion_of(*one) {
             Some(Conclusion::Unconfirmed(e)) => assert_eq!(e.fault, TransportErrorKind::Broken),
@@ -252,7 +239,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
     assert_eq!(sender.counters().peers_gone, 1);
     // The survivor removes the files of the dead process while it runs.
     let dead = receiver.incarnation.to_string();
-    wait_for("removal", || {
+    until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     sender.close();
@@ -266,11 +253,11 @@ fn content_of_a_killed_sender_stays_readable() {
     let own = receiver.location().incarnation();
     let mut sender = Process::start(&domain, "send", own);
     // More than one batch, so that the receiver has the sender open as a peer.
-    wait_for("letters", || got.arrivals() > 64);
+    until("letters", || got.arrivals() > 64);
     sender.kill();
-    wait_for("the detected end", || receiver.counters().peers_gone == 1);
+    until("the detected end", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
-    wait_for("removal", || {
+    until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     assert!(receiver.counters().borrowed > 0);
@@ -292,7 +279,7 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
         let mut senders: Vec<_> = (0..4)
             .map(|_| Process::start(&domain, "send", own))
             .collect();
-        wait_for("letters", || got.arrivals() > 8);
+        until("letters", || got.arrivals() > 8);
         for sender in &mut senders {
             sender.kill();
         }
@@ -303,7 +290,7 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
     sender
         .dispatch(one, &receiver.location(), parcel(vec![1; 5000].into()))
         .unwrap();
-    wait_for("answer", || sent.conclusion_of(one).is_some());
+    until("answer", || sent.conclusion_of(one).is_some());
     assert_eq!(
         sent.conclusion_of(one),
         Some(Conclusion::Answered(Answer::Accepted))
@@ -324,7 +311,7 @@ fn cleanup_waits_until_the_last_letters_of_dead_processes_are_taken() {
     let connected = |file: &String| file.ends_with(".connection");
     let connections = || domain.files().iter().filter(|file| connected(file)).count();
     let mut sender = Process::start(&domain, "send", receiver.incarnation);
-    wait_for("connection", || connections() >= 2);
+    until("connection", || connections() >= 2);
     // Stopped, so that it does not poll for a while.
     receiver.signal("-STOP");
     std::thread::sleep(std::time::Duration::from_millis(50));
@@ -337,7 +324,7 @@ fn cleanup_waits_until_the_last_letters_of_dead_processes_are_taken() {
         let cleaned = cleanup_dead(&domain.config()).unwrap();
         assert_eq!((cleaned.alive, cleaned.failed), (1, 0));
     });
-    wait_for("end of the connection", || connections() == 0);
+    until("end of the connection", || connections() == 0);
     receiver.kill();
     cleanup_dead(&domain.config()).unwrap();
     assert_eq!(domain.files(), Vec::<String>::new());
@@ -349,7 +336,7 @@ fn close_waits_until_the_last_letters_are_taken() {
     let mut receiver = Process::start(&domain, "drop", Incarnation::from_u64(1));
     let (sender, sent) = domain.listening();
     receiver.wait_until_up(&sender);
-    wait_for("answer", || sent.conclusions() == 1);
+    until("answer", || sent.conclusions() == 1);
     receiver.signal("-STOP");
     let to = location_of(receiver.incarnation);
     for number in 0..4 {
@@ -369,7 +356,7 @@ fn close_waits_until_the_last_letters_are_taken() {
         sender.close();
     });
     assert_eq!(sent.conclusions(), 3);
-    wait_for("end of the connection", || {
+    until("end of the connection", || {
         !domain
             .files()
             .iter()
@@ -386,7 +373,7 @@ fn cleanup_dead_removes_the_files_of_killed_processes() {
     let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
     let mut sender = Process::start(&domain, "send", receiver.incarnation);
     // Both processes run and are connected.
-    wait_for("connection", || {
+    until("connection", || {
         domain
             .files()
             .iter()
@@ -418,7 +405,7 @@ fn a_connection_without_ports_is_removed() {
         sender
             .dispatch(one, &receiver.location(), parcel(content))
             .unwrap();
-        wait_for("answer", || sent.conclusion_of(one).is_some());
+        until("answer", || sent.conclusion_of(one).is_some());
         assert_eq!(
             sent.conclusion_of(one),
             Some(Conclusion::Answered(Answer::Accepted))
@@ -488,13 +475,13 @@ fn a_cleanup_without_free_descriptors_keeps_the_files_of_living_processes() {
         let (sender, sink) = domain.listening();
         let (to, sent) = (receiver.location(), attempt());
         sender.dispatch(sent, &to, parcel(Bytes::new())).unwrap();
-        wait_for("answer", || sink.conclusion_of(sent).is_some());
+        until("answer", || sink.conclusion_of(sent).is_some());
         sender
     };
     let living = exchange();
     let before = domain.files();
     let mut cleaner = Process::start(&domain, "clean", Incarnation::from_u64(1));
-    assert!(cleaner.child.wait().unwrap().success());
+    assert!(cleaner.child.wait().success());
     assert_eq!(domain.files(), before);
     // Its mailbox can still be found.
     exchange().close();
@@ -502,7 +489,7 @@ fn a_cleanup_without_free_descriptors_keeps_the_files_of_living_processes() {
 }
 
 /// iceoryx2 leaves a mailbox like this if the process that removes its last node is killed at that
-/// moment: no node claims to use it any more.
+/// moment: no node claims to use it.
 #[test]
 fn an_unused_mailbox_is_removed() {
     let domain = TestDomain::new();
@@ -514,7 +501,7 @@ fn an_unused_mailbox_is_removed() {
         made
     };
     let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
-    wait_for("mailbox", || !made_since(".port_tag").is_empty());
+    until("mailbox", || !made_since(".port_tag").is_empty());
     receiver.kill();
     assert_eq!(made_since(".dynamic").len(), 1);
     // The files that the process removes earlier: its ports, and its node's claim.
@@ -540,7 +527,7 @@ fn a_process_that_starts_later_cleans_up() {
     assert!(!domain.files().is_empty());
     let (newcomer, _) = domain.listening();
     let dead = gone.incarnation.to_string();
-    wait_for("removal", || {
+    until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     newcomer.close();

@@ -1,6 +1,7 @@
 //! A transport decorator that injects faults.
 
 use std::collections::HashMap;
+use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -53,6 +54,14 @@ struct Plan {
     random: fastrand::Rng,
     rates: Vec<(Fault, f64)>,
     forced: Option<Fault>,
+}
+
+impl fmt::Debug for Faulty {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Faulty")
+            .field("kind", &self.inner.kind())
+            .finish_non_exhaustive()
+    }
 }
 
 impl Faulty {

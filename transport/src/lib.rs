@@ -20,16 +20,18 @@ mod location;
 mod outcome;
 mod owner;
 mod parcel;
+mod quota_address;
 mod token_bucket;
 mod transport;
 pub mod wire;
 
 pub use faulty::{Fault, Faulty};
-pub use incarnation::Incarnation;
+pub use incarnation::{Incarnation, IncarnationError};
 pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
+pub use quota_address::quota_address;
 pub use token_bucket::TokenBucket;
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,

@@ -39,8 +39,8 @@ impl TokenBucket {
         enough
     }
 
-    /// Takes `amount` tokens for something that cannot be refused any more. Returns the time until
-    /// the bucket is no longer negative, if it is; at most one second, whatever the amount.
+    /// Takes `amount` tokens for something that has already happened. If the bucket is negative then,
+    /// returns the time until it no longer is, limited to one second.
     pub fn spend(&mut self, amount: f64, per_second: f64, now: Instant) -> Option<Duration> {
         self.refill(per_second, now);
         self.left = (self.left - amount).max(-per_second);

@@ -487,7 +487,7 @@ impl TransportErrorKind {
 #[non_exhaustive]
 pub enum ListenError {
     /// An address could not be listened on.
-    #[error("cannot listen on {address}: {source}")]
+    #[error("cannot listen on {address}")]
     Bind {
         /// The address as configured.
         address: String,

@@ -14,7 +14,7 @@ use crate::{AgentId, Text};
 
 const CLAUSE: &str = "FIPA00088 AID";
 
-/// Reads the next of the consecutive identifiers in checked bytes.
+/// Reads the next identifier of a sequence. The bytes have been checked before.
 pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     (!rest.is_empty()).then_some(())?;
     let mut reader = Reader::new(rest);

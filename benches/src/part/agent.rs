@@ -14,9 +14,8 @@ use fipa::{
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 use tokio::runtime::{Builder, Runtime};
 
-use super::orders::{
-    Fill, Letters, Peer, Sent, Spread, byte_of, check, execute_orders, now_ns, to_text,
-};
+use super::orders::{Fill, Letters, Peer, Sent, Spread, byte_of, check, execute_orders, now_ns};
+use crate::error::chain_text;
 
 /// One agent, or several agents that only receive.
 pub(super) struct Agent {
@@ -42,9 +41,9 @@ struct Running {
 impl Agent {
     pub(super) fn play(config: &Config, names: &[&str], address: &str) -> Result<(), String> {
         let runtime = runtime()?;
-        let domain = runtime.block_on(Domain::open(config)).map_err(to_text)?;
+        let domain = runtime.block_on(Domain::open(config)).map_err(chain_text)?;
         let agents = names.iter().map(|name| domain.register(name));
-        let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(to_text)?;
+        let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(chain_text)?;
         let agent = agents.pop().ok_or("no agent was registered")?;
         let orders = runtime.block_on(async { orders() });
         let agent = Self {
@@ -69,7 +68,7 @@ impl Agent {
     }
 
     async fn find(&mut self, to: &str) -> Result<(), String> {
-        let all = Query::by_name(Matcher::parse(to).map_err(to_text)?);
+        let all = Query::by_name(Matcher::parse(to).map_err(chain_text)?);
         let directory = self.agent.domain().directory();
         let mut changes = directory.watch();
         let found = loop {
@@ -83,7 +82,7 @@ impl Agent {
         };
         let message = |to: &str| {
             let message = self.agent.message(Performative::Inform);
-            Ok::<_, String>(message.receiver(AgentId::new(to).map_err(to_text)?))
+            Ok::<_, String>(message.receiver(AgentId::new(to).map_err(chain_text)?))
         };
         let each = found.iter().map(|entry| message(&entry.name));
         let each = each.collect::<Result<_, _>>()?;
@@ -96,11 +95,11 @@ impl Agent {
         let mut at = Vec::with_capacity(letters.count);
         for number in 0..letters.count {
             for other in &self.others {
-                let incoming = other.receive().await.map_err(to_text)?;
+                let incoming = other.receive().await.map_err(chain_text)?;
                 let content = incoming.message.content().ok_or("no content")?;
                 check(content, letters, number)?;
             }
-            let incoming = self.agent.receive().await.map_err(to_text)?;
+            let incoming = self.agent.receive().await.map_err(chain_text)?;
             at.push(now_ns());
             let content = incoming.message.content().ok_or("no content")?;
             check(content, letters, number)?;
@@ -116,7 +115,9 @@ impl Agent {
                 let content = self.content(letters.size, byte);
                 let each = self.each.iter().cloned();
                 let messages = each.map(|message| message.content(content.clone()).build());
-                let messages = messages.collect::<Result<Vec<_>, _>>().map_err(to_text)?;
+                let messages = messages
+                    .collect::<Result<Vec<_>, _>>()
+                    .map_err(chain_text)?;
                 sent.began.push(now_ns());
                 let sending = messages.into_iter().map(|one| self.agent.send(one));
                 let sending: Vec<_> = sending.collect();
@@ -128,9 +129,9 @@ impl Agent {
                     .message
                     .clone()
                     .ok_or("the other end was not found yet")?;
-                let message = message.build().map_err(to_text)?;
+                let message = message.build().map_err(chain_text)?;
                 sent.began.push(now_ns());
-                let mut loan = self.agent.loan(message, letters.size).map_err(to_text)?;
+                let mut loan = self.agent.loan(message, letters.size).map_err(chain_text)?;
                 loan.content_mut().fill(byte);
                 if what == Spread::Together {
                     delivered(self.agent.send_loan(loan).await)?;
@@ -173,13 +174,13 @@ impl Agent {
         let byte = byte_of(number);
         if letters.fill == Fill::Copied {
             let content = self.content(letters.size, byte);
-            let message = message.content(content).build().map_err(to_text)?;
+            let message = message.content(content).build().map_err(chain_text)?;
             sent.began.push(now_ns());
             return Ok(Box::pin(self.agent.send(message)));
         }
-        let message = message.build().map_err(to_text)?;
+        let message = message.build().map_err(chain_text)?;
         sent.began.push(now_ns());
-        let mut loan = self.agent.loan(message, letters.size).map_err(to_text)?;
+        let mut loan = self.agent.loan(message, letters.size).map_err(chain_text)?;
         if letters.fill == Fill::Filled {
             loan.content_mut().fill(byte);
         }
@@ -216,7 +217,7 @@ impl Running {
     {
         let agent = self.agent.take().ok_or("the agent is not available")?;
         let task = self.runtime.spawn(async move { work(agent).await });
-        let (agent, done) = self.runtime.block_on(task).map_err(to_text)?;
+        let (agent, done) = self.runtime.block_on(task).map_err(chain_text)?;
         self.agent = Some(agent);
         Ok(done)
     }
@@ -281,7 +282,9 @@ impl Peer for Forwarding {
 
 pub(super) fn gateway(config: &Config) -> Result<(), String> {
     let runtime = runtime()?;
-    let gateway = runtime.block_on(Gateway::open(config)).map_err(to_text)?;
+    let gateway = runtime
+        .block_on(Gateway::open(config))
+        .map_err(chain_text)?;
     let orders = runtime.block_on(async { orders() });
     let mut forwarding = Forwarding { orders, runtime };
     execute_orders(&mut forwarding, String::new());
@@ -301,7 +304,7 @@ fn orders() -> Lines<BufReader<Stdin>> {
 }
 
 fn delivered(result: Result<Deliveries, SendError>) -> Result<(), String> {
-    let deliveries = result.map_err(to_text)?;
+    let deliveries = result.map_err(chain_text)?;
     if deliveries.all_succeeded() {
         return Ok(());
     }

@@ -18,8 +18,9 @@ use tokio::runtime::{Builder, Runtime};
 
 use super::iceoryx::{make_ready, place};
 use super::orders::{
-    ContentProbe, End, Fill, Letters, Peer, Sent, byte_of, execute_orders, now_ns, to_text,
+    ContentProbe, End, Fill, Letters, Peer, Sent, byte_of, execute_orders, now_ns,
 };
+use crate::error::chain_text;
 
 /// The bytes before and behind the content, as long as in messages of agents.
 const ENVELOPE: &[u8] = &[2; 80];
@@ -35,11 +36,11 @@ pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
         .worker_threads(1)
         .enable_all()
         .build()
-        .map_err(to_text)?;
+        .map_err(chain_text)?;
     let config = place(config, "letters")?;
-    let endpoint = ShmTransport::new(config, runtime.handle().clone()).map_err(to_text)?;
+    let endpoint = ShmTransport::new(config, runtime.handle().clone()).map_err(chain_text)?;
     let heard = Arc::new(ReceivedLetters::default());
-    endpoint.listen(heard.clone()).map_err(to_text)?;
+    endpoint.listen(heard.clone()).map_err(chain_text)?;
     let mut both = Both {
         endpoint,
         heard,
@@ -109,7 +110,7 @@ impl Both {
             None => {
                 let front = NAME.len() + ENVELOPE.len() + HEAD.len();
                 let loan = self.endpoint.loan(to, front, letters.size, TAIL.len());
-                let mut loan = loan.map_err(to_text)?.ok_or("no memory is loaned")?;
+                let mut loan = loan.map_err(chain_text)?.ok_or("no memory is loaned")?;
                 if letters.fill == Fill::Filled {
                     loan.content_mut().fill(byte);
                 }
@@ -119,7 +120,7 @@ impl Both {
         self.next += 1;
         let attempt = AttemptId(self.next);
         let dispatched = self.endpoint.dispatch(attempt, to, parcel(content));
-        dispatched.map_err(to_text)?;
+        dispatched.map_err(chain_text)?;
         Ok((attempt, began))
     }
 
@@ -143,7 +144,7 @@ impl Both {
 
 impl Peer for Both {
     fn find(&mut self, to: &str) -> Result<(), String> {
-        self.to = Some(to.parse().map_err(to_text)?);
+        self.to = Some(to.parse().map_err(chain_text)?);
         Ok(())
     }
 

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use clap::Args;
 use comfy_table::{Table, presets};
-use fipa::{Directory, Entry, Kind, Location, Matcher, Query, Reach, Role, Source, Time};
+use fipa::{DirectoryView, Entry, Kind, Location, Matcher, Query, Reach, Role, Source, Time};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
@@ -192,7 +192,7 @@ struct Row {
 }
 
 impl Row {
-    fn of(entry: &Entry, directory: &dyn Directory) -> Self {
+    fn of(entry: &Entry, directory: DirectoryView<'_>) -> Self {
         let through = match entry.reach {
             Reach::Local => None,
             Reach::Remote { gateway } => Some(match directory.known_incarnation(gateway) {
@@ -264,7 +264,7 @@ fn location_text(location: &Location) -> String {
     }
 }
 
-fn gateway(directory: &dyn Directory) -> Option<Arc<Entry>> {
+fn gateway(directory: DirectoryView<'_>) -> Option<Arc<Entry>> {
     let entries = directory.entries();
     let mut gateways = entries
         .iter()

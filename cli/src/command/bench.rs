@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
+use fipa::ErrorChain;
 use fipa_bench::{
     Baseline, BenchError, Comparison, Effort, Machine, Measurement, Paper, Program, Selection,
 };
@@ -239,11 +240,7 @@ fn failed(error: BenchError) -> Failure {
         BenchError::Write { .. } => "check that this user can write there",
         _ => "report it as a bug of fipa, with this text",
     };
-    let text = match std::error::Error::source(&error) {
-        Some(source) => format!("{error}: {source}"),
-        None => error.to_string(),
-    };
-    Failure::failed(text, place, advice)
+    Failure::failed(ErrorChain(&error).to_string(), place, advice)
 }
 
 fn size(text: &str) -> Result<ByteSize, String> {
@@ -268,7 +265,7 @@ fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
     })
 }
 
-/// This command, which plays the parts of a measurement too.
+/// Returns this program, which also runs as the processes of a measurement.
 fn this_program() -> Result<Program, Failure> {
     let path = std::env::current_exe().map_err(|error| {
         let advice = "check that /proc is mounted and the command was not removed";

@@ -1,7 +1,7 @@
 //! `fipa coalition`: one shared name for several agents.
 
 use clap::Args;
-use fipa::{AgentId, CoalitionError, Domain, RegisterOptions};
+use fipa::{AgentId, CoalitionError, Domain, ErrorChain, RegisterOptions};
 use fipa_acl::escape;
 
 use crate::membership::{self, Stop};
@@ -54,7 +54,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 membership::not_registered(error, arguments.name.name(), &config)
             }
             other => Failure::wrong_usage(
-                other.to_string(),
+                ErrorChain(&other).to_string(),
                 "the command line",
                 "change the members or the leader",
             ),

@@ -2,7 +2,8 @@
 
 use clap::Args;
 use fipa::{
-    Agent, AgentId, Config, Incoming, Message, Performative, ReceiveError, RegisterOptions,
+    Agent, AgentId, Config, ErrorChain, Incoming, Message, Performative, ReceiveError,
+    RegisterOptions,
 };
 use fipa_acl::escape;
 
@@ -85,11 +86,11 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
             }
             Err(error @ ReceiveError::Malformed { .. }) => {
                 received += 1;
-                report::warn(&error.to_string());
+                report::warn(&ErrorChain(&error).to_string());
             }
             Err(error) => {
                 return Err(Failure::failed(
-                    error.to_string(),
+                    ErrorChain(&error).to_string(),
                     format!("agent {:?}", agent.name()),
                     "restart the agent",
                 ));
@@ -139,6 +140,6 @@ async fn answer(agent: &Agent, incoming: &Incoming) {
     match agent.send(reply).await {
         Ok(deliveries) if deliveries.all_succeeded() => {}
         Ok(deliveries) => report::warn(&format!("the answer was not delivered: {deliveries}")),
-        Err(error) => report::warn(&format!("cannot answer: {error}")),
+        Err(error) => report::warn(&format!("cannot answer: {}", ErrorChain(&error))),
     }
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
 use comfy_table::{Table, presets};
+use fipa::ErrorChain;
 use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID};
 use fipa_acl::escape;
 use serde_json::{Value, json};
@@ -150,7 +151,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 | KeysError::PrivateKey
                 | KeysError::Own
                 | KeysError::Certificate(_) => Failure::failed(
-                    error.to_string(),
+                    ErrorChain(&error).to_string(),
                     file.display().to_string(),
                     "give the file own.pem of the other host",
                 ),
@@ -199,7 +200,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     }
 }
 
-/// The directory of the keys without `--dir` and `security.keys`.
+/// Returns the directory of the keys if neither `--dir` nor `security.keys` names one.
 fn default_directory() -> Result<PathBuf, Failure> {
     let home = std::env::var_os("HOME").filter(|home| !home.is_empty());
     let home = home.ok_or_else(|| {
@@ -232,7 +233,11 @@ fn failed(error: &KeysError, keys: &Keys) -> Failure {
         }
         _ => "check whether this user can read and write in this directory",
     };
-    Failure::failed(error.to_string(), keys.dir().display().to_string(), help)
+    Failure::failed(
+        ErrorChain(error).to_string(),
+        keys.dir().display().to_string(),
+        help,
+    )
 }
 
 /// Whether `fipa keys renew` creates this file.

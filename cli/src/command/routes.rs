@@ -5,7 +5,7 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::{Table, presets};
 use fipa::routes::{self, AskError, Report, Route, RouteState, Standing};
-use fipa::{Domain, Incarnation, Matcher, Query, Reach, RegisterOptions, Role};
+use fipa::{Domain, ErrorChain, Incarnation, Matcher, Query, Reach, RegisterOptions, Role};
 use fipa_acl::escape;
 use serde_json::json;
 
@@ -116,9 +116,9 @@ async fn gateway_report(
         return Ok(None);
     };
     let name = format!("fipa-routes-{}", Incarnation::random());
-    let failed = |error: &dyn std::fmt::Display| {
+    let failed = |error: &(dyn std::error::Error + 'static)| {
         Failure::failed(
-            error.to_string(),
+            ErrorChain(error).to_string(),
             format!("gateway {:?}", gateway.name),
             "check the log of the gateway; if it hangs, restart it (`fipa up`)",
         )

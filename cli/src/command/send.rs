@@ -7,8 +7,8 @@ use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use fipa::{
-    Agent, AgentId, Config, Deliveries, DeliveryFailure, Incarnation, Incoming, Message,
-    Performative, ReceiveError, RegisterOptions, Time,
+    Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
+    Message, Performative, ReceiveError, RegisterOptions, Time,
 };
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
@@ -165,7 +165,7 @@ async fn converse(
     let sent = agent.send_within(message.clone(), deadline).await;
     let deliveries = sent.map_err(|error| {
         Failure::failed(
-            format!("cannot send the message: {error}"),
+            format!("cannot send the message: {}", ErrorChain(&error)),
             "this process",
             "`fipa send --help` describes the parameters of a message",
         )
@@ -312,10 +312,12 @@ async fn wait(
                     }
                 }
                 Ok(other) => report::warn(&format!("ignored, not a reply: {}", other.message)),
-                Err(error @ ReceiveError::Malformed { .. }) => report::warn(&error.to_string()),
+                Err(error @ ReceiveError::Malformed { .. }) => {
+                    report::warn(&ErrorChain(&error).to_string())
+                }
                 Err(error) => {
                     return Err(Failure::failed(
-                        format!("cannot wait for a reply: {error}"),
+                        format!("cannot wait for a reply: {}", ErrorChain(&error)),
                         format!("agent {:?}", agent.name()),
                         "send the message again",
                     ));

@@ -7,11 +7,12 @@ use std::ffi::OsStr;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::PathBuf;
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::Duration;
 
+use fipa_testbed::ChildGuard;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -164,7 +165,7 @@ impl Ran {
 
 /// A running command. It is killed when the value is dropped.
 pub(crate) struct Running {
-    child: Child,
+    child: ChildGuard,
     lines: Receiver<String>,
     errors: Receiver<String>,
     /// The lines received from `errors` so far.
@@ -177,13 +178,9 @@ impl Running {
     /// Starts a command and waits for the first line of its output.
     #[track_caller]
     pub(crate) fn new(mut command: Command) -> Self {
-        let mut child = command
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let printed = lines(child.stdout.take().unwrap());
-        let errors = lines(child.stderr.take().unwrap());
+        let mut child = ChildGuard::start(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
+        let printed = lines(child.child().stdout.take().unwrap());
+        let errors = lines(child.child().stderr.take().unwrap());
         let mut running = Self {
             child,
             lines: printed,
@@ -201,7 +198,7 @@ impl Running {
         match self.lines.recv_timeout(WATCHDOG) {
             Ok(line) => line,
             Err(error) => {
-                let _ = self.child.kill();
+                self.child.kill();
                 panic!("no output ({error}): {:?}", self.end());
             }
         }
@@ -253,9 +250,7 @@ impl Running {
     /// Sends a signal.
     #[track_caller]
     pub(crate) fn send_signal(&self, signal: &str) {
-        let pid = self.child.id().to_string();
-        let sent = Command::new("kill").args([signal, &pid]).status().unwrap();
-        assert!(sent.success());
+        self.child.signal(signal);
     }
 
     /// Whether the command ends within 100 ms.
@@ -270,8 +265,8 @@ impl Running {
     /// Waits for the end, and returns the exit code and all of standard error.
     #[track_caller]
     pub(crate) fn end(&mut self) -> (Option<i32>, String) {
-        let watchdog = Watchdog::new(&self.child);
-        let status = self.child.wait().unwrap();
+        let watchdog = Watchdog::new(self.child.id());
+        let status = self.child.wait();
         drop(watchdog);
         for line in self.errors.iter() {
             self.log.push_str(&format!("{line}\n"));
@@ -280,18 +275,11 @@ impl Running {
     }
 }
 
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
 /// Runs a command to its end. Writes `input` to its standard input if that is piped.
 fn output_of(command: &mut Command, input: Vec<u8>) -> Ran {
     let piped = command.stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = piped.spawn().unwrap();
-    let watchdog = Watchdog::new(&child);
+    let watchdog = Watchdog::new(child.id());
     let stdin = child.stdin.take();
     let writer = thread::spawn(move || stdin.map(|mut stdin| stdin.write_all(&input)));
     let output = child.wait_with_output().unwrap();
@@ -307,8 +295,8 @@ struct Watchdog {
 }
 
 impl Watchdog {
-    fn new(child: &Child) -> Self {
-        let pid = child.id().to_string();
+    fn new(child: u32) -> Self {
+        let pid = child.to_string();
         let (cancel, canceled) = channel();
         thread::spawn(move || {
             if canceled.recv_timeout(WATCHDOG) == Err(RecvTimeoutError::Timeout) {

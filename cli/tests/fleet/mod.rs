@@ -15,7 +15,7 @@ use fipa::config::Sources;
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
 };
-use fipa_testbed::{Host, Network, Running};
+use fipa_testbed::{ChildGuard, Host, Network};
 use parking_lot::Mutex;
 use tokio::runtime::Runtime;
 
@@ -87,7 +87,7 @@ pub(crate) struct Fleet {
 /// A gateway and an agent on one host.
 struct Party {
     settings: Vec<String>,
-    gateway: Mutex<Option<Running>>,
+    gateway: Mutex<Option<ChildGuard>>,
     runtime: Runtime,
     agent: Arc<Agent>,
 }
@@ -435,8 +435,8 @@ impl Party {
     }
 }
 
-fn start_gateway(host: &Host, settings: &[String]) -> Running {
-    let (gateway, ready) = Running::until_ready(&mut hosts::gateway(host, settings));
+fn start_gateway(host: &Host, settings: &[String]) -> ChildGuard {
+    let (gateway, ready) = ChildGuard::until_ready(&mut hosts::gateway(host, settings));
     assert!(ready.starts_with('{'), "the gateway is not ready: {ready}");
     gateway
 }

@@ -11,7 +11,7 @@ use std::fs;
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
@@ -20,6 +20,7 @@ use std::time::{Duration, Instant};
 use fipa::config::Sources;
 use fipa::keys::{Keys, VALID};
 use fipa::{Agent, AgentId, Config, Domain, Incarnation, Outcome, Performative, ReceiveError};
+use fipa_testbed::{ChildGuard, until};
 use parking_lot::Mutex;
 use serde_json::Value;
 use tokio::runtime::Runtime;
@@ -32,15 +33,6 @@ const LINES: usize = 200;
 
 /// Prefix of the content of the honest pair's letters.
 const HONEST: &str = "honest ";
-
-/// Waits for a condition.
-pub(crate) fn until(what: &str, condition: impl Fn() -> bool) {
-    let begun = Instant::now();
-    while !condition() {
-        assert!(begun.elapsed() < WATCHDOG, "timed out waiting until {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
 
 /// Returns the number in this environment variable.
 pub(crate) fn number(variable: &str) -> Option<u64> {
@@ -101,7 +93,7 @@ pub(crate) fn usage(process: u32) -> Usage {
 
 /// A gateway process. Dropping it kills the process.
 pub(crate) struct Gateway {
-    child: Child,
+    child: ChildGuard,
     pub(crate) settings: Vec<String>,
     locations: Vec<String>,
     told: Arc<Mutex<Vec<String>>>,
@@ -116,9 +108,9 @@ impl Gateway {
         }
         command.stdin(Stdio::null());
         command.stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut child = command.spawn().unwrap();
+        let mut child = ChildGuard::start(&mut command);
         let told: Arc<Mutex<Vec<String>>> = Arc::default();
-        let (keep, errors) = (Arc::clone(&told), child.stderr.take().unwrap());
+        let (keep, errors) = (Arc::clone(&told), child.child().stderr.take().unwrap());
         std::thread::spawn(move || {
             for line in BufReader::new(errors).lines().map_while(Result::ok) {
                 let mut kept = keep.lock();
@@ -130,7 +122,7 @@ impl Gateway {
             }
         });
         let mut ready = String::new();
-        BufReader::new(child.stdout.take().unwrap())
+        BufReader::new(child.child().stdout.take().unwrap())
             .read_line(&mut ready)
             .unwrap();
         let ready: Value = serde_json::from_str(&ready).unwrap_or_else(|error| {
@@ -172,34 +164,25 @@ impl Gateway {
     pub(crate) fn end(mut self) {
         let told = self.told.lock().join("\n");
         assert!(!told.contains("panicked"), "{told}");
-        let ended = self.child.try_wait().unwrap();
+        let ended = self.child.ended();
         assert!(
             ended.is_none(),
             "the gateway has already ended ({ended:?}): {told}"
         );
-        let pid = self.child.id().to_string();
-        let sent = Command::new("kill").args(["-TERM", &pid]).status().unwrap();
-        assert!(sent.success());
+        let pid = self.child.id();
+        self.child.signal("-TERM");
         until("the gateway ends", || {
             fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| {
                 stat.rsplit_once(") ")
                     .is_none_or(|(_, state)| state.starts_with('Z'))
             })
         });
-        let status = self.child.wait().unwrap();
+        let status = self.child.wait();
         assert!(
             status.success(),
             "{status}: {}",
             self.told.lock().join("\n")
         );
-    }
-}
-
-impl Drop for Gateway {
-    fn drop(&mut self) {
-        // An error means that the process has already ended.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 

@@ -2,13 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead as _, BufReader, Write as _};
-use std::process::{ChildStdin, Command, Stdio};
+use std::process::{ChildStdin, Stdio};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use fipa_testbed::{Network, Running};
+use fipa_testbed::{ChildGuard, Network};
 use parking_lot::Mutex;
 
 use super::actor::{PART, Part};
@@ -77,8 +77,8 @@ enum State<T> {
 
 struct Host {
     settings: Vec<String>,
-    gateway: State<Running>,
-    starting: Option<JoinHandle<Running>>,
+    gateway: State<ChildGuard>,
+    starting: Option<JoinHandle<ChildGuard>>,
     address: usize,
     /// Whether its network has a fault.
     disturbed: bool,
@@ -93,7 +93,7 @@ struct Seat {
 }
 
 struct Process {
-    running: Running,
+    running: ChildGuard,
     input: ChildStdin,
     said: Arc<Mutex<Vec<String>>>,
     life: usize,
@@ -128,14 +128,8 @@ impl Process {
     }
 
     fn signal(&mut self, signal: &str) {
-        send_signal(&mut self.running, signal);
+        self.running.signal(signal);
     }
-}
-
-fn send_signal(running: &mut Running, signal: &str) {
-    let pid = running.child().id().to_string();
-    let sent = Command::new("kill").args([signal, &pid]).status();
-    assert!(sent.unwrap().success(), "kill {signal} {pid}");
 }
 
 /// The end of a fault.
@@ -515,8 +509,8 @@ impl Stage {
         let at = self.any_host();
         let state = std::mem::replace(&mut self.hosts[at].gateway, State::Down);
         self.hosts[at].gateway = match state {
-            State::Runs(mut gateway) => {
-                send_signal(&mut gateway, "-STOP");
+            State::Runs(gateway) => {
+                gateway.signal("-STOP");
                 self.count("gateways stopped");
                 self.later(30..2000, Repair::ContinueGateway(at));
                 State::Stopped(gateway)
@@ -611,8 +605,8 @@ impl Stage {
             Repair::ContinueGateway(at) => {
                 let state = std::mem::replace(&mut self.hosts[at].gateway, State::Down);
                 self.hosts[at].gateway = match state {
-                    State::Stopped(mut gateway) => {
-                        send_signal(&mut gateway, "-CONT");
+                    State::Stopped(gateway) => {
+                        gateway.signal("-CONT");
                         State::Runs(gateway)
                     }
                     other => other,
@@ -642,7 +636,7 @@ impl Stage {
         let mut command = gateway(self.network.host(at), &self.hosts[at].settings);
         // A stopped process may delay the gateway, so a thread waits for it.
         self.hosts[at].starting = Some(std::thread::spawn(move || {
-            let (gateway, ready) = Running::until_ready(&mut command);
+            let (gateway, ready) = ChildGuard::until_ready(&mut command);
             assert!(ready.starts_with('{'), "the gateway is not ready: {ready}");
             gateway
         }));
@@ -672,7 +666,7 @@ impl Stage {
             .env(PART, part.to_text())
             .stdin(Stdio::piped())
             .stdout(Stdio::piped());
-        let mut running = Running::start(&mut command);
+        let mut running = ChildGuard::start(&mut command);
         let input = running.child().stdin.take().unwrap();
         let said = Arc::<Mutex<Vec<String>>>::default();
         let (output, heard) = (running.child().stdout.take().unwrap(), said.clone());

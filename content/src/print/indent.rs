@@ -74,7 +74,7 @@ fn columns(depth: usize) -> usize {
     (depth * STEP).min(MAX_INDENT)
 }
 
-/// Returns the tokens, with the end of the list of each opening parenthesis.
+/// Returns the tokens. An opening parenthesis has the offset at which its list ends.
 fn spans(line: &[u8]) -> Vec<Span> {
     // Only the extent of byte strings matters, which the standard's rules give in every dialect.
     let mut lexer = Lexer::new(line, Dialect::Standard);

@@ -82,7 +82,7 @@ pub(super) fn is_answered(machine: &Machine, step: &Transition, act: &str) -> bo
         && others.any(|role| matches(step.from(), role))
 }
 
-/// Returns the transitions of a state and those behind optional ones.
+/// Returns the transitions of a state, and those of the states that its optional transitions lead to.
 pub(crate) fn options<'m>(machine: &'m Machine, id: &str) -> Vec<&'m Transition> {
     let mut all = Vec::new();
     for transition in state(machine, id).transitions() {

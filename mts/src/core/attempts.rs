@@ -511,7 +511,7 @@ impl AttemptTable {
         (health.retry_at > now).then_some((health.failures, health.retry_at))
     }
 
-    /// A note was answered, or is not repeated any more. A report that was refused may not be believed
+    /// A note was answered, or is no longer repeated. A report that was refused may not be believed
     /// when it is repeated.
     pub(crate) fn note_ended(&mut self, note: &Note) {
         if note.is_report() {

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::Dialect;
+use fipa_acl::{Dialect, ErrorChain};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
 use fipa_transport::{FailureReason, Incarnation, LegacySource, Location, Signature, Stream};
 
@@ -100,7 +100,7 @@ impl Core {
                 let letter = match report.written_for(name, Dialect::Standard, now.utc) {
                     Ok(letter) => letter,
                     Err(error) => {
-                        tracing::warn!(%error, %receiver, "cannot encode a failure message");
+                        tracing::warn!(error = %ErrorChain(&*error), %receiver, "cannot encode a failure message");
                         continue;
                     }
                 };
@@ -136,7 +136,7 @@ impl Core {
             let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
                 Ok(letter) => letter,
                 Err(error) => {
-                    tracing::warn!(%error, receiver = %report.receiver, "cannot encode a failure message");
+                    tracing::warn!(error = %ErrorChain(&*error), receiver = %report.receiver, "cannot encode a failure message");
                     continue;
                 }
             };

@@ -218,9 +218,9 @@ impl Core {
         taken
     }
 
-    /// The time until which a letter waits so that the receiver's legacy peer, which was found by
-    /// mDNS, can find the sender. `None` if it need not wait. At least part of the letter's
-    /// remaining time is left.
+    /// Returns the time until which a letter waits so that the receiver's legacy peer, which was
+    /// found by mDNS, can find the sender. `None` if it need not wait. The wait uses at most part of
+    /// the time that the letter has left.
     fn found_by_peer(
         &self,
         now: Now,
@@ -262,7 +262,7 @@ impl Core {
         let unknown = |why: &str| Answer::failed(FailureReason::NoSuchAgent, why);
         let refused = |why: String| Answer::failed(FailureReason::Refused, why);
         if !config.forwards {
-            return Err(unknown("the agent is not in this process any more"));
+            return Err(unknown("the agent is no longer in this process"));
         }
         let registration = parcel.stream.receiver;
         let Some(entry) = self.table.receiver(registration, &parcel.receiver) else {

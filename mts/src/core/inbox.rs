@@ -239,7 +239,7 @@ impl Inbox {
         Ok(())
     }
 
-    /// Drops senders that cannot have a letter in transit any more.
+    /// Drops senders that can no longer have a letter in transit.
     fn forget_old(&mut self, now: Instant) {
         // Twice, because a letter's remaining time does not include its time in transit.
         work::steps(self.senders.len());

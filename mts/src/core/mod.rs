@@ -40,6 +40,7 @@ pub mod work;
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -124,13 +125,23 @@ pub struct Core {
     contact_limit: SenderLimit,
     /// Whether letters of others are no longer accepted.
     ending: bool,
-    /// Whether the service has ended, so that nothing is sent any more.
+    /// Whether the service has ended, and so sends nothing.
     closed: bool,
     next_lane: u64,
     next_send: u64,
     /// Next sequence number of the letters that this service sends in its own name.
     next_sequence: u64,
     next_forget: Option<Instant>,
+}
+
+impl fmt::Debug for Core {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Core")
+            .field("lanes", &self.lanes.len())
+            .field("agents", &self.agents.len())
+            .field("closed", &self.closed)
+            .finish_non_exhaustive()
+    }
 }
 
 /// A scheduled action for a note.

@@ -11,8 +11,8 @@
 //!   received, and returns a letter when the predecessor does not arrive.
 //! * The **receiver's process** takes letters.
 //!
-//! Consequences: letters are taken in order, and at most once by each registration, whatever routes
-//! and custodians do ([`offer`]); no open letter is passed over ([`predecessor`]); a stream never
+//! Consequences: letters are taken in order, and at most once by each registration, on all routes and
+//! from all custodians ([`offer`]); no open letter is passed over ([`predecessor`]); a stream never
 //! waits for a letter that has an outcome ([`hold`]).
 
 use std::time::Duration;

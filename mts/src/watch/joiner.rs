@@ -71,7 +71,7 @@ pub struct Passage {
 }
 
 impl Passage {
-    /// Name of the sender in the message or, without one, in the envelope.
+    /// Name of the sender in the message. If the message has none, its name in the envelope.
     #[must_use]
     pub fn sender(&self) -> Option<&str> {
         let said = self.message.as_ref().and_then(Message::sender);

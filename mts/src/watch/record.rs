@@ -6,7 +6,7 @@
 //! The header has a magic number, the version and the lengths of the parts, all integers
 //! little-endian. `name` is that of the receiver (in a greeting: of the reporting message transport
 //! service); `envelope` is as in the letter; `message` is the bit-efficient encoding (FIPA00069) of
-//! the message without its content, in whatever encoding it was sent; `content` is its beginning,
+//! the message without its content, in the encoding in which it was sent; `content` is its beginning,
 //! if the watcher has requested that; `outcome` is encoded by [`wire::write_outcome`]. Absent parts
 //! have length 0.
 //!

@@ -152,8 +152,8 @@ fn lanes_are_full() {
     }
 }
 
-/// Notes of a lower predecessor save time; the protocol holds without them. It also holds whatever
-/// the order in which letters are dispatched.
+/// The properties of the protocol need no notes of a lower predecessor, which only save time. They
+/// hold for each order in which letters are dispatched.
 #[test]
 fn notes_and_the_order_of_dispatch_only_save_time() {
     let direct = protocol(Topology::Direct, 2, 1);

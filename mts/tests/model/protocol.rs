@@ -54,7 +54,7 @@ pub(crate) enum Mutant {
     MoveUncertain,
     /// Rule 16: letters for the new registration do not wait for those for the old one.
     NoWaitForOld,
-    /// Rule 17: reports are believed whatever transfer they name.
+    /// Rule 17: reports are believed even if they name another transfer.
     BelieveAny,
     /// Rule 18: the loss of a custodian leaves its letters certain.
     CertainLoss,
@@ -137,7 +137,7 @@ pub(crate) enum Action {
     TimeOut { at: Service, key: Key },
     /// The transport certifies that the frame of the attempt has not left.
     NotSent(Message),
-    /// The attempt times out; nothing of it is in transit any more.
+    /// The attempt times out; nothing of it is left in transit.
     GiveUp { at: Service, key: Key },
     /// The service notices that the custodian it handed the letter to has died.
     NoticeDeath { at: Service, key: Key },

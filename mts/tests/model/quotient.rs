@@ -36,8 +36,8 @@ impl Protocol {
     }
 
     /// Removes details without any further effect: answers to attempts that were concluded,
-    /// reports of letters that have an outcome, and entries for services that can report nothing
-    /// any more.
+    /// reports of letters that have an outcome, and entries for services that can no longer
+    /// report.
     pub(crate) fn forget(state: &mut State) {
         let mut network = std::mem::take(&mut state.network);
         network.retain(|message| {
@@ -116,7 +116,7 @@ impl Protocol {
         Self::each_transfer(state, &mut |by, sequence, transfer| {
             used[by.index()][usize::from(sequence)] |= 1 << *transfer;
         });
-        // Without gaps, the used bits with bit 0 are one less than a power of two.
+        // Numbers without gaps: bit 0 and the used bits form a block of ones at the low end.
         let mut all = used.iter().flatten();
         if all.all(|used| (used | 1) & ((used | 1) + 1) == 0) {
             return;

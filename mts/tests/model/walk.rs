@@ -10,7 +10,7 @@ const FAULT_IN: usize = 6;
 /// Longest walk. A fair run without faults ends after a few hundred steps.
 const MAX_STEPS: usize = 20_000;
 
-/// Walks until every letter has an outcome and nothing is in transit any more: a letter that has
+/// Walks until every letter has an outcome and nothing is left in transit: a letter that has
 /// failed must not be taken afterwards. Returns the number of steps.
 ///
 /// # Errors

@@ -24,7 +24,7 @@ use std::ops::Bound;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::escape;
+use fipa_acl::{ErrorChain, escape};
 use fipa_transport::{Incarnation, Location, Mandate};
 
 pub use directory::ExchangeDirectory;
@@ -736,7 +736,7 @@ impl Neighbor {
             role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {
-            tracing::debug!(gateway = %self.mts.name, %error, "agent ignored");
+            tracing::debug!(gateway = %self.mts.name, error = %ErrorChain(&error), "agent ignored");
             return None;
         }
         entry.incarnation.is_known().then(|| Arc::new(entry))
@@ -754,7 +754,7 @@ pub enum ExchangeError {
     #[error("the letter has {0} bytes; at most {max} are allowed", max = Exchange::MAX_CONTENT)]
     TooLarge(usize),
     /// The content is not a valid letter of the exchange.
-    #[error("the letter is not a valid exchange letter: {}", escape(&.0.to_string()))]
+    #[error("the letter is not a valid exchange letter")]
     Malformed(#[from] serde_json::Error),
     /// The number of agents exceeds a limit.
     #[error(

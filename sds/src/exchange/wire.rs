@@ -41,7 +41,7 @@ pub(super) enum ExchangeMessage {
     Changes(Changes),
 }
 
-/// A part of all entries of this version.
+/// Some of the entries of this version. The letters from `first` to `last` contain all.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Full {
     pub(super) version: u64,

@@ -65,7 +65,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
 /// Error of [`read`].
 #[derive(Debug, thiserror::Error)]
 pub(super) enum FileError {
-    #[error("malformed: {0}")]
+    #[error("malformed")]
     Json(#[source] serde_json::Error),
     #[error("the format is {0:?}, expected {FORMAT:?}")]
     Format(String),
@@ -75,8 +75,8 @@ pub(super) enum FileError {
     TooMany(usize),
     #[error("the name {0:?} occurs twice")]
     Twice(Arc<str>),
-    #[error("entry {name:?}: {error}")]
-    Entry { name: Arc<str>, error: EntryError },
+    #[error("entry {name:?} is not valid")]
+    Entry { name: Arc<str>, source: EntryError },
     #[error("entry {0:?} has no incarnation")]
     NoIncarnation(Arc<str>),
 }
@@ -151,9 +151,9 @@ impl WrittenEntry {
         };
         match entry.check() {
             Ok(()) => Ok(entry),
-            Err(error) => {
+            Err(source) => {
                 let name = entry.name;
-                Err(FileError::Entry { name, error })
+                Err(FileError::Entry { name, source })
             }
         }
     }

@@ -12,7 +12,7 @@ use crate::{Entry, Mts, Reach, Source};
 /// # Panics
 /// Panics when an accepted file exceeds a limit.
 pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
-    let entries = file::read(bytes).map_err(|error| error.to_string())?;
+    let entries = file::read(bytes).map_err(|error| fipa_acl::ErrorChain(&error).to_string())?;
     assert!(entries.len() <= file::MAX_ENTRIES);
     for (name, entry) in &entries {
         assert_eq!(*name, entry.name);

@@ -570,7 +570,7 @@ fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
             return Err(io("create")(error));
         }
-        // An existing path, of whatever type, is checked below.
+        // An existing path, which may be of any type, is checked below.
         _ => {}
     }
     let refused = |why: String| HostError::NotPrivate {

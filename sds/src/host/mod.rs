@@ -25,6 +25,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa_acl::ErrorChain;
 use fipa_transport::{Forked, Incarnation, OwnerProcess};
 use parking_lot::Mutex;
 use tokio::sync::watch;
@@ -108,9 +109,9 @@ impl HostDirectory {
                 gateway: self.config.mts.incarnation,
             };
             let checked = entry.check();
-            checked.map_err(|error| HostError::Entry {
+            checked.map_err(|source| HostError::Entry {
                 name: entry.name.clone(),
-                error,
+                source,
             })?;
             published.insert(entry.name.clone(), Arc::new(entry));
         }
@@ -244,7 +245,7 @@ impl Drop for HostDirectory {
             return;
         }
         if let Err(error) = self.close() {
-            tracing::error!(%error, "cannot remove this process's files from the host's directory");
+            tracing::error!(error = %ErrorChain(&error), "cannot remove this process's files from the host's directory");
         }
     }
 }
@@ -254,7 +255,7 @@ impl Directory for HostDirectory {
 
     fn refresh(&self) {
         if let Err(error) = self.shared.refresh() {
-            tracing::error!(%error, "the view of the host's directory may be out of date");
+            tracing::error!(error = %ErrorChain(&error), "the view of the host's directory may be out of date");
         }
     }
 
@@ -320,7 +321,7 @@ pub enum HostError {
         path: PathBuf,
     },
     /// A system call failed.
-    #[error("cannot {what} {}: {source}", path.display())]
+    #[error("cannot {what} {}", path.display())]
     Io {
         /// The operation, as a verb.
         what: &'static str,
@@ -330,7 +331,7 @@ pub enum HostError {
         source: io::Error,
     },
     /// The events of the directory cannot be read.
-    #[error("cannot read inotify events of {}: {source}", path.display())]
+    #[error("cannot read inotify events of {}", path.display())]
     Watch {
         /// The directory.
         path: PathBuf,
@@ -338,12 +339,12 @@ pub enum HostError {
         source: io::Error,
     },
     /// An entry to be published is not valid.
-    #[error("cannot publish {name:?}: {error}")]
+    #[error("cannot publish {name:?}")]
     Entry {
         /// Its name.
         name: Arc<str>,
         /// The violated limit.
-        error: EntryError,
+        source: EntryError,
     },
     /// The entries to publish exceed a limit.
     #[error("the directory is full: {0}")]

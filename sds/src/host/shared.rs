@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
+use fipa_acl::ErrorChain;
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -249,7 +250,7 @@ impl Shared {
         let entries = self.read_file(id).unwrap_or_else(|error| {
             // Treated as empty; the process's next file may be valid.
             let path = self.host_dir().path().join(Name::Entries(id).to_string());
-            tracing::error!(path = %path.display(), %error, "entries file ignored");
+            tracing::error!(path = %path.display(), error = %ErrorChain(&error), "entries file ignored");
             Entries::new()
         });
         let process = others.processes.entry(id).or_default();

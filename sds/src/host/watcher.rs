@@ -14,6 +14,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
+use fipa_acl::ErrorChain;
 use futures_core::Stream as _;
 use inotify::{EventMask, EventStream, Inotify, WatchMask};
 use tokio::time::Instant;
@@ -39,7 +40,7 @@ impl Watcher {
             Ok(events) => Events::Inotify(events),
             Err(error) => {
                 tracing::warn!(
-                    %error,
+                    error = %ErrorChain(&error),
                     "no inotify watch for {}: polling it every {} ms; raise \
                      fs.inotify.max_user_instances (sysctl)",
                     host_dir.path().display(),
@@ -88,7 +89,7 @@ impl Watcher {
                     // A rejoin ends this watcher.
                     shared.report_disturbed();
                 } else {
-                    tracing::error!(%error, "the view of the host's directory may be out of date");
+                    tracing::error!(error = %ErrorChain(&error), "the view of the host's directory may be out of date");
                 }
                 // The error may persist (for example `EMFILE`); the pause prevents a busy loop.
                 tokio::time::sleep(Duration::from_millis(100)).await;

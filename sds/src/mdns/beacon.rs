@@ -98,7 +98,7 @@ pub(super) enum Repair {
     Missing,
     /// For all stored records of this gateway, because some may be outdated.
     Surplus(Incarnation),
-    /// For this gateway, which sends no beacons any more.
+    /// For this gateway, which has stopped sending beacons.
     Silent(Incarnation),
 }
 

@@ -306,7 +306,7 @@ struct Shared {
     config: MdnsConfig,
     /// Entries of other gateways, by the full name of their record with its original spelling.
     table: Table<Arc<str>>,
-    /// The same records, by the gateways that announce them.
+    /// The records in `table`, by the gateway that announces them.
     peer_records: Mutex<PeerRecords>,
     /// Records that are not in the table yet.
     coalition_sync: Mutex<CoalitionSync>,

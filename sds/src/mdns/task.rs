@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use fipa_acl::ErrorChain;
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
@@ -159,7 +160,7 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Optio
         Ok(entry) => Arc::new(entry),
         Err(error) => {
             shared.status.lock().refused += 1;
-            tracing::debug!(record = label, %error, "record not used");
+            tracing::debug!(record = label, error = %ErrorChain(&error), "record not used");
             // An earlier version of the record may have been valid and stored.
             shared.put(fullname, None);
             return None;

@@ -11,26 +11,11 @@ use fipa_sds::{
     Change, DeregisterError, Directory, Entry, Matcher, Members, Query, RegisterError,
     Registration, Role, Source, Watch, resolve,
 };
+use fipa_testbed::until_some_async;
 use fipa_transport::Incarnation;
 
 /// Ends a test that hangs; no condition below takes nearly as long.
 pub const WATCHDOG: Duration = Duration::from_secs(60);
-
-/// Waits until the condition returns a value.
-pub async fn eventually<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
-    let waiting = async {
-        loop {
-            if let Some(found) = condition() {
-                return found;
-            }
-            tokio::time::sleep(Duration::from_millis(2)).await;
-        }
-    };
-    match tokio::time::timeout(WATCHDOG, waiting).await {
-        Ok(found) => found,
-        Err(_) => panic!("never happened: {what}"),
-    }
-}
 
 /// The next change.
 pub async fn next(watch: &mut Watch) -> Change {
@@ -87,7 +72,7 @@ async fn entries_arrive_as_they_were_registered(writer: &dyn Directory, reader: 
     asked.registered = registered.registered;
     assert_eq!(said(&registered), asked);
 
-    let found = eventually("lookup", || reader.lookup("arm_left")).await;
+    let found = until_some_async("lookup", || reader.lookup("arm_left")).await;
     if found.source == Source::Mdns {
         // Other hosts do not get routes within this one.
         asked.locations.retain(|it| !it.kind().is_host_local());
@@ -107,7 +92,7 @@ async fn entries_arrive_as_they_were_registered(writer: &dyn Directory, reader: 
     );
 
     writer.deregister("arm_left", asked.incarnation).unwrap();
-    eventually("deregistered", || {
+    until_some_async("deregistered", || {
         reader.lookup("arm_left").is_none().then_some(())
     })
     .await;
@@ -132,7 +117,7 @@ async fn names_survive_whatever_they_contain(writer: &dyn Directory, reader: &dy
     for registration in &registrations {
         writer.register(registration.clone()).unwrap();
     }
-    eventually("all names", || {
+    until_some_async("all names", || {
         reader.refresh();
         let entries = reader.entries();
         let names: BTreeSet<_> = entries.iter().map(|entry| entry.name.to_string()).collect();
@@ -145,7 +130,7 @@ async fn names_survive_whatever_they_contain(writer: &dyn Directory, reader: &dy
         let (name, incarnation) = (&registration.name, registration.incarnation);
         writer.deregister(name, incarnation).unwrap();
     }
-    eventually("all entries left", || {
+    until_some_async("all entries left", || {
         reader.entries().is_empty().then_some(())
     })
     .await;
@@ -172,14 +157,14 @@ async fn a_name_has_one_owner(writer: &dyn Directory, reader: &dyn Directory) {
     writer.deregister("camera", first.incarnation).unwrap();
     let second = registration("camera");
     writer.register(second.clone()).unwrap();
-    eventually("the second", || {
+    until_some_async("the second", || {
         reader.refresh();
         let found = reader.lookup("camera")?;
         (found.incarnation == second.incarnation).then_some(())
     })
     .await;
     writer.deregister("camera", second.incarnation).unwrap();
-    eventually("gone", || reader.lookup("camera").is_none().then_some(())).await;
+    until_some_async("gone", || reader.lookup("camera").is_none().then_some(())).await;
 }
 
 async fn changes_are_told_in_order(writer: &dyn Directory, reader: &dyn Directory) {
@@ -223,7 +208,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         writer.register(agent.clone()).unwrap();
     }
     for agent in &agents {
-        eventually(&format!("finding {:?}", agent.name), || {
+        until_some_async(&format!("finding {:?}", agent.name), || {
             reader.lookup(&agent.name)
         })
         .await;
@@ -330,7 +315,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
     for agent in &agents {
         writer.deregister(&agent.name, agent.incarnation).unwrap();
     }
-    eventually("all gone", || reader.entries().is_empty().then_some(())).await;
+    until_some_async("all gone", || reader.entries().is_empty().then_some(())).await;
 }
 
 fn nonsense_is_refused(writer: &dyn Directory) {

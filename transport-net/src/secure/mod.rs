@@ -48,7 +48,7 @@ pub struct Credentials {
 
 /// The reason for which credentials cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot use this private key with this certificate: {0}")]
+#[error("cannot use this private key with this certificate")]
 #[non_exhaustive]
 pub struct CredentialsError(#[from] rustls::Error);
 

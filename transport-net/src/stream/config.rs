@@ -157,9 +157,9 @@ pub struct Limits {
     /// letter that has not arrived within 12 times `stall_timeout` at its present pace ends its
     /// connection. Default 256 MiB.
     pub max_incoming: usize,
-    /// The same for the peers with one certificate, or for one source that has proved nothing: one
-    /// address (with IPv6, one network of 64 bits) or process, and with twice as much all loopback
-    /// addresses together. Default 64 MiB.
+    /// Part of `max_incoming` that one source may use. A source is the peers with one certificate, or
+    /// without proof one process or one address (with IPv6, one network of 64 bits). All loopback
+    /// addresses together are one source with twice this limit. Default 64 MiB.
     pub max_incoming_per_source: usize,
     /// Maximum number of bytes of [the sink's memory](fipa_transport::Sink::memory_for) for
     /// announced content that is arriving, on all connections together. Beyond it, content is read

@@ -5,9 +5,8 @@ use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 
 use fipa_transport::Principal;
-
 #[cfg(feature = "ip")]
-use crate::rate_limit::quota_address;
+use fipa_transport::quota_address;
 
 /// The party to which connection slots and memory of an accepted connection are charged.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -18,6 +18,7 @@ use std::net::IpAddr;
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
+use fipa_transport::quota_address;
 use parking_lot::Mutex;
 use socket2::SockRef;
 use tokio::net::TcpStream;
@@ -25,7 +26,6 @@ use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
 use super::endpoint::TcpEndpoint;
-use crate::rate_limit::quota_address;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
 

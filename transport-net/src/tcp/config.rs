@@ -5,6 +5,7 @@ use crate::stream::config::Limits;
 
 /// Configuration of a [`TcpTransport`](crate::TcpTransport).
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub struct TcpConfig {
     /// Numeric addresses to listen on, for example `127.0.0.1:0`, `[::1]:7788`, `0.0.0.0:7788` or
     /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. `[::]` is IPv6 only: list `0.0.0.0`
@@ -22,4 +23,20 @@ pub struct TcpConfig {
     /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]
     pub security: Option<crate::secure::Security>,
+}
+
+impl TcpConfig {
+    /// Returns the configuration with default limits, for the gateway of a host: no process of this
+    /// host connects over loopback, and peers need not prove their identity.
+    #[must_use]
+    pub fn new(listen: Vec<String>, identity: Identity) -> Self {
+        Self {
+            listen,
+            identity,
+            limits: Limits::default(),
+            processes: false,
+            #[cfg(feature = "secure")]
+            security: None,
+        }
+    }
 }

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Mandate,
-    Parcel, Ticket, TransportError, TransportErrorKind,
+    Parcel, Ticket, TransportError, TransportErrorKind, quota_address,
 };
 
 use super::config::UdpLimits;
@@ -30,7 +30,7 @@ use super::packet::{self, Datagram};
 use crate::Identity;
 use crate::end::ConnectionEnd;
 use crate::log_limit::warn_limited;
-use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer, quota_address};
+use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer};
 use crate::stream::budget::{ByteBudget, Meter};
 use crate::stream::source::{Home, QuotaKey};
 

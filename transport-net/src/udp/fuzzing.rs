@@ -2,6 +2,7 @@
 //! invariants of the datagrams that it sends.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
@@ -28,6 +29,15 @@ pub struct Datagrams {
     numbers: BTreeMap<SocketAddr, u64>,
     /// Addresses that have returned a cookie, or that this side has sent to first.
     proved: BTreeSet<SocketAddr>,
+}
+
+impl fmt::Debug for Datagrams {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Datagrams")
+            .field("dispatched", &self.dispatched)
+            .field("concluded", &self.concluded)
+            .finish_non_exhaustive()
+    }
 }
 
 /// A datagram as a peer writes it.

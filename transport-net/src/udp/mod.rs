@@ -22,6 +22,7 @@ mod recovery;
 mod simulation;
 mod socket;
 
+use std::fmt;
 use std::sync::Arc;
 
 use fipa_transport::{
@@ -85,6 +86,14 @@ impl UdpTransport {
             return Err(TransportError::new(TransportErrorKind::TooLarge, detail));
         }
         Ok(())
+    }
+}
+
+impl fmt::Debug for UdpTransport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("UdpTransport")
+            .field("limits", &self.endpoint.config.limits)
+            .finish_non_exhaustive()
     }
 }
 

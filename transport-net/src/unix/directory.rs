@@ -37,7 +37,7 @@ const LOCKING: Duration = Duration::from_secs(1);
 #[non_exhaustive]
 pub enum UnixError {
     /// An operation of the operating system failed.
-    #[error("cannot {what} {}: {source}", path.display())]
+    #[error("cannot {what} {}", path.display())]
     Io {
         /// The operation, as a verb for the error text.
         what: &'static str,

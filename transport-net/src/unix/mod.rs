@@ -17,6 +17,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use fipa_acl::ErrorChain;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, OwnerProcess, Parcel, Sink, Ticket,
     Transport, TransportError,
@@ -211,7 +212,8 @@ impl Transport for UnixTransport {
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let runtime = &self.endpoint.runtime;
         let open = || {
-            let unavailable = |error: UnixError| ListenError::Unavailable(error.to_string());
+            let unavailable =
+                |error: UnixError| ListenError::Unavailable(ErrorChain(&error).to_string());
             let (listener, bound) = self.bind().map_err(unavailable)?;
             let listener = UnixListener::from_std(listener).map_err(|source| {
                 bound.directory.remove(&self.name(), bound.file);

@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
+use fipa_testbed::until_some;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind,
@@ -99,19 +100,13 @@ pub(crate) fn unix_config(directory: &Path) -> UnixConfig {
 }
 
 pub(crate) fn config(listen: &[&str]) -> TcpConfig {
-    TcpConfig {
-        listen: listen.iter().map(|text| (*text).into()).collect(),
-        processes: true,
-        identity: identity(),
-        limits: Limits {
-            // A test that waits this long has failed.
-            connect_timeout: Duration::from_secs(30),
-            handshake_timeout: Duration::from_secs(30),
-            ..Limits::default()
-        },
-        #[cfg(feature = "secure")]
-        security: None,
-    }
+    let listen = listen.iter().map(|text| (*text).into()).collect();
+    let mut config = TcpConfig::new(listen, identity());
+    config.processes = true;
+    // A test that waits this long has failed.
+    config.limits.connect_timeout = Duration::from_secs(30);
+    config.limits.handshake_timeout = Duration::from_secs(30);
+    config
 }
 
 #[cfg(feature = "quic")]
@@ -308,7 +303,7 @@ impl<T: Transport> Party<T> {
 
     /// Waits for the conclusion of an attempt.
     pub(crate) fn conclusion(&self, attempt: u64) -> Conclusion {
-        until("a conclusion", || {
+        until_some("a conclusion", || {
             let record = self.sink.record.lock();
             record.concluded.get(&AttemptId(attempt))?.first().cloned()
         })
@@ -328,18 +323,6 @@ impl<T: Transport> Party<T> {
 
 pub(crate) fn accepted() -> Conclusion {
     Conclusion::Answered(Answer::Accepted)
-}
-
-pub(crate) fn until<T>(what: &str, condition: impl Fn() -> Option<T>) -> T {
-    let started = Instant::now();
-    loop {
-        if let Some(value) = condition() {
-            return value;
-        }
-        let elapsed = started.elapsed();
-        assert!(elapsed < PATIENCE, "gave up waiting for: {what}");
-        std::thread::sleep(Duration::from_micros(200));
-    }
 }
 
 pub(crate) fn parcel(sequence: u64, content: impl Into<Bytes>) -> Parcel {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use fipa::{Change, Config, Directory, Entry, Time};
+use fipa::{Change, Config, DirectoryView, Entry, Time};
 use serde_json::json;
 
 use super::{Filter, Row};
@@ -80,7 +80,7 @@ impl Shown {
     /// Prints all differences from the shown agents; an agent that was not shown is printed as `new`.
     fn all(
         &mut self,
-        directory: &dyn Directory,
+        directory: DirectoryView<'_>,
         filter: &Filter,
         new: ChangeKind,
         json: bool,
@@ -109,7 +109,7 @@ impl Shown {
     fn change(
         &mut self,
         change: &Change,
-        directory: &dyn Directory,
+        directory: DirectoryView<'_>,
         filter: &Filter,
         json: bool,
     ) -> Result<(), Failure> {
@@ -130,7 +130,7 @@ impl Shown {
         &mut self,
         name: &Arc<str>,
         entry: Option<&Arc<Entry>>,
-        directory: &dyn Directory,
+        directory: DirectoryView<'_>,
         filter: &Filter,
         json: bool,
     ) -> Result<(), Failure> {
@@ -154,7 +154,7 @@ impl Shown {
 fn print(
     change: ChangeKind,
     entry: &Entry,
-    directory: &dyn Directory,
+    directory: DirectoryView<'_>,
     json: bool,
 ) -> Result<(), Failure> {
     let row = Row::of(entry, directory);

@@ -8,7 +8,9 @@ use std::io::Write;
 use std::time::{Duration, Instant};
 
 use fipa::watch::{WatchOptions, Watcher};
-use fipa::{Agent, AgentId, Config, Deliveries, Domain, Gateway, Incoming, Performative, Reach};
+use fipa::{
+    Agent, AgentId, Config, Deliveries, Domain, ErrorChain, Gateway, Incoming, Performative, Reach,
+};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
@@ -110,7 +112,7 @@ pub(super) struct Listed {
 pub(super) async fn gateway(config: &Config) -> Result<(), String> {
     let gateway = Gateway::open(config)
         .await
-        .map_err(|error| error.to_string())?;
+        .map_err(|error| ErrorChain(&error).to_string())?;
     let locations = gateway
         .locations()
         .iter()
@@ -126,7 +128,7 @@ pub(super) async fn gateway(config: &Config) -> Result<(), String> {
 /// Watches the domain until standard input ends, and reports letters that violate their protocols.
 pub(super) async fn watcher(config: &Config) -> Result<(), String> {
     let watcher = Watcher::open(config, WatchOptions::default()).await;
-    let mut watcher = watcher.map_err(|error| error.to_string())?;
+    let mut watcher = watcher.map_err(|error| ErrorChain(&error).to_string())?;
     let mut checker = Checker::new(None).map_err(|_| "cannot read the protocols")?;
     emit(&Event::Ready {
         locations: Vec::new(),
@@ -161,8 +163,10 @@ pub(super) async fn watcher(config: &Config) -> Result<(), String> {
 pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
     let domain = Domain::open(config)
         .await
-        .map_err(|error| error.to_string())?;
-    let agent = domain.register(name).map_err(|error| error.to_string())?;
+        .map_err(|error| ErrorChain(&error).to_string())?;
+    let agent = domain
+        .register(name)
+        .map_err(|error| ErrorChain(&error).to_string())?;
     let entry = domain.directory().lookup(name);
     let locations = entry.map(|entry| entry.locations.iter().map(ToString::to_string).collect());
     emit(&Event::Ready {
@@ -190,7 +194,7 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
                         emit(&Event::Failed { error });
                     }
                 }
-                Err(error) => return Err(error.to_string()),
+                Err(error) => return Err(ErrorChain(&error).to_string()),
             },
         }
     }
@@ -216,7 +220,8 @@ fn emit(event: &Event) {
 }
 
 async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, String> {
-    let order: Order = serde_json::from_str(line).map_err(|error| error.to_string())?;
+    let order: Order =
+        serde_json::from_str(line).map_err(|error| ErrorChain(&error).to_string())?;
     match order {
         Order::Send {
             performative,
@@ -235,12 +240,14 @@ async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, Stri
             if let Some(protocol) = protocol {
                 message = message.protocol(protocol);
             }
-            let message = message.build().map_err(|error| error.to_string())?;
+            let message = message
+                .build()
+                .map_err(|error| ErrorChain(&error).to_string())?;
             outcomes(
                 &agent
                     .send(message)
                     .await
-                    .map_err(|error| error.to_string())?,
+                    .map_err(|error| ErrorChain(&error).to_string())?,
             )
         }
         Order::Converse {
@@ -255,9 +262,11 @@ async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, Stri
                 .receiver(id(&to)?)
                 .protocol("fipa-contract-net")
                 .conversation_id(conversation);
-            let message = message.build().map_err(|error| error.to_string())?;
+            let message = message
+                .build()
+                .map_err(|error| ErrorChain(&error).to_string())?;
             let deliveries = agent.send(message).await;
-            outcomes(&deliveries.map_err(|error| error.to_string())?)
+            outcomes(&deliveries.map_err(|error| ErrorChain(&error).to_string())?)
         }
         Order::SendLarge { to, len } => send_large(agent, &to, len).await,
         Order::Agents => Ok(Event::Agents {
@@ -269,7 +278,7 @@ async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, Stri
 }
 
 fn id(name: &str) -> Result<AgentId, String> {
-    AgentId::new(name).map_err(|error| error.to_string())
+    AgentId::new(name).map_err(|error| ErrorChain(&error).to_string())
 }
 
 fn outcomes(deliveries: &Deliveries) -> Result<Event, String> {
@@ -285,10 +294,10 @@ async fn send_large(agent: &Agent, to: &str, len: usize) -> Result<Event, String
         .receiver(id(to)?)
         .user_defined("checksum", format!("{expected:016x}"))
         .build()
-        .map_err(|error| error.to_string())?;
+        .map_err(|error| ErrorChain(&error).to_string())?;
     let mut loan = agent
         .loan(message, len)
-        .map_err(|error| error.to_string())?;
+        .map_err(|error| ErrorChain(&error).to_string())?;
     for (byte, value) in loan.content_mut().iter_mut().zip(pattern(len)) {
         *byte = value;
     }
@@ -296,7 +305,7 @@ async fn send_large(agent: &Agent, to: &str, len: usize) -> Result<Event, String
         &agent
             .send_loan(loan)
             .await
-            .map_err(|error| error.to_string())?,
+            .map_err(|error| ErrorChain(&error).to_string())?,
     )
 }
 
@@ -333,12 +342,12 @@ async fn measure(agent: &Agent, to: &str, len: usize, rounds: usize) -> Result<E
             .protocol(MEASURING)
             .conversation_id("measure")
             .build()
-            .map_err(|error| error.to_string())?;
+            .map_err(|error| ErrorChain(&error).to_string())?;
         let started = Instant::now();
         let deliveries = agent
             .send(message)
             .await
-            .map_err(|error| error.to_string())?;
+            .map_err(|error| ErrorChain(&error).to_string())?;
         times.push(started.elapsed());
         if !deliveries.all_succeeded() {
             return Err(deliveries.to_string());
@@ -413,8 +422,13 @@ async fn answer(agent: &Agent, incoming: &Incoming) -> Result<(), String> {
         (Performative::Inform, "done"),
     ] {
         let reply = agent.reply(message, performative).content(content);
-        let reply = reply.build().map_err(|error| error.to_string())?;
-        let deliveries = agent.send(reply).await.map_err(|error| error.to_string())?;
+        let reply = reply
+            .build()
+            .map_err(|error| ErrorChain(&error).to_string())?;
+        let deliveries = agent
+            .send(reply)
+            .await
+            .map_err(|error| ErrorChain(&error).to_string())?;
         if !deliveries.all_succeeded() {
             return Err(deliveries.to_string());
         }

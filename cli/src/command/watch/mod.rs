@@ -239,7 +239,7 @@ impl Display<'_> {
     }
 
     fn print(&mut self, text: &str) -> Result<(), Failure> {
-        self.has_reader &= output::text_if_read(text)?;
+        self.has_reader &= output::bytes_if_read(text.as_bytes())?;
         Ok(())
     }
 

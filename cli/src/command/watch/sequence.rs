@@ -55,7 +55,7 @@ pub(super) fn draw(conversation: &Conversation, look: Look) -> String {
             }
         }
     }
-    lines.push(diagram.lifelines());
+    lines.push(diagram.blank().text());
     if conversation.left_out > 0 {
         lines.push(format!("{} more letters", conversation.left_out));
     }
@@ -104,10 +104,7 @@ impl Diagram<'_> {
         line.text()
     }
 
-    fn lifelines(&self) -> String {
-        self.blank().text()
-    }
-
+    /// A line with the lifelines alone.
     fn blank(&self) -> Line {
         let mut line = Line::blank(self.width);
         for column in 0..self.columns {

@@ -3,7 +3,7 @@
 //! and notes about predecessors.
 //!
 //! It also has the previous hop's checks: that service periodically asks a custodian whether it has
-//! the letter. A custodian without the letter has lost it, whatever became of its report.
+//! the letter. A custodian without the letter has lost it, even if its report was lost as well.
 
 use std::time::{Duration, Instant};
 

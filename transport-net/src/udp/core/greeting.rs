@@ -4,7 +4,7 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use fipa_transport::{Hop, Kind, Location, Principal};
+use fipa_transport::{Hop, Kind, Location, Principal, quota_address};
 
 use super::super::connection::{Connection, Path};
 use super::super::packet::{self, NO_COOKIE};
@@ -13,7 +13,6 @@ use crate::address;
 use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
 use crate::log_limit::warn_limited;
-use crate::rate_limit::quota_address;
 
 /// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.

@@ -1,0 +1,183 @@
+//! Each error of the public interface has a message without the messages of its causes, and reports
+//! the causes as sources. [`ErrorChain`] prints all of them once.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::error::Error;
+use std::io;
+use std::sync::Arc;
+
+use fipa::config::ConfigError;
+use fipa::routes::AskError;
+use fipa::{
+    CoalitionError, DeregisterError, DomainDirError, EncodeError, EntryError, ErrorChain,
+    HostError, Kind, ListenError, MembersError, Message, NameError, OpenError, Payload, PostError,
+    ReceiveError, RegisterError, SendError, blocking,
+};
+use fipa_acl::Letter;
+
+const CAUSE: &str = "the disk is on fire";
+
+fn cause() -> io::Error {
+    io::Error::other(CAUSE)
+}
+
+/// Each error with all of its text.
+fn errors() -> Vec<(Box<dyn Error>, String)> {
+    let path = || "/dir".into();
+    let name = NameError::Empty.to_string();
+    let encode = EncodeError::EnvelopeTooLong(70_000);
+    let decode = Message::decode(&Payload::from(bytes::Bytes::from_static(b"?"))).unwrap_err();
+    let malformed = decode.to_string();
+    let directory = || HostError::Io {
+        what: "open",
+        path: path(),
+        source: cause(),
+    };
+    let mut all: Vec<(Box<dyn Error>, String)> = vec![
+        (
+            Box::new(OpenError::Listen {
+                kind: Kind::Tcp,
+                source: ListenError::Bind {
+                    address: "127.0.0.1:7".into(),
+                    source: cause(),
+                },
+            }),
+            format!("cannot open the transport tcp: cannot listen on 127.0.0.1:7: {CAUSE}"),
+        ),
+        (
+            Box::new(OpenError::Config(ConfigError::Read {
+                path: path(),
+                named_by: "named by --config",
+                source: cause(),
+            })),
+            format!("cannot read the configuration /dir (named by --config): {CAUSE}"),
+        ),
+        (
+            Box::new(OpenError::DomainDir(DomainDirError::Io {
+                path: path(),
+                source: cause(),
+            })),
+            format!("cannot use the directory /dir: {CAUSE}"),
+        ),
+        (
+            Box::new(OpenError::Directory(directory())),
+            format!("cannot open /dir: {CAUSE}"),
+        ),
+        (
+            Box::new(OpenError::Directory(HostError::Watch {
+                path: path(),
+                source: cause(),
+            })),
+            format!("cannot read inotify events of /dir: {CAUSE}"),
+        ),
+        (
+            Box::new(OpenError::Name(RegisterError::Failed(
+                Arc::new(directory()),
+            ))),
+            format!(
+                "cannot register the gateway: cannot register in the directory: cannot open /dir: \
+                 {CAUSE}"
+            ),
+        ),
+        (
+            Box::new(OpenError::Watch(cause())),
+            format!("cannot listen to the processes of the domain: {CAUSE}"),
+        ),
+        (
+            Box::new(OpenError::StaticPeers(EntryError::MtsName(
+                NameError::Empty,
+            ))),
+            format!(
+                "cannot use discovery.static: the name of the message transport service is not \
+                 valid: {name}"
+            ),
+        ),
+        (
+            Box::new(HostError::Entry {
+                name: "arm".into(),
+                source: EntryError::Name(NameError::Empty),
+            }),
+            format!("cannot publish \"arm\": {name}"),
+        ),
+        (
+            Box::new(RegisterError::Invalid(EntryError::Name(NameError::Empty))),
+            format!("cannot register: {name}"),
+        ),
+        (
+            Box::new(DeregisterError::Failed(Arc::new(directory()))),
+            format!("cannot deregister from the directory: cannot open /dir: {CAUSE}"),
+        ),
+        (
+            Box::new(CoalitionError::Members(MembersError::Name(
+                NameError::Empty,
+            ))),
+            format!("the name of a member is not valid: {name}"),
+        ),
+        (
+            Box::new(AskError::Send(SendError::Post(PostError::Encode(
+                encode.clone(),
+            )))),
+            format!("cannot send the request to the gateway: cannot encode the letter: {encode}"),
+        ),
+        (
+            Box::new(ReceiveError::Malformed {
+                source: decode,
+                letter: Box::new(Letter::new(bytes::Bytes::new(), bytes::Bytes::new())),
+            }),
+            format!("received a letter with a message that cannot be decoded: {malformed}"),
+        ),
+        (
+            Box::new(blocking::OpenError::Thread(cause())),
+            format!("cannot start the background thread: {CAUSE}"),
+        ),
+    ];
+    #[cfg(feature = "secure")]
+    all.extend([
+        (
+            Box::new(OpenError::Keys(fipa::keys::KeysError::Io {
+                path: path(),
+                source: cause(),
+            })) as Box<dyn Error>,
+            format!("cannot use security.keys: cannot use /dir: {CAUSE}"),
+        ),
+        (
+            Box::new(fipa::keys::KeysError::Make(Box::new(cause()))),
+            format!("cannot make a key: {CAUSE}"),
+        ),
+    ]);
+    #[cfg(feature = "monitor")]
+    all.extend([
+        (
+            Box::new(fipa::ProtocolError::Read {
+                path: path(),
+                source: cause(),
+            }) as Box<dyn Error>,
+            format!("monitor.protocols: cannot read /dir: {CAUSE}"),
+        ),
+        (
+            Box::new(fipa::ProtocolError::Full(fipa::monitor::LibraryFull)),
+            format!(
+                "monitor.protocols: too many protocols: {}",
+                fipa::monitor::LibraryFull
+            ),
+        ),
+    ]);
+    all
+}
+
+#[test]
+fn an_error_and_its_sources_say_each_cause_once() {
+    for (error, text) in errors() {
+        assert_eq!(ErrorChain(&*error).to_string(), text);
+        let mut next: &dyn Error = &*error;
+        while let Some(source) = next.source() {
+            let (message, cause) = (next.to_string(), source.to_string());
+            assert!(
+                !message.contains(&cause),
+                "{message:?} prints its source {cause:?}"
+            );
+            next = source;
+        }
+    }
+}
