@@ -162,7 +162,10 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
     let domain = Domain::open(config)
         .await
         .map_err(|error| error.to_string())?;
-    let agent = domain.register(name).map_err(|error| error.to_string())?;
+    let agent = domain
+        .register(name)
+        .await
+        .map_err(|error| error.to_string())?;
     let entry = domain.directory().lookup(name);
     let locations = entry.map(|entry| entry.locations.iter().map(ToString::to_string).collect());
     emit(&Event::Ready {
