@@ -102,12 +102,12 @@ impl Pair {
         .unwrap();
         let runtime = one_thread();
         let domain = runtime.block_on(Domain::open(&config)).unwrap();
-        let rover = domain.register("rover").unwrap();
+        let rover = runtime.block_on(domain.register("rover")).unwrap();
         let (ready, is_ready) = std::sync::mpsc::channel();
         let arm = std::thread::spawn(move || {
             let runtime = one_thread();
             let domain = runtime.block_on(Domain::open(&config)).unwrap();
-            let arm = domain.register("arm").unwrap();
+            let arm = runtime.block_on(domain.register("arm")).unwrap();
             ready.send(()).unwrap();
             runtime.block_on(answer(&arm));
             drop(arm);

@@ -16,10 +16,10 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let domain = Domain::open(&Config::load(&Sources::from_environment())?).await?;
-    let rover = domain.register("rover")?;
+    let rover = domain.register("rover").await?;
     let mut arms = Vec::new();
     for (name, price) in [("arm_1", 30), ("arm_2", 10), ("arm_3", 20)] {
-        let arm = domain.register(name)?;
+        let arm = domain.register(name).await?;
         arms.push(arm.id().clone());
         tokio::spawn(async move { work(&arm, price).await });
     }

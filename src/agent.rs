@@ -6,9 +6,10 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, AgentIdError, ErrorChain, Letter, Message, MessageBuilder, Performative};
 use fipa_mts::{LetterDraft, PostError, letter_for};
-use fipa_sds::{DeregisterError, Directory, RegisterError, Registration};
+use fipa_sds::{Cancellation, DeregisterError, RegisterError, Registration};
 use fipa_transport::{Incarnation, LoanedContent};
 
+use crate::background;
 use crate::delivery::{Deliveries, deliveries};
 use crate::demultiplexer::Demultiplexer;
 use crate::domain::{Domain, RegisterOptions, warn_of_name};
@@ -28,19 +29,41 @@ impl Domain {
     ///
     /// # Errors
     /// See [`register_with`](Self::register_with).
-    pub fn register(&self, name: &str) -> Result<Agent, RegisterError> {
-        self.register_with(name, RegisterOptions::default())
+    pub async fn register(&self, name: &str) -> Result<Agent, RegisterError> {
+        self.register_with(name, RegisterOptions::default()).await
     }
 
     /// Registers an agent. Afterwards other agents find it by its name on this host and, if a gateway
     /// is running, on other hosts. Its letters wait in its queue until it receives them.
     ///
+    /// Waits for other processes that change the directory on a thread for blocking calls, up to a
+    /// minute. Dropping the future ends the wait; the name is then not registered, or is removed
+    /// again if it already was.
+    /// [`blocking::Domain::register_with`](crate::blocking::Domain::register_with) is the blocking
+    /// call.
+    ///
     /// # Errors
     /// If the name is invalid or another agent has it, or if the directory cannot be written.
-    pub fn register_with(
+    pub async fn register_with(
         &self,
         name: &str,
         options: RegisterOptions,
+    ) -> Result<Agent, RegisterError> {
+        self.inner.owner.check()?;
+        let (domain, name) = (self.clone(), name.to_owned());
+        let registered = background::run(&self.inner.service.runtime, move |cancellation| {
+            domain.register_unless(&name, options, cancellation)
+        });
+        // Without a runtime, the domain has no tasks any more.
+        registered.await.unwrap_or(Err(RegisterError::Closed))
+    }
+
+    /// Registers an agent on the calling thread.
+    pub(crate) fn register_unless(
+        &self,
+        name: &str,
+        options: RegisterOptions,
+        cancellation: &Cancellation,
     ) -> Result<Agent, RegisterError> {
         self.inner.owner.check()?;
         let service = &self.inner.service;
@@ -55,7 +78,7 @@ impl Domain {
             description: options.description,
             ..Registration::new(Arc::clone(&name), incarnation, service.locations())
         };
-        match service.host.register(registration) {
+        match service.host.register_unless(registration, cancellation) {
             Ok(_) => {
                 warn_of_name(&id);
                 Ok(Agent {

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{Message, MessageBuilder, Performative};
-use fipa_sds::{DeregisterError, RegisterError};
+use fipa_sds::{Cancellation, DeregisterError, RegisterError};
 use tokio::runtime::{Builder, Runtime};
 
 use crate::owner::Owner;
@@ -115,7 +115,9 @@ impl Domain {
         name: &str,
         options: crate::RegisterOptions,
     ) -> Result<Agent, RegisterError> {
-        let agent = self.domain.register_with(name, options)?;
+        let agent = self
+            .domain
+            .register_unless(name, options, &Cancellation::new())?;
         Ok(Agent {
             agent,
             runtime: self.runtime.clone(),

@@ -4,7 +4,8 @@ use std::fmt;
 use std::sync::Arc;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
-use fipa_sds::Query;
+use fipa_sds::{Cancellation, Query};
+use tokio::runtime::Handle;
 
 use crate::checks::Rules;
 use crate::directory_view::DirectoryView;
@@ -12,7 +13,7 @@ use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::routes::{self, Report};
 use crate::service::{Role, Service};
-use crate::{AgentId, Config};
+use crate::{AgentId, Config, background};
 
 /// The membership of this process in a domain. The processes of one domain on one host find each
 /// other.
@@ -66,10 +67,24 @@ impl Domain {
     /// Joins the domain that the configuration names. Must be called within a tokio runtime, which
     /// then runs the background tasks.
     ///
+    /// Waits for other processes on a thread for blocking calls, up to a minute. Dropping the future
+    /// ends the wait, and the process leaves the domain again.
+    /// [`blocking::Domain::open`](crate::blocking::Domain::open) is the blocking call.
+    ///
     /// # Errors
     /// If the configuration is invalid, if the directory of the domain cannot be used, or if no
     /// transport can be used.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        let runtime = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
+        let config = config.clone();
+        let opened = background::run(&runtime, move |cancellation| {
+            Self::join(&config, cancellation)
+        });
+        opened.await.unwrap_or(Err(OpenError::NoRuntime))
+    }
+
+    /// Joins the domain on a thread for blocking calls.
+    fn join(config: &Config, cancellation: &Cancellation) -> Result<Self, OpenError> {
         let rules = Rules::load(&config.monitor)?;
         let host = gethostname::gethostname();
         let name = format!("{}-{}", host.to_string_lossy(), std::process::id());
@@ -85,6 +100,7 @@ impl Domain {
                 security: None,
                 view: &|host, _| Ok(host),
             },
+            cancellation,
         )?;
         let deadline = config.mts.deadline;
         Ok(Self {

@@ -20,11 +20,12 @@ use fipa_acl::ErrorChain;
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
+    Cancellation, ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
     Role as EntryRole, StaticDirectory,
 };
 use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind};
 use parking_lot::Mutex;
+use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 
 use self::exchange::{Exchanging, Means};
@@ -39,7 +40,7 @@ use crate::directory_view::DirectoryView;
 use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::service::{Role, Service};
-use crate::{AgentId, Config};
+use crate::{AgentId, Config, background};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
 pub struct Gateway {
@@ -57,10 +58,24 @@ impl Gateway {
     /// Starts the gateway of the domain that the configuration names. Must be called within a
     /// tokio runtime, which runs the background tasks of the gateway.
     ///
+    /// Waits for other processes of the domain on a thread for blocking calls, up to a minute.
+    /// Dropping the future ends the wait; the gateway is then not registered, or ends again if it
+    /// already was.
+    ///
     /// # Errors
     /// Fails when the configuration, the domain's directory or a configured address cannot be used,
     /// or when the domain already has a gateway.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        let runtime = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
+        let config = config.clone();
+        let opened = background::run(&runtime, move |cancellation| {
+            Self::start(&config, cancellation)
+        });
+        opened.await.unwrap_or(Err(OpenError::NoRuntime))
+    }
+
+    /// Starts the gateway on a thread for blocking calls.
+    fn start(config: &Config, cancellation: &Cancellation) -> Result<Self, OpenError> {
         #[cfg(feature = "secure")]
         let guard = Guard::open(&config.security, &config.mts.name)?;
         #[cfg(not(feature = "secure"))]
@@ -96,6 +111,7 @@ impl Gateway {
                     Ok(view)
                 },
             },
+            cancellation,
         )?;
         let Some((network, known, view)) = made.into_inner() else {
             return Err(OpenError::NoRuntime);
@@ -114,7 +130,7 @@ impl Gateway {
         let own = &gateway.service.own;
         let mts = &gateway.service.mts;
         mts.register(Arc::clone(&own.name), own.incarnation);
-        if let Err(error) = gateway.enter() {
+        if let Err(error) = gateway.enter(cancellation) {
             gateway.abort();
             return Err(error);
         }
@@ -184,9 +200,9 @@ impl Gateway {
     }
 
     /// Registers the gateway in the directory of this host, in which the processes find it.
-    fn enter(&self) -> Result<(), OpenError> {
+    fn enter(&self, cancellation: &Cancellation) -> Result<(), OpenError> {
         let service = &self.service;
-        let own = register(service);
+        let own = register(service, cancellation);
         let own = own.map_err(|error| match error {
             RegisterError::AlreadyRegistered { holder } if holder.role == EntryRole::Gateway => {
                 OpenError::GatewayRunning(holder.name.to_string())
@@ -346,8 +362,8 @@ impl Drop for Gateway {
 }
 
 /// Registers the gateway with its current locations.
-fn register(service: &Service) -> Result<Arc<Entry>, RegisterError> {
-    service.host.register(Registration {
+fn register(service: &Service, cancellation: &Cancellation) -> Result<Arc<Entry>, RegisterError> {
+    let registration = Registration {
         role: EntryRole::Gateway,
         agent_type: "fipa-mts".to_owned(),
         description: "message transport service".to_owned(),
@@ -356,7 +372,8 @@ fn register(service: &Service) -> Result<Arc<Entry>, RegisterError> {
             service.own.incarnation,
             service.locations(),
         )
-    })
+    };
+    service.host.register_unless(registration, cancellation)
 }
 
 /// Updates the gateway's own entry and greets its neighbors when its locations change. The
@@ -374,7 +391,11 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
             locations = now.join(" "),
             "the locations of this gateway have changed"
         );
-        if let Err(error) = register(&service) {
+        let registering = Arc::clone(&service);
+        let registered = background::run(&service.runtime, move |cancellation| {
+            register(&registering, cancellation)
+        });
+        if let Some(Err(error)) = registered.await {
             tracing::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
         }
         service.mts.greet(neighbours.to_greet(Instant::now()));

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fipa_sds::{HostConfig, HostDirectory, HostError};
+use fipa_sds::{Cancellation, HostConfig, HostDirectory, HostError};
 
 use crate::domain_dir::{DomainDir, RETRIES};
 use crate::error::OpenError;
@@ -12,16 +12,18 @@ pub(crate) fn join(
     domain: &str,
     own: &fipa_sds::Mts,
     gateway: bool,
+    cancellation: &Cancellation,
 ) -> Result<(DomainDir, Arc<HostDirectory>), OpenError> {
     let mut tries = 0;
     loop {
         tries += 1;
         let mut dir = DomainDir::prepare(domain)?;
-        let joined = HostDirectory::open(HostConfig {
+        let config = HostConfig {
             dir: dir.part("directory"),
             mts: own.clone(),
             gateway,
-        });
+        };
+        let joined = HostDirectory::open_unless(config, cancellation);
         match joined {
             Ok(host) => {
                 // Not earlier, because a leaving process may still remove an empty directory.

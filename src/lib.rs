@@ -9,7 +9,7 @@
 //!
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let domain = Domain::open(&Config::load(&fipa::config::Sources::from_environment())?).await?;
-//! let agent = domain.register("rover")?;
+//! let agent = domain.register("rover").await?;
 //! let request = agent
 //!     .message(Performative::Request)
 //!     .receiver(AgentId::new("arm_1")?)
@@ -38,6 +38,7 @@
 mod access;
 mod access_gate;
 mod agent;
+mod background;
 pub mod blocking;
 #[cfg(feature = "monitor")]
 mod checks;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use fipa_acl::ErrorChain;
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
-use fipa_sds::{Directory, Entry, HostDirectory, Pattern};
+use fipa_sds::{Cancellation, Directory, Entry, HostDirectory, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -42,6 +42,8 @@ pub(crate) struct Service {
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
     maintenance: JoinHandle<()>,
+    /// The runtime of the background tasks.
+    pub(crate) runtime: Handle,
 }
 
 /// The differences between a robot process and the gateway.
@@ -64,12 +66,18 @@ pub(crate) type View<'a> =
     dyn Fn(Arc<HostDirectory>, &fipa_sds::Mts) -> Result<Arc<dyn Directory>, OpenError> + 'a;
 
 impl Service {
-    pub(crate) fn start(config: &Config, role: Role<'_>) -> Result<Self, OpenError> {
+    /// Starts the service. Waits for other processes, so it must be called on a thread for blocking
+    /// calls.
+    pub(crate) fn start(
+        config: &Config,
+        role: Role<'_>,
+        cancellation: &Cancellation,
+    ) -> Result<Self, OpenError> {
         config.check()?;
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let incarnation = Incarnation::random();
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
-        let (dir, host) = host_directory::join(&config.domain, &own, role.gateway)?;
+        let (dir, host) = host_directory::join(&config.domain, &own, role.gateway, cancellation)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| dir.leave())?;
         let gate = gate(config, &role, &host).inspect_err(|_| dir.leave())?;
         let watchers = Arc::new(Watchers::new(&own, role.gateway));
@@ -106,6 +114,7 @@ impl Service {
             host,
             own,
             dir,
+            runtime: handle,
         };
         for (kind, error) in failed {
             // A gateway needs all its network transports; within the host another one may do.

@@ -69,12 +69,12 @@ async fn rules_are_kept(kind: Kind) {
     let rules = "access.deny={ \"ro.*\" = [\"arm performative=request\"] }";
     let (lax, strict) = host(kind, rules).await;
     let (rover, crex) = (
-        lax.register("rover").unwrap(),
-        lax.register("crex").unwrap(),
+        lax.register("rover").await.unwrap(),
+        lax.register("crex").await.unwrap(),
     );
     let (arm, leg) = (
-        strict.register("arm").unwrap(),
-        strict.register("leg").unwrap(),
+        strict.register("arm").await.unwrap(),
+        strict.register("leg").await.unwrap(),
     );
     for (from, to, performative) in [
         (&rover, "arm", Performative::Inform),
@@ -124,10 +124,10 @@ async fn a_sender_beyond_its_rate_is_refused_and_others_are_not() {
     const RATE: usize = 5;
     let (lax, strict) = host(Kind::Shm, "access.rate=5").await;
     let (rover, crex) = (
-        lax.register("rover").unwrap(),
-        lax.register("crex").unwrap(),
+        lax.register("rover").await.unwrap(),
+        lax.register("crex").await.unwrap(),
     );
-    let arm = strict.register("arm").unwrap();
+    let arm = strict.register("arm").await.unwrap();
     let (begun, mut taken, mut last) = (Instant::now(), 0, None);
     while last.is_none() {
         let outcome = send(&rover, "arm", Performative::Inform).await;
@@ -221,7 +221,7 @@ async fn a_forged_name_of_the_gateway_is_refused_over_tcp() {
         "access.deny={ \".*\" = [\"arm\"] }",
     ]);
     let strict = Domain::open(&rules).await.unwrap();
-    let arm = strict.register("arm").unwrap();
+    let arm = strict.register("arm").await.unwrap();
     let entry = gateway.directory().lookup("arm").unwrap();
     let refused = hand_over(&gateway, &entry).await;
     let Conclusion::Answered(Answer::Failed { reason, detail }) = &refused else {
@@ -232,7 +232,7 @@ async fn a_forged_name_of_the_gateway_is_refused_over_tcp() {
     assert!(arm.try_receive().unwrap().is_none());
     // A process listens on TCP only if transport.tcp.processes is true.
     let quiet = Domain::open(&config(&[])).await.unwrap();
-    let leg = quiet.register("leg").unwrap();
+    let leg = quiet.register("leg").await.unwrap();
     let entry = gateway.directory().lookup("leg").unwrap();
     let kinds: Vec<Kind> = entry.locations.iter().map(|it| it.kind()).collect();
     assert_eq!(kinds, [Kind::Shm, Kind::Unix]);

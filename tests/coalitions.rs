@@ -81,9 +81,9 @@ fn to(deliveries: &Deliveries) -> BTreeSet<&str> {
 async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     let near = Host::start(None).await;
     let far = Host::start(Some(&near)).await;
-    let rover = near.domain.register("rover").unwrap();
-    let arm = far.domain.register("arm").unwrap();
-    let camera = far.domain.register("camera").unwrap();
+    let rover = near.domain.register("rover").await.unwrap();
+    let arm = far.domain.register("arm").await.unwrap();
+    let camera = far.domain.register("camera").await.unwrap();
     let mut team = near.form("team", &["rover", "arm", "camera"], None);
     far.until_known(&["team", "rover"]).await;
     near.until_known(&["arm", "camera"]).await;

@@ -10,8 +10,7 @@ use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
-    RegisterError,
+    AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative, RegisterError,
 };
 use support::{config, inform, two};
 
@@ -39,8 +38,8 @@ async fn letters_arrive_in_both_directions_and_report_their_transport() {
         let config = config(&[&format!("mts.transports={transports}")]);
         let (here, there) = two(&config).await;
         let (rover, arm) = (
-            here.register("rover").unwrap(),
-            there.register("arm").unwrap(),
+            here.register("rover").await.unwrap(),
+            there.register("arm").await.unwrap(),
         );
         let (conversation, reply_with) = (rover.unique_id(), rover.unique_id());
         assert_ne!(conversation, reply_with);
@@ -82,9 +81,9 @@ async fn letters_arrive_in_both_directions_and_report_their_transport() {
 async fn a_name_belongs_to_one_agent_at_a_time() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
-    let first = here.register("arm").unwrap();
+    let first = here.register("arm").await.unwrap();
     for domain in [&here, &there] {
-        match domain.register("arm") {
+        match domain.register("arm").await {
             Err(RegisterError::AlreadyRegistered { holder }) => {
                 assert_eq!(holder.incarnation, first.incarnation());
             }
@@ -93,7 +92,7 @@ async fn a_name_belongs_to_one_agent_at_a_time() {
         }
     }
     assert!(first.deregister().unwrap().is_empty());
-    there.register("arm").unwrap();
+    there.register("arm").await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -101,8 +100,8 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
     let config = config(&["mts.queue=16"]);
     let (here, there) = two(&config).await;
     let (rover, arm) = (
-        here.register("rover").unwrap(),
-        there.register("arm").unwrap(),
+        here.register("rover").await.unwrap(),
+        there.register("arm").await.unwrap(),
     );
     let total = 1000_u32;
     let reading = tokio::spawn(async move {
@@ -149,10 +148,10 @@ async fn futures_poll_once<T>(
 async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers() {
     let config = config(&["mts.queue=2"]);
     let (here, there) = two(&config).await;
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     let (slow, quick) = (
-        there.register("slow").unwrap(),
-        there.register("quick").unwrap(),
+        there.register("slow").await.unwrap(),
+        there.register("quick").await.unwrap(),
     );
     for _ in 0..2 {
         assert!(
@@ -207,11 +206,12 @@ async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers()
 async fn a_pattern_reaches_all_but_the_sender() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
-    let sender = here.register("arm_0").unwrap();
-    let others: Vec<Agent> = (1..4)
-        .map(|number| there.register(&format!("arm_{number}")).unwrap())
-        .collect();
-    let stranger = there.register("camera").unwrap();
+    let sender = here.register("arm_0").await.unwrap();
+    let mut others = Vec::new();
+    for number in 1..4 {
+        others.push(there.register(&format!("arm_{number}")).await.unwrap());
+    }
+    let stranger = there.register("camera").await.unwrap();
     let deliveries = sender
         .send(inform(&sender, "arm_.*", "stop"))
         .await
@@ -236,7 +236,7 @@ async fn a_pattern_reaches_all_but_the_sender() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_unknown_name_yields_one_failure_message() {
     let domain = Domain::open(&config(&[])).await.unwrap();
-    let rover = domain.register("rover").unwrap();
+    let rover = domain.register("rover").await.unwrap();
     for to in ["unknown", "unknown_.*", "broken("] {
         let deliveries = rover.send(inform(&rover, to, "hello")).await.unwrap();
         assert_eq!(reason(&deliveries), FailureReason::NoSuchAgent);
@@ -267,8 +267,8 @@ async fn loaned_content_is_not_copied() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
     let (rover, arm) = (
-        here.register("rover").unwrap(),
-        there.register("arm").unwrap(),
+        here.register("rover").await.unwrap(),
+        there.register("arm").await.unwrap(),
     );
     for len in [100_000, 4 << 20] {
         let mut loan = rover.loan(inform(&rover, "arm", []), len).unwrap();
@@ -288,7 +288,7 @@ async fn loaned_content_is_not_copied() {
         assert!(is_shared_memory(content), "{len} bytes were copied");
     }
     // Short content for several receivers is copied for each of them.
-    let other = there.register("arm_2").unwrap();
+    let other = there.register("arm_2").await.unwrap();
     for len in [5000, 1 << 20] {
         let mut loan = rover.loan(inform(&rover, "arm.*", []), len).unwrap();
         loan.content_mut().fill(7);
@@ -304,10 +304,11 @@ async fn loaned_content_is_not_copied() {
 async fn large_content_for_several_receivers_is_in_memory_once() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
-    let rover = here.register("rover").unwrap();
-    let arms: Vec<Agent> = (0..4)
-        .map(|number| there.register(&format!("arm_{number}")).unwrap())
-        .collect();
+    let rover = here.register("rover").await.unwrap();
+    let mut arms = Vec::new();
+    for number in 0..4 {
+        arms.push(there.register(&format!("arm_{number}")).await.unwrap());
+    }
     let message = |to: &[&str]| {
         let empty = rover.message(Performative::Inform);
         let message = to.iter().fold(empty, |message, to| {
@@ -365,11 +366,11 @@ async fn large_content_for_several_receivers_also_reaches_those_without_shared_m
         Domain::open(&config).await.unwrap(),
         Domain::open(&plain).await.unwrap(),
     );
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     let arms = [
-        there.register("arm_0").unwrap(),
-        there.register("arm_1").unwrap(),
-        beyond.register("arm_2").unwrap(),
+        there.register("arm_0").await.unwrap(),
+        there.register("arm_1").await.unwrap(),
+        beyond.register("arm_2").await.unwrap(),
     ];
     let sent = rover
         .send(inform(&rover, "arm.*", vec![9; 1 << 20]))
@@ -400,8 +401,8 @@ async fn a_letter_that_is_too_large_fails_with_that_reason() {
     let config = config(&["transport.shm.max_letter=64KiB"]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
-        domain.register("rover").unwrap(),
-        domain.register("arm").unwrap(),
+        domain.register("rover").await.unwrap(),
+        domain.register("arm").await.unwrap(),
     );
     let deliveries = rover
         .send(inform(&rover, "arm", vec![0; 100_000]))
@@ -426,8 +427,8 @@ async fn a_letter_that_is_too_large_fails_with_that_reason() {
 async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
-    let rover = here.register("rover").unwrap();
-    let arm = there.register("arm").unwrap();
+    let rover = here.register("rover").await.unwrap();
+    let arm = there.register("arm").await.unwrap();
     assert!(
         rover
             .send(inform(&rover, "arm", "first"))
@@ -442,7 +443,7 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     assert_eq!(unread.message.content().unwrap(), "first");
     let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
-    let arm = there.register("arm").unwrap();
+    let arm = there.register("arm").await.unwrap();
     assert!(
         rover
             .send(inform(&rover, "arm", "second"))
@@ -502,8 +503,8 @@ async fn closing_a_domain_removes_its_files_and_shared_memory() {
     let dir = format!("/tmp/fipa-{user}/{}", config.domain);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
-        domain.register("rover").unwrap(),
-        domain.register("arm").unwrap(),
+        domain.register("rover").await.unwrap(),
+        domain.register("arm").await.unwrap(),
     );
     assert!(
         rover
@@ -524,8 +525,8 @@ async fn closing_a_domain_removes_its_files_and_shared_memory() {
 async fn calls_after_closing_the_domain_fail_and_do_not_hang() {
     let (here, there) = two(&config(&[])).await;
     let (rover, arm) = (
-        here.register("rover").unwrap(),
-        there.register("arm").unwrap(),
+        here.register("rover").await.unwrap(),
+        there.register("arm").await.unwrap(),
     );
     let message = inform(&rover, arm.name(), "too late");
     here.close().await;
@@ -575,9 +576,9 @@ async fn routes_between_hosts_do_not_change_those_within_a_host() {
     // the usual order.
     let config = config(&["routes={ \"arm\" = [\"tcp\"], \"leg\" = [\"unix\"] }"]);
     let (here, there) = two(&config).await;
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     for (name, via) in [("arm", Kind::Shm), ("leg", Kind::Unix)] {
-        let agent = there.register(name).unwrap();
+        let agent = there.register(name).await.unwrap();
         let sent = rover.send(inform(&rover, name, "x")).await.unwrap();
         assert_eq!(only(&sent).via(), Some(via), "{sent}");
         drop(agent);

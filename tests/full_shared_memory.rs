@@ -38,10 +38,10 @@ async fn large_contents() {
     let config = config(fastrand::u64(..), "shm,unix");
     let here = Domain::open(&config).await.unwrap();
     let there = Domain::open(&config).await.unwrap();
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     let arms = [
-        there.register("arm_0").unwrap(),
-        there.register("arm_1").unwrap(),
+        there.register("arm_0").await.unwrap(),
+        there.register("arm_1").await.unwrap(),
     ];
     let mut transports_used = Vec::new();
     // The letters are kept, so that each needs new memory. They are for one receiver, loaned for one,
@@ -126,8 +126,8 @@ async fn full() {
     let name = fastrand::u64(..);
     let here = Domain::open(&config(name, "shm,unix")).await.unwrap();
     let there = Domain::open(&config(name, "shm,unix")).await.unwrap();
-    let rover = here.register("rover").unwrap();
-    let arm = there.register("arm").unwrap();
+    let rover = here.register("rover").await.unwrap();
+    let arm = there.register("arm").await.unwrap();
     let letter = async || {
         let message = rover
             .message(Performative::Inform)

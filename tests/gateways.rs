@@ -101,8 +101,8 @@ async fn small_letters_use_udp_and_letters_too_large_for_it_use_tcp() {
     let (here, there) = (Host::new(&order), Host::new(&order));
     let (_near, at_home) = here.start().await;
     let (_far, abroad) = there.start().await;
-    let rover = at_home.register(&here.name("rover")).unwrap();
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     for round in 0..10 {
         for (len, expected) in [(100, Kind::Udp), (200_000, Kind::Tcp), (20_000, Kind::Udp)] {
@@ -132,8 +132,8 @@ async fn hosts_discover_each_other_and_exchange_letters() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
     let (_near, at_home) = here.start().await;
     let (_far, abroad) = there.start().await;
-    let rover = at_home.register(&here.name("rover")).unwrap();
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     known(&abroad, rover.name()).await;
 
@@ -177,8 +177,8 @@ async fn a_slow_agent_on_another_host_holds_its_sender_back() {
     let (here, there) = (Host::new(&[]), Host::new(&["mts.queue=2"]));
     let (_near, at_home) = here.start().await;
     let (_far, abroad) = there.start().await;
-    let rover = at_home.register(&here.name("rover")).unwrap();
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     for _ in 0..2 {
         via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
@@ -209,9 +209,9 @@ async fn agents_of_one_host_exchange_letters_without_their_gateway() {
         Domain::open(&here.config).await.unwrap(),
         Domain::open(&there.config).await.unwrap(),
     );
-    let rover = at_home.register(&here.name("rover")).unwrap();
-    let camera = next_door.register(&here.name("camera")).unwrap();
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let camera = next_door.register(&here.name("camera")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     via(&rover
         .send(inform(&rover, arm.name(), "before"))
@@ -275,12 +275,13 @@ async fn a_new_agent_that_sends_a_letter_can_be_answered_at_once() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
     let (_near, at_home) = here.start().await;
     let (_far, abroad) = there.start().await;
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     for round in 0..5 {
         // Its letter may arrive before its announcement.
         let newcomer = at_home
             .register(&here.name(&format!("newcomer-{round}")))
+            .await
             .unwrap();
         via(&newcomer
             .send(inform(&newcomer, arm.name(), "hello"))
@@ -308,13 +309,13 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
     let there = Host::new(&[]);
     let (near, at_home) = here.start().await;
     let (far, abroad) = there.start().await;
-    let rover = at_home.register(&here.name("rover")).unwrap();
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     for _ in 0..5 {
         via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
     }
-    let asker = at_home.register(&here.name("asker")).unwrap();
+    let asker = at_home.register(&here.name("asker")).await.unwrap();
     let gateway = at_home.directory().lookup(near.name()).unwrap();
     let patience = Duration::from_secs(30);
     let ask = || routes::of_gateway(&asker, &gateway, Some(arm.name()), patience);
@@ -395,8 +396,8 @@ async fn reloading_the_configuration_loses_no_letter() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
     let (mut near, at_home) = here.start().await;
     let (_far, abroad) = there.start().await;
-    let rover = Arc::new(at_home.register(&here.name("rover")).unwrap());
-    let arm = abroad.register(&there.name("arm")).unwrap();
+    let rover = Arc::new(at_home.register(&here.name("rover")).await.unwrap());
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
     let sending = numbered(Arc::clone(&rover), arm.name().to_owned(), 0..LETTERS);
     let sending = tokio::spawn(sending);
@@ -445,8 +446,8 @@ async fn letters_in_transit_when_the_gateway_ends_have_an_outcome() {
     let (here, there) = (Host::new(&["mts.deadline=3s"]), Host::new(&[]));
     let (near, at_home) = here.start().await;
     let (_far, abroad) = there.start().await;
-    let rover = Arc::new(at_home.register(&here.name("rover")).unwrap());
-    let arm = Arc::new(abroad.register(&there.name("arm")).unwrap());
+    let rover = Arc::new(at_home.register(&here.name("rover")).await.unwrap());
+    let arm = Arc::new(abroad.register(&there.name("arm")).await.unwrap());
     known(&at_home, arm.name()).await;
     let sending = numbered(Arc::clone(&rover), arm.name().to_owned(), 0..LETTERS);
     let sending = tokio::spawn(sending);

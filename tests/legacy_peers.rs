@@ -102,7 +102,11 @@ fn read(letter: &[u8]) -> (Envelope, Letter, Message) {
 #[tokio::test(flavor = "multi_thread")]
 async fn letters_of_fipa_services_are_received_and_answered_in_its_dialect() {
     let host = Host::new("alice", "fipa-services").await;
-    let [bob, carol, dave] = ["bob", "carol", "dave"].map(|it| host.domain.register(it).unwrap());
+    let [bob, carol, dave] = [
+        host.domain.register("bob").await.unwrap(),
+        host.domain.register("carol").await.unwrap(),
+        host.domain.register("dave").await.unwrap(),
+    ];
     let letters = recorded![
         "e01_simple.be",
         "e01_simple.xml",
@@ -152,7 +156,10 @@ async fn letters_of_fipa_services_are_received_and_answered_in_its_dialect() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_letter_that_fipa_services_cannot_decode_fails_at_once_with_the_reason() {
     let host = Host::new("alice", "fipa-services").await;
-    let [rover, my_arm] = ["rover", "my arm"].map(|it| host.domain.register(it).unwrap());
+    let [rover, my_arm] = [
+        host.domain.register("rover").await.unwrap(),
+        host.domain.register("my arm").await.unwrap(),
+    ];
     let letter = |from: &Agent| {
         from.message(Performative::Request)
             .receiver(AgentId::new("alice").unwrap())
@@ -187,7 +194,7 @@ async fn a_letter_that_fipa_services_cannot_decode_fails_at_once_with_the_reason
 #[tokio::test(flavor = "multi_thread")]
 async fn fipa_services_gets_a_failure_for_a_letter_that_cannot_be_decoded() {
     let host = Host::new("alice", "fipa-services").await;
-    let bob = host.domain.register("bob").unwrap();
+    let bob = host.domain.register("bob").await.unwrap();
     let [(_, recorded)] = recorded!["e01_simple.be"];
     send_as_peer(&recorded[..recorded.len() - 3], &host.address()).await;
     let (_, letter, failure) = read(&host.read_by_peer().await);
@@ -250,7 +257,7 @@ fn letter_to(
 async fn an_unannounced_agent_is_answered_in_its_dialect_for_all_encodings() {
     use Representation::{BitEfficient, String, Xml};
     let host = Host::new("alice", "fipa-services").await;
-    let bob = host.domain.register("bob").unwrap();
+    let bob = host.domain.register("bob").await.unwrap();
     let at = format!("tcp://{}", host.peer.local_addr().unwrap());
     let encodings = [
         [BitEfficient, String],
@@ -287,7 +294,7 @@ async fn an_unannounced_agent_is_answered_at_the_address_in_its_letter() {
     let plain = [Representation::BitEfficient; 2];
     // The directory knows another agent at the peer only.
     let host = Host::new("alice", "fipa-services").await;
-    let bob = host.domain.register("bob").unwrap();
+    let bob = host.domain.register("bob").await.unwrap();
     let at = format!("tcp://{}", host.peer.local_addr().unwrap());
     send_as_peer(&letter_from("carol", &at, plain), &host.address()).await;
     let asked = receive(&bob).await;
@@ -326,7 +333,7 @@ async fn an_unannounced_agent_is_answered_at_the_address_in_its_letter() {
 #[tokio::test(flavor = "multi_thread")]
 async fn jades_proxy_gets_a_request_and_answers_at_the_address_in_the_letter() {
     let host = Host::new("echo@jadetest", "jade").await;
-    let rusty = host.domain.register("rusty@rustap").unwrap();
+    let rusty = host.domain.register("rusty@rustap").await.unwrap();
     let question = rusty
         .message(Performative::Request)
         .receiver(AgentId::new("echo@jadetest").unwrap())
@@ -357,7 +364,10 @@ async fn jades_proxy_gets_a_request_and_answers_at_the_address_in_the_letter() {
 async fn fipa_services_gets_a_failure_in_its_dialect_for_a_letter_that_a_rule_refuses() {
     let deny = "access.deny={ alice = [\"bob\"] }";
     let host = Host::with("alice", "fipa-services", &[deny]).await;
-    let [bob, carol] = ["bob", "carol"].map(|it| host.domain.register(it).unwrap());
+    let [bob, carol] = [
+        host.domain.register("bob").await.unwrap(),
+        host.domain.register("carol").await.unwrap(),
+    ];
     let [(_, recorded)] = recorded!["e01_simple.be"];
     send_as_peer(recorded, &host.address()).await;
     let (_, letter, failure) = read(&host.read_by_peer().await);

@@ -60,7 +60,7 @@ impl Host {
     async fn register_when_free(&self, name: &str) -> Agent {
         let started = Instant::now();
         loop {
-            match self.domain.register(name) {
+            match self.domain.register(name).await {
                 Ok(agent) => return agent,
                 Err(RegisterError::AlreadyRegistered { .. }) => {}
                 Err(other) => panic!("{other}"),
@@ -95,7 +95,7 @@ async fn every_letter_to_a_moving_agent_has_one_correct_outcome() {
     let first = Host::start(&[]).await;
     let second = Host::start(&[&first]).await;
     let third = Host::start(&[&first, &second]).await;
-    let rover = Arc::new(first.domain.register("rover").unwrap());
+    let rover = Arc::new(first.domain.register("rover").await.unwrap());
     let taken = Arc::new(Taken::default());
     let moved = Arc::new(AtomicUsize::new(0));
 

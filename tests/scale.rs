@@ -37,9 +37,11 @@ async fn a_process_of_its_own() {
     let number = std::env::var(NUMBER).unwrap();
     let before = private_memory(std::process::id());
     let domain = Domain::open(&config(&domain)).await.unwrap();
-    let agents: Vec<_> = (0..AGENTS)
-        .map(|agent| domain.register(&format!("agent-{number}-{agent}")).unwrap())
-        .collect();
+    let mut agents = Vec::new();
+    for agent in 0..AGENTS {
+        let name = format!("agent-{number}-{agent}");
+        agents.push(domain.register(&name).await.unwrap());
+    }
     let line = format!("ready {before}\n");
     std::io::stdout().write_all(line.as_bytes()).unwrap();
     let waiting = tokio::task::spawn_blocking(|| {

@@ -66,7 +66,7 @@ async fn the_gateway_answers_an_unknown_ontology_with_not_understood() {
     let config = config(&[]);
     let gateway = Gateway::open(&config).await.unwrap();
     let domain = Domain::open(&config).await.unwrap();
-    let rover = domain.register("rover").unwrap();
+    let rover = domain.register("rover").await.unwrap();
     let request = rover
         .message(Performative::Request)
         .receiver(AgentId::new(gateway.name()).unwrap())
@@ -93,12 +93,12 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
     let far_config = config(&[]);
     let far = Gateway::open(&far_config).await.unwrap();
     let far_host = Domain::open(&far_config).await.unwrap();
-    let arm = far_host.register("arm").unwrap();
+    let arm = far_host.register("arm").await.unwrap();
     // Only one of them knows the other's address.
     let near_config = config(&[&knowing("far", &[&address(&far)])]);
     let near = Gateway::open(&near_config).await.unwrap();
     let near_host = Domain::open(&near_config).await.unwrap();
-    let rover = near_host.register("rover").unwrap();
+    let rover = near_host.register("rover").await.unwrap();
 
     until_async("the arm is known", || seen(&near_host, "arm").is_some()).await;
     until_async("the rover is known", || seen(&far_host, "rover").is_some()).await;
@@ -119,7 +119,7 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
     }
 
     // Changes are exchanged.
-    let leg = far_host.register("leg").unwrap();
+    let leg = far_host.register("leg").await.unwrap();
     until_async("the leg is known", || seen(&near_host, "leg").is_some()).await;
     drop(leg);
     until_async("the leg is gone", || seen(&near_host, "leg").is_none()).await;
@@ -135,12 +135,12 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     let (far_config, third_config) = (config(&[]), config(&[]));
     let far = Gateway::open(&far_config).await.unwrap();
     let far_host = Domain::open(&far_config).await.unwrap();
-    let earlier = far_host.register("arm").unwrap();
+    let earlier = far_host.register("arm").await.unwrap();
     let near_config = config(&[]);
     let near_host = Domain::open(&near_config).await.unwrap();
     // Registered while neither gateway knows the other registration.
     tokio::time::sleep(Duration::from_millis(5)).await;
-    let later = near_host.register("arm").unwrap();
+    let later = near_host.register("arm").await.unwrap();
     let mut knows_both = near_config.clone();
     knows_both.discovery = config(&[&knowing("far", &[&address(&far)])]).discovery;
     let near = Gateway::open(&knows_both).await.unwrap();
@@ -154,7 +154,7 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     let mut watcher = third_config.clone();
     watcher.discovery = config(&[&knowing("near", &[&address(&near)])]).discovery;
     let third = Gateway::open(&watcher).await.unwrap();
-    let here = near_host.register("only here").unwrap();
+    let here = near_host.register("only here").await.unwrap();
     until_async("the third host has the directory", || {
         third.directory().known("only here").is_some()
     })
@@ -177,8 +177,8 @@ async fn a_static_legacy_peer_gets_its_letters_in_its_dialect() {
     let config = config(&[&knowing("old_arm", &[&at])]);
     let gateway = Gateway::open(&config).await.unwrap();
     let host = Domain::open(&config).await.unwrap();
-    let rover = host.register("rover").unwrap();
-    until_async("the legacy peer is known", || {
+    let leg = far_host.register("leg").await.unwrap();
+    until_async("the leg is known", || seen(&near_host, "leg").is_some()).await;
         host.directory().lookup("old_arm").is_some()
     })
     .await;

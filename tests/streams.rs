@@ -50,8 +50,8 @@ fn was_refused(outcome: &Outcome) -> bool {
 async fn outcomes(rules: &str, performatives: &[Performative]) -> Vec<Outcome> {
     let far = Host::open(&[rules]).await;
     let near = Host::open(&[&far.as_peer()]).await;
-    let arm = Arc::new(far.domain.register("arm").unwrap());
-    let rover = near.domain.register("rover").unwrap();
+    let arm = Arc::new(far.domain.register("arm").await.unwrap());
+    let rover = near.domain.register("rover").await.unwrap();
     while near.domain.directory().lookup("arm").is_none() {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
@@ -111,8 +111,8 @@ async fn letters_beyond_the_rate_of_a_gateway_delay_no_others() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_letter_sent_after_closing_the_domain_fails_as_closed() {
     let host = Host::open(&[]).await;
-    let rover = host.domain.register("rover").unwrap();
-    let arm = host.domain.register("arm").unwrap();
+    let rover = host.domain.register("rover").await.unwrap();
+    let arm = host.domain.register("arm").await.unwrap();
     let late = message(&rover, Performative::Inform);
     host.domain.close().await;
     let outcome = rover.send(late).await.unwrap().0.remove(0).outcome;

@@ -82,8 +82,11 @@ async fn each_letter_yields_one_event_with_its_outcome() {
         Domain::open(&config).await.unwrap(),
         Domain::open(&config).await.unwrap(),
     );
-    let rover = here.register("rover").unwrap();
-    let arms = ["arm_1", "arm_2"].map(|name| there.register(name).unwrap());
+    let rover = here.register("rover").await.unwrap();
+    let arms = [
+        there.register("arm_1").await.unwrap(),
+        there.register("arm_2").await.unwrap(),
+    ];
     let mut watcher = Watcher::open(&config, WatchOptions::default())
         .await
         .unwrap();
@@ -143,7 +146,7 @@ async fn each_letter_yields_one_event_with_its_outcome() {
 
     // A process that joins later is watched, too.
     let late = Domain::open(&config).await.unwrap();
-    let late = late.register("late").unwrap();
+    let late = late.register("late").await.unwrap();
     until_seen(&mut watcher, &late, "rover").await;
     assert!(watcher.directory().lookup("late").is_some());
 }
@@ -153,8 +156,8 @@ async fn only_a_watcher_that_requests_content_gets_it() {
     let config = config(&[]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, _arm) = (
-        domain.register("rover").unwrap(),
-        domain.register("arm").unwrap(),
+        domain.register("rover").await.unwrap(),
+        domain.register("arm").await.unwrap(),
     );
     let options = WatchOptions { content: 4 };
     let (mut with_content, mut without_content) = (
@@ -187,8 +190,8 @@ async fn a_dropped_watcher_removes_its_files() {
     let config = config(&[]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
-        domain.register("rover").unwrap(),
-        domain.register("arm").unwrap(),
+        domain.register("rover").await.unwrap(),
+        domain.register("arm").await.unwrap(),
     );
     for _ in 0..3 {
         let mut watcher = Watcher::open(&config, WatchOptions::default())
@@ -216,8 +219,8 @@ async fn a_watcher_that_does_not_read_delays_no_agent_and_gets_the_count_of_lost
         Domain::open(&config).await.unwrap(),
         Domain::open(&config).await.unwrap(),
     );
-    let rover = here.register("rover").unwrap();
-    let arm = there.register("arm").unwrap();
+    let rover = here.register("rover").await.unwrap();
+    let arm = there.register("arm").await.unwrap();
     let reading = tokio::spawn(async move {
         let mut last = String::new();
         while last != "end" {
@@ -275,8 +278,8 @@ async fn invalid_records_are_refused_without_effect_on_others() {
     let config = config(&[]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, _arm) = (
-        domain.register("rover").unwrap(),
-        domain.register("arm").unwrap(),
+        domain.register("rover").await.unwrap(),
+        domain.register("arm").await.unwrap(),
     );
     let mut watcher = Watcher::open(&config, WatchOptions::default())
         .await
@@ -310,11 +313,11 @@ async fn invalid_records_are_refused_without_effect_on_others() {
 async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
     let config = config(&[]);
     let there = Domain::open(&config).await.unwrap();
-    let arm = there.register("arm").unwrap();
+    let arm = there.register("arm").await.unwrap();
     let mut watcher = Watcher::open(&config, WatchOptions::default())
         .await
         .unwrap();
-    let own = there.register("own").unwrap();
+    let own = there.register("own").await.unwrap();
     until_seen(&mut watcher, &own, "own").await;
     // Fills the queue of the arm.
     let moment = Duration::from_millis(200);
@@ -326,7 +329,7 @@ async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
     for number in 0..5 {
         let here = Domain::open(&config).await.unwrap();
         let name = format!("rover_{number}");
-        let rover = here.register(&name).unwrap();
+        let rover = here.register(&name).await.unwrap();
         let only = request(&rover, "arm", "only");
         let deliveries = rover.send_within(only, moment).await.unwrap();
         let Outcome::Failed {
@@ -377,8 +380,8 @@ async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
     let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
     let at = location.address();
     let (near, at_home, mut watching_near) = watched(Some(at)).await;
-    let rover = at_home.register("rover").unwrap();
-    let arm = abroad.register("arm").unwrap();
+    let rover = at_home.register("rover").await.unwrap();
+    let arm = abroad.register("arm").await.unwrap();
     known(&at_home, "arm").await;
     known(&abroad, "rover").await;
     // Waits until both processes have connected to their watchers.

@@ -107,7 +107,7 @@ impl Robot {
             });
             let agents = (0..AGENTS).map(|number| {
                 let agent = format!("{name}.agent_{number:03}");
-                domain.register(&agent).unwrap()
+                runtime.block_on(domain.register(&agent)).unwrap()
             });
             Self {
                 _agents: agents.collect(),

@@ -170,13 +170,13 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
 }
 
 /// Registers an agent.
-pub(crate) fn register(
+pub(crate) async fn register(
     domain: &Domain,
     name: &str,
     options: RegisterOptions,
     config: &Config,
 ) -> Result<Agent, Failure> {
-    let registered = domain.register_with(name, options);
+    let registered = domain.register_with(name, options).await;
     registered.map_err(|error| not_registered(error, name, config))
 }
 

@@ -122,7 +122,9 @@ impl Robot {
             ..Sources::default()
         });
         let domain = runtime.block_on(Domain::open(&config.unwrap())).unwrap();
-        let writer = domain.register(&format!("{name}.writer")).unwrap();
+        let writer = runtime
+            .block_on(domain.register(&format!("{name}.writer")))
+            .unwrap();
         Self {
             name,
             gateway: Some(gateway),
@@ -144,7 +146,7 @@ impl Robot {
         match self.agents.remove(&name) {
             Some(agent) if registered => drop(self.agents.insert(name, agent)),
             None if registered => {
-                let agent = self.domain.register(&name).unwrap();
+                let agent = self.runtime.block_on(self.domain.register(&name)).unwrap();
                 self.agents.insert(name, agent);
             }
             _ => {}

@@ -46,7 +46,7 @@ pub use contacts::ContactDirectory;
 pub use directory::{DeregisterError, Directory, RegisterError, Updated};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use exchange::{EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, Present};
-pub use host::{Departures, HostConfig, HostDirectory, HostError, SocketId};
+pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, Withdrawal, probe};
 pub use memory::{MemoryDirectory, StaticDirectory};

@@ -13,8 +13,8 @@ use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
 use common::{conforms, next, registration};
 use fipa_sds::{
-    Change, Directory, Entry, HostConfig, HostDirectory, HostError, Mts, Reach, RegisterError,
-    Role, Source,
+    Cancellation, Change, Directory, Entry, HostConfig, HostDirectory, HostError, Mts, Reach,
+    RegisterError, Role, Source,
 };
 use fipa_testbed::{ChildGuard, until_some_async};
 use fipa_transport::Incarnation;
@@ -420,6 +420,37 @@ async fn many_processes_register_at_once_and_all_succeed() {
             assert!(directory.lookup(&name).is_some(), "{name} is missing");
         }
     }
+}
+
+#[tokio::test]
+async fn canceled_calls_end_without_the_lock_and_change_nothing() {
+    let runtime = tokio::runtime::Handle::current();
+    let (_parent, dir) = fresh_dir();
+    let member = open(&dir);
+    let before = files(&dir);
+    let lock = std::fs::File::open(dir.join("lock")).unwrap();
+    lock.lock().unwrap();
+    let cancellation = Cancellation::new();
+    std::thread::scope(|scope| {
+        let joining = scope.spawn(|| {
+            let _context = runtime.enter();
+            HostDirectory::open_unless(config(&dir), &cancellation).map(drop)
+        });
+        let registering =
+            scope.spawn(|| member.register_unless(registration("arm"), &cancellation));
+        cancellation.cancel();
+        assert!(matches!(joining.join().unwrap(), Err(HostError::Canceled)));
+        match registering.join().unwrap() {
+            Err(RegisterError::Failed(error)) => {
+                let error = error.downcast_ref::<HostError>();
+                assert!(matches!(error, Some(HostError::Canceled)));
+            }
+            other => panic!("{other:?}"),
+        }
+    });
+    drop(lock);
+    assert_eq!(files(&dir), before);
+    assert!(member.entries().is_empty());
 }
 
 #[tokio::test]

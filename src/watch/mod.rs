@@ -23,7 +23,7 @@ use fipa_acl::ErrorChain;
 use fipa_mts::watch::Joiner;
 use fipa_mts::watch::record::{MAX_CONTENT, Wish};
 pub use fipa_mts::watch::{Event, Fate, Passage, RecordError};
-use fipa_sds::{Directory, HostDirectory, Reach};
+use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
 use fipa_transport::Incarnation;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -76,7 +76,7 @@ impl Watcher {
         tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let name = format!("fipa-watch-{}", std::process::id());
         let own = fipa_sds::Mts::new(name, Incarnation::random());
-        let (dir, host) = host_directory::join(&config.domain, &own, false)?;
+        let (dir, host) = host_directory::join(&config.domain, &own, false, &Cancellation::new())?;
         let socket = host.listen().inspect_err(|_| leave(&host, &dir))?;
         let socket = socket::listening(socket).map_err(|source| {
             leave(&host, &dir);

@@ -142,7 +142,7 @@ async fn gateway(role: &Role, mut queue: Receiver<String>) {
 
 async fn agent(role: &Role, mut queue: Receiver<String>) {
     let domain = Domain::open(&role.config()).await.unwrap();
-    let agent = Arc::new(domain.register(&role.name).unwrap());
+    let agent = Arc::new(domain.register(&role.name).await.unwrap());
     say!("ready");
     let (release, mut released) = channel::<()>(1);
     let receiving = tokio::spawn({

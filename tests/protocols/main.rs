@@ -41,12 +41,21 @@ async fn two(set: &[&str]) -> (Domain, Domain) {
     support::two(&config(set)).await
 }
 
+/// Registers agents in a domain.
+async fn registered<const N: usize>(domain: &Domain, names: [&str; N]) -> [Agent; N] {
+    let mut agents = Vec::new();
+    for name in names {
+        agents.push(domain.register(name).await.unwrap());
+    }
+    agents.try_into().unwrap()
+}
+
 /// Registers a rover, and an arm of another process.
 async fn pair(set: &[&str]) -> (Agent, Agent) {
     let (here, there) = two(set).await;
     (
-        here.register("rover").unwrap(),
-        there.register("arm").unwrap(),
+        here.register("rover").await.unwrap(),
+        there.register("arm").await.unwrap(),
     )
 }
 
@@ -299,9 +308,9 @@ async fn a_request_is_cancelled() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_contract_net_with_several_participants() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     let names = ["cheap", "dear", "lazy"];
-    let arms = names.map(|name| there.register(name).unwrap());
+    let arms = registered(&there, names).await;
     let mut called: Vec<AgentId> = arms.iter().map(|arm| arm.id().clone()).collect();
     called.push(AgentId::new("unknown").unwrap());
     let participants = async {
@@ -384,8 +393,8 @@ async fn only_one_checks(set: &[&str]) -> (Agent, Agent) {
     let here = Domain::open(&checked).await.unwrap();
     let there = Domain::open(&unchecked).await.unwrap();
     (
-        here.register("rover").unwrap(),
-        there.register("arm").unwrap(),
+        here.register("rover").await.unwrap(),
+        there.register("arm").await.unwrap(),
     )
 }
 

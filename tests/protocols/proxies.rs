@@ -8,7 +8,7 @@ async fn enforcing<const N: usize>(names: [&str; N]) -> [Agent; N] {
     let mut agents = Vec::new();
     for name in names {
         let domain = Domain::open(&config).await.unwrap();
-        agents.push(domain.register(name).unwrap());
+        agents.push(domain.register(name).await.unwrap());
     }
     agents.try_into().ok().unwrap()
 }

@@ -5,8 +5,8 @@ use super::*;
 /// Registers a rover, and agents of another process.
 async fn rover_and<const N: usize>(names: [&str; N]) -> (Agent, [Agent; N]) {
     let (here, there) = two(&["monitor.check=enforce"]).await;
-    let rover = here.register("rover").unwrap();
-    (rover, names.map(|name| there.register(name).unwrap()))
+    let rover = here.register("rover").await.unwrap();
+    (rover, registered(&there, names).await)
 }
 
 fn ids(agents: &[Agent]) -> Vec<AgentId> {
@@ -115,8 +115,8 @@ async fn a_violation_by_one_participant_does_not_affect_the_others() {
         Domain::open(&checked).await.unwrap(),
         Domain::open(&unchecked).await.unwrap(),
     );
-    let rover = here.register("rover").unwrap();
-    let arms = ["wild", "tame"].map(|name| there.register(name).unwrap());
+    let rover = here.register("rover").await.unwrap();
+    let arms = registered(&there, ["wild", "tame"]).await;
     let [wild, tame] = &arms;
     let participants = async {
         let call = next_message(wild).await.unwrap().message;
@@ -161,8 +161,8 @@ async fn winners_do_not_wait_for_losers() {
         Domain::open(&config).await.unwrap(),
         Domain::open(&config).await.unwrap(),
     );
-    let rover = here.register("rover").unwrap();
-    let arms = ["loser", "winner"].map(|name| there.register(name).unwrap());
+    let rover = here.register("rover").await.unwrap();
+    let arms = registered(&there, ["loser", "winner"]).await;
     let [loser, winner] = &arms;
     let (proposed, first) = tokio::sync::oneshot::channel();
     let (done, finished) = tokio::sync::oneshot::channel();

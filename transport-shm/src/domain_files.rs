@@ -96,7 +96,7 @@ impl DomainFiles {
 
     /// Performs the last cleanup of an endpoint.
     pub(crate) fn leave(&self) -> Result<Cleaned, ShmError> {
-        self.closing.store(true, Ordering::SeqCst);
+        self.begin_closing();
         self.clean(true)
     }
 
@@ -143,12 +143,31 @@ impl DomainFiles {
     }
 
     /// Keeps other processes from cleaning up, but not from taking this lock, until the result is
-    /// dropped. Taken to create files outside of [`DomainFiles::lock`]. Senders of this process
-    /// wait meanwhile.
+    /// dropped. Taken to create files outside of [`DomainFiles::lock`]. Letters to a process wait
+    /// while its mailbox is opened.
     pub(crate) fn lock_shared(&self) -> Result<OwnedFd, ShmError> {
-        self.locked(FlockOperation::NonBlockingLockShared, || {
-            SHARED_LOCK_TIMEOUT
+        let how = FlockOperation::NonBlockingLockShared;
+        self.locked(how, || match self.closing.load(Ordering::Relaxed) {
+            true => Duration::ZERO,
+            false => SHARED_LOCK_TIMEOUT,
         })
+    }
+
+    /// Takes the lock like [`lock_shared`](Self::lock_shared) without a wait. `None` if another
+    /// process has it.
+    pub(crate) fn try_lock_shared(&self) -> Result<Option<OwnedFd>, ShmError> {
+        let root = &self.config.root;
+        let how = FlockOperation::NonBlockingLockShared;
+        match lock(root, how, || Duration::ZERO) {
+            Ok(lock) => Ok(Some(lock)),
+            Err(Errno::WOULDBLOCK) => Ok(None),
+            Err(e) => Err(file_error("cannot lock", root, e)),
+        }
+    }
+
+    /// Ends waits and cleanups of other threads early, because the endpoint closes.
+    pub(crate) fn begin_closing(&self) {
+        self.closing.store(true, Ordering::SeqCst);
     }
 
     /// Takes the lock. After a timeout, the next calls do not wait until one has succeeded.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
+use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -13,21 +14,21 @@ use fipa_transport::{
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
-use parking_lot::{Mutex, RwLock};
+use parking_lot::{Condvar, Mutex, RwLock};
 use tokio::runtime::Handle;
 
 use crate::combiner::Combiner;
 use crate::counters::{Tally, count};
 use crate::domain_files::{DomainFiles, file_error};
-use crate::errors::retired;
+use crate::errors::{closed, opening};
 use crate::fork::Owner;
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
 use crate::loan::ShmLoan;
 use crate::memory::{Budget, SHM};
-use crate::outbox::{Opening, Outbox, Posted};
+use crate::outbox::{MemoryLock, Opening, Outbox};
 use crate::peer_segments::PeerSegments;
-use crate::peers::Peer;
+use crate::peers::{BacklogLimits, BacklogStep, Dispatched, OpenOutbox, Peer};
 use crate::pool::Pool;
 use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, wait_for_polls};
 use crate::storage::{self, Shortage};
@@ -54,6 +55,7 @@ pub(crate) struct Endpoint {
     /// Counts uses of peers, to find the least recently used one.
     uses: AtomicU64,
     node: Mutex<Option<Node<Svc>>>,
+    backlogs: Arc<BacklogThreads>,
     presence: RwLock<Option<Presence>>,
     doorbell: Arc<Doorbell>,
     /// Number of requests for a cleanup.
@@ -143,6 +145,7 @@ impl Endpoint {
             peers: RwLock::default(),
             uses: AtomicU64::new(0),
             node: Mutex::new(Some(node)),
+            backlogs: Arc::default(),
             presence: RwLock::new(Some(presence)),
             doorbell,
             dirty: AtomicU64::new(0),
@@ -334,34 +337,76 @@ impl Endpoint {
         self: &Arc<Self>,
         attempt: AttemptId,
         to: &Location,
-        parcel: &Parcel,
+        parcel: Parcel,
     ) -> Result<(), TransportError> {
         self.check_owner()?;
         if self.sink.get().is_none() {
             return Err(closed());
         }
-        // The second attempt opens a new outbox if the first one was retired.
-        for _ in 0..2 {
-            let peer = self.peer_at(to)?;
-            match self.outbox(&peer)?.post(attempt, parcel)? {
-                Posted::Sent => {
-                    count(&self.tally.sent);
-                    if peer.wake() {
-                        count(&self.tally.rung);
-                    }
-                    return Ok(());
-                }
-                Posted::Retired => peer.renew(),
-            }
+        let peer = self.peer_at(to)?;
+        let limits = BacklogLimits {
+            parcels: self.config.window,
+            bytes: self.config.max_letter,
+        };
+        match peer.post(attempt, parcel, limits)? {
+            Dispatched::Sent => self.wake_for_parcel(&peer),
+            Dispatched::Queued => {}
+            Dispatched::QueuedFirst => self.start_backlog(peer),
         }
-        Err(retired())
+        Ok(())
     }
 
-    /// Abandons an attempt. The parcel is in the other process's mailbox, which may still take it.
+    fn wake_for_parcel(&self, peer: &Peer) {
+        count(&self.tally.sent);
+        if peer.wake() {
+            count(&self.tally.rung);
+        }
+    }
+
+    /// Starts a thread that opens a peer's mailbox and sends its backlog. Both may wait for other
+    /// processes.
+    fn start_backlog(self: &Arc<Self>, peer: Arc<Peer>) {
+        let (endpoint, threads) = (Arc::downgrade(self), Arc::clone(&self.backlogs));
+        self.runtime.spawn_blocking(move || {
+            let _running = threads.enter();
+            // Without the endpoint, the parcels are concluded already.
+            if let Some(endpoint) = endpoint.upgrade() {
+                endpoint.serve_backlog(&peer);
+            }
+        });
+    }
+
+    fn serve_backlog(&self, peer: &Peer) {
+        let mut lock = None;
+        loop {
+            let mut concluded = Vec::new();
+            let step = peer.send_next(lock.take(), &mut concluded);
+            match step {
+                BacklogStep::Sent => self.wake_for_parcel(peer),
+                BacklogStep::Failed => {}
+                BacklogStep::NeedsMemory => match self.budget.lock() {
+                    Ok(taken) => lock = Some(taken),
+                    Err(error) => peer.fail_next(error, &mut concluded),
+                },
+                BacklogStep::NotOpen => {
+                    if let Err(error) = self.open_waiting(peer) {
+                        peer.fail_backlog(&error, &mut concluded);
+                        self.report(concluded);
+                        return;
+                    }
+                }
+                BacklogStep::Empty => return,
+            }
+            self.report(concluded);
+        }
+    }
+
+    /// Abandons an attempt. The parcel may be in the other process's mailbox, and that process may
+    /// still take it.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let peers = self.peers.read();
-        let _known = peers.values().any(|peer| peer.abandon(attempt));
-        Abandoned::Unconfirmed
+        let abandoned = peers.values().find_map(|peer| peer.abandon(attempt));
+        abandoned.unwrap_or(Abandoned::Unconfirmed)
     }
 
     pub(crate) fn loan(
@@ -373,7 +418,20 @@ impl Endpoint {
     ) -> Result<ShmLoan, TransportError> {
         self.check_owner()?;
         let peer = self.peer_at(to)?;
-        self.outbox(&peer)?.loan(head_room, len, tail_room)
+        let outbox = match peer.outbox()? {
+            OpenOutbox::Open(outbox) => outbox,
+            OpenOutbox::Claimed => {
+                let opened = self.open_at_once(&peer);
+                // Parcels that were queued meanwhile, or the mailbox if it could not be opened
+                // without a wait.
+                let waits = matches!(opened, Ok(None));
+                if waits || !peer.leave_backlog() {
+                    self.start_backlog(peer);
+                }
+                opened?.ok_or_else(opening)?
+            }
+        };
+        outbox.loan(head_room, len, tail_room)
     }
 
     fn check_owner(&self) -> Result<(), TransportError> {
@@ -386,26 +444,63 @@ impl Endpoint {
         }
     }
 
-    /// Returns the outbox to a peer; opens its mailbox if necessary.
-    fn outbox(&self, peer: &Peer) -> Result<Arc<Outbox>, TransportError> {
-        peer.outbox(|| {
-            let node = self.node.lock();
-            let name = mailbox_name(peer.incarnation());
-            let service = ServiceName::new(&name).map_err(|e| {
-                TransportError::new(TransportErrorKind::Unreachable, format_args!("{e:?}"))
-            })?;
-            Outbox::open(Opening {
-                node: node.as_ref().ok_or_else(closed)?,
-                service: &service,
-                own: self.config.incarnation,
-                waiting: self.waiting.clone(),
-                max_loans: self.config.max_loans,
-                budget: self.budget.clone(),
-                pool: self.pool.clone(),
-                tally: self.tally.clone(),
-                domain: self.domain.clone(),
-            })
-        })
+    /// Opens a peer's mailbox. Waits for other processes.
+    fn open_waiting(&self, peer: &Peer) -> Result<(), TransportError> {
+        if peer.is_open() {
+            return Ok(());
+        }
+        let lock = self
+            .domain
+            .lock_shared()
+            .map_err(|e| TransportError::new(TransportErrorKind::Congested, e))?;
+        let node = self.node.lock();
+        self.open_outbox(peer, node.as_ref(), lock, MemoryLock::Wait)
+            .map(drop)
+    }
+
+    /// Opens a peer's mailbox. `None` if that would take a wait.
+    fn open_at_once(&self, peer: &Peer) -> Result<Option<Arc<Outbox>>, TransportError> {
+        let Some(node) = self.node.try_lock() else {
+            return Ok(None);
+        };
+        let lock = self
+            .domain
+            .try_lock_shared()
+            .map_err(|e| TransportError::new(TransportErrorKind::Congested, e))?;
+        let Some(lock) = lock else {
+            return Ok(None);
+        };
+        self.open_outbox(peer, node.as_ref(), lock, MemoryLock::Try)
+            .map(Some)
+    }
+
+    /// Opens a peer's mailbox. The node stays locked meanwhile, so that it outlives the outbox if
+    /// the peer has ended.
+    fn open_outbox(
+        &self,
+        peer: &Peer,
+        node: Option<&Node<Svc>>,
+        lock: OwnedFd,
+        memory: MemoryLock,
+    ) -> Result<Arc<Outbox>, TransportError> {
+        let node = node.filter(|_| !self.is_closed()).ok_or_else(closed)?;
+        let name = mailbox_name(peer.incarnation());
+        let service = ServiceName::new(&name).map_err(|e| {
+            TransportError::new(TransportErrorKind::Unreachable, format_args!("{e:?}"))
+        })?;
+        peer.opened(Outbox::open(Opening {
+            node,
+            service: &service,
+            own: self.config.incarnation,
+            waiting: self.waiting.clone(),
+            max_loans: self.config.max_loans,
+            budget: self.budget.clone(),
+            pool: self.pool.clone(),
+            tally: self.tally.clone(),
+            domain: self.domain.clone(),
+            lock,
+            memory,
+        })?)
     }
 
     fn peer_at(self: &Arc<Self>, to: &Location) -> Result<Arc<Peer>, TransportError> {
@@ -545,11 +640,18 @@ impl Endpoint {
         });
     }
 
+    fn report(&self, concluded: Vec<(AttemptId, Conclusion)>) {
+        if let Some(sink) = self.sink.get() {
+            report_conclusions(&**sink, concluded);
+        }
+    }
+
     /// Closes the endpoint. The sink must not call this from one of its methods.
     pub(crate) fn close(&self) {
         if !self.owner.is_this() || self.closed.swap(true, Ordering::SeqCst) {
             return;
         }
+        self.domain.begin_closing();
         // While other processes still consider this process alive.
         self.pool.close();
         // Peers must take the remaining parcels before the outboxes are closed.
@@ -572,9 +674,9 @@ impl Endpoint {
         };
         drop(peers);
         *self.node.lock() = None;
-        if let Some(sink) = self.sink.get() {
-            report_conclusions(&**sink, concluded);
-        }
+        // They hold files of the domain.
+        self.backlogs.wait();
+        self.report(concluded);
         // The error has no receiver; the next process that starts removes what is left.
         let _ = self.domain.leave();
     }
@@ -592,6 +694,32 @@ fn report_conclusions(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) 
     }
 }
 
-fn closed() -> TransportError {
-    TransportError::new(TransportErrorKind::Closed, "")
+/// The threads that serve backlogs.
+#[derive(Debug, Default)]
+struct BacklogThreads {
+    running: Mutex<usize>,
+    ended: Condvar,
+}
+
+/// A running thread that serves a backlog.
+struct BacklogThread<'a>(&'a BacklogThreads);
+
+impl BacklogThreads {
+    fn enter(&self) -> BacklogThread<'_> {
+        *self.running.lock() += 1;
+        BacklogThread(self)
+    }
+
+    /// Waits until none is running.
+    fn wait(&self) {
+        let mut running = self.running.lock();
+        self.ended.wait_while(&mut running, |running| *running > 0);
+    }
+}
+
+impl Drop for BacklogThread<'_> {
+    fn drop(&mut self) {
+        *self.0.running.lock() -= 1;
+        self.0.ended.notify_all();
+    }
 }

@@ -21,6 +21,24 @@ pub(crate) fn retired() -> TransportError {
     )
 }
 
+pub(crate) fn closed() -> TransportError {
+    TransportError::new(TransportErrorKind::Closed, "")
+}
+
+pub(crate) fn opening() -> TransportError {
+    TransportError::new(
+        TransportErrorKind::Congested,
+        "the mailbox of the other process is being opened",
+    )
+}
+
+pub(crate) fn allocating() -> TransportError {
+    TransportError::new(
+        TransportErrorKind::Congested,
+        "another process of the domain is allocating shared memory",
+    )
+}
+
 pub(crate) fn window_full(window: usize) -> TransportError {
     TransportError::new(
         TransportErrorKind::Congested,

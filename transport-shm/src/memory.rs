@@ -80,31 +80,38 @@ impl Budget {
         Ok(())
     }
 
-    /// Checks that `need` more bytes can be allocated, and locks out other processes of the domain
-    /// until the result is dropped. The pages must be allocated before that ([`populate`]).
+    /// Locks out other processes of the domain that allocate memory, until the result is dropped.
+    /// Waits for them at most [`LOCK_TIMEOUT`]. The caller checks that there is room
+    /// ([`check`](Self::check)), and allocates the pages ([`populate`]) before the result is
+    /// dropped.
     ///
     /// A holder of the domain's lock may take this lock, but not the other way round.
-    pub(crate) fn reserve(&self, need: u64) -> Result<OwnedFd, TransportError> {
-        let lock_directory = self.lock_directory().map_err(|e| {
-            TransportError::new(
-                TransportErrorKind::Congested,
-                format_args!(
-                    "cannot lock {} to allocate memory: {e}",
-                    self.directory.display()
-                ),
-            )
-        })?;
-        self.check(need)?;
-        Ok(lock_directory)
+    pub(crate) fn lock(&self) -> Result<OwnedFd, TransportError> {
+        self.lock_directory(LOCK_TIMEOUT)
+            .map_err(|e| self.lock_error(e))
+    }
+
+    /// Takes the lock like [`lock`](Self::lock) without a wait. `None` if another process has it.
+    pub(crate) fn try_lock(&self) -> Result<Option<OwnedFd>, TransportError> {
+        match self.lock_directory(Duration::ZERO) {
+            Ok(lock) => Ok(Some(lock)),
+            Err(Errno::WOULDBLOCK) => Ok(None),
+            Err(e) => Err(self.lock_error(e)),
+        }
+    }
+
+    fn lock_error(&self, error: Errno) -> TransportError {
+        let directory = self.directory.display();
+        TransportError::new(
+            TransportErrorKind::Congested,
+            format_args!("cannot lock {directory} to allocate memory: {error}"),
+        )
     }
 
     /// Locks the directory itself, so that no lock file remains.
-    fn lock_directory(&self) -> rustix::io::Result<OwnedFd> {
-        lock(
-            &self.directory,
-            FlockOperation::NonBlockingLockExclusive,
-            || LOCK_TIMEOUT,
-        )
+    fn lock_directory(&self, timeout: Duration) -> rustix::io::Result<OwnedFd> {
+        let how = FlockOperation::NonBlockingLockExclusive;
+        lock(&self.directory, how, || timeout)
     }
 
     /// Checks that `need` more bytes can be allocated now.

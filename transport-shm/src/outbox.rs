@@ -2,6 +2,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
+use std::os::fd::OwnedFd;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
@@ -19,7 +20,8 @@ use parking_lot::Mutex;
 use crate::counters::{Tally, count};
 use crate::domain_files::DomainFiles;
 use crate::errors::{
-    create_error, loan_error, open_error, retired, send_error, too_large, window_full, wire_error,
+    allocating, create_error, loan_error, open_error, retired, send_error, too_large, window_full,
+    wire_error,
 };
 use crate::fork::Owner;
 use crate::layout::{
@@ -121,6 +123,18 @@ pub(crate) enum Posted {
     Sent,
     /// The outbox is retired and has not taken the parcel.
     Retired,
+    /// The parcel needs more memory, and another process is allocating some.
+    Contended,
+}
+
+/// The lock under which memory is allocated.
+pub(crate) enum MemoryLock {
+    /// Taken if it is free.
+    Try,
+    /// Waited for.
+    Wait,
+    /// Taken by the caller.
+    Held(OwnedFd),
 }
 
 /// The arguments of [`Outbox::open`].
@@ -135,15 +149,16 @@ pub(crate) struct Opening<'a> {
     pub(crate) pool: Arc<Pool>,
     pub(crate) tally: Arc<Tally>,
     pub(crate) domain: Arc<DomainFiles>,
+    /// The shared lock of the domain.
+    pub(crate) lock: OwnedFd,
+    /// Whether to wait for another process that allocates memory.
+    pub(crate) memory: MemoryLock,
 }
 
 impl Outbox {
     pub(crate) fn open(opening: Opening<'_>) -> Result<Self, TransportError> {
         opening.budget.check(OPENING)?;
-        let _lock = opening
-            .domain
-            .lock_shared()
-            .map_err(|e| TransportError::new(TransportErrorKind::Congested, e))?;
+        let _lock = opening.lock;
         let service = opening
             .node
             .service_builder(opening.service)
@@ -198,7 +213,8 @@ impl Outbox {
             domain: opening.domain,
         };
         // Allocates the pages of the first segment.
-        drop(outbox.take(&mut outbox.state.lock(), 1)?);
+        let request = outbox.take(&mut outbox.state.lock(), 1, opening.memory)?;
+        drop(request.ok_or_else(allocating)?);
         Ok(outbox)
     }
 
@@ -228,6 +244,7 @@ impl Outbox {
         &self,
         attempt: AttemptId,
         parcel: &Parcel,
+        lock: MemoryLock,
     ) -> Result<Posted, TransportError> {
         let (header, pieces) = ParcelHeader::borrowing(parcel).map_err(wire_error)?;
         let (content, tail) = match &parcel.body {
@@ -277,7 +294,9 @@ impl Outbox {
                 None => count(&self.tally.loans_copied),
             }
         }
-        let mut request = self.take(&mut state, offsets.end)?;
+        let Some(mut request) = self.take(&mut state, offsets.end, lock)? else {
+            return Ok(Posted::Contended);
+        };
         let header = Header::new(&header, offset(offsets.start)?, self.own, token);
         *request.user_header_mut() = header.referring(reference);
         let payload = request.payload_mut();
@@ -430,7 +449,8 @@ impl Outbox {
                 ),
             ));
         }
-        let request = self.take(&mut state, offsets.end)?;
+        let request = self.take(&mut state, offsets.end, MemoryLock::Try)?;
+        let request = request.ok_or_else(allocating)?;
         self.loans.fetch_add(1, Ordering::AcqRel);
         let loan = Loan::new(
             request,
@@ -457,8 +477,24 @@ impl Outbox {
         self.loans.fetch_sub(1, Ordering::AcqRel);
     }
 
-    /// Takes a request with a payload of this length, all of whose pages are allocated.
-    fn take(&self, state: &mut State, len: usize) -> Result<UninitRequest, TransportError> {
+    /// Takes a request with a payload of this length, all of whose pages are allocated. `None` if
+    /// memory must be allocated and the lock for that is not available.
+    fn take(
+        &self,
+        state: &mut State,
+        len: usize,
+        memory: MemoryLock,
+    ) -> Result<Option<UninitRequest>, TransportError> {
+        let reserve = |need: u64| {
+            let lock = match memory {
+                MemoryLock::Try => self.budget.try_lock()?,
+                MemoryLock::Wait => Some(self.budget.lock()?),
+                MemoryLock::Held(lock) => Some(lock),
+            };
+            self.budget.check(need)?;
+            Ok::<_, TransportError>(lock)
+        };
+        let mut reserve = Some(reserve);
         let segment = &mut state.segment;
         let grows = len > segment.room;
         // Keeps other processes from allocating until the pages are allocated here.
@@ -466,7 +502,12 @@ impl Outbox {
         if grows {
             let headers = self.chunks.saturating_mul(FIRST_CHUNK) as u64;
             let need = (len as u64).saturating_add(headers);
-            _lock = Some(self.budget.reserve(need)?);
+            if let Some(reserve) = reserve.take() {
+                _lock = reserve(need)?;
+            }
+            if _lock.is_none() {
+                return Ok(None);
+            }
         }
         let (request, shortage) = storage::with_shortage(|| self.client.loan_slice_uninit(len));
         let mut request = request.map_err(|error| match shortage {
@@ -501,12 +542,17 @@ impl Outbox {
         if *ready < len {
             let missing = len - *ready;
             if missing > 2 * FIRST_CHUNK && !grows {
-                _lock = Some(self.budget.reserve(missing as u64)?);
+                if let Some(reserve) = reserve.take() {
+                    _lock = reserve(missing as u64)?;
+                }
+                if _lock.is_none() {
+                    return Ok(None);
+                }
             }
             populate(payload.wrapping_add(*ready), missing)?;
             *ready = len;
         }
-        Ok(request)
+        Ok(Some(request))
     }
 
     /// Collects the available answers. `ended` states that the other process has ended, so that no

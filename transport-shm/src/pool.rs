@@ -10,6 +10,7 @@ use fipa_transport::{Incarnation, LoanedContent, TransportError, TransportErrorK
 use parking_lot::Mutex;
 
 use crate::domain_files::DomainFiles;
+use crate::errors::allocating;
 use crate::memory::{Budget, PAGE, no_room_error, populate};
 use crate::segment::{ContentReference, SegmentFile};
 
@@ -118,16 +119,13 @@ impl Pool {
         }
         let room = room_for(len);
         let need = room.saturating_add(PAGE) as u64;
-        let lock = loop {
-            match self.budget.reserve(need) {
-                Ok(lock) => break lock,
-                Err(error) => {
-                    if error.fault == TransportErrorKind::TooLarge || !self.drop_idle(state) {
-                        return Err(error);
-                    }
-                }
+        // Without a wait: senders need the state that is locked here.
+        let lock = self.budget.try_lock()?.ok_or_else(allocating)?;
+        while let Err(error) = self.budget.check(need) {
+            if error.fault == TransportErrorKind::TooLarge || !self.drop_idle(state) {
+                return Err(error);
             }
-        };
+        }
         // Numbers are unique in the process: peers may still have segments of an earlier endpoint
         // open.
         static LAST_NUMBER: AtomicU64 = AtomicU64::new(0);

@@ -191,7 +191,7 @@ impl Transport for ShmTransport {
         if let Body::Letter(letter) = &parcel.body {
             self.check_len(letter.len())?;
         }
-        let posted = self.endpoint.load().post(attempt, to, &parcel);
+        let posted = self.endpoint.load().post(attempt, to, parcel);
         posted.map_err(|error| self.retriable_while_rejoining(error))
     }
 

@@ -2,6 +2,7 @@
 
 mod common;
 
+use std::any::Any;
 use std::sync::Arc;
 
 use common::TestDomain;
@@ -17,6 +18,10 @@ impl Fixture for Shm {
 
     fn nowhere(&self) -> Location {
         common::location_of(Incarnation::random())
+    }
+
+    fn obstacle(&self) -> Option<Box<dyn Any>> {
+        Some(Box::new(self.0.locked()))
     }
 }
 

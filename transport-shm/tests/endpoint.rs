@@ -167,29 +167,117 @@ fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
     let domain = TestDomain::new();
     let (one, _) = domain.listening();
     let (other, sink) = domain.listening();
-    let root = domain.directory.path().join("domain");
     // Starting, ending and cleaning processes take this lock; this holder does not release it.
-    let stopped = File::open(&root).unwrap();
-    stopped.lock().unwrap();
+    let stopped = domain.locked();
+    let (refused, unsent) = (attempt(), attempt());
+    other
+        .dispatch(refused, &one.location(), parcel(Bytes::new()))
+        .unwrap();
+    until("conclusion", || sink.conclusion_of(refused).is_some());
+    match sink.conclusion_of(refused) {
+        Some(Conclusion::NotSent(error)) => {
+            assert_eq!(error.fault, TransportErrorKind::Congested);
+            assert!(error.detail.contains("stopped"), "{error}");
+        }
+        end => panic!("{end:?}"),
+    }
+    other
+        .dispatch(unsent, &one.location(), parcel(Bytes::new()))
+        .unwrap();
     let (done, finished) = mpsc::channel();
-    let refused = std::thread::spawn(move || {
-        let refused = other.dispatch(attempt(), &one.location(), parcel(Bytes::new()));
+    std::thread::spawn(move || {
         other.close();
         one.close();
         done.send(()).unwrap();
-        refused
     });
     let watchdog = Duration::from_secs(60);
     finished.recv_timeout(watchdog).unwrap();
-    let refused = refused.join().unwrap().unwrap_err();
-    assert_eq!(refused.fault, TransportErrorKind::Congested);
-    assert!(refused.detail.contains("stopped"), "{refused}");
-    assert_eq!(sink.conclusions(), 0);
+    let end = sink.conclusion_of(unsent);
+    assert!(matches!(end, Some(Conclusion::NotSent(_))), "{end:?}");
+    assert_eq!(sink.conclusions(), 2);
     // After the release, the next process removes what was left.
     drop(stopped);
     let (next, _) = domain.listening();
     next.close();
     assert_eq!(domain.files(), Vec::<String>::new());
+}
+
+#[test]
+fn parcels_that_wait_for_an_open_mailbox_are_bounded() {
+    let domain = TestDomain::new();
+    let mut config = domain.config();
+    config.max_letter = 100_000;
+    let (sender, sink) = domain.listening_with(config.clone());
+    let (many, large) = (domain.listening(), domain.listening());
+    let stopped = domain.locked();
+    let dispatch = |to: &ShmTransport, content: usize| {
+        let parcel = parcel(vec![1; content].into());
+        sender.dispatch(attempt(), &to.location(), parcel)
+    };
+    for _ in 0..config.window {
+        dispatch(&many.0, 10).unwrap();
+    }
+    let refused = dispatch(&many.0, 10).unwrap_err();
+    assert_eq!(refused.fault, TransportErrorKind::Congested);
+    dispatch(&large.0, 60_000).unwrap();
+    let refused = dispatch(&large.0, 60_000).unwrap_err();
+    assert_eq!(refused.fault, TransportErrorKind::Congested);
+    dispatch(&large.0, 10_000).unwrap();
+    drop(stopped);
+    until("conclusions", || sink.conclusions() == config.window + 2);
+}
+
+#[test]
+fn parcels_that_wait_for_the_mailbox_of_a_process_that_ends_are_not_sent() {
+    let domain = TestDomain::new();
+    let (sender, sink) = domain.listening();
+    let (receiver, got) = domain.listening();
+    let stopped = domain.locked();
+    let one = attempt();
+    sender
+        .dispatch(one, &receiver.location(), parcel(Bytes::new()))
+        .unwrap();
+    receiver.close();
+    until("conclusion", || sink.conclusion_of(one).is_some());
+    let end = sink.conclusion_of(one);
+    assert!(matches!(end, Some(Conclusion::NotSent(_))), "{end:?}");
+    drop(stopped);
+    assert_eq!((got.arrivals(), sink.conclusions()), (0, 1));
+}
+
+/// A large letter needs more memory, which one process of the domain allocates at a time.
+#[test]
+fn a_letter_that_needs_memory_waits_for_a_process_that_allocates_some() {
+    let accepted = Some(Conclusion::Answered(Answer::Accepted));
+    // The wait has a timeout, which passes on a busy machine.
+    for _ in 0..20 {
+        let domain = TestDomain::new();
+        let (sender, sink) = domain.listening();
+        let (receiver, got) = domain.listening();
+        let dispatch = |content: usize| {
+            let (one, content) = (attempt(), vec![2; content].into());
+            sender
+                .dispatch(one, &receiver.location(), parcel(content))
+                .unwrap();
+            one
+        };
+        let first = dispatch(10);
+        until("answer", || sink.conclusion_of(first).is_some());
+        let allocating = domain.memory_locked();
+        let (large, small) = (dispatch(300_000), dispatch(10));
+        // Allocates no memory, so it is on the heap.
+        assert!(sender.loan(&receiver.location(), 100, 400_000, 1).is_err());
+        assert!(sender.loan_for_many(400_000).is_err());
+        drop(allocating);
+        until("answers", || sink.conclusions() == 3);
+        if sink.conclusion_of(large) != accepted {
+            continue;
+        }
+        assert_eq!(sink.conclusion_of(small), accepted);
+        assert_eq!((got.content(1).len(), got.content(2).len()), (300_000, 10));
+        return;
+    }
+    panic!("the letter was never sent");
 }
 
 /// A process that waits for the lock of a directory must not clean up in a new directory that

@@ -234,12 +234,20 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
     let (sender, sent) = domain.listening_with(config);
     let (receiver, _got) = domain.listening();
     let to = receiver.location();
+    // The first letter to a process is sent after its mailbox has been opened.
+    let one = attempt();
+    sender.dispatch(one, &to, parcel(pattern(9 << 20))).unwrap();
+    until("conclusion", || sent.conclusion_of(one).is_some());
+    match sent.conclusion_of(one) {
+        Some(Conclusion::NotSent(error)) => assert_eq!(error.fault, TransportErrorKind::TooLarge),
+        end => panic!("{end:?}"),
+    }
     let refused = sender
         .dispatch(attempt(), &to, parcel(pattern(9 << 20)))
         .unwrap_err();
     assert_eq!(refused.fault, TransportErrorKind::TooLarge);
     // The receiver keeps every letter, so each one takes new memory.
-    let mut taken = 0;
+    let mut taken = 1;
     let refused = loop {
         match sender.dispatch(attempt(), &to, parcel(pattern(1 << 20))) {
             Ok(()) => taken += 1,

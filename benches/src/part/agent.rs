@@ -42,8 +42,14 @@ impl Agent {
     pub(super) fn play(config: &Config, names: &[&str], address: &str) -> Result<(), String> {
         let runtime = runtime()?;
         let domain = runtime.block_on(Domain::open(config)).map_err(chain_text)?;
-        let agents = names.iter().map(|name| domain.register(name));
-        let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(chain_text)?;
+        let mut agents = Vec::new();
+        for name in names {
+            agents.push(
+                runtime
+                    .block_on(domain.register(name))
+                    .map_err(chain_text)?,
+            );
+        }
         let agent = agents.pop().ok_or("no agent was registered")?;
         let orders = runtime.block_on(async { orders() });
         let agent = Self {

@@ -57,7 +57,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         agent_type: arguments.agent_type,
         description: arguments.description,
     };
-    let agent = membership::register(&domain, arguments.name.name(), options, config)?;
+    let agent = membership::register(&domain, arguments.name.name(), options, config).await?;
     output::text(&format!(
         "agent {} of domain {} is ready; press Ctrl-C to stop\n",
         escape(agent.name()),

@@ -125,6 +125,7 @@ async fn gateway_report(
     };
     let agent = domain
         .register_with(&name, RegisterOptions::default())
+        .await
         .map_err(|error| failed(&error))?;
     let report = routes::of_gateway(&agent, gateway, receivers, GATEWAY_TIMEOUT).await;
     match report {

@@ -145,7 +145,7 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
             agent_type: "fipa-send".to_owned(),
             ..RegisterOptions::default()
         };
-        let agent = membership::register(&domain, &name, options, &config)?;
+        let agent = membership::register(&domain, &name, options, &config).await?;
         let done = converse(&agent, &arguments, content, &config).await;
         drop(agent);
         domain.close().await;

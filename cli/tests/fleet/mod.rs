@@ -422,7 +422,7 @@ impl Party {
             let runtime = builder.worker_threads(2).enable_all().build().unwrap();
             let domain = runtime.block_on(Domain::open(&config)).unwrap();
             let agent = runtime
-                .block_on(async { domain.register(&name(at)) })
+                .block_on(async { domain.register(&name(at)).await })
                 .unwrap();
             (runtime, Arc::new(agent))
         });

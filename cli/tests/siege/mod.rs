@@ -298,7 +298,9 @@ impl Party {
         let mut builder = tokio::runtime::Builder::new_multi_thread();
         let runtime = builder.worker_threads(1).enable_all().build().unwrap();
         let domain = runtime.block_on(Domain::open(&config)).unwrap();
-        let agent = runtime.block_on(async { domain.register(name) }).unwrap();
+        let agent = runtime
+            .block_on(async { domain.register(name).await })
+            .unwrap();
         Self {
             runtime,
             agent: Arc::new(agent),

@@ -190,7 +190,7 @@ async fn agent(
 ) {
     shared.journal.note(&Event::Begins { name: name.clone() });
     let agent = loop {
-        match shared.domain.register(&name) {
+        match shared.domain.register(&name).await {
             Ok(agent) => break agent,
             Err(RegisterError::AlreadyRegistered { .. }) => {}
             Err(other) => panic!("{name}: {other}"),

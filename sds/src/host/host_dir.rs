@@ -14,7 +14,7 @@ use parking_lot::{Mutex, MutexGuard};
 use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
-use super::HostError;
+use super::{Cancellation, HostError};
 
 /// Identifies the files of one process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -100,6 +100,9 @@ const FIRST_PAUSE: Duration = Duration::from_micros(200);
 /// more CPU time than the processes they wait for.
 const LAST_PAUSE: Duration = Duration::from_millis(8);
 
+/// Maximum time between two checks of whether a waiting call was canceled.
+const LONGEST_CHECK: Duration = Duration::from_millis(20);
+
 /// Duration of a turn, in which a process may lock several times: after another process's turn it
 /// must read that one's changes, which takes longer than a registration.
 const TURN: Duration = Duration::from_millis(20);
@@ -107,7 +110,11 @@ const TURN: Duration = Duration::from_millis(20);
 impl HostDir {
     /// Opens the directory, creates it if necessary, checks it, and joins as the process with this
     /// ID.
-    pub(super) fn join(path: &Path, id: Id) -> Result<Self, HostError> {
+    pub(super) fn join(
+        path: &Path,
+        id: Id,
+        cancellation: &Cancellation,
+    ) -> Result<Self, HostError> {
         // With a trailing slash, the kernel would follow a symbolic link.
         let path: PathBuf = path.components().collect();
         let dir = open_private(&path)?;
@@ -120,7 +127,7 @@ impl HostDir {
             process: Mutex::new(None),
         };
         let deadline = Instant::now() + LONGEST;
-        while !host_dir.try_join()? {
+        while !host_dir.try_join(cancellation)? {
             // The last process left in between and removed the lock file.
             host_dir.domain = open_domain(&host_dir.dir, &host_dir.path)?;
             if Instant::now() > deadline {
@@ -132,8 +139,8 @@ impl HostDir {
         Ok(host_dir)
     }
 
-    fn try_join(&self) -> Result<bool, HostError> {
-        let guard = self.lock_any()?;
+    fn try_join(&self, cancellation: &Cancellation) -> Result<bool, HostError> {
+        let guard = self.lock_any(cancellation)?;
         if !guard.is_current()? {
             return Ok(false);
         }
@@ -210,7 +217,12 @@ impl HostDir {
 
     /// Waits for the lock of the domain.
     pub(super) fn lock(&self) -> Result<Guard<'_>, HostError> {
-        let guard = self.lock_any()?;
+        self.lock_unless(&Cancellation::new())
+    }
+
+    /// Waits for the lock of the domain, unless the call is canceled.
+    pub(super) fn lock_unless(&self, cancellation: &Cancellation) -> Result<Guard<'_>, HostError> {
+        let guard = self.lock_any(cancellation)?;
         if guard.is_current()? {
             Ok(guard)
         } else {
@@ -236,12 +248,19 @@ impl HostDir {
     /// An advisory lock is not fair: a process that has just unlocked it is the likeliest to lock
     /// it again. A second lock, on the directory itself, therefore grants turns: its holder waits
     /// for the domain's lock, and the other processes compete for the next turn with equal chances.
-    fn lock_any(&self) -> Result<Guard<'_>, HostError> {
+    fn lock_any(&self, cancellation: &Cancellation) -> Result<Guard<'_>, HostError> {
         let busy = || HostError::Busy {
             path: self.path.join(Name::Domain.to_string()),
         };
         let began = Instant::now();
-        let mut threads = self.threads.try_lock_for(LONGEST).ok_or_else(busy)?;
+        let mut threads = loop {
+            cancellation.check()?;
+            match self.threads.try_lock_for(LONGEST_CHECK) {
+                Some(threads) => break threads,
+                None if began.elapsed() > LONGEST => return Err(busy()),
+                None => {}
+            }
+        };
         let in_turn = threads.is_some_and(|began| began.elapsed() < TURN);
         if in_turn && self.try_domain()? {
             return Ok(Guard {
@@ -253,6 +272,7 @@ impl HostDir {
         let mut pause = FIRST_PAUSE;
         let (mut seen, mut moved) = (None, Instant::now());
         loop {
+            cancellation.check()?;
             if turn.is_none() {
                 turn = self.try_turn()?;
             }

@@ -11,6 +11,7 @@
 //!
 //! Nothing about the network belongs here. A gateway publishes the agents of other hosts here.
 
+mod cancellation;
 mod file;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
@@ -30,6 +31,7 @@ use fipa_transport::{Forked, Incarnation, OwnerProcess};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
+pub use self::cancellation::Cancellation;
 use self::host_dir::{HostDir, Id};
 use self::shared::Shared;
 use self::watcher::Watcher;
@@ -68,10 +70,19 @@ impl HostDirectory {
     /// # Errors
     /// Fails when no tokio runtime is running, or the directory is not private or cannot be used.
     pub fn open(config: HostConfig) -> Result<Self, HostError> {
+        Self::open_unless(config, &Cancellation::new())
+    }
+
+    /// Joins the directory like [`open`](Self::open), unless the call is canceled while it waits for
+    /// other processes. Nothing is left of a canceled call.
+    ///
+    /// # Errors
+    /// Fails like [`open`](Self::open), and with [`HostError::Canceled`].
+    pub fn open_unless(config: HostConfig, cancellation: &Cancellation) -> Result<Self, HostError> {
         let runtime = tokio::runtime::Handle::try_current().map_err(|_| HostError::NoRuntime)?;
         // Not the service's incarnation, because a process may open the directory more than once.
         let id = Id(Incarnation::random().as_u64());
-        let host_dir = HostDir::join(&config.dir, id)?;
+        let host_dir = HostDir::join(&config.dir, id, cancellation)?;
         let shared = Arc::new(Shared::new(host_dir, config.mts.clone()));
         // Starts to watch before reading, so that no change is missed in between.
         let watcher = Watcher::new(&shared.host_dir());
@@ -116,6 +127,21 @@ impl HostDirectory {
             published.insert(entry.name.clone(), Arc::new(entry));
         }
         self.shared.publish(published.into_values().collect())
+    }
+
+    /// Registers an agent like [`Directory::register`], unless the call is canceled before the
+    /// registration is written. The name is then not visible to any process.
+    ///
+    /// # Errors
+    /// Fails like [`Directory::register`], and with [`HostError::Canceled`] as the source.
+    pub fn register_unless(
+        &self,
+        registration: Registration,
+        cancellation: &Cancellation,
+    ) -> Result<Arc<Entry>, RegisterError> {
+        self.owner.check()?;
+        let entry = registration.into_entry(&self.config.mts, Source::Host)?;
+        self.shared.register(entry, cancellation)
     }
 
     /// Registers or updates all `registrations` and removes those in `leaving`, by name and
@@ -260,9 +286,7 @@ impl Directory for HostDirectory {
     }
 
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
-        self.owner.check()?;
-        let entry = registration.into_entry(&self.config.mts, Source::Host)?;
-        self.shared.register(entry)
+        self.register_unless(registration, &Cancellation::new())
     }
 
     fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
@@ -298,6 +322,9 @@ pub enum HostError {
         /// The lock file.
         path: PathBuf,
     },
+    /// The call was canceled before it changed anything.
+    #[error("canceled while waiting for other processes of the domain")]
+    Canceled,
     /// Another program removed files of running processes.
     #[error(
         "the files in {} were removed by another program; this process joins the directory again \

@@ -9,10 +9,9 @@ use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
-use super::HostError;
-use super::SocketId;
 use super::file::{self, Entries, FileError};
 use super::host_dir::{Guard, HostDir, Id, MAX_ENTRIES_FILE, Name, Version};
+use super::{Cancellation, HostError, SocketId};
 use crate::table::Table;
 use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
 
@@ -115,7 +114,11 @@ impl Shared {
             return Ok(false);
         }
         let before = self.host_dir();
-        let host_dir = Arc::new(HostDir::join(before.path(), before.id())?);
+        let host_dir = Arc::new(HostDir::join(
+            before.path(),
+            before.id(),
+            &Cancellation::new(),
+        )?);
         let guard = host_dir.lock()?;
         let mut own = self.own.lock();
         if own.closed {
@@ -306,10 +309,16 @@ impl Shared {
         Ok(true)
     }
 
-    pub(super) fn register(&self, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
+    pub(super) fn register(
+        &self,
+        entry: Entry,
+        cancellation: &Cancellation,
+    ) -> Result<Arc<Entry>, RegisterError> {
         let host_dir = self.host_dir();
-        let guard = host_dir.lock().map_err(failed)?;
+        let guard = host_dir.lock_unless(cancellation).map_err(failed)?;
         self.free(&guard, &entry)?;
+        // The check above may have read many files.
+        cancellation.check().map_err(failed)?;
         let mut own = self.own.lock();
         if own.closed {
             return Err(RegisterError::Closed);

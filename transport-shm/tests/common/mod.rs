@@ -4,6 +4,7 @@
 #![allow(dead_code)]
 #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
+use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -67,6 +68,20 @@ impl TestDomain {
         let sink = Arc::new(RecordingSink::default());
         endpoint.listen(sink.clone()).unwrap();
         (endpoint, sink)
+    }
+
+    /// Takes the lock of the domain, which processes hold while they start, end and clean up.
+    pub(crate) fn locked(&self) -> File {
+        let lock = File::open(self.directory.path().join("domain")).unwrap();
+        lock.lock().unwrap();
+        lock
+    }
+
+    /// Takes the lock under which processes of the domain allocate memory.
+    pub(crate) fn memory_locked(&self) -> File {
+        let lock = File::open(self.directory.path().join("domain/processes")).unwrap();
+        lock.lock().unwrap();
+        lock
     }
 
     /// All files of this domain, sorted.

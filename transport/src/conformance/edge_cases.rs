@@ -161,6 +161,65 @@ pub fn a_closed_transport_refuses_parcels(fixture: &dyn Fixture) {
     assert!(not_sent, "a closed endpoint was reached");
 }
 
+/// No call waits for a lock that another process holds. Parcels that need such a lock leave in order
+/// when it is free, unless they were abandoned.
+pub fn no_call_waits_for_another_process(fixture: &dyn Fixture) {
+    // A transport gives up waiting for the lock after a while, which passes on a busy machine.
+    for _ in 0..20 {
+        let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
+        let Some(obstacle) = fixture.obstacle() else {
+            return;
+        };
+        // A call that waited would fail, because the lock is released only afterwards.
+        for attempt in 1..=3 {
+            a.send(attempt, &b, parcel(attempt, letter("x")));
+        }
+        assert_eq!(a.transport.abandon(AttemptId(2)), Abandoned::NotSent);
+        a.transport.drive();
+        // A loan may fail, but does not wait either.
+        let _ = a.transport.loan(&b.location, 64, 1000, 1);
+        drop(obstacle);
+        let ends = [1, 3].map(|attempt| concluded(&[&a, &b], &a, attempt));
+        if ends.contains(&accepted()) {
+            assert_eq!(ends, [accepted(), accepted()]);
+            let arrived: Vec<u64> = (0..2).map(|it| b.arrived(it).sequence).collect();
+            assert_eq!((b.arrivals(), arrived), (2, vec![1, 3]));
+            assert_eq!(a.conclusion(2), None);
+            return;
+        }
+        for end in ends {
+            assert!(matches!(end, Conclusion::NotSent(_)), "{end:?}");
+        }
+        assert_eq!(b.arrivals(), 0);
+    }
+    panic!("no parcel was sent after the lock was released");
+}
+
+/// Parcels that are dispatched before and while the way to a location is opened arrive in the order
+/// of the calls, each once.
+pub fn the_first_parcels_arrive_in_order(fixture: &dyn Fixture) {
+    for _ in 0..20 {
+        let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
+        let mut taken = Vec::new();
+        let mut attempt = 0;
+        while taken.len() < 8 || a.conclusion(taken[0]).is_none() {
+            attempt += 1;
+            let one = parcel(attempt, letter("x"));
+            match a.transport.dispatch(AttemptId(attempt), &b.location, one) {
+                Ok(()) => taken.push(attempt),
+                Err(error) => assert_eq!(error.fault, TransportErrorKind::Congested, "{error}"),
+            }
+            a.transport.drive();
+            b.transport.drive();
+        }
+        for attempt in &taken {
+            assert_eq!(concluded(&[&a, &b], &a, *attempt), accepted());
+        }
+        let arrived: Vec<u64> = (0..b.arrivals()).map(|it| b.arrived(it).sequence).collect();
+        assert_eq!(arrived, taken);
+    }
+}
+
 /// Loaned memory arrives with the content that was written to it and stays readable for the sender.
 /// A letter that was loaned for one location can also go to another.
 pub fn loaned_content_arrives(fixture: &dyn Fixture) {

@@ -13,6 +13,7 @@ mod edge_cases;
 mod endpoint;
 mod letters;
 
+use std::any::Any;
 use std::sync::Arc;
 
 use crate::{Location, Transport};
@@ -28,6 +29,13 @@ pub trait Fixture {
 
     /// A location of this transport without an endpoint.
     fn nowhere(&self) -> Location;
+
+    /// Takes the locks that other processes of this host take while they change what the endpoints
+    /// share, and holds them until the result is dropped, as a stopped process does. `None` if the
+    /// transport has no such locks.
+    fn obstacle(&self) -> Option<Box<dyn Any>> {
+        None
+    }
 }
 
 /// Defines one test per rule. The argument is an expression for a new [`Fixture`].
@@ -51,6 +59,8 @@ macro_rules! conformance_tests {
             attempts_to_a_closing_receiver_are_concluded
             attempts_of_a_closing_sender_are_concluded
             a_closed_transport_refuses_parcels
+            no_call_waits_for_another_process
+            the_first_parcels_arrive_in_order
             loaned_content_arrives
             shared_content_arrives_at_all_receivers
             a_flood_is_bounded_and_every_attempt_concluded

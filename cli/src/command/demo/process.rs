@@ -166,6 +166,7 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
         .map_err(|error| ErrorChain(&error).to_string())?;
     let agent = domain
         .register(name)
+        .await
         .map_err(|error| ErrorChain(&error).to_string())?;
     let entry = domain.directory().lookup(name);
     let locations = entry.map(|entry| entry.locations.iter().map(ToString::to_string).collect());
