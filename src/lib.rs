@@ -34,6 +34,15 @@
 //! * [`Gateway`] (feature `net`) is the gateway that `fipa up` runs; robot processes do not need it.
 //!
 //! Not in this crate: delivery (`fipa-mts`), the transports, and terminal output (`fipa-cli`).
+//!
+#![cfg_attr(
+    not(feature = "net"),
+    doc = "[`Gateway`]: https://docs.rs/fipa/latest/fipa/struct.Gateway.html"
+)]
+#![cfg_attr(
+    not(feature = "secure"),
+    doc = "[`keys`]: https://docs.rs/fipa/latest/fipa/keys/index.html"
+)]
 
 mod access;
 mod access_gate;

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use common::{Party, accepted, config, letter_parcel, parcel};
-use fipa_acl::Letter;
+use fipa_acl::{ErrorChain, Letter};
 use fipa_testbed::until_some;
 use fipa_transport::{
     Answer, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport,
@@ -240,7 +240,7 @@ fn a_port_in_use_is_reported_with_address_and_remedy() {
     let second = TcpTransport::new(config(&["127.0.0.1:0", taken]), runtime.clone());
     match second.listen(sink.clone()) {
         Err(error @ ListenError::Bind { .. }) => {
-            let text = error.to_string();
+            let text = ErrorChain(&error).to_string();
             assert!(text.contains(taken), "{text}");
             assert!(text.contains("choose another port"), "{text}");
         }

@@ -12,7 +12,8 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 
 /// A transport of letters.
 ///
-/// A transport tries once and reports. It keeps these rules, which [`crate::conformance`] checks:
+/// A transport tries once and reports. It keeps these rules, which the module `conformance` (feature
+/// of that name) checks:
 ///
 /// 1. **One conclusion.** Every [`dispatch`](Self::dispatch) that returned `Ok` has exactly one
 ///    conclusion: by [`Sink::concluded`], or at once by [`abandon`](Self::abandon).
