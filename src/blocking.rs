@@ -4,6 +4,8 @@
 //! sleeps when it has nothing to do.
 
 #[cfg(feature = "monitor")]
+mod platform;
+#[cfg(feature = "monitor")]
 mod protocol;
 
 use std::ops::Deref;
@@ -17,6 +19,8 @@ use tokio::runtime::{Builder, Runtime};
 use crate::owner::Owner;
 use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError, Unread};
 
+#[cfg(feature = "monitor")]
+pub use self::platform::{Ams, Df, Notifications};
 #[cfg(feature = "monitor")]
 pub use self::protocol::Side;
 
