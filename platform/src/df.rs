@@ -23,6 +23,10 @@ pub struct Df {
     id: AgentId,
     /// The descriptions, by the name of their agent.
     entries: BTreeMap<Arc<str>, Entry>,
+    /// The ends of the leases, the earliest first.
+    leases: BTreeSet<(Instant, Arc<str>)>,
+    /// Number of descriptions of each platform.
+    platforms: BTreeMap<Platform, usize>,
     subscriptions: BTreeMap<SubscriptionId, Subscription>,
     next_subscription: u64,
     /// The identifiers of the latest searches, the oldest first.
@@ -48,6 +52,8 @@ impl Df {
         Self {
             id,
             entries: BTreeMap::new(),
+            leases: BTreeSet::new(),
+            platforms: BTreeMap::new(),
             subscriptions: BTreeMap::new(),
             next_subscription: 0,
             search_ids: VecDeque::new(),
@@ -120,12 +126,12 @@ impl Df {
     /// Returns the time of the next call of [`handle_timeout`](Self::handle_timeout).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        let leases = self.entries.values().filter_map(|entry| entry.ends);
+        let leases = self.leases.first().map(|(ends, _)| *ends);
         let waiting = self.subscriptions.values();
         let waiting = waiting
             .filter(|it| !it.is_under_way && !it.changed.is_empty())
             .map(|it| it.not_before);
-        leases.chain(waiting).min()
+        leases.into_iter().chain(waiting).min()
     }
 
     /// Returns the next message to be sent.
@@ -222,20 +228,19 @@ impl Df {
         if self.entries.contains_key(asker.id.name()) {
             return Err(Exception::AlreadyRegistered);
         }
-        let foreign = |entry: &&Entry| entry.platform != Platform::Host;
-        let of_platform = |other: &&Entry| other.platform == entry.platform;
-        let count = |which: &dyn Fn(&&Entry) -> bool| self.entries.values().filter(which).count();
+        let count = |platform| self.platforms.get(&platform).copied().unwrap_or(0);
+        let foreign = self.entries.len() - count(Platform::Host);
         let is_full = self.entries.len() >= limits::DESCRIPTIONS
-            || foreign(&&entry)
-                && (count(&foreign) >= limits::FOREIGN_DESCRIPTIONS
-                    || count(&of_platform) >= limits::DESCRIPTIONS_OF_PLATFORM);
+            || entry.platform != Platform::Host
+                && (foreign >= limits::FOREIGN_DESCRIPTIONS
+                    || count(entry.platform) >= limits::DESCRIPTIONS_OF_PLATFORM);
         if is_full {
             let words = "the directory has no room for a further description of this platform";
             return Err(Exception::InternalError(words.to_owned()));
         }
         let name: Arc<str> = asker.id.name().into();
         self.changed(&name, None, Some(&entry.description));
-        self.entries.insert(name, entry);
+        self.insert(name, entry);
         Ok(())
     }
 
@@ -243,7 +248,8 @@ impl Df {
         self.own_entry(asker)?;
         let name: Arc<str> = asker.id.name().into();
         let new = entry.description.clone();
-        let old = self.entries.insert(Arc::clone(&name), entry);
+        let old = self.take(&name).map(|(_, old)| old);
+        self.insert(Arc::clone(&name), entry);
         self.changed(&name, old.as_ref().map(|old| &old.description), Some(&new));
         Ok(())
     }
@@ -258,17 +264,39 @@ impl Df {
     }
 
     fn remove(&mut self, name: &str) {
-        if let Some((name, entry)) = self.entries.remove_entry(name) {
+        if let Some((name, entry)) = self.take(name) {
             self.changed(&name, Some(&entry.description), None);
         }
     }
 
+    /// Adds an entry under a free name.
+    fn insert(&mut self, name: Arc<str>, entry: Entry) {
+        let lease = entry.ends.map(|ends| (ends, Arc::clone(&name)));
+        self.leases.extend(lease);
+        *self.platforms.entry(entry.platform).or_default() += 1;
+        self.entries.insert(name, entry);
+    }
+
+    /// Removes an entry, without a notification.
+    fn take(&mut self, name: &str) -> Option<(Arc<str>, Entry)> {
+        let (name, entry) = self.entries.remove_entry(name)?;
+        if let Some(ends) = entry.ends {
+            self.leases.remove(&(ends, Arc::clone(&name)));
+        }
+        if let Some(count) = self.platforms.get_mut(&entry.platform) {
+            *count -= 1;
+            if *count == 0 {
+                self.platforms.remove(&entry.platform);
+            }
+        }
+        Some((name, entry))
+    }
+
     /// Removes the descriptions whose leases have ended.
     fn expire(&mut self, now: Instant) {
-        let ended = self.entries.iter();
-        let ended = ended.filter(|(_, entry)| entry.ends.is_some_and(|ends| ends <= now));
-        let ended: Vec<Arc<str>> = ended.map(|(name, _)| Arc::clone(name)).collect();
-        for name in ended {
+        while self.leases.first().is_some_and(|(ends, _)| *ends <= now)
+            && let Some((_, name)) = self.leases.pop_first()
+        {
             self.remove(&name);
         }
     }
@@ -302,7 +330,8 @@ impl Df {
             self.known_search_ids.insert(id);
         }
         let most = max_results(constraints.max_results);
-        let (mut comparisons, mut found) = (Comparisons::default(), Found::default());
+        let mut comparisons = Comparisons::default();
+        let mut found = Found::new(limits::RESULT_BYTES);
         for entry in self.entries.values() {
             if found.texts.len() >= most {
                 break;
@@ -460,7 +489,7 @@ impl Df {
             {
                 continue;
             }
-            let mut found = Found::default();
+            let mut found = Found::new(limits::NOTIFICATION_BYTES);
             while found.texts.len() < limits::RESULTS
                 && let Some(name) = subscription.changed.pop_first()
             {
@@ -499,20 +528,28 @@ impl Df {
 }
 
 /// Descriptions for an answer, as text.
-#[derive(Default)]
 struct Found {
     texts: Vec<Vec<u8>>,
     bytes: usize,
+    most_bytes: usize,
 }
 
 impl Found {
+    fn new(most_bytes: usize) -> Self {
+        Self {
+            texts: Vec::new(),
+            bytes: 0,
+            most_bytes,
+        }
+    }
+
     /// Adds a description, unless the answer is long enough already. A description that the dialect has
     /// no notation for is left out.
     fn add(&mut self, description: &AgentDescription, dialect: Dialect) -> bool {
         let Ok(text) = request::print(dialect, &description.to_term()) else {
             return true;
         };
-        if !self.texts.is_empty() && self.bytes + text.len() > limits::RESULT_BYTES {
+        if !self.texts.is_empty() && self.bytes + text.len() > self.most_bytes {
             return false;
         }
         self.bytes += text.len();

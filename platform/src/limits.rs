@@ -43,6 +43,8 @@ pub const SUBSCRIPTIONS_OF_PLATFORM: usize = 64;
 pub const SUBSCRIPTIONS_OF_AGENT: usize = 16;
 /// Maximum number of changed descriptions that wait for one subscriber. A subscription with more ends.
 pub const CHANGES: usize = 4096;
+/// Length of a notification, in bytes, from which on further changes wait for the next one.
+pub const NOTIFICATION_BYTES: usize = 64 << 10;
 /// Minimum time between two notifications of one subscription.
 pub const NOTIFICATION_PAUSE: Duration = Duration::from_millis(500);
 

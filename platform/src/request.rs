@@ -109,14 +109,14 @@ impl<'m> Request<'m> {
 /// A message that an agent does not act on.
 pub(crate) struct Rejection<'m> {
     /// The requested action, if the content was understood.
-    pub(crate) action: Option<ActionExpression<'m>>,
+    pub(crate) action: Option<Box<ActionExpression<'m>>>,
     pub(crate) reason: Exception,
 }
 
 impl<'m> Rejection<'m> {
     pub(crate) fn of(action: ActionExpression<'m>, reason: Exception) -> Self {
         Self {
-            action: Some(action),
+            action: Some(Box::new(action)),
             reason,
         }
     }
@@ -189,7 +189,7 @@ pub(crate) fn rejected(
     let Rejection { action, reason } = rejection;
     let wff = reason.to_wff(asker.dialect);
     let content = match action {
-        Some(action) => Content::of_refusal(action, wff),
+        Some(action) => Content::of_refusal(*action, wff),
         // The messages of JADE's own agents have this form.
         None if asker.dialect == Dialect::Jade => Content::from(wff),
         None => {

@@ -560,9 +560,11 @@ fn descriptions_are_bounded_per_platform_and_in_all() {
     }
     assert!(is_full(it.register(&asker("unproved", Platform::Unproved))));
     // Other hosts leave room for this one.
-    let mut platform = 0;
-    while it.df.descriptions().count() < limits::FOREIGN_DESCRIPTIONS {
-        platform += 1;
+    let (foreign, of_one) = (
+        limits::FOREIGN_DESCRIPTIONS,
+        limits::DESCRIPTIONS_OF_PLATFORM,
+    );
+    for platform in 1..u8::try_from(foreign / of_one - 1).unwrap() {
         for number in 0..limits::DESCRIPTIONS_OF_PLATFORM {
             let name = format!("p-{platform}-{number}");
             let of = Platform::Proved([platform; 32]);
@@ -572,11 +574,19 @@ fn descriptions_are_bounded_per_platform_and_in_all() {
     assert!(is_full(
         it.register(&asker("late", Platform::Proved([99; 32])))
     ));
-    while it.df.descriptions().count() < limits::DESCRIPTIONS {
-        let name = format!("here-{}", it.df.descriptions().count());
-        it.register(&local(&name)).unwrap();
+    for number in foreign..limits::DESCRIPTIONS {
+        it.register(&local(&format!("here-{number}"))).unwrap();
     }
     assert!(is_full(it.register(&local("here"))));
+    assert_eq!(it.df.descriptions().count(), limits::DESCRIPTIONS);
+    // An end of one makes room for another.
+    it.call(
+        0.0,
+        &asker("far-0", OTHER),
+        &Function::deregister(&id("far-0")),
+    )
+    .unwrap();
+    it.register(&asker("far", OTHER)).unwrap();
 }
 
 #[test]
@@ -641,4 +651,29 @@ fn a_jade_agent_is_answered_in_its_dialect() {
         "((action (agent-identifier :name df@mts) (deregister (df-agent-description :name \
          (agent-identifier :name jade@host)))) not-registered )"
     );
+}
+
+#[test]
+fn a_long_notification_goes_on_with_the_next() {
+    let mut it = Facilitator::new();
+    for number in 0..30 {
+        let name = format!("crane-{number:02}");
+        let long = AgentDescription {
+            languages: vec!["x".repeat(7000)],
+            ..lifting(&name)
+        };
+        it.call(0.0, &local(&name), &Function::register(&long))
+            .unwrap();
+    }
+    subscribe(&mut it, &local("rover"), "s-1");
+    let (mut all, mut count) = (Vec::new(), 0);
+    while let Some(answer) = it.df.poll_answer() {
+        let length = answer.message.content().unwrap().len();
+        assert!(length < limits::NOTIFICATION_BYTES + 1024, "{length}");
+        all.extend(notified(&answer.message).unwrap());
+        count += 1;
+        let now = it.clock.after(f64::from(count)).at;
+        it.df.handle_sent(now, answer.notification.unwrap(), true);
+    }
+    assert_eq!((names(&all).len(), count), (30, 4));
 }

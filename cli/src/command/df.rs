@@ -17,8 +17,8 @@ use crate::report::Failure;
 
 /// Register, find and watch services of agents
 ///
-/// Services are listed by the directory facilitator (DF) of a gateway (FIPA00023). Agents of all
-/// platforms use it over FIPA messages, also those of JADE. Without --df, that of this host is used.
+/// Services are listed by the directory facilitator (DF) of a gateway (FIPA00023). Agents of this host and
+/// of others use it by FIPA messages. Without --df, that of this host is used.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
