@@ -478,6 +478,8 @@ fn a_subscriber_is_notified_of_each_change() {
         .unwrap();
     assert_eq!(next(&mut it), None);
     assert_eq!(it.df.poll_timeout(), None);
+    it.df.handle_timeout(it.clock.after(10.0).at);
+    assert_eq!(next(&mut it), None, "the first one is under way");
     it.df.handle_sent(it.clock.after(0.1).at, id_, true);
     assert_eq!(next(&mut it), None, "too early");
     let pause = limits::NOTIFICATION_PAUSE.as_secs_f64();

@@ -120,6 +120,29 @@ fn the_work_of_a_search_is_bounded() {
         ..AgentDescription::default()
     };
     assert!(it.names(0.0, &template).is_empty());
+    // A hundred texts each, and a template that compares with all of them, many times.
+    let many = |names: usize, last: &str| AgentDescription {
+        languages: (1..names)
+            .map(|number| format!("l-{number}"))
+            .chain([last.to_owned()])
+            .collect(),
+        ..AgentDescription::default()
+    };
+    for number in 0..400 {
+        let name = format!("here-{number}");
+        let description = AgentDescription {
+            name: Some(common::id(&name)),
+            ..many(120, "last")
+        };
+        let register = Function::register(&description);
+        it.call(0.0, &local(&name), &register).unwrap();
+    }
+    let search = Function::search(&many(30, "other"), &Constraints::all());
+    let refused = it.call(0.0, &local("rover"), &search);
+    assert!(
+        matches!(&refused, Err(Exception::InternalError(words)) if words.contains("comparisons")),
+        "{refused:?}"
+    );
     let wide = AgentDescription {
         languages: vec!["x".to_owned(); limits::TEMPLATE_PARTS + 1],
         ..AgentDescription::default()
