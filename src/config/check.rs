@@ -237,12 +237,12 @@ impl Findings {
     fn platform(&mut self, platform: &Platform) {
         for (key, agent) in [("ams", &platform.ams), ("df", &platform.df)] {
             if let PlatformAgent::Named(name) = agent
-                && let Err(error) = check_name(name)
+                && check_name(name).is_err()
             {
                 self.add(
                     &["platform", key],
-                    format_args!("cannot be {name:?}: {error}"),
-                    "use true, false, or a name of an agent",
+                    format_args!("cannot be {name:?}, which is no name of an agent"),
+                    "use true, false, or a name without any of * + ? [ ( { | ^ $ \\",
                 );
             }
         }
