@@ -4,6 +4,8 @@
 //! sleeps when it has nothing to do.
 
 #[cfg(feature = "monitor")]
+mod platform;
+#[cfg(feature = "monitor")]
 mod protocol;
 
 use std::ops::Deref;
@@ -19,6 +21,8 @@ use crate::{
     AgentId, Config, Deliveries, DirectoryView, Incoming, Loan, ReceiveError, SendError, Unread,
 };
 
+#[cfg(feature = "monitor")]
+pub use self::platform::{Ams, Df, Notifications};
 #[cfg(feature = "monitor")]
 pub use self::protocol::Side;
 

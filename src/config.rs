@@ -47,6 +47,9 @@
 //! check = "off"                       # or "warn", "enforce": reaction to protocol violations
 //! answer = false                      # true: violations are answered with not-understood
 //! protocols = []                      # SCXML files with further protocols
+//! [platform]
+//! ams = true                          # false: no agent management system; or its name
+//! df = true                           # false: no directory facilitator; or its name
 //! ```
 //!
 //! Not in this module: opening anything that the configuration names. A transport that this process
@@ -103,6 +106,8 @@ pub struct Config {
     pub access: Access,
     /// `[monitor]`: the checks of messages against their protocols.
     pub monitor: Monitor,
+    /// `[platform]`: the agents of the gateway that list agents and services (FIPA00023).
+    pub platform: Platform,
 }
 
 /// `[mts]`: the message transport service of a process.
@@ -317,6 +322,29 @@ impl Check {
     }
 }
 
+/// `[platform]`: the agents of the gateway that list agents and services (FIPA00023).
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub struct Platform {
+    /// `ams`: the agent management system, `ams@` and the name of the gateway by default.
+    pub ams: PlatformAgent,
+    /// `df`: the directory facilitator, `df@` and the name of the gateway by default.
+    pub df: PlatformAgent,
+}
+
+/// An agent of the gateway: `true`, `false` or a name.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub enum PlatformAgent {
+    /// The agent does not run.
+    Off,
+    /// The agent runs under its default name.
+    #[default]
+    On,
+    /// The agent runs under this name.
+    Named(String),
+}
+
 /// A network interface, as the configuration names it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Interface {
@@ -393,6 +421,7 @@ impl Config {
                 answer: false,
                 protocols: Vec::new(),
             },
+            platform: Platform::default(),
         }
     }
 

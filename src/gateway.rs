@@ -10,6 +10,7 @@ mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
 mod neighbours;
+mod platform_agents;
 mod publisher;
 
 use std::fmt;
@@ -34,6 +35,7 @@ use self::gateway_agent::GatewayAgent;
 use self::guard::Guard;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
+use self::platform_agents::PlatformAgents;
 use self::publisher::{PublishTask, Publisher};
 use crate::config::ConfigError;
 use crate::directory_view::DirectoryView;
@@ -179,6 +181,14 @@ impl Gateway {
             notices: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));
+        let platform_agents = PlatformAgents {
+            service: Arc::clone(&self.service),
+            neighbours: Arc::clone(&self.neighbours),
+            view: Arc::clone(&self.view),
+            known: Arc::clone(&known),
+            has_keys: !config.security.keys.is_empty(),
+        };
+        self.tasks.extend(platform_agents.start(&config.platform));
         let exchange = Arc::clone(&self.exchange);
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);

@@ -31,6 +31,8 @@
 //! * [`routes`] reports the routes that letters would take now, and the reasons.
 //! * [`doctor`] checks whether a machine meets the requirements.
 //! * [`keys`] (feature `secure`) manages the keys of this host and the certificates of its peers.
+//! * [`platform`] (feature `monitor`) registers and finds services with the directory facilitator of a
+//!   gateway, and lists agents with its agent management system.
 //! * [`Gateway`] (feature `net`) is the gateway that `fipa up` runs; robot processes do not need it.
 //!
 //! Not in this crate: delivery (`fipa-mts`), the transports, and terminal output (`fipa-cli`).
@@ -79,6 +81,8 @@ mod incoming;
 #[cfg(feature = "secure")]
 pub mod keys;
 mod owner;
+#[cfg(feature = "monitor")]
+pub mod platform;
 #[cfg(feature = "monitor")]
 pub mod protocol;
 pub mod routes;

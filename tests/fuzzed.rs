@@ -33,6 +33,8 @@ mod host;
 mod input;
 #[path = "../fuzz/src/mdns.rs"]
 mod mdns;
+#[path = "../fuzz/src/platform.rs"]
+mod platform;
 #[path = "../fuzz/src/seeds.rs"]
 mod seeds;
 #[path = "../fuzz/src/shm.rs"]
@@ -109,6 +111,6 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, config, datagrams, delivery, exchange, framed, host, mdns, shm, texts
+        access, config, datagrams, delivery, exchange, framed, host, mdns, platform, shm, texts
     );
 }

@@ -381,3 +381,97 @@ async fn fipa_services_gets_a_failure_in_its_dialect_for_a_letter_that_a_rule_re
     drop(carol);
     host.gateway.close().await;
 }
+
+/// Makes a letter to the directory facilitator as JADE's proxy writes it.
+fn letter_of_jade(sender: &str, message: &[u8]) -> Vec<u8> {
+    let df = AgentId::new("df@jadetest").unwrap();
+    let base = EnvelopeParams {
+        to: vec![df.clone()],
+        from: Some(AgentId::new(sender).unwrap()),
+        acl_representation: Some(Representation::String.into()),
+        payload_length: Some(message.len() as u64),
+        date: Some("20261120T111213456Z".parse().unwrap()),
+        intended_receivers: vec![df],
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let mut letter = envelope
+        .encode(Representation::Xml, Dialect::Jade)
+        .unwrap()
+        .to_vec();
+    letter.extend_from_slice(message);
+    letter
+}
+
+/// Makes a request to the directory facilitator.
+fn request_of_jade(sender: &str, act: &str) -> Vec<u8> {
+    let content = format!("((action (agent-identifier :name df@jadetest) {act}))");
+    let message = Message::builder(Performative::Request)
+        .sender(AgentId::new(sender).unwrap())
+        .receiver(AgentId::new("df@jadetest").unwrap())
+        .ontology("FIPA-Agent-Management")
+        .language("FIPA-SL0")
+        .reply_with("rw-2")
+        .content(content)
+        .build()
+        .unwrap();
+    let message = message.encode(Representation::String, Dialect::Jade);
+    letter_of_jade(sender, &message.unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_of_jade_uses_the_directory_facilitator() {
+    let df = "platform.df=df@jadetest";
+    let host = Host::with("rusty@rustap", "jade", &[df]).await;
+    let rover = host.domain.register("rover").unwrap();
+    let ask = async |letter: Vec<u8>| {
+        send_as_peer(&letter, &host.address()).await;
+        read(&host.read_by_peer().await)
+    };
+    let text = |message: &Message| String::from_utf8(message.content().unwrap().to_vec()).unwrap();
+    // The recorded search is answered as JADE answered it.
+    let vectors = "platform/tests/vectors";
+    let [search, expected] = ["df_search_request.str", "df_search_reply.str"].map(|file| {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        std::fs::read(root.join(vectors).join(file)).unwrap()
+    });
+    let expected = Message::decode(&fipa::Payload::from(bytes::Bytes::from(expected))).unwrap();
+    let (_, letter, answer) = ask(letter_of_jade("rusty@rustap", &search)).await;
+    let representation = Representation::detect(&letter.payload().head);
+    assert_eq!(representation, Some(Representation::String));
+    assert_eq!(answer.content(), expected.content());
+    assert_eq!(answer.in_reply_to(), expected.in_reply_to());
+    assert_eq!(answer.conversation_id(), expected.conversation_id());
+    assert_eq!(answer.receivers()[0].name(), "rusty@rustap");
+    // It registers itself, for a time, and no other agent.
+    let register = |name: &str| {
+        let description = format!(
+            "(df-agent-description :name (agent-identifier :name {name}) :services (set \
+             (service-description :name s-1 :type echo)))"
+        );
+        request_of_jade("rusty@rustap", &format!("(register {description})"))
+    };
+    let (_, _, answer) = ask(register("rusty@rustap")).await;
+    assert_eq!(*answer.performative(), Performative::Inform, "{answer}");
+    assert!(text(&answer).contains(":lease-time 2"), "{answer}");
+    let (_, _, answer) = ask(register("rover")).await;
+    assert_eq!(*answer.performative(), Performative::Refuse, "{answer}");
+    assert!(text(&answer).ends_with(" unauthorised )"), "{answer}");
+    #[cfg(feature = "monitor")]
+    {
+        let all = fipa::platform::AgentDescription::default();
+        let found = rover.df().unwrap().search(&all).await.unwrap();
+        assert_eq!(found.len(), 1);
+        assert_eq!(found[0].name.as_ref().unwrap().name(), "rusty@rustap");
+    }
+    // A letter in the name of an agent of this host is not answered: no connection proves the name.
+    let forged = "(search (df-agent-description) (search-constraints))";
+    send_as_peer(&request_of_jade("rover", forged), &host.address()).await;
+    let (_, _, answer) = ask(register("rusty@rustap")).await;
+    assert_eq!(text(&answer).matches("already-registered").count(), 1);
+    assert!(rover.try_receive().unwrap().is_none());
+    host.gateway.close().await;
+}

@@ -124,7 +124,9 @@ impl Robot {
         let remote = |directory: DirectoryView<'_>| {
             directory.refresh();
             let entries = directory.entries();
-            let remote = entries.iter().filter(|it| it.reach != Reach::Local);
+            let remote = entries
+                .iter()
+                .filter(|it| it.reach != Reach::Local && !it.is_platform_agent());
             remote.filter(|it| !it.name.starts_with(&self.name)).count()
         };
         remote(self.gateway.directory()) == AGENTS && remote(self.domain.directory()) == AGENTS

@@ -1,12 +1,15 @@
 //! The commands, one file each: its arguments with their help, and `run`.
 
 mod agents;
+mod ams;
 #[cfg(feature = "bench")]
 mod bench;
 mod coalition;
 mod config;
+mod content;
 mod decode;
 mod demo;
+mod df;
 mod doctor;
 mod echo;
 mod encode;
@@ -30,6 +33,8 @@ pub(crate) enum Command {
     Send(Box<send::Arguments>),
     Echo(echo::Arguments),
     Coalition(coalition::Arguments),
+    Df(df::Arguments),
+    Ams(ams::Arguments),
     Routes(routes::Arguments),
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
@@ -38,6 +43,7 @@ pub(crate) enum Command {
     Bench(bench::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
+    Content(content::Arguments),
     Protocol(protocol::Arguments),
     Keys(keys::Arguments),
     Config(config::Arguments),
@@ -51,6 +57,8 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Send(arguments) => send::run(*arguments, global),
         Command::Echo(arguments) => echo::run(arguments, global),
         Command::Coalition(arguments) => coalition::run(arguments, global),
+        Command::Df(arguments) => df::run(arguments, global),
+        Command::Ams(arguments) => ams::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
@@ -59,6 +67,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Bench(arguments) => bench::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),
+        Command::Content(arguments) => content::run(arguments, global),
         Command::Protocol(arguments) => protocol::run(arguments, global),
         Command::Keys(arguments) => keys::run(arguments, global),
         Command::Config(arguments) => config::run(arguments, global),

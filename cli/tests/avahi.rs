@@ -49,6 +49,10 @@ fn agents_come_and_go(avahi: &Avahi<'_>) {
         "transport.tcp.listen=[\"10.99.0.1:0\"]",
         "--set",
         "security.insecure=true",
+        "--set",
+        "platform.ams=false",
+        "--set",
+        "platform.df=false",
     ]);
     let first = start_first(&host);
     let second = host.echo(SECOND);

@@ -130,6 +130,10 @@ check = \"off\"                        # default
 answer = false                       # default
 protocols = []                       # default
 
+[platform]
+ams = true                           # default
+df = true                            # default
+
 [routes]
 \"arm_.*\" = [\"tcp\"]                   # fipa.toml:5
 ";

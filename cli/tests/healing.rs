@@ -162,7 +162,9 @@ impl Robot {
         let directory = self.domain.directory();
         directory.refresh();
         let entries = directory.entries();
-        let agents = entries.iter().filter(|entry| entry.role == Role::Agent);
+        let agents = entries
+            .iter()
+            .filter(|entry| entry.role == Role::Agent && !entry.is_platform_agent());
         agents.map(|entry| entry.name.to_string()).collect()
     }
 

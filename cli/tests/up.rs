@@ -29,11 +29,14 @@ fn the_gateway_prints_its_name_and_locations() {
     );
     let listed = host.run(&["agents", "--json"]).done_json();
     assert_eq!(listed["gateway"], "sherpa");
-    let entry = &listed["agents"][0];
-    assert_eq!(
-        (&entry["role"], &entry["name"]),
-        (&json!("gateway"), &json!("sherpa"))
-    );
+    let agents = listed["agents"].as_array().unwrap();
+    let entry = agents.iter().find(|it| it["name"] == "sherpa").unwrap();
+    assert_eq!(entry["role"], json!("gateway"));
+    for (name, agent_type) in [("ams@sherpa", "fipa-ams"), ("df@sherpa", "fipa-df")] {
+        let agent = agents.iter().find(|it| it["name"] == name).unwrap();
+        assert_eq!(agent["type"], agent_type);
+        assert_eq!(agent["mts"]["name"], "sherpa");
+    }
     assert_eq!(entry["incarnation"], ready["incarnation"]);
     assert_eq!(entry["locations"], ready["locations"]);
     assert_eq!(gateway.signal("-TERM"), (Some(0), String::new()));

@@ -9,6 +9,7 @@ pub mod framed;
 pub mod host;
 pub mod input;
 pub mod mdns;
+pub mod platform;
 pub mod seeds;
 pub mod shm;
 pub mod texts;

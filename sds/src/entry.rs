@@ -59,6 +59,19 @@ impl Entry {
         rank(self) < rank(other)
     }
 
+    /// Type of the agent management system of a gateway (FIPA00023).
+    pub const AMS_TYPE: &str = "fipa-ams";
+    /// Type of the directory facilitator of a gateway (FIPA00023).
+    pub const DF_TYPE: &str = "fipa-df";
+
+    /// Whether the entry is that of an agent management system or directory facilitator, by its type.
+    /// Patterns do not match it: `.*` addresses the agents of robots.
+    #[must_use]
+    pub fn is_platform_agent(&self) -> bool {
+        let agent_type = self.agent_type.as_str();
+        self.role == Role::Agent && (agent_type == Self::AMS_TYPE || agent_type == Self::DF_TYPE)
+    }
+
     /// Whether the entry has locations, and all of them use transports that this project does not
     /// support.
     #[must_use]

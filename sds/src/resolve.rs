@@ -26,7 +26,8 @@ pub enum Resolution {
 ///
 /// The name of a coalition resolves to its members without the sender, or to its leader. A name
 /// that [is a pattern](is_pattern) resolves to every agent whose whole name matches, except the
-/// sender; gateways are left out, because `.*` addresses agents. No agent can have a pattern as its
+/// sender; gateways and their [platform agents](Entry::is_platform_agent) are left out, because `.*`
+/// addresses the agents of robots. No agent can have a pattern as its
 /// name.
 ///
 /// # Errors
@@ -51,7 +52,9 @@ pub fn resolve(
     let pattern = Pattern::new(receiver)?;
     // The failed lookup above has already refreshed the directory.
     let mut found = directory.search(&Query::by_name(Matcher::Pattern(pattern)));
-    found.retain(|entry| *entry.name != *sender && entry.role == Role::Agent);
+    found.retain(|entry| {
+        *entry.name != *sender && entry.role == Role::Agent && !entry.is_platform_agent()
+    });
     Ok(if found.is_empty() {
         Resolution::None
     } else {
@@ -143,6 +146,20 @@ mod tests {
         assert_eq!(none, Resolution::None);
         let gateway = resolve(&directory, "arm_gateway", "camera").unwrap();
         assert_eq!(names(&gateway), ["arm_gateway"]);
+    }
+
+    #[test]
+    fn platform_agents_are_left_out_of_a_multicast() {
+        let directory = directory(&["arm"]);
+        for (name, agent_type) in [("ams@mts", Entry::AMS_TYPE), ("df@mts", Entry::DF_TYPE)] {
+            let mut agent = Registration::new(name, Incarnation::random(), Vec::new());
+            agent.agent_type = agent_type.to_owned();
+            directory.register(agent).unwrap();
+        }
+        let all = resolve(&directory, ".*", "me").unwrap();
+        assert_eq!(names(&all), ["arm"]);
+        let one = resolve(&directory, "df@mts", "me").unwrap();
+        assert_eq!(names(&one), ["df@mts"]);
     }
 
     #[test]

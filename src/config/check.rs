@@ -13,7 +13,9 @@ use fipa_transport::{Kind, Location};
 
 use super::keys::{is_interface_name, is_numeric_address};
 use super::reader::dotted;
-use super::{Access, Config, Interface, Mistake, Origin, Peer, Route, Shm};
+use super::{
+    Access, Config, Interface, Mistake, Origin, Peer, Platform, PlatformAgent, Route, Shm,
+};
 
 /// Maximum length of the name of a domain, in bytes.
 const MAX_DOMAIN: usize = 32;
@@ -94,6 +96,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.security(config);
     found.access(&config.access);
     found.protocols(&config.monitor.protocols);
+    found.platform(&config.platform);
     found.0
 }
 
@@ -228,6 +231,26 @@ impl Findings {
         }
         if files.iter().any(String::is_empty) {
             self.add(&path, "lists an empty path", "list paths of SCXML files");
+        }
+    }
+
+    fn platform(&mut self, platform: &Platform) {
+        for (key, agent) in [("ams", &platform.ams), ("df", &platform.df)] {
+            if let PlatformAgent::Named(name) = agent
+                && check_name(name).is_err()
+            {
+                self.add(
+                    &["platform", key],
+                    format_args!("cannot be {name:?}, which is no name of an agent"),
+                    "use true, false, or a name without any of * + ? [ ( { | ^ $ \\",
+                );
+            }
+        }
+        if let (PlatformAgent::Named(ams), PlatformAgent::Named(df)) = (&platform.ams, &platform.df)
+            && ams == df
+        {
+            let what = format_args!("is {df:?}, which is the name of platform.ams, too");
+            self.add(&["platform", "df"], what, "use another name");
         }
     }
 

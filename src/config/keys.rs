@@ -15,7 +15,7 @@ use fipa_transport::{Kind, LocationError};
 use toml_edit::Value as Toml;
 
 use super::effective::Value;
-use super::{AccessRule, Check, Config, Interface, Peer, Route};
+use super::{AccessRule, Check, Config, Interface, Peer, PlatformAgent, Route};
 
 /// A key with a fixed path.
 pub(super) struct Key {
@@ -58,6 +58,7 @@ pub(super) struct InvalidValue {
 const KINDS: &str = r#"a list of transports such as ["shm", "unix", "tcp"]"#;
 const SIZE: &str = r#"a size such as "64MiB""#;
 const ACCESS: &str = r#"a list of receivers such as ["arm_.* performative=request,cancel"]"#;
+const PLATFORM_AGENT: &str = r#"true, false or a name such as "directory""#;
 const ADDRESSES: &str = r#"a list of numeric addresses with port such as ["127.0.0.1:0"]"#;
 
 /// Former names of keys, which are read as well.
@@ -255,6 +256,20 @@ pub(super) const KEYS: &[Key] = &[
         write: |config, value| items(value, text).map(|all| config.monitor.protocols = all),
         read: |config| Value::list(&config.monitor.protocols),
     },
+    Key {
+        path: &["platform", "ams"],
+        shape: Shape::Text,
+        expected: PLATFORM_AGENT,
+        write: |config, value| platform_agent(value).map(|ams| config.platform.ams = ams),
+        read: |config| platform_agent_value(&config.platform.ams),
+    },
+    Key {
+        path: &["platform", "df"],
+        shape: Shape::Text,
+        expected: PLATFORM_AGENT,
+        write: |config, value| platform_agent(value).map(|df| config.platform.df = df),
+        read: |config| platform_agent_value(&config.platform.df),
+    },
 ];
 
 /// Every table of names.
@@ -386,6 +401,30 @@ fn truth(value: &Toml) -> Result<bool, InvalidValue> {
     value
         .as_bool()
         .ok_or_else(|| InvalidValue::kind_of_value(value))
+}
+
+/// Reads `true`, `false` or a name. An argument of `--set` is text in all three cases.
+fn platform_agent(value: &Toml) -> Result<PlatformAgent, InvalidValue> {
+    if let Some(on) = value.as_bool() {
+        return Ok(if on {
+            PlatformAgent::On
+        } else {
+            PlatformAgent::Off
+        });
+    }
+    Ok(match text(value)?.as_str() {
+        "true" => PlatformAgent::On,
+        "false" => PlatformAgent::Off,
+        name => PlatformAgent::Named(name.to_owned()),
+    })
+}
+
+fn platform_agent_value(agent: &PlatformAgent) -> Value {
+    match agent {
+        PlatformAgent::Off => Value::Truth(false),
+        PlatformAgent::On => Value::Truth(true),
+        PlatformAgent::Named(name) => Value::Text(name.clone()),
+    }
 }
 
 fn number(value: &Toml) -> Result<usize, InvalidValue> {

@@ -10,7 +10,9 @@ use fipa_transport::Kind;
 use proptest::prelude::*;
 
 use super::reader::Reader;
-use super::{Check, Config, ConfigError, Effective, Interface, Origin, Peer, Route, Sources};
+use super::{
+    Check, Config, ConfigError, Effective, Interface, Origin, Peer, PlatformAgent, Route, Sources,
+};
 
 /// Loads a text as if it stood in `./fipa.toml`.
 fn load(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
@@ -127,6 +129,9 @@ fn every_key_is_read() {
         check = "enforce"
         answer = true
         protocols = ["lift.scxml"]
+        [platform]
+        ams = false
+        df = "yellow pages"
         "#,
         &[],
     );
@@ -169,6 +174,9 @@ fn every_key_is_read() {
     assert_eq!(config.monitor.check, Check::Enforce);
     assert!(config.monitor.answer);
     assert_eq!(config.monitor.protocols, ["lift.scxml"]);
+    assert_eq!(config.platform.ams, PlatformAgent::Off);
+    let named = PlatformAgent::Named("yellow pages".to_owned());
+    assert_eq!(config.platform.df, named);
     let addresses = ["10.0.0.7", "fe80::1"].map(|text| Interface::Address(text.parse().unwrap()));
     let [first, second] = addresses;
     assert_eq!(
@@ -334,6 +342,10 @@ rate = 0                             # default
 check = "off"                        # default
 answer = false                       # default
 protocols = []                       # default
+
+[platform]
+ams = true                           # default
+df = true                            # default
 
 [routes]
 "a b" = ["tcp"]                      # --set

@@ -95,6 +95,12 @@ impl Neighbours {
         self.state.lock().present.values().cloned().collect()
     }
 
+    /// Returns the identity that the links of this neighbor prove.
+    pub(super) fn principal(&self, gateway: Incarnation) -> Option<Principal> {
+        let state = self.state.lock();
+        state.present.get(&gateway).map(|it| it.principal)
+    }
+
     /// Waits until a neighbor changes or a location is doubted. Only one task may wait.
     pub(super) async fn changed(&self) {
         self.changed.notified().await;

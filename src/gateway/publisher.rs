@@ -83,14 +83,8 @@ pub(super) fn own_agents(
     let agents = entries
         .iter()
         .filter(|entry| entry.reach == Reach::Local && entry.role != Role::Gateway);
-    let age = |entry: &Entry| (entry.registered, entry.incarnation);
     for entry in agents {
-        let holder = known.known(&entry.name);
-        let holder = holder.filter(|holder| holder.incarnation != entry.incarnation);
-        let holder = holder.filter(|holder| match has_keys {
-            true => known.mandate(holder.mts.incarnation).is_proved(),
-            false => age(holder) < age(entry),
-        });
+        let holder = other_holder(entry, known, has_keys);
         if holder.is_none() || has_keys {
             own.push(Arc::clone(entry));
         }
@@ -103,6 +97,23 @@ pub(super) fn own_agents(
         }
     }
     (own, contested)
+}
+
+/// Returns the agent of another host that has the name of this agent of this host, with a better or a
+/// proved claim: see [`own_agents`].
+pub(super) fn other_holder(
+    entry: &Entry,
+    known: &dyn Directory,
+    has_keys: bool,
+) -> Option<Arc<Entry>> {
+    let age = |entry: &Entry| (entry.registered, entry.incarnation);
+    let holder = known.known(&entry.name)?;
+    let has_name = holder.incarnation != entry.incarnation
+        && match has_keys {
+            true => known.mandate(holder.mts.incarnation).is_proved(),
+            false => age(&holder) < age(entry),
+        };
+    has_name.then_some(holder)
 }
 
 /// An agent of this host whose name an agent of another host also has.

@@ -18,17 +18,19 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, mts, transport, discovery, security, access, monitor, routes)",
+             (known at the top: domain, mts, transport, discovery, security, access, monitor, \
+             platform, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, mts, transport, discovery, security, access, monitor, routes)",
+             (known at the top: domain, mts, transport, discovery, security, access, monitor, \
+             platform, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
             "fipa.toml:1: unknown key `radio`; known at the top: domain, mts, transport, discovery, \
-             security, access, monitor, routes",
+             security, access, monitor, platform, routes",
         ),
         (
             "[transport.serial]\nlisten = []\n",
@@ -55,6 +57,11 @@ fn mistakes_are_reported_with_line_and_key() {
              write [routes] and below it some of its keys: names of your choice",
         ),
         // Values of the wrong kind.
+        (
+            "[platform]\ndf = 5\n",
+            "fipa.toml:2: `platform.df` is invalid: 5: an integer is not allowed here; \
+             expected true, false or a name such as \"directory\"",
+        ),
         (
             "domain = 5\n",
             "fipa.toml:1: `domain` is invalid: 5: an integer is not allowed here; \
@@ -275,6 +282,16 @@ fn mistakes_are_reported_with_line_and_key() {
             "[discovery.static]\ncrex = [\"tcp://10.0.0.2\"]\n",
             "fipa.toml:2: `discovery.static.crex` lists tcp://10.0.0.2, which has no port; \
              write for example tcp://10.0.0.2:7788 or tcp://[fe80::1%eth0]:7788",
+        ),
+        (
+            "[platform]\nams = \"a\"\ndf = \"a\"\n",
+            "fipa.toml:3: `platform.df` is \"a\", which is the name of platform.ams, too; \
+             use another name",
+        ),
+        (
+            "[platform]\nams = \"arm_.*\"\n",
+            "fipa.toml:2: `platform.ams` cannot be \"arm_.*\", which is no name of an agent; \
+             use true, false, or a name without any of * + ? [ ( { | ^ $ \\",
         ),
         // Files that are not TOML.
         (

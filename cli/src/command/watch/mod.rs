@@ -91,6 +91,8 @@ pub(crate) struct Arguments {
     violations: bool,
 
     /// Show content, at most this number of bytes per message
+    ///
+    /// Complete content in FIPA-SL is formatted for reading.
     #[arg(long, value_name = "BYTES", num_args = 0..=1, default_missing_value = "80",
           require_equals = true, value_parser = bytes)]
     content: Option<usize>,

@@ -7,6 +7,7 @@ use anstyle::{AnsiColor, Style};
 use fipa::watch::{Fate, Passage};
 use fipa::{Message, Outcome, Time};
 use fipa_acl::escape;
+use fipa_content::{Content, Printer, Profile};
 use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
 use super::checker::{CheckResult, Overdue};
@@ -182,7 +183,12 @@ impl TextOutput {
             below(Ink::Warning, &problem);
         }
         if !passage.content.is_empty() {
-            below(Ink::Quiet, &escape(&content(passage)));
+            match formatted(passage) {
+                Some(lines) => lines
+                    .lines()
+                    .for_each(|line| below(Ink::Quiet, &escape(line))),
+                None => below(Ink::Quiet, &escape(&content(passage))),
+            }
         }
         text
     }
@@ -357,6 +363,15 @@ fn delivery_problem(fate: &Fate) -> Option<String> {
         }
         _ => None,
     }
+}
+
+/// Returns complete content in FIPA-SL on several lines, if it is longer than one line.
+fn formatted(passage: &Passage) -> Option<String> {
+    let language = passage.message.as_ref()?.language()?;
+    Profile::of_language(language)?;
+    let content = Content::parse(&passage.content).ok()?;
+    let lines = Printer::new().indented().print(&content).ok()?;
+    String::from_utf8(lines).ok()
 }
 
 fn content(passage: &Passage) -> String {

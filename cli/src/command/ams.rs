@@ -1,0 +1,136 @@
+//! `fipa ams`: lists the agents of a platform.
+
+use clap::Args;
+use comfy_table::{Table, presets};
+use fipa::AgentId;
+use fipa::platform::{AmsDescription, ApDescription, State};
+use fipa_acl::escape;
+use serde_json::{Value, json};
+
+use super::df::{asking, failed};
+use crate::membership;
+use crate::options::Global;
+use crate::output;
+use crate::report::Failure;
+
+/// List the agents of a platform as its agent management system reports them
+///
+/// Every platform after FIPA has an agent management system (AMS, FIPA00023), which agents ask by
+/// messages. Without --ams, that of this host is asked. `fipa agents` reads the directory of this host
+/// instead, and lists the agents of all hosts.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa ams
+  fipa ams --state active
+  fipa ams --ams ams@crex-mts --json
+
+JSON:
+  { \"ams\": name, \"platform\": { \"name\", \"services\": { transport: [address] } },
+    \"agents\": [ { \"name\", \"ownership\": text or null, \"state\" } ] }")]
+pub(crate) struct Arguments {
+    /// Name of the agent management system [default: that of this host]
+    #[arg(long, value_name = "NAME")]
+    ams: Option<AgentId>,
+
+    /// Only the agent with this name
+    #[arg(long, value_name = "NAME")]
+    agent: Option<AgentId>,
+
+    /// Only agents of this owner
+    #[arg(long, value_name = "OWNER")]
+    ownership: Option<String>,
+
+    /// Only agents in this state: initiated, active, suspended, waiting or transit
+    #[arg(long, value_name = "STATE", value_parser = state)]
+    state: Option<State>,
+
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn state(text: &str) -> Result<State, String> {
+    let state = State::of(text);
+    state.ok_or_else(|| "expected initiated, active, suspended, waiting or transit".to_owned())
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    let template = AmsDescription {
+        name: arguments.agent,
+        ownership: arguments.ownership,
+        state: arguments.state,
+    };
+    let (ams, platform, agents) = membership::run(async {
+        let domain = membership::join(&config).await?;
+        let asked = async {
+            let agent = asking(&domain, "ams", &config)?;
+            let ams = match arguments.ams {
+                Some(ams) => agent.ams_of(ams),
+                None => agent.ams().map_err(|error| failed(&error, &config))?,
+            };
+            let platform = ams.description().await;
+            let platform = platform.map_err(|error| failed(&error, &config))?;
+            let agents = ams.search(&template).await;
+            let mut agents = agents.map_err(|error| failed(&error, &config))?;
+            // The agent of this command is not of interest.
+            agents.retain(|it| it.name.as_ref().is_none_or(|id| !id.same_agent(agent.id())));
+            Ok((ams.id().clone(), platform, agents))
+        };
+        let asked = asked.await;
+        domain.close().await;
+        asked
+    })?;
+    if arguments.json {
+        return output::json(&value(&ams, &platform, &agents));
+    }
+    let mut text = format!(
+        "platform {} of {}\n",
+        escape(&platform.name),
+        escape(ams.name())
+    );
+    for (name, addresses) in &platform.services {
+        let addresses = addresses.join(" ");
+        text.push_str(&format!("{} {}\n", escape(name), escape(&addresses)));
+    }
+    let mut table = Table::new();
+    table
+        .load_style(presets::NOTHING)
+        .set_header(["AGENT", "STATE", "OWNER"]);
+    for column in table.column_iter_mut() {
+        column.set_padding((0, 2));
+    }
+    table.add_rows(agents.iter().map(|agent| {
+        let state = agent.state.map(State::as_str);
+        [
+            escape(&name(agent)).into_owned(),
+            state.unwrap_or("-").to_owned(),
+            escape(agent.ownership.as_deref().unwrap_or("-")).into_owned(),
+        ]
+    }));
+    output::text(&format!("{text}{}\n", table.trim_fmt()))
+}
+
+fn name(agent: &AmsDescription) -> String {
+    let name = agent.name.as_ref();
+    name.map_or_else(String::new, |id| id.name().to_owned())
+}
+
+fn value(ams: &AgentId, platform: &ApDescription, agents: &[AmsDescription]) -> Value {
+    let services = platform.services.iter();
+    let services = services.map(|(name, addresses)| (name.clone(), json!(addresses)));
+    let services: serde_json::Map<String, Value> = services.collect();
+    let agents = agents.iter().map(|agent| {
+        json!({
+            "name": name(agent),
+            "ownership": agent.ownership,
+            "state": agent.state.map(State::as_str),
+        })
+    });
+    json!({
+        "ams": ams.name(),
+        "platform": { "name": platform.name, "services": services },
+        "agents": agents.collect::<Vec<_>>(),
+    })
+}

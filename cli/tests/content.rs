@@ -1,0 +1,85 @@
+//! `fipa content` in processes of their own.
+
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use std::fs;
+
+use common::Host;
+
+const GOAL: &str = "((action (agent-identifier :name crex) (dock :target (pose :x 1.5 :y 0.2 :yaw \
+                    3.1 :frame \"sherpa/emi 2\"))))";
+
+#[test]
+fn content_is_checked() {
+    let host = Host::new();
+    fs::write(host.path("goal.sl"), format!("{GOAL}\n")).unwrap();
+    assert_eq!(
+        host.run(&["content", "check", "goal.sl"]).done(),
+        "fipa-sl0\n"
+    );
+    let query = "((iota ?x (p ?x)))";
+    let smallest = host.run_with_input(&["content", "check"], query.as_bytes());
+    assert_eq!(smallest.done(), "fipa-sl2\n");
+    let profile = ["content", "check", "-", "--profile", "fipa-sl0"];
+    let refused = host.run_with_input(&profile, query.as_bytes()).failed(1);
+    assert!(refused.contains("fipa-sl0 has no"), "{refused}");
+    let wrong = host.run_with_input(&["content", "check"], b"((action crex))");
+    let wrong = wrong.failed(1);
+    assert!(
+        wrong.contains("at byte 13") && wrong.contains("FIPA00008"),
+        "{wrong}"
+    );
+    let missing = host.run(&["content", "check", "no-such-file"]).failed(1);
+    assert!(missing.contains("no-such-file"), "{missing}");
+}
+
+#[test]
+fn content_is_formatted() {
+    let host = Host::new();
+    let formatted = host.run_with_input(&["content", "format"], GOAL.as_bytes());
+    let formatted = formatted.done();
+    assert_eq!(formatted.lines().count(), 3, "{formatted}");
+    let again = host.run_with_input(&["content", "format", "--line"], formatted.as_bytes());
+    assert_eq!(again.done(), format!("{GOAL}\n"));
+    // JADE writes bytes in Base64.
+    let bytes = ["content", "format", "--dialect", "jade", "--line"];
+    let standard = host.run_with_input(&bytes, b"((p #4\"aGk=))").done();
+    assert_eq!(standard, "((p #2\"hi))\n");
+    let jade = [
+        "content",
+        "format",
+        "--dialect",
+        "jade",
+        "--to",
+        "jade",
+        "--line",
+    ];
+    let jade = host.run_with_input(&jade, b"((p #4\"aGk=))").done();
+    assert_eq!(jade, "((p #4\"aGk=))\n");
+}
+
+#[test]
+fn content_survives_json() {
+    let host = Host::new();
+    let json = host.run_with_input(&["content", "to-json"], GOAL.as_bytes());
+    let json = json.done();
+    let parsed: serde_json::Value = serde_json::from_str(&json).unwrap();
+    let target = &parsed[0]["action"]["slots"]["target"];
+    assert_eq!(target["function"], "pose");
+    assert_eq!(target["slots"]["x"], 1.5);
+    // The order of slots stays.
+    assert!(
+        json.find("\"x\"").unwrap() < json.find("\"frame\"").unwrap(),
+        "{json}"
+    );
+    let again = host.run_with_input(&["content", "from-json"], json.as_bytes());
+    assert_eq!(again.done(), format!("{GOAL}\n"));
+    let wrong = host.run_with_input(&["content", "from-json"], b"[{\"x\\u001b\": 1}]");
+    let wrong = wrong.failed(1);
+    assert!(
+        wrong.contains("is not a formula") && !wrong.contains('\u{1b}'),
+        "{wrong}"
+    );
+}

@@ -1,0 +1,134 @@
+//! `fipa df` and `fipa ams` in processes of their own, with a gateway.
+
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use common::{Host, Running};
+use serde_json::{Value, json};
+
+fn next_json(running: &mut Running) -> Value {
+    serde_json::from_str(&running.line()).unwrap()
+}
+
+#[test]
+fn services_are_registered_found_and_watched() {
+    let host = Host::new();
+    let alone = host.run(&["df", "search"]).failed(1);
+    assert!(
+        alone.contains("no directory facilitator is registered"),
+        "{alone}"
+    );
+    let _gateway = host.start(&["--set", "mts.name=robot", "up"]);
+    let none = host.run(&["df", "search"]).done();
+    assert_eq!(none, "df@robot knows no such service\n");
+    let mut watching = host.start(&["df", "watch", "--type", "lifting", "--json"]);
+    let expected = json!({ "event": "watching", "df": "df@robot" });
+    assert_eq!(
+        serde_json::from_str::<Value>(&watching.ready).unwrap(),
+        expected
+    );
+    let crane = host.start(&[
+        "df",
+        "register",
+        "crane",
+        "lifting",
+        "--service",
+        "lift-1",
+        "--property",
+        "load=5 t",
+    ]);
+    assert_eq!(
+        crane.ready,
+        "agent crane offers lifting at df@robot; press Ctrl-C to stop"
+    );
+    let changed = next_json(&mut watching);
+    assert_eq!(changed["event"], "changed");
+    assert_eq!(changed["agent"]["services"][0]["name"], "lift-1");
+    for filter in [
+        &["--type", "Lifting"][..],
+        &["--service", "lift-1"],
+        &["--agent", "crane"],
+        &["--property", "load=5 t"],
+        &["--df", "df@robot"],
+    ] {
+        let found = host.run(&[&["df", "search", "--json"], filter].concat());
+        let found = found.done_json();
+        assert_eq!(found["df"], "df@robot");
+        assert_eq!(found["agents"][0]["name"], "crane", "{filter:?}");
+        let properties = &found["agents"][0]["services"][0]["properties"];
+        assert_eq!(*properties, json!({ "load": "\"5 t\"" }));
+    }
+    for filter in [["--type", "towing"], ["--property", "load=6 t"]] {
+        let found = host.run(&[&["df", "search", "--json"], &filter[..]].concat());
+        assert_eq!(found.done_json()["agents"], json!([]), "{filter:?}");
+    }
+    let table = host.run(&["df", "search"]).done();
+    assert!(
+        table.contains("crane") && table.contains("load=\"5 t\""),
+        "{table}"
+    );
+    assert_eq!(crane.signal("-INT"), (Some(0), String::new()));
+    let expected = json!({ "event": "left", "name": "crane" });
+    assert_eq!(next_json(&mut watching), expected);
+    assert_eq!(watching.signal("-INT"), (Some(0), String::new()));
+    let unknown = host.run(&["df", "search", "--df", "df@nowhere"]).failed(1);
+    assert!(unknown.contains("df@nowhere"), "{unknown}");
+}
+
+#[test]
+fn the_agents_of_a_platform_are_listed() {
+    let host = Host::new();
+    let alone = host.run(&["ams"]).failed(1);
+    assert!(alone.contains("no agent management system"), "{alone}");
+    let gateway = host.start(&["--set", "mts.name=robot", "up", "--json"]);
+    let _parrot = host.echo("parrot");
+    let listed = host.run(&["ams", "--json"]).done_json();
+    assert_eq!(listed["ams"], "ams@robot");
+    assert_eq!(listed["platform"]["name"], "robot");
+    let address = format!("tcp://{}", gateway.tcp_address());
+    assert_eq!(listed["platform"]["services"], json!({ "tcp": [address] }));
+    let expected = json!([
+        { "name": "ams@robot", "ownership": null, "state": "active" },
+        { "name": "df@robot", "ownership": null, "state": "active" },
+        { "name": "parrot", "ownership": null, "state": "active" },
+    ]);
+    assert_eq!(listed["agents"], expected);
+    let table = host.run(&["ams", "--agent", "parrot"]).done();
+    assert!(
+        table.starts_with("platform robot of ams@robot\n"),
+        "{table}"
+    );
+    assert!(
+        table.contains("parrot") && !table.contains("df@robot"),
+        "{table}"
+    );
+    let none = host
+        .run(&["ams", "--state", "waiting", "--json"])
+        .done_json();
+    assert_eq!(none["agents"], json!([]));
+    let wrong = host.run(&["ams", "--state", "dead"]).failed(2);
+    assert!(wrong.contains("suspended"), "{wrong}");
+}
+
+#[test]
+fn watch_formats_content_in_sl() {
+    let host = Host::new();
+    let _gateway = host.start(&["--set", "mts.name=robot", "up"]);
+    let mut watching = host.start(&["watch", "--agent", "df@robot", "--content=4000"]);
+    let _ = watching.line();
+    host.run(&["df", "search", "--type", "lifting"]).done();
+    let mut lines = Vec::new();
+    while !lines.iter().any(|line: &String| line.contains("((result")) {
+        lines.push(watching.line());
+    }
+    // A list of more than 80 bytes has several lines.
+    let all = lines.join("\n");
+    let request = lines
+        .iter()
+        .position(|line| line.trim_start().starts_with("((action"));
+    let request = request.unwrap_or_else(|| panic!("{all}"));
+    assert!(lines[request + 1].starts_with("     "), "{all}");
+    assert!(!lines[request].contains("df-agent-description"), "{all}");
+    drop(watching);
+}

@@ -1,0 +1,340 @@
+//! The agent management system: the agents of the platform (FIPA00023 clause 4.2).
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::Instant;
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_content::{Content, Dialect, Term, Wff};
+
+use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
+use crate::df::{authorize, result};
+use crate::exception::Exception;
+use crate::request::{self, Rejection, Request};
+use crate::search::max_results;
+use crate::{AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, limits};
+
+/// The agent management system of a platform.
+///
+/// The agents of this host are those of the directory: the caller passes them with each message.
+/// An agent that another platform registers is listed until its lease ends, and for agents of the same
+/// platform only. A platform thus cannot place names in the lists of others.
+///
+/// The calls are those of [`Df`](crate::Df).
+pub struct Ams {
+    id: AgentId,
+    platform: ApDescription,
+    /// The owners and states that agents of this host have set for themselves.
+    residents: BTreeMap<Arc<str>, (u64, AmsDescription)>,
+    /// The agents that platforms of other hosts have registered.
+    foreign: BTreeMap<(Platform, Arc<str>), Foreign>,
+    answers: VecDeque<Answer>,
+}
+
+/// An agent of this host.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[allow(
+    clippy::exhaustive_structs,
+    reason = "the shell of the core creates it"
+)]
+pub struct Resident {
+    /// The name of the agent.
+    pub name: Arc<str>,
+    /// Its registration: see [`Asker::registration`].
+    pub registration: u64,
+}
+
+struct Foreign {
+    description: AmsDescription,
+    ends: Instant,
+}
+
+impl Ams {
+    /// Creates an agent management system. The identifier is its own, the description that of its
+    /// platform.
+    #[must_use]
+    pub fn new(id: AgentId, platform: ApDescription) -> Self {
+        Self {
+            id,
+            platform,
+            residents: BTreeMap::new(),
+            foreign: BTreeMap::new(),
+            answers: VecDeque::new(),
+        }
+    }
+
+    /// Changes the identifier of the agent, which has registered under another name.
+    pub fn rename(&mut self, id: AgentId) {
+        self.id = id;
+    }
+
+    /// Changes the description of the platform.
+    pub fn describe(&mut self, platform: ApDescription) {
+        self.platform = platform;
+    }
+
+    /// Handles a message to the agent. `residents` are the agents of this host, sorted by name.
+    pub fn handle_message(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        message: &Message,
+        residents: &[Resident],
+    ) {
+        self.handle_timeout(now.at);
+        let (act, content) = match message.performative() {
+            Performative::Request => match self.request(now, asker, message, residents) {
+                Ok(content) => (Performative::Inform, content),
+                Err(rejection) => request::rejected(message, asker, rejection),
+            },
+            act if request::expects_answer(act) => {
+                let reason = Exception::UnsupportedAct(act.as_str().to_owned());
+                request::rejected(message, asker, reason.into())
+            }
+            _ => return,
+        };
+        let answer = request::reply(message, asker, &self.id, act).content(content);
+        self.answers.extend(request::answer(asker, answer));
+    }
+
+    /// Ends leases.
+    pub fn handle_timeout(&mut self, now: Instant) {
+        self.foreign.retain(|_, agent| agent.ends > now);
+    }
+
+    /// Returns the time of the next call of [`handle_timeout`](Self::handle_timeout).
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Instant> {
+        self.foreign.values().map(|agent| agent.ends).min()
+    }
+
+    /// Returns the next message to be sent.
+    pub fn poll_answer(&mut self) -> Option<Answer> {
+        self.answers.pop_front()
+    }
+
+    /// Returns the agents that platforms of other hosts have registered.
+    pub fn foreign(&self) -> impl Iterator<Item = (Platform, &AmsDescription)> {
+        let agents = self.foreign.iter();
+        agents.map(|((platform, _), agent)| (*platform, &agent.description))
+    }
+
+    fn request<'m>(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        message: &'m Message,
+        residents: &[Resident],
+    ) -> Result<Vec<u8>, Rejection<'m>> {
+        let request = Request::read(message, asker, &self.id)?;
+        let answer = self.execute(now, asker, &request, residents);
+        answer.map_err(|reason| Rejection::of(request.action, reason))
+    }
+
+    fn execute(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        request: &Request<'_>,
+        residents: &[Resident],
+    ) -> Result<Vec<u8>, Exception> {
+        match &*request.function {
+            "register" => {
+                let description = own_description(asker, request)?;
+                self.register(now, asker, description, residents)?;
+                Ok(request.done.clone())
+            }
+            "modify" => {
+                let description = own_description(asker, request)?;
+                self.modify(now, asker, description, residents)?;
+                Ok(request.done.clone())
+            }
+            "deregister" => {
+                own_description(asker, request)?;
+                self.deregister(asker, residents)?;
+                Ok(request.done.clone())
+            }
+            "search" => {
+                let [template, constraints] = request.arguments([AMS_DESCRIPTION, CONSTRAINTS])?;
+                let template = AmsDescription::from_term(template)?;
+                let constraints = Constraints::from_term(constraints)?;
+                let found = self.search(asker, &template, &constraints, residents)?;
+                result(request, found, asker.dialect)
+            }
+            "get-description" => {
+                request.arguments([])?;
+                let description = self.platform.to_term();
+                // The standard returns the description, JADE a sequence of one.
+                let value = match asker.dialect {
+                    Dialect::Jade => Term::Sequence(vec![description]),
+                    _ => description,
+                };
+                let action = Box::new(request.action.clone().into());
+                let result = Wff::Result(action, Box::new(value));
+                request::print(asker.dialect, &Content::from(result))
+                    .map_err(|_| Exception::InternalError("cannot answer".to_owned()))
+            }
+            other => Err(Exception::UnsupportedFunction(other.to_owned())),
+        }
+    }
+
+    fn register(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        description: AmsDescription,
+        residents: &[Resident],
+    ) -> Result<(), Exception> {
+        let key = key(asker);
+        if is_resident(residents, &key.1) || self.foreign.contains_key(&key) {
+            return Err(Exception::AlreadyRegistered);
+        }
+        if asker.platform == Platform::Host {
+            let words = "an agent of this host registers with the directory of the host";
+            return Err(Exception::InternalError(words.to_owned()));
+        }
+        let same = self.foreign.keys().filter(|(of, _)| *of == asker.platform);
+        if self.foreign.len() >= limits::FOREIGN_AGENTS
+            || same.count() >= limits::FOREIGN_AGENTS_OF_PLATFORM
+        {
+            let words = "no room for a further agent of this platform";
+            return Err(Exception::InternalError(words.to_owned()));
+        }
+        let ends = now.at + limits::LEASE;
+        self.foreign.insert(key, Foreign { description, ends });
+        Ok(())
+    }
+
+    fn modify(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        description: AmsDescription,
+        residents: &[Resident],
+    ) -> Result<(), Exception> {
+        let key = key(asker);
+        if asker.platform == Platform::Host && is_resident(residents, &key.1) {
+            // Of agents that have ended, nothing is kept.
+            self.residents.retain(|name, (registration, _)| {
+                registration_of(residents, name) == Some(*registration)
+            });
+            let known = (asker.registration, description);
+            self.residents.insert(key.1, known);
+            return Ok(());
+        }
+        match self.foreign.get_mut(&key) {
+            Some(known) => {
+                known.description = description;
+                known.ends = now.at + limits::LEASE;
+                Ok(())
+            }
+            None => Err(Exception::NotRegistered),
+        }
+    }
+
+    fn deregister(&mut self, asker: &Asker, residents: &[Resident]) -> Result<(), Exception> {
+        let key = key(asker);
+        if self.foreign.remove(&key).is_some() {
+            return Ok(());
+        }
+        if asker.platform == Platform::Host && is_resident(residents, &key.1) {
+            // The registration belongs to the process of the agent.
+            let words = "an agent of this host is deregistered by its own process";
+            return Err(Exception::InternalError(words.to_owned()));
+        }
+        Err(Exception::NotRegistered)
+    }
+
+    fn search(
+        &self,
+        asker: &Asker,
+        template: &AmsDescription,
+        constraints: &Constraints,
+        residents: &[Resident],
+    ) -> Result<Vec<Vec<u8>>, Exception> {
+        let most = max_results(constraints.max_results);
+        let (mut found, mut bytes) = (Vec::new(), 0);
+        let residents = residents.iter().filter_map(|resident| {
+            let set = self.residents.get(&resident.name);
+            let set = set.filter(|(registration, _)| *registration == resident.registration);
+            let set = set.map(|(_, set)| set);
+            Some(AmsDescription {
+                name: Some(AgentId::new(&*resident.name).ok()?),
+                ownership: set.and_then(|set| set.ownership.clone()),
+                state: Some(set.and_then(|set| set.state).unwrap_or(State::Active)),
+            })
+        });
+        let foreign = self.foreign.iter();
+        let foreign = foreign
+            .filter(|((platform, _), _)| *platform == asker.platform)
+            .map(|(_, agent)| agent.description.clone());
+        for description in residents.chain(foreign) {
+            if found.len() >= most {
+                break;
+            }
+            if !matches(template, &description) {
+                continue;
+            }
+            let Ok(text) = request::print(asker.dialect, &description.to_term()) else {
+                continue;
+            };
+            if !found.is_empty() && bytes + text.len() > limits::RESULT_BYTES {
+                break;
+            }
+            bytes += text.len();
+            found.push(text);
+        }
+        Ok(found)
+    }
+}
+
+fn key(asker: &Asker) -> (Platform, Arc<str>) {
+    (asker.platform, asker.id.name().into())
+}
+
+fn is_resident(residents: &[Resident], name: &str) -> bool {
+    registration_of(residents, name).is_some()
+}
+
+fn registration_of(residents: &[Resident], name: &str) -> Option<u64> {
+    let found = residents.binary_search_by(|resident| (*resident.name).cmp(name));
+    let resident = residents.get(found.ok()?)?;
+    Some(resident.registration)
+}
+
+/// Returns the description in the request, which is the asker's own.
+fn own_description(asker: &Asker, request: &Request<'_>) -> Result<AmsDescription, Exception> {
+    authorize(asker, request)?;
+    let [description] = request.arguments([AMS_DESCRIPTION])?;
+    let description = AmsDescription::from_term(description)?;
+    if description.name.is_none() {
+        return Err(Exception::missing(AMS_DESCRIPTION, "name"));
+    }
+    let size = description.size();
+    if size.parts > limits::TEMPLATE_PARTS || size.bytes > limits::DESCRIPTION_BYTES {
+        let words = "the description is too large";
+        return Err(Exception::InternalError(words.to_owned()));
+    }
+    Ok(AmsDescription {
+        state: description.state.or(Some(State::Active)),
+        ..description
+    })
+}
+
+/// Whether a description matches the template (FIPA00023 clause 6.4.2.1).
+fn matches(template: &AmsDescription, description: &AmsDescription) -> bool {
+    let name = match (&template.name, &description.name) {
+        (None, _) => true,
+        (Some(template), Some(agent)) => matches_agent(template, agent),
+        (Some(_), None) => false,
+    };
+    let ownership = match (&template.ownership, &description.ownership) {
+        (None, _) => true,
+        (Some(template), Some(owner)) => template.eq_ignore_ascii_case(owner),
+        (Some(_), None) => false,
+    };
+    name && ownership
+        && template
+            .state
+            .is_none_or(|it| Some(it) == description.state)
+}

@@ -1,0 +1,633 @@
+//! The directory facilitator: the services of agents (FIPA00023 clause 4.1).
+
+use std::collections::{BTreeMap, BTreeSet, HashSet, VecDeque};
+use std::sync::Arc;
+use std::time::Instant;
+
+use fipa_acl::{AgentId, Message, Performative, Time};
+use fipa_content::{Content, Dialect, Term, Wff};
+
+use crate::description::{Constraints, described};
+use crate::exception::Exception;
+use crate::request::{self, Rejection, Request};
+use crate::search::{Comparisons, max_results};
+use crate::subscription::{Subscription, checked_template};
+use crate::{AgentDescription, Answer, Asker, Now, Platform, SubscriptionId, limits};
+
+/// The directory facilitator of a platform.
+///
+/// The caller passes each message for the agent to [`handle_message`](Self::handle_message), calls
+/// [`handle_timeout`](Self::handle_timeout) at the time of [`poll_timeout`](Self::poll_timeout), and
+/// sends the messages of [`poll_answer`](Self::poll_answer) after each call.
+pub struct Df {
+    id: AgentId,
+    /// The descriptions, by the name of their agent.
+    entries: BTreeMap<Arc<str>, Entry>,
+    /// The ends of the leases, the earliest first.
+    leases: BTreeSet<(Instant, Arc<str>)>,
+    /// Number of descriptions of each platform.
+    platforms: BTreeMap<Platform, usize>,
+    subscriptions: BTreeMap<SubscriptionId, Subscription>,
+    next_subscription: u64,
+    /// The identifiers of the latest searches, the oldest first.
+    search_ids: VecDeque<Arc<str>>,
+    known_search_ids: HashSet<Arc<str>>,
+    answers: VecDeque<Answer>,
+}
+
+struct Entry {
+    platform: Platform,
+    registration: u64,
+    description: AgentDescription,
+    /// The end of the lease; `None` for an agent of this host without a lease.
+    ends: Option<Instant>,
+}
+
+const DESCRIPTION: &str = "df-agent-description";
+
+impl Df {
+    /// Creates a directory facilitator without descriptions. The identifier is its own.
+    #[must_use]
+    pub fn new(id: AgentId) -> Self {
+        Self {
+            id,
+            entries: BTreeMap::new(),
+            leases: BTreeSet::new(),
+            platforms: BTreeMap::new(),
+            subscriptions: BTreeMap::new(),
+            next_subscription: 0,
+            search_ids: VecDeque::new(),
+            known_search_ids: HashSet::new(),
+            answers: VecDeque::new(),
+        }
+    }
+
+    /// Changes the identifier of the agent, which has registered under another name.
+    pub fn rename(&mut self, id: AgentId) {
+        self.id = id;
+    }
+
+    /// Handles a message to the agent.
+    pub fn handle_message(&mut self, now: Now, asker: &Asker, message: &Message) {
+        self.expire(now.at);
+        match message.performative() {
+            Performative::Request => {
+                let (act, content) = match self.request(now, asker, message) {
+                    Ok(content) => (Performative::Inform, content),
+                    Err(rejection) => request::rejected(message, asker, rejection),
+                };
+                self.answer(asker, message, act, content);
+            }
+            Performative::Subscribe => self.subscribe(now, asker, message),
+            Performative::Cancel => self.cancel(asker, message),
+            act if request::expects_answer(act) => {
+                let reason = Exception::UnsupportedAct(act.as_str().to_owned());
+                let (act, content) = request::rejected(message, asker, reason.into());
+                self.answer(asker, message, act, content);
+            }
+            _ => {}
+        }
+        self.notify(now.at);
+    }
+
+    /// Ends leases, and makes the notifications that are due.
+    pub fn handle_timeout(&mut self, now: Instant) {
+        self.expire(now);
+        self.notify(now);
+    }
+
+    /// Handles the end of agents of this host: their descriptions and subscriptions end. `is_registered`
+    /// returns whether an agent of this host has this name and this registration.
+    pub fn handle_departures(&mut self, now: Instant, is_registered: impl Fn(&str, u64) -> bool) {
+        let gone = self.entries.iter().filter(|(name, entry)| {
+            entry.platform == Platform::Host && !is_registered(name, entry.registration)
+        });
+        let gone: Vec<Arc<str>> = gone.map(|(name, _)| Arc::clone(name)).collect();
+        self.subscriptions.retain(|_, subscription| {
+            let asker = &subscription.asker;
+            asker.platform != Platform::Host || is_registered(asker.id.name(), asker.registration)
+        });
+        for name in gone {
+            self.remove(&name);
+        }
+        self.notify(now);
+    }
+
+    /// Handles the outcome of a notification. A subscription whose notification was not delivered ends.
+    pub fn handle_sent(&mut self, now: Instant, id: SubscriptionId, is_delivered: bool) {
+        if !is_delivered {
+            self.subscriptions.remove(&id);
+        } else if let Some(subscription) = self.subscriptions.get_mut(&id) {
+            subscription.is_under_way = false;
+        }
+        self.notify(now);
+    }
+
+    /// Returns the time of the next call of [`handle_timeout`](Self::handle_timeout).
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Instant> {
+        let leases = self.leases.first().map(|(ends, _)| *ends);
+        let waiting = self.subscriptions.values();
+        let waiting = waiting
+            .filter(|it| !it.is_under_way && !it.changed.is_empty())
+            .map(|it| it.not_before);
+        leases.into_iter().chain(waiting).min()
+    }
+
+    /// Returns the next message to be sent.
+    pub fn poll_answer(&mut self) -> Option<Answer> {
+        self.answers.pop_front()
+    }
+
+    /// Returns the descriptions, sorted by name.
+    pub fn descriptions(&self) -> impl Iterator<Item = &AgentDescription> {
+        self.entries.values().map(|entry| &entry.description)
+    }
+
+    /// Returns the number of subscriptions.
+    #[must_use]
+    pub fn subscriptions(&self) -> usize {
+        self.subscriptions.len()
+    }
+
+    fn answer(&mut self, asker: &Asker, message: &Message, act: Performative, content: Vec<u8>) {
+        let answer = request::reply(message, asker, &self.id, act).content(content);
+        self.answers.extend(request::answer(asker, answer));
+    }
+
+    /// Executes a request and returns the content of the answer.
+    fn request<'m>(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        message: &'m Message,
+    ) -> Result<Vec<u8>, Rejection<'m>> {
+        let request = Request::read(message, asker, &self.id)?;
+        let answer = self.execute(now, asker, &request);
+        answer.map_err(|reason| Rejection::of(request.action, reason))
+    }
+
+    fn execute(
+        &mut self,
+        now: Now,
+        asker: &Asker,
+        request: &Request<'_>,
+    ) -> Result<Vec<u8>, Exception> {
+        match &*request.function {
+            "register" | "modify" => {
+                authorize(asker, request)?;
+                let [description] = request.arguments([DESCRIPTION])?;
+                let asked = AgentDescription::from_term(description)?;
+                let (description, ends) = granted(now, asker, asked.clone())?;
+                // The asker learns a lease that differs from the one it asked for.
+                let done = match description == asked {
+                    true => request.done.clone(),
+                    false => {
+                        let action = request.with_argument(description.to_term());
+                        let done = Content::from(Wff::done(action));
+                        request::print(asker.dialect, &done)
+                            .map_err(|_| Exception::InternalError("cannot answer".to_owned()))?
+                    }
+                };
+                let entry = Entry {
+                    platform: asker.platform,
+                    registration: asker.registration,
+                    description,
+                    ends,
+                };
+                match &*request.function {
+                    "register" => self.register(asker, entry)?,
+                    _ => self.modify(asker, entry)?,
+                }
+                Ok(done)
+            }
+            "deregister" => {
+                authorize(asker, request)?;
+                let [description] = request.arguments([DESCRIPTION])?;
+                let description = AgentDescription::from_term(description)?;
+                if description.name.is_none() {
+                    return Err(Exception::missing(DESCRIPTION, "name"));
+                }
+                self.own_entry(asker)?;
+                self.remove(asker.id.name());
+                Ok(request.done.clone())
+            }
+            "search" => {
+                let [template, constraints] =
+                    request.arguments([DESCRIPTION, crate::description::CONSTRAINTS])?;
+                let template = checked_template(AgentDescription::from_term(template)?)?;
+                let constraints = Constraints::from_term(constraints)?;
+                let found = self.search(&template, &constraints, asker.dialect)?;
+                result(request, found, asker.dialect)
+            }
+            other => Err(Exception::UnsupportedFunction(other.to_owned())),
+        }
+    }
+
+    fn register(&mut self, asker: &Asker, entry: Entry) -> Result<(), Exception> {
+        if self.entries.contains_key(asker.id.name()) {
+            return Err(Exception::AlreadyRegistered);
+        }
+        let count = |platform| self.platforms.get(&platform).copied().unwrap_or(0);
+        let foreign = self.entries.len() - count(Platform::Host);
+        let is_full = self.entries.len() >= limits::DESCRIPTIONS
+            || entry.platform != Platform::Host
+                && (foreign >= limits::FOREIGN_DESCRIPTIONS
+                    || count(entry.platform) >= limits::DESCRIPTIONS_OF_PLATFORM);
+        if is_full {
+            let words = "the directory has no room for a further description of this platform";
+            return Err(Exception::InternalError(words.to_owned()));
+        }
+        let name: Arc<str> = asker.id.name().into();
+        self.changed(&name, None, Some(&entry.description));
+        self.insert(name, entry);
+        Ok(())
+    }
+
+    fn modify(&mut self, asker: &Asker, entry: Entry) -> Result<(), Exception> {
+        self.own_entry(asker)?;
+        let name: Arc<str> = asker.id.name().into();
+        let new = entry.description.clone();
+        let old = self.take(&name).map(|(_, old)| old);
+        self.insert(Arc::clone(&name), entry);
+        self.changed(&name, old.as_ref().map(|old| &old.description), Some(&new));
+        Ok(())
+    }
+
+    /// Checks that the asker has an entry that it may change.
+    fn own_entry(&self, asker: &Asker) -> Result<(), Exception> {
+        match self.entries.get(asker.id.name()) {
+            None => Err(Exception::NotRegistered),
+            Some(entry) if entry.platform != asker.platform => Err(Exception::Unauthorised),
+            Some(_) => Ok(()),
+        }
+    }
+
+    fn remove(&mut self, name: &str) {
+        if let Some((name, entry)) = self.take(name) {
+            self.changed(&name, Some(&entry.description), None);
+        }
+    }
+
+    /// Adds an entry under a free name.
+    fn insert(&mut self, name: Arc<str>, entry: Entry) {
+        let lease = entry.ends.map(|ends| (ends, Arc::clone(&name)));
+        self.leases.extend(lease);
+        *self.platforms.entry(entry.platform).or_default() += 1;
+        self.entries.insert(name, entry);
+    }
+
+    /// Removes an entry, without a notification.
+    fn take(&mut self, name: &str) -> Option<(Arc<str>, Entry)> {
+        let (name, entry) = self.entries.remove_entry(name)?;
+        if let Some(ends) = entry.ends {
+            self.leases.remove(&(ends, Arc::clone(&name)));
+        }
+        if let Some(count) = self.platforms.get_mut(&entry.platform) {
+            *count -= 1;
+            if *count == 0 {
+                self.platforms.remove(&entry.platform);
+            }
+        }
+        Some((name, entry))
+    }
+
+    /// Removes the descriptions whose leases have ended.
+    fn expire(&mut self, now: Instant) {
+        while self.leases.first().is_some_and(|(ends, _)| *ends <= now)
+            && let Some((_, name)) = self.leases.pop_first()
+        {
+            self.remove(&name);
+        }
+    }
+
+    /// Returns the texts of the matching descriptions.
+    fn search(
+        &mut self,
+        template: &AgentDescription,
+        constraints: &Constraints,
+        dialect: Dialect,
+    ) -> Result<Vec<Vec<u8>>, Exception> {
+        if let Some(id) = &constraints.search_id {
+            let (most, longest) = limits::SEARCH_IDS;
+            if id.len() > longest {
+                return Err(Exception::unrecognised(
+                    crate::description::CONSTRAINTS,
+                    "search-id",
+                ));
+            }
+            if self.known_search_ids.contains(&**id) {
+                let words = "search-id already served";
+                return Err(Exception::InternalError(words.to_owned()));
+            }
+            if self.search_ids.len() >= most
+                && let Some(oldest) = self.search_ids.pop_front()
+            {
+                self.known_search_ids.remove(&oldest);
+            }
+            let id: Arc<str> = id.as_str().into();
+            self.search_ids.push_back(Arc::clone(&id));
+            self.known_search_ids.insert(id);
+        }
+        let most = max_results(constraints.max_results);
+        let mut comparisons = Comparisons::default();
+        let mut found = Found::new(limits::RESULT_BYTES);
+        for entry in self.entries.values() {
+            if found.texts.len() >= most {
+                break;
+            }
+            if comparisons.agent(template, &entry.description)?
+                && !found.add(&entry.description, dialect)
+            {
+                break;
+            }
+        }
+        Ok(found.texts)
+    }
+
+    fn subscribe(&mut self, now: Now, asker: &Asker, message: &Message) {
+        let read = match asker.is_proved {
+            true => Subscription::read(message, asker, &self.id, now.at),
+            // Notifications must not go to an agent that did not subscribe.
+            false => Err(Exception::Unauthorised),
+        };
+        let admitted = read.and_then(|read| {
+            // A subscription with the same conversation replaces the earlier one.
+            let conversation = message.conversation_id();
+            self.subscriptions
+                .retain(|_, other| !other.is_of(asker, conversation));
+            self.make_room(asker).map(|()| read)
+        });
+        let (mut subscription, agreed) = match admitted {
+            Ok(read) => read,
+            Err(reason) => {
+                let (act, content) = request::rejected(message, asker, reason.into());
+                return self.answer(asker, message, act, content);
+            }
+        };
+        self.answer(asker, message, Performative::Agree, agreed);
+        let mut comparisons = Comparisons::default();
+        for (name, entry) in &self.entries {
+            match comparisons.agent(&subscription.template, &entry.description) {
+                Ok(true) => drop(subscription.changed.insert(Arc::clone(name))),
+                Ok(false) => {}
+                Err(_) => break,
+            }
+        }
+        let id = SubscriptionId(self.next_subscription);
+        self.next_subscription += 1;
+        self.subscriptions.insert(id, subscription);
+    }
+
+    /// Checks that the asker may have a further subscription. The oldest one of a platform of another
+    /// host ends for a new one, because the end of a subscriber there is detected late.
+    fn make_room(&mut self, asker: &Asker) -> Result<(), Exception> {
+        let full = || {
+            let words = "no further subscription is possible; cancel one";
+            Exception::InternalError(words.to_owned())
+        };
+        let all = self.subscriptions.iter();
+        let of_agent = all.clone().filter(|(_, it)| {
+            it.asker.platform == asker.platform && it.asker.id.same_agent(&asker.id)
+        });
+        if of_agent.count() >= limits::SUBSCRIPTIONS_OF_AGENT {
+            return Err(full());
+        }
+        let foreign = |it: &Subscription| it.asker.platform != Platform::Host;
+        if asker.platform != Platform::Host {
+            let same = all
+                .clone()
+                .filter(|(_, it)| it.asker.platform == asker.platform);
+            if same.clone().count() >= limits::SUBSCRIPTIONS_OF_PLATFORM {
+                let oldest = same.map(|(id, _)| *id).min();
+                if let Some(oldest) = oldest {
+                    self.end(
+                        oldest,
+                        "the platform of the subscriber has too many subscriptions",
+                    );
+                }
+            } else if all.filter(|(_, it)| foreign(it)).count() >= limits::FOREIGN_SUBSCRIPTIONS {
+                return Err(full());
+            }
+        }
+        match self.subscriptions.len() {
+            0..limits::SUBSCRIPTIONS => Ok(()),
+            _ => Err(full()),
+        }
+    }
+
+    /// Ends a subscription with a `failure`.
+    fn end(&mut self, id: SubscriptionId, words: &str) {
+        if let Some(subscription) = self.subscriptions.remove(&id) {
+            let reason = Exception::InternalError(words.to_owned());
+            let (asker, message) = (&subscription.asker, &subscription.message);
+            let (act, content) = request::rejected(message, asker, reason.into());
+            self.answer(asker, message, act, content);
+        }
+    }
+
+    /// Ends the subscription of this conversation (FIPA00035, the cancel meta-protocol).
+    fn cancel(&mut self, asker: &Asker, message: &Message) {
+        let conversation = message.conversation_id();
+        let mut all = self.subscriptions.iter();
+        let found = all.find(|(_, it)| it.is_of(asker, conversation));
+        let cancel = fipa_content::ActionExpression::Action {
+            agent: Term::from(&asker.id),
+            act: Term::functional("cancel", []),
+        };
+        let (act, content) = match found.map(|(id, _)| *id) {
+            Some(id) => {
+                self.subscriptions.remove(&id);
+                let done = Content::from(Wff::done(cancel));
+                let done = request::print(asker.dialect, &done);
+                (Performative::Inform, done.unwrap_or_default())
+            }
+            None => {
+                let words = "there is no subscription with this conversation";
+                let reason = Exception::InternalError(words.to_owned());
+                request::rejected(message, asker, Rejection::of(cancel, reason))
+            }
+        };
+        self.answer(asker, message, act, content);
+    }
+
+    /// Records a change for the subscriptions whose template matches the description before or after.
+    fn changed(
+        &mut self,
+        name: &Arc<str>,
+        before: Option<&AgentDescription>,
+        after: Option<&AgentDescription>,
+    ) {
+        let mut overrun = BTreeSet::new();
+        for (id, subscription) in &mut self.subscriptions {
+            // The sizes of templates and descriptions bound the comparisons of one pair.
+            let matches = |description: Option<&AgentDescription>| {
+                description.is_some_and(|description| {
+                    let mut comparisons = Comparisons::default();
+                    let found = comparisons.agent(&subscription.template, description);
+                    found.unwrap_or(false)
+                })
+            };
+            if matches(before) || matches(after) {
+                subscription.changed.insert(Arc::clone(name));
+                if subscription.changed.len() > limits::CHANGES {
+                    overrun.insert(*id);
+                }
+            }
+        }
+        for id in overrun {
+            self.end(id, "more changes than can wait for the subscriber");
+        }
+    }
+
+    /// Makes the notifications that are due.
+    fn notify(&mut self, now: Instant) {
+        for (id, subscription) in &mut self.subscriptions {
+            if subscription.is_under_way
+                || subscription.changed.is_empty()
+                || subscription.not_before > now
+            {
+                continue;
+            }
+            let mut found = Found::new(limits::NOTIFICATION_BYTES);
+            while found.texts.len() < limits::RESULTS
+                && let Some(name) = subscription.changed.pop_first()
+            {
+                let dialect = subscription.dialect();
+                let has_room = match self.entries.get(&name) {
+                    Some(entry) => found.add(&entry.description, dialect),
+                    // A description without services reports the end of the registration, as in JADE.
+                    None => match AgentId::new(&*name) {
+                        Ok(agent) => {
+                            let gone = AgentDescription {
+                                name: Some(agent),
+                                ..AgentDescription::default()
+                            };
+                            found.add(&gone, dialect)
+                        }
+                        Err(_) => true,
+                    },
+                };
+                if !has_room {
+                    subscription.changed.insert(name);
+                    break;
+                }
+            }
+            subscription.is_under_way = true;
+            subscription.not_before = now + limits::NOTIFICATION_PAUSE;
+            let (asker, message) = (&subscription.asker, &subscription.message);
+            let content = subscription.notification(&found.texts);
+            let notification = request::reply(message, asker, &self.id, Performative::Inform);
+            let answer = request::answer(asker, notification.content(content));
+            self.answers.extend(answer.map(|answer| Answer {
+                notification: Some(*id),
+                ..answer
+            }));
+        }
+    }
+}
+
+/// Descriptions for an answer, as text.
+struct Found {
+    texts: Vec<Vec<u8>>,
+    bytes: usize,
+    most_bytes: usize,
+}
+
+impl Found {
+    fn new(most_bytes: usize) -> Self {
+        Self {
+            texts: Vec::new(),
+            bytes: 0,
+            most_bytes,
+        }
+    }
+
+    /// Adds a description, unless the answer is long enough already. A description that the dialect has
+    /// no notation for is left out.
+    fn add(&mut self, description: &AgentDescription, dialect: Dialect) -> bool {
+        let Ok(text) = request::print(dialect, &description.to_term()) else {
+            return true;
+        };
+        if !self.texts.is_empty() && self.bytes + text.len() > self.most_bytes {
+            return false;
+        }
+        self.bytes += text.len();
+        self.texts.push(text);
+        true
+    }
+}
+
+/// Returns the content of the answer with the results of a search.
+pub(crate) fn result(
+    request: &Request<'_>,
+    found: Vec<Vec<u8>>,
+    dialect: Dialect,
+) -> Result<Vec<u8>, Exception> {
+    let unprintable = |_| Exception::InternalError("cannot answer".to_owned());
+    let empty = Wff::Result(
+        Box::new(request.action.clone().into()),
+        Box::new(Term::Sequence(Vec::new())),
+    );
+    let mut text = request::print(dialect, &Content::from(empty)).map_err(unprintable)?;
+    // The text ends with the parentheses of the sequence, the formula and the content.
+    let end = text.split_off(text.len().saturating_sub(3));
+    for description in found {
+        text.push(b' ');
+        text.extend(description);
+    }
+    text.extend(end);
+    Ok(text)
+}
+
+/// Checks that the asker may change the description in the request: its connection proves its name, and
+/// the description is its own. A description without a readable name is refused later, for that.
+pub(crate) fn authorize(asker: &Asker, request: &Request<'_>) -> Result<(), Exception> {
+    let other = described(request.first_argument());
+    let other = other.is_some_and(|agent| !agent.same_agent(&asker.id));
+    match asker.is_proved && !other {
+        true => Ok(()),
+        false => Err(Exception::Unauthorised),
+    }
+}
+
+/// Checks a description that is to be stored. Returns it with the granted lease, and the end of the
+/// lease.
+fn granted(
+    now: Now,
+    asker: &Asker,
+    mut description: AgentDescription,
+) -> Result<(AgentDescription, Option<Instant>), Exception> {
+    description.check()?;
+    let size = description.size();
+    if size.parts > limits::DESCRIPTION_PARTS || size.bytes > limits::DESCRIPTION_BYTES {
+        return Err(Exception::InternalError(format!(
+            "the description is too large: at most {} parts and {} bytes of text",
+            limits::DESCRIPTION_PARTS,
+            limits::DESCRIPTION_BYTES
+        )));
+    }
+    let invalid = || Exception::unrecognised(DESCRIPTION, "lease-time");
+    let asked = match description.lease_time {
+        None => None,
+        Some(time) => {
+            let left = time.to_system_time(now.wall).duration_since(now.wall);
+            let left = left.ok().filter(|left| !left.is_zero());
+            Some(left.ok_or_else(invalid)?)
+        }
+    };
+    let lease = match asker.platform {
+        Platform::Host => asked,
+        _ => Some(asked.unwrap_or(limits::LEASE).min(limits::LEASE)),
+    };
+    let Some(lease) = lease else {
+        return Ok((description, None));
+    };
+    let is_relative = description.lease_time.is_some_and(Time::is_relative);
+    if asked != Some(lease) || is_relative {
+        let until = now.wall.checked_add(lease).ok_or_else(invalid)?;
+        description.lease_time = Some(Time::from_system_time(until).map_err(|_| invalid())?);
+    }
+    // A lease beyond the range of the clock does not end.
+    Ok((description, now.at.checked_add(lease)))
+}

@@ -1,0 +1,478 @@
+//! The platform agents of the gateway: the agent management system and the directory facilitator
+//! (FIPA00023). This module is the I/O around [`fipa_platform`].
+//!
+//! Each of the two is an agent of this host with a name, a queue and a directory entry of its own.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Message, escape};
+use fipa_content::Dialect;
+use fipa_mts::core::{Received, Submission};
+use fipa_mts::{Sending, letter_for};
+use fipa_platform::{
+    Ams, Answer, ApDescription, Asker, Df, Now, Platform, Resident, SubscriptionId,
+};
+use fipa_sds::{Directory, Entry, MergedDirectory, Reach, RegisterError, Registration, Role};
+use fipa_transport::{Incarnation, Location, Principal, Signature};
+use tokio::task::{JoinHandle, JoinSet};
+
+use super::neighbours::Neighbours;
+use super::publisher::other_holder;
+use crate::config;
+use crate::service::Service;
+
+/// Deadline for the delivery of an answer.
+const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
+
+/// Time for which an agent of another host must have the name before this one changes its own. The
+/// updates of a directory may arrive in the wrong order.
+const CONTESTED: Duration = Duration::from_secs(1);
+
+/// Maximum number of names that are tried.
+const TRIES: usize = 8;
+
+/// The parts of the gateway that the platform agents use.
+#[derive(Clone)]
+pub(super) struct PlatformAgents {
+    pub(super) service: Arc<Service>,
+    pub(super) neighbours: Arc<Neighbours>,
+    pub(super) view: Arc<dyn Directory>,
+    /// The agents of other hosts.
+    pub(super) known: Arc<MergedDirectory>,
+    /// Whether `security.keys` is set.
+    pub(super) has_keys: bool,
+}
+
+impl PlatformAgents {
+    /// Registers the agents that the configuration turns on, and starts their tasks. An agent that
+    /// cannot register is logged; letters do not depend on it.
+    pub(super) fn start(self, config: &config::Platform) -> Vec<JoinHandle<()>> {
+        let agents = [
+            (Kind::Ams, "ams", &config.ams),
+            (Kind::Df, "df", &config.df),
+        ];
+        let started = agents.into_iter().filter_map(|(kind, prefix, agent)| {
+            let name = match agent {
+                config::PlatformAgent::Off => return None,
+                config::PlatformAgent::On => format!("{prefix}@{}", self.service.own.name),
+                config::PlatformAgent::Named(name) => name.clone(),
+            };
+            let task = Task::register(self.clone(), kind, name)?;
+            Some(tokio::spawn(task.run()))
+        });
+        started.collect()
+    }
+
+    /// Describes the agent that sent a letter, as far as its connection proves it. Returns `None` if no
+    /// answer can reach it.
+    fn asker(&self, message: &Message, received: &Received) -> Option<Asker> {
+        let claimed = message.sender()?;
+        let holder = self.view.lookup(claimed.name());
+        let (entry, is_proved) = if received.sender.is_known() {
+            let entry = self.view.by_incarnation(received.sender)?;
+            let is_holder = holder.is_some_and(|it| it.incarnation == entry.incarnation);
+            let is_proved = is_holder && *entry.name == *claimed.name();
+            (entry, is_proved)
+        } else {
+            // An agent of a legacy peer, which has no registration. Answers go to its name only if no
+            // agent with a registration has the name.
+            let entry = holder.filter(|it| !it.incarnation.is_known())?;
+            (entry, true)
+        };
+        let id = match *claimed.name() == *entry.name {
+            true => claimed.clone(),
+            false => AgentId::new(&*entry.name).ok()?,
+        };
+        let mut asker = Asker::new(
+            id,
+            received.sender.as_u64(),
+            self.platform(&entry, received),
+        );
+        asker.is_proved = is_proved;
+        let is_jade = |location: &Location| location.signature() == Signature::JadeProxy;
+        if entry.locations.iter().any(is_jade) {
+            asker.dialect = Dialect::Jade;
+        }
+        Some(asker)
+    }
+
+    /// Returns the platform of an agent. A gateway of this host in another domain counts as another
+    /// host.
+    fn platform(&self, entry: &Entry, received: &Received) -> Platform {
+        if entry.reach == Reach::Local && !received.remote {
+            return Platform::Host;
+        }
+        match self.neighbours.principal(received.service) {
+            Some(Principal::Certificate(fingerprint)) => Platform::Proved(fingerprint),
+            _ => Platform::Unproved,
+        }
+    }
+
+    /// Returns the agents of this host, sorted by name.
+    fn residents(&self) -> Vec<Resident> {
+        let entries = self.service.host.entries();
+        let agents = entries
+            .iter()
+            .filter(|it| it.reach == Reach::Local && it.role == Role::Agent);
+        agents
+            .map(|entry| Resident {
+                name: Arc::clone(&entry.name),
+                registration: entry.incarnation.as_u64(),
+            })
+            .collect()
+    }
+
+    /// Describes the platform: the gateway, and its addresses on the network.
+    fn description(&self) -> ApDescription {
+        let mut services: Vec<(String, Vec<String>)> = Vec::new();
+        for location in self.service.locations() {
+            let kind = location.kind();
+            if kind.is_host_local() {
+                continue;
+            }
+            let address = format!("{}://{}", kind.name(), location.address());
+            match services.iter_mut().find(|(name, _)| name == kind.name()) {
+                Some((_, addresses)) => addresses.push(address),
+                None => services.push((kind.name().to_owned(), vec![address])),
+            }
+        }
+        ApDescription {
+            name: self.service.own.name.to_string(),
+            services,
+        }
+    }
+
+    /// Sends a message of an agent of this gateway.
+    fn send(&self, from: Incarnation, answer: &Answer) -> Option<Sending> {
+        let letter = letter_for(&answer.message, SystemTime::now());
+        let letter = letter
+            .inspect_err(|error| tracing::warn!(%error, "cannot encode a letter of the gateway"))
+            .ok()?;
+        let mut submission = Submission {
+            sender: from,
+            letter,
+            receivers: Vec::new(),
+            deadline: ANSWER_DEADLINE,
+        };
+        let registration = Incarnation::from_u64(answer.registration);
+        if !registration.is_known() {
+            submission.receivers = vec![Arc::clone(&answer.to)];
+            return Some(self.service.mts.send(submission));
+        }
+        let Some(to) = self.view.by_incarnation(registration) else {
+            tracing::info!("dropping a reply: its requester is no longer registered");
+            return None;
+        };
+        Some(self.service.mts.send_to(submission, &to))
+    }
+}
+
+/// The two agents.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Ams,
+    Df,
+}
+
+impl Kind {
+    fn agent_type(self) -> &'static str {
+        match self {
+            Self::Ams => Entry::AMS_TYPE,
+            Self::Df => Entry::DF_TYPE,
+        }
+    }
+
+    fn description(self) -> &'static str {
+        match self {
+            Self::Ams => "agent management system",
+            Self::Df => "directory facilitator",
+        }
+    }
+}
+
+enum Core {
+    Ams(Ams),
+    Df(Df),
+}
+
+/// One of the agents, while the gateway runs.
+struct Task {
+    means: PlatformAgents,
+    kind: Kind,
+    core: Core,
+    /// The name of the configuration.
+    configured: String,
+    name: Arc<str>,
+    incarnation: Incarnation,
+    /// Since when an agent of another host has the name.
+    contested: Option<Instant>,
+    /// The notifications under way.
+    sent: JoinSet<(SubscriptionId, bool)>,
+}
+
+impl Task {
+    /// Registers the agent in the directory of this host.
+    fn register(means: PlatformAgents, kind: Kind, configured: String) -> Option<Self> {
+        let (id, incarnation) = enter(&means, kind, &configured, false)?;
+        let name: Arc<str> = id.name().into();
+        let core = match kind {
+            Kind::Ams => Core::Ams(Ams::new(id, means.description())),
+            Kind::Df => Core::Df(Df::new(id)),
+        };
+        Some(Self {
+            means,
+            kind,
+            core,
+            configured,
+            name,
+            incarnation,
+            contested: None,
+            sent: JoinSet::new(),
+        })
+    }
+
+    /// Reads and answers letters until the service ends.
+    async fn run(mut self) {
+        let service = Arc::clone(&self.means.service);
+        let (mut here, mut there) = (service.host.watch(), self.means.known.watch());
+        let mut locations = service.follow_locations();
+        loop {
+            self.send_answers();
+            let contested = self.contested.map(|since| since + CONTESTED);
+            let due = [self.poll_timeout(), contested].into_iter().flatten().min();
+            let due = due.map(tokio::time::Instant::from_std);
+            tokio::select! {
+                received = service.mts.receive(self.incarnation) => match received {
+                    Some(received) => self.handle(&received),
+                    None => return,
+                },
+                change = here.next() => {
+                    if change.is_none() {
+                        return;
+                    }
+                    // Several pending changes are handled together.
+                    while here.try_next().is_some() {}
+                    self.handle_departures();
+                }
+                change = there.next() => {
+                    if change.is_none() {
+                        return;
+                    }
+                    while there.try_next().is_some() {}
+                    self.check_name();
+                }
+                moved = locations.changed() => {
+                    if moved.is_err() {
+                        return;
+                    }
+                    self.relocate();
+                }
+                Some(sent) = self.sent.join_next() => {
+                    if let (Ok((id, is_delivered)), Core::Df(df)) = (sent, &mut self.core) {
+                        df.handle_sent(Instant::now(), id, is_delivered);
+                    }
+                }
+                () = tokio::time::sleep_until(due.unwrap_or_else(tokio::time::Instant::now)),
+                    if due.is_some() =>
+                {
+                    self.handle_timeout();
+                }
+            }
+        }
+    }
+
+    fn handle(&mut self, received: &Received) {
+        let message = match Message::decode(received.letter.payload()) {
+            Ok(message) => message,
+            Err(error) => {
+                tracing::info!(%error, agent = %self.name, "cannot decode a letter to an agent of the gateway");
+                let mts = &self.means.service.mts;
+                return mts.handle_undecodable(&self.name, received, error.to_string());
+            }
+        };
+        let Some(asker) = self.means.asker(&message, received) else {
+            tracing::info!(agent = %self.name, "cannot answer a letter: its sender is not registered");
+            return;
+        };
+        let now = Now {
+            at: Instant::now(),
+            wall: SystemTime::now(),
+        };
+        match &mut self.core {
+            Core::Ams(ams) => {
+                ams.handle_message(now, &asker, &message, &self.means.residents());
+            }
+            Core::Df(df) => df.handle_message(now, &asker, &message),
+        }
+    }
+
+    fn handle_departures(&mut self) {
+        let host = &self.means.service.host;
+        if let Core::Df(df) = &mut self.core {
+            df.handle_departures(Instant::now(), |name, registration| {
+                let known = host.known_incarnation(Incarnation::from_u64(registration));
+                known.is_some_and(|it| *it.name == *name && it.reach == Reach::Local)
+            });
+        }
+    }
+
+    fn poll_timeout(&self) -> Option<Instant> {
+        match &self.core {
+            Core::Ams(ams) => ams.poll_timeout(),
+            Core::Df(df) => df.poll_timeout(),
+        }
+    }
+
+    fn handle_timeout(&mut self) {
+        let now = Instant::now();
+        match &mut self.core {
+            Core::Ams(ams) => ams.handle_timeout(now),
+            Core::Df(df) => df.handle_timeout(now),
+        }
+        self.check_name();
+    }
+
+    fn send_answers(&mut self) {
+        loop {
+            let answer = match &mut self.core {
+                Core::Ams(ams) => ams.poll_answer(),
+                Core::Df(df) => df.poll_answer(),
+            };
+            let Some(answer) = answer else {
+                return;
+            };
+            let sending = self.means.send(self.incarnation, &answer);
+            let Some(id) = answer.notification else {
+                // The outcome is not awaited: a requester that gets no answer asks again.
+                continue;
+            };
+            self.sent.spawn(async move {
+                let is_delivered = match sending {
+                    Some(sending) => {
+                        let outcomes = sending.outcomes().await;
+                        outcomes.iter().all(|(_, outcome)| outcome.is_success())
+                    }
+                    None => false,
+                };
+                (id, is_delivered)
+            });
+        }
+    }
+
+    /// Updates the addresses of the agent after a change of the locations of the gateway.
+    fn relocate(&mut self) {
+        let means = &self.means;
+        if let Err(error) = entry(means, self.kind, &self.name, self.incarnation) {
+            tracing::warn!(%error, agent = %self.name, "cannot update an agent of the gateway");
+        }
+        if let Core::Ams(ams) = &mut self.core {
+            ams.describe(means.description());
+        }
+    }
+
+    /// Changes the name when an agent of another host has had it for [`CONTESTED`].
+    fn check_name(&mut self) {
+        let own = self.means.service.host.known(&self.name);
+        let own = own.filter(|own| own.incarnation == self.incarnation);
+        let holder =
+            own.and_then(|own| other_holder(&own, &*self.means.known, self.means.has_keys));
+        let Some(holder) = holder else {
+            self.contested = None;
+            return;
+        };
+        let since = *self.contested.get_or_insert_with(Instant::now);
+        if since.elapsed() < CONTESTED {
+            return;
+        }
+        self.contested = None;
+        let Some((id, incarnation)) = enter(&self.means, self.kind, &self.configured, true) else {
+            return;
+        };
+        tracing::info!(
+            before = %self.name, now = id.name(), holder = %escape(&holder.mts.name),
+            "an agent of the gateway has a new name: an agent of another host has its name"
+        );
+        let service = Arc::clone(&self.means.service);
+        // Answers to letters that arrived under the former name have that name.
+        while let Some(received) = service.mts.try_receive(self.incarnation) {
+            self.handle(&received);
+        }
+        self.send_answers();
+        if let Err(error) = service.host.deregister(&self.name, self.incarnation) {
+            tracing::warn!(%error, agent = %self.name, "cannot deregister an agent of the gateway");
+        }
+        drop(service.mts.deregister(self.incarnation));
+        self.name = id.name().into();
+        self.incarnation = incarnation;
+        match &mut self.core {
+            Core::Ams(ams) => ams.rename(id),
+            Core::Df(df) => df.rename(id),
+        }
+    }
+}
+
+/// Registers an agent under its name, or, if the name is taken, under the name with `-` and four
+/// hexadecimal digits.
+fn enter(
+    means: &PlatformAgents,
+    kind: Kind,
+    configured: &str,
+    is_taken: bool,
+) -> Option<(AgentId, Incarnation)> {
+    let mut with_digits = is_taken;
+    let mut last = None;
+    for _ in 0..TRIES {
+        let incarnation = Incarnation::random();
+        let name: Arc<str> = match with_digits {
+            true => format!("{configured}-{:04x}", incarnation.as_u64() & 0xffff).into(),
+            false => configured.into(),
+        };
+        with_digits = true;
+        let id = match AgentId::new(&*name) {
+            Ok(id) => id,
+            Err(error) => {
+                tracing::warn!(%error, "cannot register an agent of the gateway");
+                return None;
+            }
+        };
+        // The queue must exist before the name is visible, because letters can arrive from then on.
+        let mts = &means.service.mts;
+        mts.register(Arc::clone(&name), incarnation);
+        match entry(means, kind, &name, incarnation) {
+            Ok(_) => return Some((id, incarnation)),
+            Err(error) => {
+                drop(mts.deregister(incarnation));
+                let is_taken = matches!(error, RegisterError::AlreadyRegistered { .. });
+                last = Some(error);
+                if !is_taken {
+                    break;
+                }
+            }
+        }
+    }
+    if let Some(error) = last {
+        tracing::warn!(%error, "cannot register the {} of the gateway", kind.description());
+    }
+    None
+}
+
+/// Registers or updates the directory entry of an agent.
+fn entry(
+    means: &PlatformAgents,
+    kind: Kind,
+    name: &Arc<str>,
+    incarnation: Incarnation,
+) -> Result<Arc<Entry>, RegisterError> {
+    let known = means.service.host.known_incarnation(incarnation);
+    let registration = Registration {
+        agent_type: kind.agent_type().to_owned(),
+        description: kind.description().to_owned(),
+        ..Registration::new(Arc::clone(name), incarnation, means.service.locations())
+    };
+    means.service.host.register(Registration {
+        // The age of the registration decides about the name.
+        registered: known.map_or(registration.registered, |known| known.registered),
+        ..registration
+    })
+}

@@ -1,0 +1,391 @@
+//! The directory facilitator and the agent management system of a platform (FIPA00023), as calls.
+//!
+//! Every gateway runs both. [`Agent::df`] and [`Agent::ams`] use those of this host;
+//! [`Agent::df_of`] and [`Agent::ams_of`] use those of any platform, for example of another robot or of
+//! JADE. [`blocking`](crate::blocking) has the same calls for processes without an async runtime.
+//!
+//! ```no_run
+//! use fipa::platform::{AgentDescription, ServiceDescription};
+//!
+//! # async fn example(crane: fipa::Agent, rover: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
+//! crane
+//!     .df()?
+//!     .register_service(ServiceDescription::new("lift-1", "lifting"))
+//!     .await?;
+//!
+//! let lifting = AgentDescription {
+//!     services: vec![ServiceDescription::of_type("lifting")],
+//!     ..AgentDescription::default()
+//! };
+//! for found in rover.df()?.search(&lifting).await? {
+//!     println!("{:?}", found.name);
+//! }
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! A description of an agent of the same host stays in its directory facilitator as long as the agent is
+//! registered, or until its lease ends. A description of an agent of another host has a lease of at most
+//! [`limits::LEASE`]; [`Df::modify`] renews it.
+//!
+//! Not in this module: the agents themselves (`fipa-platform`, and the gateway).
+
+use std::time::Duration;
+
+use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_content::PrintError;
+pub use fipa_platform::{
+    AgentDescription, AmsDescription, AnswerError, ApDescription, Constraints, Exception, ONTOLOGY,
+    Property, ServiceDescription, State, limits,
+};
+use fipa_platform::{Function, found, notified, registered, subscription};
+use fipa_sds::{Entry, Reach};
+
+use crate::agent::Agent;
+use crate::protocol::{DialogueError, Subscription};
+
+/// The error of a call to a directory facilitator or an agent management system.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PlatformError {
+    /// This host has no such agent.
+    #[error(
+        "no {0} is registered on this host; start a gateway (`fipa up`), or turn the agent on \
+         (`[platform]` of its configuration)"
+    )]
+    NoAgent(&'static str),
+    /// The agent refused, failed or did not understand. Holds its reason.
+    #[error("{0}")]
+    Rejected(Exception),
+    /// The conversation failed.
+    #[error(transparent)]
+    Dialogue(DialogueError),
+    /// The answer cannot be read.
+    #[error(transparent)]
+    Answer(#[from] AnswerError),
+    /// A description cannot be written.
+    #[error(transparent)]
+    Print(#[from] PrintError),
+}
+
+impl From<DialogueError> for PlatformError {
+    fn from(error: DialogueError) -> Self {
+        let reason = match &error {
+            DialogueError::Refused(message)
+            | DialogueError::Failed(message)
+            | DialogueError::NotUnderstood(message) => Exception::of(message),
+            _ => None,
+        };
+        reason.map_or(Self::Dialogue(error), Self::Rejected)
+    }
+}
+
+impl Agent {
+    /// Returns the directory facilitator of this host, which lists services of agents.
+    ///
+    /// # Errors
+    /// If this host has none: it needs a gateway.
+    pub fn df(&self) -> Result<Df<'_>, PlatformError> {
+        let df = self.platform_agent(Entry::DF_TYPE);
+        let df = df.ok_or(PlatformError::NoAgent("directory facilitator"))?;
+        Ok(self.df_of(df))
+    }
+
+    /// Returns the directory facilitator with this identifier.
+    #[must_use]
+    pub fn df_of(&self, df: AgentId) -> Df<'_> {
+        Df(Client {
+            agent: self,
+            server: df,
+        })
+    }
+
+    /// Returns the agent management system of this host, which lists its agents.
+    ///
+    /// # Errors
+    /// If this host has none: it needs a gateway.
+    pub fn ams(&self) -> Result<Ams<'_>, PlatformError> {
+        let ams = self.platform_agent(Entry::AMS_TYPE);
+        let ams = ams.ok_or(PlatformError::NoAgent("agent management system"))?;
+        Ok(self.ams_of(ams))
+    }
+
+    /// Returns the agent management system with this identifier.
+    #[must_use]
+    pub fn ams_of(&self, ams: AgentId) -> Ams<'_> {
+        Ams(Client {
+            agent: self,
+            server: ams,
+        })
+    }
+
+    fn platform_agent(&self, agent_type: &str) -> Option<AgentId> {
+        let directory = self.domain().directory();
+        directory.refresh();
+        let entries = directory.entries();
+        let mut here = entries.iter().filter(|entry| {
+            entry.reach == Reach::Local
+                && entry.is_platform_agent()
+                && entry.agent_type == agent_type
+        });
+        AgentId::new(&*here.next()?.name).ok()
+    }
+}
+
+/// A directory facilitator.
+#[derive(Debug, Clone)]
+pub struct Df<'a>(Client<'a>);
+
+impl<'a> Df<'a> {
+    /// Returns the identifier of the directory facilitator.
+    #[must_use]
+    pub fn id(&self) -> &AgentId {
+        &self.0.server
+    }
+
+    /// Adds a service to the description of this agent, or replaces its service of the same name.
+    /// Returns the description, with its lease.
+    ///
+    /// # Errors
+    /// If the directory facilitator refuses, fails or does not answer.
+    pub async fn register_service(
+        &self,
+        service: ServiceDescription,
+    ) -> Result<AgentDescription, PlatformError> {
+        let own = AgentDescription {
+            name: Some(self.own_name()),
+            ..AgentDescription::default()
+        };
+        match self.search(&own).await?.pop() {
+            Some(mut known) => {
+                known.services.retain(|other| other.name != service.name);
+                known.services.push(service);
+                // The lease begins again.
+                known.lease_time = None;
+                self.modify(known).await
+            }
+            None => {
+                let services = vec![service];
+                self.register(AgentDescription { services, ..own }).await
+            }
+        }
+    }
+
+    /// Registers a description of this agent. Its name, if it is missing, is that of this agent. Returns
+    /// the description, with its lease.
+    ///
+    /// # Errors
+    /// If the agent has a description already ([`Exception::AlreadyRegistered`]), or the directory
+    /// facilitator refuses, fails or does not answer.
+    pub async fn register(
+        &self,
+        description: AgentDescription,
+    ) -> Result<AgentDescription, PlatformError> {
+        let description = self.named(description);
+        let answer = self.0.request(&Function::register(&description)).await?;
+        Ok(registered(&answer)?)
+    }
+
+    /// Replaces the description of this agent, and renews its lease.
+    ///
+    /// # Errors
+    /// If the agent has no description ([`Exception::NotRegistered`]), or the directory facilitator
+    /// refuses, fails or does not answer.
+    pub async fn modify(
+        &self,
+        description: AgentDescription,
+    ) -> Result<AgentDescription, PlatformError> {
+        let description = self.named(description);
+        let answer = self.0.request(&Function::modify(&description)).await?;
+        Ok(registered(&answer)?)
+    }
+
+    /// Removes the description of this agent.
+    ///
+    /// # Errors
+    /// See [`modify`](Self::modify).
+    pub async fn deregister(&self) -> Result<(), PlatformError> {
+        let own = self.own_name();
+        self.0.request(&Function::deregister(&own)).await.map(drop)
+    }
+
+    /// Returns the descriptions that match a template: each slot of the template has its counterpart in
+    /// the description, texts in any case. An answer has at most [`limits::RESULTS`] descriptions.
+    ///
+    /// # Errors
+    /// If the directory facilitator refuses, fails or does not answer.
+    pub async fn search(
+        &self,
+        template: &AgentDescription,
+    ) -> Result<Vec<AgentDescription>, PlatformError> {
+        self.search_within(template, &Constraints::all()).await
+    }
+
+    /// Searches like [`search`](Self::search), within these bounds.
+    ///
+    /// # Errors
+    /// See [`search`](Self::search).
+    pub async fn search_within(
+        &self,
+        template: &AgentDescription,
+        constraints: &Constraints,
+    ) -> Result<Vec<AgentDescription>, PlatformError> {
+        let search = Function::search(template, constraints);
+        let answer = self.0.request(&search).await?;
+        Ok(found(&answer)?)
+    }
+
+    /// Subscribes to the descriptions that match a template. The first notification has those that
+    /// match now, if there are any.
+    ///
+    /// # Errors
+    /// If the directory facilitator refuses, fails or does not answer.
+    pub async fn subscribe(
+        &self,
+        template: &AgentDescription,
+    ) -> Result<Notifications<'a>, PlatformError> {
+        let client = &self.0;
+        let content = subscription(&client.server, template)?;
+        let message = client.message(Performative::Subscribe, "fipa-sl2", content);
+        let subscription = client.agent.subscribe(message, client.patience()).await?;
+        Ok(Notifications(subscription))
+    }
+
+    fn own_name(&self) -> AgentId {
+        self.0.agent.id().clone()
+    }
+
+    fn named(&self, description: AgentDescription) -> AgentDescription {
+        AgentDescription {
+            name: description.name.or_else(|| Some(self.own_name())),
+            ..description
+        }
+    }
+}
+
+/// A subscription to a directory facilitator. Dropping it does not cancel it; further notifications go
+/// to [`Agent::receive`].
+#[derive(Debug)]
+#[must_use = "next() returns the notifications"]
+pub struct Notifications<'a>(Subscription<'a>);
+
+impl Notifications<'_> {
+    /// Waits for the next notification, without a time limit, and returns the descriptions that have
+    /// changed. A description with a name only is that of an agent that has deregistered.
+    ///
+    /// # Errors
+    /// If the directory facilitator ends the subscription.
+    pub async fn next(&mut self) -> Result<Vec<AgentDescription>, PlatformError> {
+        let message = self.0.next().await?;
+        Ok(notified(&message)?)
+    }
+
+    /// Cancels the subscription.
+    ///
+    /// # Errors
+    /// If the directory facilitator does not confirm within `patience`.
+    pub async fn cancel(self, patience: Duration) -> Result<(), PlatformError> {
+        Ok(self.0.cancel(patience).await?)
+    }
+}
+
+/// An agent management system.
+#[derive(Debug, Clone)]
+pub struct Ams<'a>(Client<'a>);
+
+impl Ams<'_> {
+    /// Returns the identifier of the agent management system.
+    #[must_use]
+    pub fn id(&self) -> &AgentId {
+        &self.0.server
+    }
+
+    /// Returns the agents of the platform that match a template. An answer has at most
+    /// [`limits::RESULTS`] descriptions.
+    ///
+    /// # Errors
+    /// If the agent management system refuses, fails or does not answer.
+    pub async fn search(
+        &self,
+        template: &AmsDescription,
+    ) -> Result<Vec<AmsDescription>, PlatformError> {
+        let search = Function::search_agents(template, &Constraints::all());
+        let answer = self.0.request(&search).await?;
+        Ok(AmsDescription::found(&answer)?)
+    }
+
+    /// Returns the description of the platform.
+    ///
+    /// # Errors
+    /// See [`search`](Self::search).
+    pub async fn description(&self) -> Result<ApDescription, PlatformError> {
+        let answer = self.0.request(&Function::get_description()).await?;
+        Ok(ApDescription::found(&answer)?)
+    }
+
+    /// Registers this agent. An agent of the host of the agent management system is registered already.
+    ///
+    /// # Errors
+    /// See [`search`](Self::search).
+    pub async fn register(&self, description: &AmsDescription) -> Result<(), PlatformError> {
+        let register = Function::register_agent(description);
+        self.0.request(&register).await.map(drop)
+    }
+
+    /// Sets the owner and the state of this agent, and renews its lease.
+    ///
+    /// # Errors
+    /// See [`search`](Self::search).
+    pub async fn modify(&self, description: &AmsDescription) -> Result<(), PlatformError> {
+        let modify = Function::modify_agent(description);
+        self.0.request(&modify).await.map(drop)
+    }
+
+    /// Deregisters this agent.
+    ///
+    /// # Errors
+    /// See [`search`](Self::search).
+    pub async fn deregister(&self) -> Result<(), PlatformError> {
+        let own = AmsDescription {
+            name: Some(self.0.agent.id().clone()),
+            ..AmsDescription::default()
+        };
+        let deregister = Function::deregister_agent(&own);
+        self.0.request(&deregister).await.map(drop)
+    }
+}
+
+/// An agent of this process that asks an agent of a platform.
+#[derive(Debug, Clone)]
+struct Client<'a> {
+    agent: &'a Agent,
+    server: AgentId,
+}
+
+impl Client<'_> {
+    /// Returns the time for an answer: the deadlines of the request and of the answer.
+    fn patience(&self) -> Duration {
+        self.agent.domain().inner.deadline * 2
+    }
+
+    fn message(
+        &self,
+        performative: Performative,
+        language: &str,
+        content: Vec<u8>,
+    ) -> MessageBuilder {
+        self.agent
+            .message(performative)
+            .receiver(self.server.clone())
+            .ontology(ONTOLOGY)
+            .language(language)
+            .content(content)
+    }
+
+    async fn request(&self, function: &Function) -> Result<Message, PlatformError> {
+        let content = function.content(&self.server)?;
+        let request = self.message(Performative::Request, "fipa-sl0", content);
+        let request = self.agent.request(request, self.patience()).await?;
+        Ok(request.result().await?)
+    }
+}

@@ -1,0 +1,298 @@
+//! The agent management system and the directory facilitator of gateways, used over letters.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa::config::Sources;
+use fipa::platform::{
+    AgentDescription, AmsDescription, Exception, PlatformError, ServiceDescription, limits,
+};
+use fipa::{AgentId, Config, Domain, Gateway, Kind, Performative, blocking};
+
+/// Time limit of all waits, which a passing test does not reach.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn config(set: &[&str]) -> Config {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let mark = format!("{}-{number}", std::process::id());
+    let own = [
+        format!("domain=platform-{mark}"),
+        format!("mts.name=mts-{mark}"),
+        "discovery.mdns=false".to_owned(),
+        "mts.deadline=30s".to_owned(),
+    ];
+    let set = set.iter().map(|&one| one.to_owned());
+    Config::load(&Sources {
+        set: own.into_iter().chain(set).collect(),
+        ..Sources::default()
+    })
+    .unwrap()
+}
+
+async fn host(config: &Config) -> (Gateway, Domain) {
+    let gateway = Gateway::open(config).await.unwrap();
+    (gateway, Domain::open(config).await.unwrap())
+}
+
+/// Starts two hosts that know each other from their configuration.
+async fn two_hosts(set: &[&str]) -> [(Gateway, Domain); 2] {
+    let near = host(&config(set)).await;
+    let locations = near.0.locations();
+    let at = locations.iter().find(|it| it.kind() == Kind::Tcp).unwrap();
+    let peer = format!(
+        "discovery.static={{ \"near\" = [\"tcp://{}\"] }}",
+        at.address()
+    );
+    let far = host(&config(&[set, &[&*peer]].concat())).await;
+    [near, far]
+}
+
+async fn until(what: &str, condition: impl Fn() -> bool) {
+    let started = Instant::now();
+    while !condition() {
+        assert!(started.elapsed() < PATIENCE, "never: {what}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+async fn knows(domain: &Domain, name: &str) {
+    until(name, || domain.directory().lookup(name).is_some()).await;
+}
+
+fn lifting() -> AgentDescription {
+    AgentDescription {
+        services: vec![ServiceDescription::of_type("lifting")],
+        ..AgentDescription::default()
+    }
+}
+
+fn names<'a>(ids: impl IntoIterator<Item = &'a Option<AgentId>>) -> Vec<String> {
+    let ids = ids.into_iter().flatten();
+    ids.map(|id| id.name().to_owned()).collect()
+}
+
+/// Waits for the next notification.
+async fn next(notifications: &mut fipa::platform::Notifications<'_>) -> Vec<AgentDescription> {
+    let next = tokio::time::timeout(PATIENCE, notifications.next()).await;
+    next.unwrap().unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn services_are_registered_found_and_watched() {
+    let config = config(&[]);
+    let (gateway, domain) = host(&config).await;
+    let rover = domain.register("rover").unwrap();
+    let crane = domain.register("crane").unwrap();
+    let df = rover.df().unwrap();
+    assert_eq!(df.id().name(), format!("df@{}", gateway.name()));
+    let mut notifications = df.subscribe(&lifting()).await.unwrap();
+    let facilitator = crane.df().unwrap();
+    for (name, service_type) in [("lift-1", "lifting"), ("tow-1", "towing")] {
+        let service = ServiceDescription::new(name, service_type);
+        facilitator.register_service(service).await.unwrap();
+    }
+    let found = df.search(&lifting()).await.unwrap();
+    assert_eq!(found.len(), 1);
+    assert_eq!(found[0].name.as_ref().unwrap().name(), "crane");
+    assert_eq!(found[0].services.len(), 2);
+    // Both registrations, in one notification or two.
+    let mut services = 0;
+    while services < 2 {
+        let changed = next(&mut notifications).await;
+        assert_eq!(changed.len(), 1);
+        services = changed[0].services.len();
+    }
+    let again = facilitator.register(lifting()).await;
+    let missing = matches!(
+        &again,
+        Err(PlatformError::Rejected(Exception::MissingParameter { parameter, .. }))
+            if parameter == "name"
+    );
+    assert!(missing, "{again:?}");
+    let again = facilitator.register(AgentDescription::default()).await;
+    assert!(matches!(
+        again,
+        Err(PlatformError::Rejected(Exception::AlreadyRegistered))
+    ));
+    // The description ends with its agent.
+    drop(crane);
+    let gone = next(&mut notifications).await;
+    assert_eq!(names(gone.iter().map(|it| &it.name)), ["crane"]);
+    assert!(gone[0].services.is_empty());
+    assert!(df.search(&lifting()).await.unwrap().is_empty());
+    notifications.cancel(PATIENCE).await.unwrap();
+    domain.close().await;
+    gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_agents_and_the_platform_are_listed() {
+    let config = config(&[]);
+    let (gateway, domain) = host(&config).await;
+    let rover = domain.register("rover").unwrap();
+    let ams = rover.ams().unwrap();
+    let all = ams.search(&AmsDescription::default()).await.unwrap();
+    let own = gateway.name();
+    let expected = [
+        format!("ams@{own}"),
+        format!("df@{own}"),
+        "rover".to_owned(),
+    ];
+    assert_eq!(names(all.iter().map(|it| &it.name)), expected);
+    let description = ams.description().await.unwrap();
+    assert_eq!(description.name, own);
+    let locations = gateway.locations();
+    let tcp = locations.iter().find(|it| it.kind() == Kind::Tcp).unwrap();
+    let addresses = vec![format!("tcp://{}", tcp.address())];
+    assert_eq!(description.services, [("tcp".to_owned(), addresses)]);
+    let named = AmsDescription {
+        name: Some(rover.id().clone()),
+        ownership: Some("ACME".to_owned()),
+        ..AmsDescription::default()
+    };
+    ams.modify(&named).await.unwrap();
+    let found = ams.search(&named).await.unwrap();
+    assert_eq!(names(found.iter().map(|it| &it.name)), ["rover"]);
+    assert!(ams.register(&named).await.is_err());
+    // Patterns address agents of robots.
+    let to_all = rover
+        .message(Performative::Inform)
+        .receiver(AgentId::new(".*").unwrap())
+        .build()
+        .unwrap();
+    let sent = rover.send(to_all).await.unwrap();
+    assert!(!sent.all_succeeded(), "{sent}");
+    domain.close().await;
+    gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_of_another_host_registers_itself_for_a_time() {
+    let [(near, at_home), (far, abroad)] = two_hosts(&[]).await;
+    let rover = at_home.register("rover").unwrap();
+    let crane = abroad.register("crane").unwrap();
+    let [df, ams] = ["df", "ams"].map(|it| AgentId::new(format!("{it}@{}", near.name())).unwrap());
+    knows(&abroad, df.name()).await;
+    knows(&abroad, ams.name()).await;
+    knows(&at_home, "crane").await;
+    let before = SystemTime::now();
+    let facilitator = crane.df_of(df);
+    let service = ServiceDescription::new("lift-1", "lifting");
+    let registered = facilitator.register_service(service).await.unwrap();
+    let ends = registered.lease_time.unwrap().to_system_time(before);
+    let lease = ends.duration_since(before).unwrap();
+    assert!(lease <= limits::LEASE + PATIENCE, "{lease:?}");
+    let found = rover.df().unwrap().search(&lifting()).await.unwrap();
+    assert_eq!(found, [registered]);
+    // The agent management system lists it for agents of its platform only.
+    let own = AmsDescription {
+        name: Some(crane.id().clone()),
+        ..AmsDescription::default()
+    };
+    let management = crane.ams_of(ams);
+    management.register(&own).await.unwrap();
+    assert_eq!(management.search(&own).await.unwrap().len(), 1);
+    let here = rover.ams().unwrap().search(&own).await.unwrap();
+    assert!(here.is_empty(), "{here:?}");
+    management.deregister().await.unwrap();
+    // It cannot change the description of an agent of this host.
+    let rovers = AgentDescription {
+        name: Some(rover.id().clone()),
+        ..lifting()
+    };
+    let refused = facilitator.register(rovers).await;
+    assert!(matches!(
+        refused,
+        Err(PlatformError::Rejected(Exception::Unauthorised))
+    ));
+    for domain in [at_home, abroad] {
+        domain.close().await;
+    }
+    far.close().await;
+    near.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
+    let same = format!("mts.name=robot-{}", std::process::id());
+    let [(near, at_home), (far, abroad)] = two_hosts(&[&same]).await;
+    assert_eq!(near.name(), far.name());
+    let listed = |domain: &Domain, prefix: &str| {
+        let entries = domain.directory().entries();
+        let all = entries.iter().filter(|it| it.name.starts_with(prefix));
+        all.map(|it| it.name.to_string()).collect::<Vec<_>>()
+    };
+    for prefix in ["ams@", "df@"] {
+        let plain = format!("{prefix}{}", near.name());
+        for domain in [&at_home, &abroad] {
+            until("two agents", || listed(domain, prefix).len() == 2).await;
+            let names = listed(domain, prefix);
+            assert_eq!(names[0], plain);
+            let digits = names[1].strip_prefix(&format!("{plain}-")).unwrap();
+            assert!(digits.len() == 4 && digits.chars().all(|c| c.is_ascii_hexdigit()));
+        }
+    }
+    // Each agent uses the directory facilitator of its own host.
+    let rover = abroad.register("rover").unwrap();
+    let df = rover.df().unwrap();
+    let own = df
+        .register_service(ServiceDescription::new("a", "lifting"))
+        .await;
+    assert_eq!(own.unwrap().lease_time, None);
+    assert_eq!(df.search(&lifting()).await.unwrap().len(), 1);
+    let other = at_home.register("other").unwrap();
+    let other = other.df().unwrap().search(&lifting()).await.unwrap();
+    assert!(other.is_empty());
+    for domain in [at_home, abroad] {
+        domain.close().await;
+    }
+    far.close().await;
+    near.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_configuration_names_the_agents_and_turns_them_off() {
+    let (gateway, domain) = host(&config(&["platform.ams=false", "platform.df=pages"])).await;
+    let rover = domain.register("rover").unwrap();
+    assert_eq!(rover.df().unwrap().id().name(), "pages");
+    assert!(
+        rover
+            .df()
+            .unwrap()
+            .search(&lifting())
+            .await
+            .unwrap()
+            .is_empty()
+    );
+    assert!(matches!(rover.ams(), Err(PlatformError::NoAgent(_))));
+    drop(rover);
+    domain.close().await;
+    gateway.close().await;
+}
+
+#[test]
+fn a_process_without_a_runtime_uses_the_same_calls() {
+    let config = config(&[]);
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let gateway = runtime.block_on(Gateway::open(&config)).unwrap();
+    let domain = blocking::Domain::open(&config).unwrap();
+    let crane = domain.register("crane").unwrap();
+    let rover = domain.register("rover").unwrap();
+    let mut notifications = rover.df().unwrap().subscribe(&lifting()).unwrap();
+    let service = ServiceDescription::new("lift-1", "lifting");
+    let df = crane.df().unwrap();
+    df.register_service(service).unwrap();
+    assert_eq!(notifications.next().unwrap().len(), 1);
+    assert_eq!(df.search(&lifting()).unwrap().len(), 1);
+    df.deregister().unwrap();
+    assert!(notifications.next().unwrap()[0].services.is_empty());
+    notifications.cancel(PATIENCE).unwrap();
+    let ams = rover.ams().unwrap();
+    assert_eq!(ams.description().unwrap().name, gateway.name());
+    drop((crane, rover));
+    domain.close();
+    runtime.block_on(gateway.close());
+}
