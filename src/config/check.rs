@@ -89,6 +89,10 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
         &["transport", "quic", "listen"],
         &config.transport.quic.listen,
     );
+    found.listen(
+        &["transport", "http", "listen"],
+        &config.transport.http.listen,
+    );
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
@@ -179,6 +183,7 @@ impl Findings {
         for (kind, listen) in [
             (Kind::Tcp, &config.transport.tcp.listen),
             (Kind::Udp, &config.transport.udp.listen),
+            (Kind::Http, &config.transport.http.listen),
         ] {
             // `listen` reports entries that are not addresses.
             let mut addresses = listen.iter().filter(|text| is_numeric_address(text));

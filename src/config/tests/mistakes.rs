@@ -68,12 +68,12 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
             "fipa.toml:4: `mts.transports` is invalid: \"tpc\": unknown transport \"tpc\" \
-             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\ntransports = [\"udt\"]\n",
             "fipa.toml:2: `mts.transports` is invalid: \"udt\": unknown transport \"udt\" \
-             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
