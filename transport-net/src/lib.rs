@@ -26,9 +26,9 @@ mod end;
 #[doc(hidden)]
 pub mod fuzzing;
 mod hello;
-mod identity;
 #[cfg(feature = "http")]
 mod http;
+mod identity;
 #[cfg(feature = "ip")]
 mod interfaces;
 #[cfg(feature = "ip")]

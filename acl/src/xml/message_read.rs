@@ -22,16 +22,24 @@ enum ContentForm {
     Unescaped,
 }
 
+/// The beginning of a message of JADE, which writes acts in upper case.
+const OF_JADE: &[u8] = b"<fipa-message act=\"";
+
 /// Reads a message.
 ///
-/// A message that is not well-formed is read a second time, as JADE writes it: the content is text
-/// without escapes and markup.
+/// A message of JADE that is not well-formed is read a second time, as JADE writes it: the content is
+/// text without escapes and markup.
 ///
 /// # Errors
 /// The bytes are not one whole message in this encoding.
 pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
-    read(bytes, ContentForm::Escaped)
-        .or_else(|error| read(bytes, ContentForm::Unescaped).map_err(|_| error))
+    read(bytes, ContentForm::Escaped).or_else(|error| {
+        let act = bytes.trim_ascii_start().strip_prefix(OF_JADE);
+        match act.and_then(|act| act.first()) {
+            Some(b'A'..=b'Z') => read(bytes, ContentForm::Unescaped).map_err(|_| error),
+            _ => Err(error),
+        }
+    })
 }
 
 fn read(bytes: &[u8], form: ContentForm) -> Result<MessageView<'_>, DecodeError> {

@@ -105,7 +105,9 @@ impl HttpSender {
         };
         let patience = endpoint.stream.limits().stall_timeout;
         for piece in pieces {
-            let written = progress.write(&mut connection.stream, piece, patience).await;
+            let written = progress
+                .write(&mut connection.stream, piece, patience)
+                .await;
             written.map_err(|error| progress.broken(error))?;
         }
         let answer = connection.answer(patience).await;
@@ -145,11 +147,7 @@ impl HttpSender {
 }
 
 impl LegacySender for HttpSender {
-    async fn deliver(
-        &mut self,
-        delivery: &LegacyDelivery,
-        progress: &Progress<'_>,
-    ) -> Conclusion {
+    async fn deliver(&mut self, delivery: &LegacyDelivery, progress: &Progress<'_>) -> Conclusion {
         let sent = self.send(delivery, progress).await;
         sent.unwrap_or_else(|conclusion| conclusion)
     }
@@ -173,8 +171,7 @@ impl Connection {
         let until = Instant::now() + patience;
         loop {
             let answer = self.reader.next();
-            let incompatible =
-                |error| TransportError::new(TransportErrorKind::Incompatible, error);
+            let incompatible = |error| TransportError::new(TransportErrorKind::Incompatible, error);
             if let Some(answer) = answer.map_err(incompatible)? {
                 return Ok(answer);
             }

@@ -87,7 +87,11 @@ impl Connections {
     pub(super) fn close(&self) {
         let mut state = self.0.lock();
         state.closed = true;
-        let tasks: Vec<_> = state.entries.values_mut().filter_map(|it| it.task.take()).collect();
+        let tasks: Vec<_> = state
+            .entries
+            .values_mut()
+            .filter_map(|it| it.task.take())
+            .collect();
         drop(state);
         for task in tasks {
             task.abort();
@@ -105,7 +109,9 @@ impl State {
             *count += 1;
         }
         let homes = homes.into_iter().filter(|(_, (has_idle, _))| *has_idle);
-        homes.max_by_key(|(_, (_, count))| *count).map(|(home, _)| home)
+        homes
+            .max_by_key(|(_, (_, count))| *count)
+            .map(|(home, _)| home)
     }
 }
 

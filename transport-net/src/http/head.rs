@@ -38,10 +38,7 @@ impl HeadEnd {
 pub(super) fn unfolded(head: &[u8]) -> Vec<u8> {
     let mut out = head.to_vec();
     let mut from = 0;
-    while let Some(found) = out
-        .get(from..)
-        .and_then(|rest| memchr::memchr(b'\n', rest))
-    {
+    while let Some(found) = out.get(from..).and_then(|rest| memchr::memchr(b'\n', rest)) {
         let at = from + found;
         from = at + 1;
         if !matches!(out.get(from), Some(b' ' | b'\t')) {
@@ -129,8 +126,14 @@ mod tests {
         for (value, expected) in [
             ("multipart/mixed ; boundary=\"abc\"", Some("abc")),
             ("multipart/mixed;boundary=abc", Some("abc")),
-            ("multipart/mixed;     Boundary=\"a b;c\" ; x=1", Some("a b;c")),
-            ("multipart/mixed; x=\"boundary=no\"; boundary = yes ", Some("yes")),
+            (
+                "multipart/mixed;     Boundary=\"a b;c\" ; x=1",
+                Some("a b;c"),
+            ),
+            (
+                "multipart/mixed; x=\"boundary=no\"; boundary = yes ",
+                Some("yes"),
+            ),
             ("multipart/mixed; x; boundary=\"q\\\"q\"", Some("q\"q")),
             ("multipart/mixed; boundary=\"open", None),
             ("multipart/mixed; boundary", None),

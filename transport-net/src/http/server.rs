@@ -48,9 +48,7 @@ enum Refusal {
     Request(#[from] RequestError),
     #[error(transparent)]
     Letter(#[from] LetterError),
-    #[error(
-        "the peer cannot prove its identity, and is not listed in security.legacy_peers"
-    )]
+    #[error("the peer cannot prove its identity, and is not listed in security.legacy_peers")]
     Unproved,
     #[error("the head of the request arrived too slowly (handshake_timeout)")]
     SlowHead,
@@ -176,7 +174,10 @@ impl Serving {
         };
         let before = counter.fetch_add(1, Ordering::Relaxed);
         let from = self.from;
-        warn_limited(before, format_args!("{from}: HTTP request refused: {refusal}"));
+        warn_limited(
+            before,
+            format_args!("{from}: HTTP request refused: {refusal}"),
+        );
         let refused = self.refuse(refusal.status());
         if let Ok(Err(error)) = timeout(LAST_ANSWER, refused).await {
             tracing::debug!(%from, "cannot answer a refused request: {error}");
@@ -185,7 +186,9 @@ impl Serving {
 
     /// Answers a refused request, and reads what the client still sends.
     async fn refuse(&mut self, status: Status) -> io::Result<()> {
-        self.stream.write_all(status.answer(false).as_bytes()).await?;
+        self.stream
+            .write_all(status.answer(false).as_bytes())
+            .await?;
         self.stream.shutdown().await?;
         let (mut ignored, mut read) = ([0; READ], 0);
         while read < LAST_BYTES {

@@ -118,8 +118,7 @@ fn recorded_requests_are_read_and_written_byte_for_byte() {
         let url = Url::parse(url.strip_prefix("http://").unwrap()).unwrap();
         let boundary = std::str::from_utf8(&head.boundary).unwrap();
         let payload_of = (payload.len(), None);
-        let (mut written, end) =
-            request::write(&url, boundary, envelope, payload_of, head.keeps);
+        let (mut written, end) = request::write(&url, boundary, envelope, payload_of, head.keeps);
         written.extend_from_slice(payload);
         written.extend_from_slice(end.as_bytes());
         written.extend_from_slice(&left);
@@ -192,8 +191,14 @@ fn answers_that_are_none_end_in_an_error() {
         reader.buffer().extend_from_slice(bytes);
         reader.next()
     };
-    assert_eq!(all(b"HTTP/1.1 2x0 OK\r\n\r\n"), Err(ResponseError::Malformed));
-    assert_eq!(all(&b"no answer\n".repeat(7000)), Err(ResponseError::NoAnswer));
+    assert_eq!(
+        all(b"HTTP/1.1 2x0 OK\r\n\r\n"),
+        Err(ResponseError::Malformed)
+    );
+    assert_eq!(
+        all(&b"no answer\n".repeat(7000)),
+        Err(ResponseError::NoAnswer)
+    );
     assert_eq!(all(&b"x".repeat(70_000)), Err(ResponseError::NoAnswer));
     let endless = [&b"HTTP/1.1 200 OK\r\n"[..], &b"a: b\r\n".repeat(3000)].concat();
     assert_eq!(all(&endless), Err(ResponseError::HeadTooLarge));
@@ -239,7 +244,10 @@ fn quirks_of_requests_are_accepted() {
 #[test]
 fn other_requests_are_refused() {
     let many = format!("{MIXED}{}", "a: b\r\n".repeat(100));
-    let long = format!("Content-Type: multipart/mixed; boundary={}\r\n", "b".repeat(10_000));
+    let long = format!(
+        "Content-Type: multipart/mixed; boundary={}\r\n",
+        "b".repeat(10_000)
+    );
     let huge = format!("{MIXED}{}", "a: b\r\n".repeat(10_000));
     for (line, fields, expected) in [
         ("GET /acc HTTP/1.1", MIXED, RequestError::Method),
@@ -247,8 +255,16 @@ fn other_requests_are_refused() {
         ("POST http://h HTTP/1.1", MIXED, RequestError::Path),
         ("POST /acc HTTP/2.0", MIXED, RequestError::Version),
         (LINE, "", RequestError::NotMultipart),
-        (LINE, "Content-Type: text/plain\r\n", RequestError::NotMultipart),
-        (LINE, "Content-Type: multipart/mixed\r\n", RequestError::Boundary),
+        (
+            LINE,
+            "Content-Type: text/plain\r\n",
+            RequestError::NotMultipart,
+        ),
+        (
+            LINE,
+            "Content-Type: multipart/mixed\r\n",
+            RequestError::Boundary,
+        ),
         (LINE, &long, RequestError::Boundary),
         (LINE, &many, RequestError::HeadTooLarge),
         (LINE, &huge, RequestError::HeadTooLarge),
@@ -287,7 +303,10 @@ fn other_requests_are_refused() {
     for length in ["-1", "+1", "0x1", "1 2", ""] {
         let text = format!("{LINE}\r\n{MIXED}Content-Length: {length}\r\n\r\n");
         let refused = read(text.as_bytes(), 100);
-        assert!(matches!(refused, Err(RequestError::Malformed(_))), "{length}");
+        assert!(
+            matches!(refused, Err(RequestError::Malformed(_))),
+            "{length}"
+        );
     }
     assert!(read(&b"\r\n".repeat(100), 10).is_err());
     assert!(matches!(
@@ -301,7 +320,10 @@ fn bodies_have_two_parts() {
     let of = |body: &str| multipart::parse(body.as_bytes(), b"b");
     for (body, expected) in [
         ("", MultipartError::Truncated),
-        ("--b\r\n\r\ne\r\n--b\r\n\r\np\r\n", MultipartError::Truncated),
+        (
+            "--b\r\n\r\ne\r\n--b\r\n\r\np\r\n",
+            MultipartError::Truncated,
+        ),
         ("--b\r\n\r\ne\r\n--b--\r\n", MultipartError::Parts),
         ("--b--\r\n", MultipartError::Truncated),
         (
@@ -309,7 +331,10 @@ fn bodies_have_two_parts() {
             MultipartError::Parts,
         ),
         ("--b\r\n--b\r\n--b--\r\n", MultipartError::PartHead),
-        ("--b\r\nA\r\n--b\r\n\r\np\r\n--b--", MultipartError::PartHead),
+        (
+            "--b\r\nA\r\n--b\r\n\r\np\r\n--b--",
+            MultipartError::PartHead,
+        ),
         (
             "--b\r\nContent-Transfer-Encoding: base64\r\n\r\ne\r\n--b\r\n\r\np\r\n--b--",
             MultipartError::TransferEncoding,

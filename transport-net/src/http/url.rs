@@ -77,7 +77,11 @@ mod tests {
     fn port_and_path_have_defaults() {
         for (address, target, url) in [
             ("10.0.0.1", "10.0.0.1:7778", "http://10.0.0.1:7778/acc"),
-            ("jade.local/x/y", "jade.local:7778", "http://jade.local:7778/x/y"),
+            (
+                "jade.local/x/y",
+                "jade.local:7778",
+                "http://jade.local:7778/x/y",
+            ),
             ("[::1]:80", "[::1]:80", "http://[::1]:80/acc"),
             ("[::1]/acc", "[::1]:7778", "http://[::1]:7778/acc"),
             ("[fe80::1%7]:1/", "[fe80::1%7]:1", "http://[fe80::1]:1/"),
@@ -86,7 +90,14 @@ mod tests {
             assert_eq!(parsed.target(), target);
             assert_eq!(parsed.to_string(), url);
         }
-        for wrong in ["", "/acc", ":1/acc", "a:b@c:1/acc", "10.0.0.1:x", "a:1/\u{e9}"] {
+        for wrong in [
+            "",
+            "/acc",
+            ":1/acc",
+            "a:b@c:1/acc",
+            "10.0.0.1:x",
+            "a:1/\u{e9}",
+        ] {
             assert!(Url::parse(wrong).is_err(), "{wrong}");
         }
     }

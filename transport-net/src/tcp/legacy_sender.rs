@@ -29,11 +29,7 @@ pub(super) struct TcpSender {
 }
 
 impl LegacySender for TcpSender {
-    async fn deliver(
-        &mut self,
-        delivery: &LegacyDelivery,
-        progress: &Progress<'_>,
-    ) -> Conclusion {
+    async fn deliver(&mut self, delivery: &LegacyDelivery, progress: &Progress<'_>) -> Conclusion {
         let sent = self.send(delivery, progress).await;
         sent.unwrap_or_else(|conclusion| conclusion)
     }

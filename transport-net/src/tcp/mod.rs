@@ -29,9 +29,9 @@ pub use self::config::TcpConfig;
 use self::endpoint::TcpEndpoint;
 use self::legacy_sender::TcpSender;
 use crate::end::ConnectionEnd;
+use crate::sockets;
 use crate::stream::config::StreamConfig;
 use crate::stream::counters::Counters;
-use crate::sockets;
 use crate::stream::endpoint::Endpoint;
 
 /// Carries parcels over TCP.
