@@ -8,7 +8,7 @@ mod common;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use common::{Host, Running};
 use fipa::{Message, Performative};
@@ -86,7 +86,16 @@ fn post(request: &[u8], to: &str) {
 
 /// Reads a request, answers it as JADE does, and returns its message.
 fn accept(listener: &TcpListener) -> Message {
-    let (mut stream, _) = listener.accept().unwrap();
+    listener.set_nonblocking(true).unwrap();
+    let until = Instant::now() + PATIENCE;
+    let mut stream = loop {
+        match listener.accept() {
+            Ok((stream, _)) => break stream,
+            Err(error) => assert!(Instant::now() < until, "no request came: {error}"),
+        }
+        thread::sleep(Duration::from_millis(1));
+    };
+    stream.set_nonblocking(false).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let mut bytes = Vec::new();
     let mut more = [0; 65536];
@@ -108,7 +117,11 @@ fn accept(listener: &TcpListener) -> Message {
     let payload = body.split("\r\n\r\n").nth(3).unwrap();
     let (payload, _) = payload.rsplit_once("\r\n--").unwrap();
     let payload = payload.to_owned().into_bytes();
-    Message::decode(&bytes::Bytes::from(payload).into()).unwrap()
+    let payload = fipa_acl::Payload {
+        head: payload.into(),
+        ..fipa_acl::Payload::default()
+    };
+    Message::decode(&payload).unwrap()
 }
 
 /// Receives a request, and then sends this one.
@@ -152,9 +165,9 @@ fn an_agent_answers_a_platform_at_the_address_in_the_letter() {
     // The entries of agents have no locations that only legacy peers may use.
     let agents = host.run(&["agents", "--json"]).done_json().to_string();
     assert!(!agents.contains("http://"), "{agents}");
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
     for request in REQUESTS {
-        let platform = TcpListener::bind("127.0.0.1:0").unwrap();
-        let here = platform.local_addr().unwrap().to_string();
         post(
             &at(
                 request,

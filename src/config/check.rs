@@ -448,6 +448,16 @@ impl Findings {
                 format_args!("lists {location}, which works only within one host"),
                 "write for example tcp://10.0.0.2:7788",
             );
+        } else if kind == Kind::Http {
+            // The port is optional.
+            let authority = location.authority();
+            if !has_port(authority) && !has_port(&format!("{authority}:7778")) {
+                self.add(
+                    path,
+                    format_args!("lists {location}, which has no host or a wrong port"),
+                    "write for example http://10.0.0.7:7778/acc",
+                );
+            }
         } else if !has_port(location.address()) {
             self.add(
                 path,

@@ -276,6 +276,11 @@ fn mistakes_are_reported_with_line_and_key() {
             "fipa.toml:2: `discovery.static.crex` lists tcp://10.0.0.2, which has no port; \
              write for example tcp://10.0.0.2:7788 or tcp://[fe80::1%eth0]:7788",
         ),
+        (
+            "[discovery.static]\necho = [\"http://:7778/acc\"]\n",
+            "fipa.toml:2: `discovery.static.echo` lists http://:7778/acc, which has no host or a wrong \
+             port; write for example http://10.0.0.7:7778/acc",
+        ),
         // Files that are not TOML.
         (
             "domain = \"a\"\n[mts\nname = 5\n",
