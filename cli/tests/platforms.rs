@@ -297,5 +297,5 @@ fn a_letter_is_sent_to_a_platform_and_its_reply_or_failure_is_received() {
             "--json",
         ])
         .failed_json();
-    assert_eq!(json["deliveries"][0]["attempts"][0]["via"], "http");
+    assert_eq!(json["deliveries"][0]["outcome"], "failed");
 }

@@ -23,7 +23,10 @@ pub const RECORDED: [(u8, &[u8]); 6] = [
     (0, recorded!("string.3-echo-reply-from-jade")),
     (0, recorded!("xml.3-echo-reply-from-jade")),
     (0, recorded!("bitefficient.3-echo-reply-from-jade")),
-    (0, recorded!("failure-unknown-agent.3-ams-failure-from-jade")),
+    (
+        0,
+        recorded!("failure-unknown-agent.3-ams-failure-from-jade"),
+    ),
     (1, recorded!("keepalive-http-response-from-jade")),
     (1, recorded!("string.4-http-response-to-jade")),
 ];

@@ -32,7 +32,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[transport.serial]\nlisten = []\n",
-            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic",
+            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, http",
         ),
         (
             "[mts]\nname.first = \"x\"\n",
@@ -168,7 +168,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, http",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -218,7 +218,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, http",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",
