@@ -255,3 +255,37 @@ fn dialect_of(entry: &Entry) -> Dialect {
         _ => Dialect::Standard,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_platform_is_answered_only_at_the_host_that_its_letter_came_from() {
+        let from = LegacySource {
+            address: IpAddr::from([10, 0, 0, 7]),
+            signature: Signature::JadeProxy,
+        };
+        let given = |address: &str| {
+            let locations = locations_given([address], from);
+            locations.first().map(ToString::to_string)
+        };
+        for (stated, expected) in [
+            ("http://10.0.0.7:7778/acc", Some("http://10.0.0.7:7778/acc")),
+            ("http://10.0.0.7/acc", Some("http://10.0.0.7:7778/acc")),
+            ("http://crex:7778/acc", Some("http://10.0.0.7:7778/acc")),
+            ("http://crex.local/x", Some("http://10.0.0.7:7778/x")),
+            ("tcp://10.0.0.7:6789", Some("tcp://10.0.0.7:6789;jade")),
+            // A third party.
+            ("http://10.0.0.8:7778/acc", None),
+            ("http://10.0.0.8/acc", None),
+            ("http://[::1]:7778/acc", None),
+            ("http://crex:0/acc", None),
+            ("http://crex:x/acc", None),
+            ("tcp://crex:6789", None),
+            ("udp://10.0.0.7:7778", None),
+        ] {
+            assert_eq!(given(stated).as_deref(), expected, "{stated}");
+        }
+    }
+}
