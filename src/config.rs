@@ -30,6 +30,8 @@
 //! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
 //! [transport.quic]
 //! listen = ["127.0.0.1:0"]            # as for tcp; always encrypted; needs security.keys
+//! [transport.http]
+//! listen = ["127.0.0.1:7778"]         # as for tcp; for JADE and other platforms; never encrypted
 //! [discovery]
 //! mdns = true
 //! interfaces = []                     # names or addresses; empty: all
@@ -152,6 +154,9 @@ pub struct Transports {
     pub udp: Listen,
     /// `[transport.quic]`; needs [`Security::keys`].
     pub quic: Listen,
+    /// `[transport.http]`: letters of platforms such as JADE, and to them. With
+    /// [`Security::keys`], only of [`Security::legacy_peers`].
+    pub http: Listen,
 }
 
 /// `[transport.shm]`: shared memory.
@@ -179,7 +184,7 @@ pub struct Tcp {
     pub processes: bool,
 }
 
-/// `[transport.udp]` and `[transport.quic]`: a network transport of the gateway.
+/// `[transport.udp]`, `[transport.quic]` and `[transport.http]`: a network transport of the gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Listen {
@@ -400,6 +405,9 @@ impl Config {
                 },
                 udp: loopback.clone(),
                 quic: loopback,
+                http: Listen {
+                    listen: vec!["127.0.0.1:7778".to_owned()],
+                },
             },
             discovery: Discovery {
                 mdns: true,

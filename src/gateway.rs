@@ -247,7 +247,7 @@ impl Gateway {
     /// Returns the current locations of the gateway.
     #[must_use]
     pub fn locations(&self) -> Vec<Location> {
-        self.service.locations()
+        self.service.all_locations()
     }
 
     /// Returns the directory of this host and of other hosts.

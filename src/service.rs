@@ -8,7 +8,7 @@ use fipa_acl::ErrorChain;
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Cancellation, Directory, Entry, HostDirectory, Pattern};
-use fipa_transport::{Incarnation, Kind, Location, Transport};
+use fipa_transport::{Incarnation, Kind, Location, Signature, Transport};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -137,11 +137,20 @@ impl Service {
         Ok(service)
     }
 
-    /// Returns the current locations of the service, at most as many as a directory entry can have.
+    /// Returns the current locations of the service.
+    #[cfg(feature = "net")]
+    pub(crate) fn all_locations(&self) -> Vec<Location> {
+        self.locations.borrow().to_vec()
+    }
+
+    /// Returns the current locations of the service for directories, at most as many as an entry can
+    /// have. The locations for legacy peers only are left out: services that confirm deliveries must
+    /// not use them.
     pub(crate) fn locations(&self) -> Vec<Location> {
         let locations = self.locations.borrow();
         locations
             .iter()
+            .filter(|location| location.signature() == Signature::Frames)
             .take(Entry::MAX_LOCATIONS)
             .cloned()
             .collect()
@@ -294,6 +303,8 @@ fn transports(
                 // Cannot happen: the check of the configuration demands keys for QUIC.
                 None => continue,
             },
+            #[cfg(feature = "http")]
+            Kind::Http => http(config, role, &maintenance.dir, incarnation, handle),
             // One configuration serves all processes of a robot; their features may differ.
             other => {
                 tracing::debug!(kind = %other, "this program was built without a transport");
@@ -428,6 +439,25 @@ fn quic(
         security: security.clone(),
     };
     Ok(Arc::new(QuicTransport::new(config, handle.clone())))
+}
+
+#[cfg(feature = "http")]
+fn http(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{HttpConfig, HttpTransport};
+    let config = HttpConfig {
+        listen: config.transport.http.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: stream_limits(config),
+        #[cfg(feature = "secure")]
+        security: role.security.clone(),
+    };
+    Ok(Arc::new(HttpTransport::new(config, handle.clone())))
 }
 
 /// Returns the limits of the transports that carry letters of any size.

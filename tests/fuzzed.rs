@@ -29,6 +29,8 @@ mod exchange;
 mod framed;
 #[path = "../fuzz/src/host.rs"]
 mod host;
+#[path = "../fuzz/src/http.rs"]
+mod http;
 #[path = "../fuzz/src/input.rs"]
 mod input;
 #[path = "../fuzz/src/mdns.rs"]
@@ -111,6 +113,7 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, config, datagrams, delivery, exchange, framed, host, mdns, platform, shm, texts
+        access, config, datagrams, delivery, exchange, framed, host, http, mdns, platform, shm,
+        texts
     );
 }

@@ -293,6 +293,60 @@ fn base64_content_of_jade_is_decoded() {
     assert_eq!(problem(wrong), Problem::Base64);
 }
 
+#[test]
+fn content_that_jade_does_not_escape_is_read_as_it_is() {
+    let message = |content: &str| {
+        format!(
+            "<fipa-message act=\"INFORM\" >\n\t<sender>\n\t\t<agent-identifier>\n\t\t\t<name \
+             id=\"echo@jadetest\" />\n\t\t</agent-identifier>\n\t</sender>\n\t\
+             <content>{content}</content>\n\t<language>fipa-sl</language>\n\t\
+             <conversation-id>c</conversation-id>\n</fipa-message>\n"
+        )
+    };
+    for content in [
+        "a < b > & c",
+        "AT&T",
+        "<b>unclosed",
+        "</b>",
+        "a </content> b",
+        "</content></content>",
+        "<!-- no end",
+        "<?",
+        "if (a<b && c>d) { \"x\" }",
+        "& &amp; &lt;",
+        "x < y\r\n \t",
+    ] {
+        let read = read(&message(content)).unwrap();
+        assert_eq!(read.content().unwrap(), content);
+        assert_eq!(read.language(), Some("fipa-sl"), "{content}");
+        assert_eq!(read.conversation_id(), Some("c"));
+        assert_eq!(read.sender().unwrap().name(), "echo@jadetest");
+    }
+    // Behind the content, user-defined parameters are read; in front of it, they are ambiguous.
+    let last = "<fipa-message act=\"INFORM\"><content>a<b</content><X-k>v</X-k></fipa-message>";
+    let last = read(last).unwrap();
+    assert_eq!(last.content().unwrap(), "a<b");
+    assert_eq!(last.user_defined(), [("k".to_owned(), "v".to_owned())]);
+    for ambiguous in [
+        // Not of JADE.
+        message("a & b").replace("INFORM", "inform"),
+        message("a<b <language>x</language>"),
+        message("a<b</content> <ontology> </content> c"),
+        message("a & </fipa-message>"),
+        message("<![CDATA[a]]> & b"),
+        "<fipa-message act=\"INFORM\"><X-k>v</X-k><content>a<b</content></fipa-message>".to_owned(),
+        "<fipa-message act=\"INFORM\"><content>&</content><content>&</content></fipa-message>"
+            .to_owned(),
+        "<fipa-message act=\"INFORM\"><content href='x'>&</content></fipa-message>".to_owned(),
+        "<fipa-message act=\"INFORM\"><content>a & b".to_owned(),
+        "<fipa-message act=\"INFORM\"><content>&</content>x<language/></fipa-message>".to_owned(),
+        "<fipa-message act=\"INFORM\"><content>ok</content><language>&</language></fipa-message>"
+            .to_owned(),
+    ] {
+        assert!(read(&ambiguous).is_err(), "{ambiguous}");
+    }
+}
+
 /// fipa_services writes content into one CDATA section, `]]>` included.
 #[test]
 fn content_with_an_unescaped_end_of_a_cdata_section_is_refused() {

@@ -126,6 +126,44 @@ fn decoded(bytes: &Bytes) -> Message {
 
 proptest! {
     #[test]
+    fn unescaped_content_is_read_as_it_is_and_well_formed_content_as_xml(
+        text in prop_oneof![
+            text(),
+            "[a-c<>&/ ;]{0,16}",
+            vec(prop_oneof![
+                Just("</content>"), Just("<content>"), Just("<b>"), Just("</b>"), Just("<x/>"),
+                Just("&amp;"), Just("&"), Just("<"), Just("a"), Just(" "), Just("<!-- "),
+                Just("-->"), Just("<language>"), Just("</language>"), Just("<![CDATA["),
+                Just("]]>"), Just("</fipa-message>"), Just("&#65;"),
+            ], 0..8).prop_map(|pieces| pieces.concat()),
+        ],
+    ) {
+        let read = |xml: String| Message::decode(&Payload::from(Bytes::from(xml)));
+        // Without content, a message must be well-formed, so this is the value that XML gives it.
+        let strict = read(format!("<fipa-message act='inform'><language>{text}</language></fipa-message>"));
+        let jade = read(format!(
+            "<fipa-message act=\"INFORM\" ><content>{text}</content>\n\t<protocol>p</protocol></fipa-message>"
+        ));
+        match (strict, jade) {
+            // A text with the element itself inside has another meaning there.
+            _ if text.contains("language>") || text.contains("<content") => {}
+            (Ok(strict), Ok(jade)) => {
+                let content = jade.content().map(|it| String::from_utf8_lossy(it).into_owned());
+                prop_assert_eq!(content.as_deref(), strict.language());
+                prop_assert_eq!(jade.protocol(), Some("p"));
+            }
+            (Ok(_), Err(error)) => prop_assert!(false, "well-formed content is refused: {error}"),
+            (Err(_), Ok(jade)) => {
+                prop_assert_eq!(jade.content().unwrap(), &text);
+                prop_assert_eq!(jade.protocol(), Some("p"));
+            }
+            (Err(_), Err(_)) => {}
+        }
+    }
+}
+
+proptest! {
+    #[test]
     fn a_message_of_text_is_the_same_after_a_round_trip(message in message()) {
         let encoded = message.encode(XML, Dialect::Standard).unwrap();
         prop_assert_eq!(decoded(&encoded), message);

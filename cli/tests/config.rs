@@ -109,6 +109,9 @@ listen = [\"127.0.0.1:0\"]             # default
 [transport.quic]
 listen = [\"127.0.0.1:0\"]             # default
 
+[transport.http]
+listen = [\"127.0.0.1:7778\"]          # default
+
 [discovery]
 mdns = true                          # default
 interfaces = []                      # default

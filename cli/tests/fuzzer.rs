@@ -45,6 +45,8 @@ enum Attack {
     Frames,
     /// A letter of a legacy peer.
     LegacyPeer,
+    /// Requests of a platform over HTTP.
+    Http,
     /// Datagrams that may begin a UDP connection.
     Datagrams,
     /// A UDP connection.
@@ -62,10 +64,11 @@ enum Attack {
 }
 
 use Attack::*;
-const CLEAR: [Attack; 4] = [Frames, LegacyPeer, Datagrams, Udp];
-const SECURED: [Attack; 7] = [
+const CLEAR: [Attack; 5] = [Frames, LegacyPeer, Http, Datagrams, Udp];
+const SECURED: [Attack; 8] = [
     Frames,
     LegacyPeer,
+    Http,
     Handshake,
     Tls,
     QuicDatagrams,
@@ -95,6 +98,7 @@ struct Target {
     attacks: &'static [Attack],
     tcp: SocketAddr,
     datagrams: SocketAddr,
+    http: SocketAddr,
     tls: Option<Arc<rustls::ClientConfig>>,
     quic: Option<quinn::ClientConfig>,
     receivers: Vec<String>,
@@ -137,6 +141,7 @@ impl Setup {
             known,
             attacks: if secured { &SECURED } else { &CLEAR },
             tcp: pair.gateway.at("tcp"),
+            http: pair.gateway.at("http"),
             datagrams: pair.gateway.at(if secured { "quic" } else { "udp" }),
             handshakes: match (&tls, &quic) {
                 (Some(tls), Some(quic)) => handshakes(tls, quic),
@@ -210,6 +215,10 @@ impl Target {
             LegacyPeer => {
                 let script = writer.legacy_peer();
                 Some(stream::plain(self.tcp, script).await)
+            }
+            Http => {
+                let script = writer.requests();
+                Some(stream::plain(self.http, script).await)
             }
             Datagrams | QuicDatagrams => {
                 let pieces = match attack {

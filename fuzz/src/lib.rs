@@ -7,6 +7,7 @@ pub mod delivery;
 pub mod exchange;
 pub mod framed;
 pub mod host;
+pub mod http;
 pub mod input;
 pub mod mdns;
 pub mod platform;

@@ -35,6 +35,7 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
             }
             seeds
         }
+        "http" => crate::http::seeds(),
         "texts" => texts(),
         "config" => config(),
         "host" => vec![HOST.to_vec(), HOST[..120].to_vec()],

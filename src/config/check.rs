@@ -91,6 +91,10 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
         &["transport", "quic", "listen"],
         &config.transport.quic.listen,
     );
+    found.listen(
+        &["transport", "http", "listen"],
+        &config.transport.http.listen,
+    );
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
@@ -182,6 +186,7 @@ impl Findings {
         for (kind, listen) in [
             (Kind::Tcp, &config.transport.tcp.listen),
             (Kind::Udp, &config.transport.udp.listen),
+            (Kind::Http, &config.transport.http.listen),
         ] {
             // `listen` reports entries that are not addresses.
             let mut addresses = listen.iter().filter(|text| is_numeric_address(text));
@@ -466,6 +471,16 @@ impl Findings {
                 format_args!("lists {location}, which works only within one host"),
                 "write for example tcp://10.0.0.2:7788",
             );
+        } else if kind == Kind::Http {
+            // The port is optional.
+            let authority = location.authority();
+            if !has_port(authority) && !has_port(&format!("{authority}:7778")) {
+                self.add(
+                    path,
+                    format_args!("lists {location}, which has no host or a wrong port"),
+                    "write for example http://10.0.0.7:7778/acc",
+                );
+            }
         } else if !has_port(location.address()) {
             self.add(
                 path,

@@ -166,6 +166,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.transport.quic.listen),
     },
     Key {
+        path: &["transport", "http", "listen"],
+        shape: Shape::List,
+        expected: ADDRESSES,
+        write: |config, value| addresses(value).map(|all| config.transport.http.listen = all),
+        read: |config| Value::list(&config.transport.http.listen),
+    },
+    Key {
         path: &["discovery", "mdns"],
         shape: Shape::Plain,
         expected: "true or false",

@@ -322,6 +322,9 @@ listen = ["127.0.0.1:0"]             # default
 [transport.quic]
 listen = ["127.0.0.1:0"]             # default
 
+[transport.http]
+listen = ["127.0.0.1:7778"]          # default
+
 [discovery]
 mdns = true                          # default
 interfaces = []                      # default
@@ -492,6 +495,21 @@ fn a_gateway_listens_on_the_network_only_with_keys_or_with_insecure() {
         "transport.udp.listen=0.0.0.0:7788",
     ];
     assert!(mistakes(&datagrams).contains("`transport.udp.listen` lists 0.0.0.0:7788"));
+    let platforms = [
+        "mts.transports=shm,http",
+        "transport.http.listen=0.0.0.0:7778",
+    ];
+    assert!(mistakes(&platforms).contains("`transport.http.listen` lists 0.0.0.0:7778"));
+    let keys = "security.keys=/etc/fipa/keys";
+    assert_eq!(mistakes(&[platforms[0], platforms[1], keys]), "");
+    for static_peer in [
+        "http://10.0.0.7:7778/acc",
+        "http://jade.local/acc",
+        "http://[::1]/acc",
+    ] {
+        let line = format!("discovery.static={{ \"echo@jade\" = [\"{static_peer}\"] }}");
+        assert_eq!(mistakes(&[&line]), "");
+    }
     assert_eq!(mistakes(&[open, "security.insecure=true"]), "");
     assert_eq!(mistakes(&[open, "security.keys=/etc/fipa/keys"]), "");
     assert_eq!(

@@ -10,13 +10,18 @@ const LOCATIONS: &str = "locations";
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let transport = &config.transport;
-    let listens: [(Kind, &[String]); 3] = [
+    let listens: [(Kind, &[String]); 4] = [
         (Kind::Tcp, &transport.tcp.listen),
         (Kind::Udp, &transport.udp.listen),
         (Kind::Quic, &transport.quic.listen),
+        (Kind::Http, &transport.http.listen),
     ];
     let used = |kind| config.mts.transports.contains(&kind);
-    let built = |kind| kind != Kind::Quic || cfg!(feature = "quic");
+    let built = |kind| match kind {
+        Kind::Quic => cfg!(feature = "quic"),
+        Kind::Http => cfg!(feature = "http"),
+        _ => true,
+    };
     let mut found = Vec::new();
     for (kind, listen) in listens {
         if !used(kind) || !built(kind) {
@@ -51,7 +56,10 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         .any(|(_, address)| !address.ip().to_canonical().is_loopback());
     let texts: Vec<String> = found
         .iter()
-        .map(|(kind, address)| format!("{kind}://{address}"))
+        .map(|(kind, address)| match kind {
+            Kind::Http => format!("{kind}://{address}/acc"),
+            _ => format!("{kind}://{address}"),
+        })
         .collect();
     let texts = texts.join(", ");
     checks.push(match (open, has_address) {

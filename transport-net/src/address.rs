@@ -207,6 +207,10 @@ impl Listening {
         incarnation: Incarnation,
     ) -> Result<Vec<Location>, LocationError> {
         let locations = self.reachable.iter().map(|address| {
+            if kind == Kind::Http {
+                // Platforms know no incarnations.
+                return Location::new(kind, &format!("{address}/acc"));
+            }
             let location = Location::new(kind, &address.to_string())?;
             Ok(location.with_incarnation(incarnation))
         });

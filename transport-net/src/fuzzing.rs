@@ -6,6 +6,8 @@
     reason = "a violated invariant must panic"
 )]
 
+#[cfg(feature = "http")]
+pub use crate::http::fuzzing as http;
 #[cfg(feature = "secure")]
 pub use crate::secure::certified;
 pub use crate::stream::fuzzing::{Framed, answer_body, frame, hello_body, parcel_body};

@@ -4,6 +4,8 @@
 //!   one domain on one host.
 //! * `TcpTransport` (feature `ip`) carries them in the same frames over one persistent connection
 //!   per peer, and accepts the unframed letters of legacy peers on the same port.
+//! * `HttpTransport` (feature `http`) exchanges letters with platforms that use FIPA's transport over
+//!   HTTP, such as JADE.
 //! * `UdpTransport` (feature `ip`) carries parcels over UDP, one acknowledged datagram each.
 //! * `QuicTransport` (feature `quic`) carries parcels in the same frames over QUIC, each in a
 //!   stream of its own.
@@ -24,9 +26,13 @@ mod end;
 #[doc(hidden)]
 pub mod fuzzing;
 mod hello;
+#[cfg(feature = "http")]
+mod http;
 mod identity;
 #[cfg(feature = "ip")]
 mod interfaces;
+#[cfg(feature = "ip")]
+mod legacy;
 #[cfg_attr(
     not(any(feature = "ip", test)),
     expect(dead_code, reason = "only TCP resets connections")
@@ -41,6 +47,8 @@ mod quic;
 mod rate_limit;
 #[cfg(feature = "secure")]
 pub mod secure;
+#[cfg(feature = "ip")]
+mod sockets;
 mod stream;
 #[cfg(feature = "ip")]
 mod tcp;
@@ -50,6 +58,8 @@ mod unix;
 
 #[cfg(feature = "ip")]
 pub use address::{AddressError, reachable_at};
+#[cfg(feature = "http")]
+pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;
 #[cfg(feature = "quic")]
 pub use quic::{QuicConfig, QuicTransport};

@@ -26,17 +26,20 @@ pub enum Kind {
     Unix,
     /// UDT, one of the transports of fipa_services. Not [supported](Kind::is_supported).
     Udt,
+    /// Letters in multipart messages over HTTP (FIPA00084): JADE's transport between platforms.
+    Http,
 }
 
 impl Kind {
     /// All kinds. The position is the code on the wire, so new ones go last.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::Shm,
         Self::Tcp,
         Self::Udp,
         Self::Quic,
         Self::Unix,
         Self::Udt,
+        Self::Http,
     ];
 
     /// Whether this project has a transport of this kind. The directory may contain locations of
@@ -56,6 +59,7 @@ impl Kind {
             Self::Quic => "quic",
             Self::Unix => "unix",
             Self::Udt => "udt",
+            Self::Http => "http",
         }
     }
 
@@ -94,8 +98,8 @@ pub enum Signature {
     Frames,
     /// One letter per connection, bit-efficient in the dialect of fipa_services, not acknowledged.
     FipaServices,
-    /// One letter per connection, an XML envelope and a string message, not acknowledged: JADE's
-    /// proxy agent.
+    /// An XML envelope and a string message, whose delivery is not confirmed: JADE. Over TCP, its
+    /// proxy agent reads one letter per connection.
     JadeProxy,
 }
 
@@ -154,9 +158,9 @@ impl FromStr for Signature {
 /// service.
 ///
 /// Written `kind://address`, then `;signature` unless the protocol is frames (it may be omitted for
-/// `udt`, over which only fipa_services is supported), then `#incarnation` if known:
-/// `tcp://10.0.0.2:7788#00abcdef01234567`, `tcp://10.0.0.3:6789;fipa-services`,
-/// `tcp://10.0.0.4:6789;jade`. The transport defines the meaning of `address`. Ports are reused, so
+/// `udt`, over which only fipa_services is supported, and is omitted for `http`, over which only JADE
+/// is), then `#incarnation` if known: `tcp://10.0.0.2:7788#00abcdef01234567`,
+/// `tcp://10.0.0.3:6789;fipa-services`, `tcp://10.0.0.4:6789;jade`, `http://10.0.0.4:7778/acc`. The transport defines the meaning of `address`. Ports are reused, so
 /// a transport that finds another incarnation than the known one at a location reports that no
 /// receiver was reached.
 ///
@@ -174,7 +178,7 @@ impl Location {
     pub const MAX_ADDRESS: usize = 512;
 
     /// Creates a location with an unknown incarnation and the signature [`Signature::Frames`] (over
-    /// UDT: [`Signature::FipaServices`]).
+    /// UDT: [`Signature::FipaServices`], over HTTP: [`Signature::JadeProxy`]).
     ///
     /// # Errors
     /// Returns an error if the address is empty, too long, or contains white space,
@@ -196,6 +200,7 @@ impl Location {
             address: address.into(),
             signature: match kind {
                 Kind::Udt => Signature::FipaServices,
+                Kind::Http => Signature::JadeProxy,
                 _ => Signature::Frames,
             },
             incarnation: Incarnation::UNKNOWN,
@@ -213,11 +218,12 @@ impl Location {
     ///
     /// # Errors
     /// Returns an error if this kind of transport does not support it: TCP supports every
-    /// signature, UDT only that of fipa_services, and all others only frames.
+    /// signature, UDT only that of fipa_services, HTTP only that of JADE, and all others only frames.
     pub fn with_signature(mut self, signature: Signature) -> Result<Self, LocationError> {
         let is_spoken = match self.kind {
             Kind::Tcp => true,
             Kind::Udt => signature == Signature::FipaServices,
+            Kind::Http => signature == Signature::JadeProxy,
             _ => signature == Signature::Frames,
         };
         if !is_spoken {
@@ -239,6 +245,16 @@ impl Location {
         &self.address
     }
 
+    /// Host and port of the address: the part of an address of HTTP in front of its path, and the
+    /// whole address of other transports.
+    #[must_use]
+    pub fn authority(&self) -> &str {
+        match (self.kind, self.address.find('/')) {
+            (Kind::Http, Some(path)) => self.address.get(..path).unwrap_or_default(),
+            _ => &self.address,
+        }
+    }
+
     /// The protocol at the location.
     #[must_use]
     pub fn signature(&self) -> Signature {
@@ -255,7 +271,7 @@ impl Location {
 impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}://{}", self.kind, self.address)?;
-        if self.signature != Signature::Frames {
+        if self.signature != Signature::Frames && self.kind != Kind::Http {
             write!(f, ";{}", self.signature)?;
         }
         if self.incarnation.is_known() {
@@ -279,7 +295,7 @@ pub enum LocationError {
     #[error("not a location (expected for example tcp://10.0.0.2:7788): {0:?}")]
     NoScheme(String),
     /// No transport has this name.
-    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic)")]
+    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic, http)")]
     UnknownKind(String),
     /// The address is empty or too long.
     #[error("the address has {0} bytes; 1 to {max} are allowed", max = Location::MAX_ADDRESS)]
@@ -357,6 +373,8 @@ mod tests {
             "tcp://10.0.0.3:6789;fipa-services",
             "tcp://[fe80::1%eth0]:6789;jade#00abcdef01234567",
             "udt://10.0.0.3:6790;fipa-services",
+            "http://10.0.0.4:7778/acc",
+            "http://jade.local:7778/acc#00abcdef01234567",
         ] {
             assert_eq!(text.parse::<Location>().unwrap().to_string(), text);
         }
@@ -380,6 +398,20 @@ mod tests {
             let refused = udt.clone().with_signature(refused);
             assert!(matches!(refused, Err(LocationError::NotOverKind(..))));
         }
+    }
+
+    #[test]
+    fn http_supports_only_jade() {
+        let http: Location = "http://10.0.0.4:7778/acc".parse().unwrap();
+        assert_eq!(http.signature(), Signature::JadeProxy);
+        assert_eq!("http://10.0.0.4:7778/acc;jade".parse(), Ok(http.clone()));
+        assert_eq!(http.authority(), "10.0.0.4:7778");
+        for refused in [Signature::Frames, Signature::FipaServices] {
+            let refused = http.clone().with_signature(refused);
+            assert!(matches!(refused, Err(LocationError::NotOverKind(..))));
+        }
+        let tcp: Location = "tcp://10.0.0.4:6789;jade".parse().unwrap();
+        assert_eq!(tcp.authority(), "10.0.0.4:6789");
     }
 
     #[test]

@@ -155,6 +155,65 @@ impl<'a> Elements<'a> {
         Some(text)
     }
 
+    /// Reads the current element, including its end, as text without markup. It ends with the last
+    /// end tag of its name before the next start tag that `follows`, or before the end of the parent.
+    ///
+    /// # Errors
+    /// There is no such end tag, or it is followed by more than white space.
+    pub(super) fn raw(
+        &mut self,
+        follows: impl Fn(&Element<'a>) -> bool,
+    ) -> Result<&'a [u8], DecodeError> {
+        let malformed = Problem::Xml("an element with unescaped text has no clear end");
+        let error = self.error(self.position(), malformed);
+        let depth = self.depth.checked_sub(1).filter(|_| !self.ends);
+        let depth = depth.ok_or_else(|| error.clone())?;
+        let own = self.open.get(depth).copied().unwrap_or_default();
+        let parent = depth.checked_sub(1).and_then(|depth| self.open.get(depth));
+        let parent = parent.copied().unwrap_or_default();
+        let (text, mut at, mut end) = (self.rest, 0, None);
+        loop {
+            let found = text.get(at..).and_then(|rest| scan::find_byte(rest, b'<'));
+            at += found.ok_or_else(|| error.clone())?;
+            let behind = text.get(at + 1..).unwrap_or_default();
+            let (is_end, behind) = match behind.strip_prefix(b"/") {
+                Some(behind) => (true, behind),
+                None => (false, behind),
+            };
+            let ends = |byte: &u8| byte.is_ascii_whitespace() || matches!(byte, b'>' | b'<' | b'/');
+            let len = behind.iter().position(ends).unwrap_or(behind.len());
+            let (name, behind) = behind.split_at(len);
+            if is_end && name == own {
+                if let Some(rest) = behind.trim_ascii_start().strip_prefix(b">") {
+                    end = Some((at, rest));
+                }
+            } else if is_end && name == parent {
+                break;
+            } else if !is_end {
+                let element = Element {
+                    tag: Tag::of(local(name)),
+                    name,
+                    attributes: &[],
+                    offset: self.position() + at,
+                };
+                if follows(&element) {
+                    break;
+                }
+            }
+            at += 1;
+        }
+        let (len, rest) = end.ok_or_else(|| error.clone())?;
+        let between = text.len() - rest.len();
+        let between = text.get(between..at).unwrap_or_default();
+        if !between.trim_ascii().is_empty() {
+            return Err(error);
+        }
+        self.begin = self.position() + len;
+        self.rest = rest;
+        self.depth = depth;
+        Ok(text.get(..len).unwrap_or_default())
+    }
+
     /// Skips the current element, including its end.
     pub(super) fn skip(&mut self) -> Result<(), DecodeError> {
         let outside = self.depth.saturating_sub(1);

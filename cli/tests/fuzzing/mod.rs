@@ -22,6 +22,15 @@ const LEGACY_PEERS: [&[u8]; 2] = [
     include_bytes!("../../../transport-net/tests/data/tcp_letter_jade.bin"),
 ];
 
+/// Recorded requests of JADE, in each encoding of messages.
+const REQUESTS: [&[u8]; 3] = [
+    include_bytes!("../../../transport-net/tests/data/jade_http/string.3-echo-reply-from-jade.bin"),
+    include_bytes!("../../../transport-net/tests/data/jade_http/xml.3-echo-reply-from-jade.bin"),
+    include_bytes!(
+        "../../../transport-net/tests/data/jade_http/bitefficient.3-echo-reply-from-jade.bin"
+    ),
+];
+
 /// Values at the limits of lengths and counters.
 const EDGES: [u64; 14] = [
     0,
@@ -99,6 +108,17 @@ impl Writer<'_> {
         let letter = LEGACY_PEERS[self.random.usize(..LEGACY_PEERS.len())];
         let pieces = letter.chunks(self.random.usize(16..600));
         let pieces = pieces.map(<[u8]>::to_vec).collect();
+        self.script(pieces)
+    }
+
+    /// Returns requests of a platform on one connection, with mutations.
+    pub(crate) fn requests(&mut self) -> Script {
+        let mut pieces = Vec::new();
+        for _ in 0..self.random.usize(1..4) {
+            let request = REQUESTS[self.random.usize(..REQUESTS.len())];
+            let chunks = request.chunks(self.random.usize(16..2000));
+            pieces.extend(chunks.map(<[u8]>::to_vec));
+        }
         self.script(pieces)
     }
 

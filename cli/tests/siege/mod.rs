@@ -141,7 +141,8 @@ impl Gateway {
 
     /// Returns the `discovery.static` setting with the locations of this gateway.
     pub(crate) fn known_as(&self, name: &str) -> String {
-        let network = self.locations.iter().filter(|it| !it.starts_with("shm"));
+        let is_other = |it: &&String| it.starts_with("shm") || it.starts_with("http");
+        let network = self.locations.iter().filter(|it| !is_other(it));
         let locations: Vec<String> = network.map(|location| format!("{location:?}")).collect();
         format!(
             "discovery.static={{ {name:?} = [{}] }}",
@@ -153,7 +154,9 @@ impl Gateway {
     pub(crate) fn at(&self, kind: &str) -> SocketAddr {
         let mut locations = self.locations.iter();
         let found = locations.find_map(|it| it.strip_prefix(kind)?.strip_prefix("://"));
-        found.unwrap().parse().unwrap()
+        // An address of HTTP has a path.
+        let address = found.unwrap().trim_end_matches("/acc");
+        address.parse().unwrap()
     }
 
     pub(crate) fn usage(&self) -> Usage {
@@ -219,13 +222,14 @@ impl Pair {
                 "security.loopback=true".to_owned(),
                 // Long enough for a busy machine.
                 "mts.deadline=60s".to_owned(),
+                "transport.http.listen=127.0.0.1:0".to_owned(),
             ];
             match secured {
                 true => settings.extend([
                     format!("security.keys={}", place.join(name).display()),
-                    "mts.transports=shm,quic,tcp".to_owned(),
+                    "mts.transports=shm,quic,tcp,http".to_owned(),
                 ]),
-                false => settings.push("mts.transports=shm,udp,tcp".to_owned()),
+                false => settings.push("mts.transports=shm,udp,tcp,http".to_owned()),
             }
             settings
         };

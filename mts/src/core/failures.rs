@@ -1,12 +1,12 @@
 //! Failure messages: their receivers and their rate.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Dialect, ErrorChain};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
-use fipa_transport::{FailureReason, Incarnation, LegacySource, Location, Signature, Stream};
+use fipa_transport::{FailureReason, Incarnation, Kind, LegacySource, Location, Signature, Stream};
 
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, registration_of};
 use super::inbox::Received;
@@ -179,22 +179,47 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
     format!("the message cannot be decoded: {why}")
 }
 
+/// The port of an address of HTTP without one.
+const HTTP_PORT: u16 = 7778;
+
 /// The locations that an agent of a legacy peer states as its own: of its addresses, the numeric
 /// ones of the host that its letter came from. Others could be claimed to make this service send to
-/// a third party.
+/// a third party. JADE states its host by name; the name is replaced by the address that the letter
+/// came from.
 pub(super) fn locations_given<'a>(
     addresses: impl IntoIterator<Item = &'a str>,
     from: LegacySource,
 ) -> Vec<Location> {
     let locations = addresses.into_iter().filter_map(|address| {
         let location: Location = address.parse().ok()?;
-        let claimed: SocketAddr = location.address().parse().ok()?;
+        let location = match location.kind() {
+            Kind::Http => at_host(&location, from.address)?,
+            _ => location,
+        };
+        let claimed: SocketAddr = location.authority().parse().ok()?;
         if claimed.ip().to_canonical() != from.address || !location.kind().is_supported() {
             return None;
         }
         location.with_signature(from.signature).ok()
     });
     locations.take(Entry::MAX_LOCATIONS).collect()
+}
+
+/// A location of HTTP with a name replaced by the address of the host that states it, and with a
+/// port.
+fn at_host(location: &Location, host: IpAddr) -> Option<Location> {
+    let authority = location.authority();
+    let path = location.address().get(authority.len()..)?;
+    let at = match (authority.parse::<SocketAddr>(), authority.parse::<IpAddr>()) {
+        (Ok(at), _) => at,
+        (_, Ok(ip)) => SocketAddr::new(ip, HTTP_PORT),
+        _ => match authority.rsplit_once(':') {
+            Some((_, port)) => SocketAddr::new(host, port.parse().ok()?),
+            None => SocketAddr::new(host, HTTP_PORT),
+        },
+    };
+    let location = Location::new(Kind::Http, &format!("{at}{path}")).ok();
+    location.filter(|_| at.port() != 0)
 }
 
 /// An agent that is not in the directory, with the locations that it states as its own.
@@ -228,5 +253,39 @@ fn dialect_of(entry: &Entry) -> Dialect {
         Some(Signature::FipaServices) => Dialect::FipaServices,
         Some(Signature::JadeProxy) => Dialect::Jade,
         _ => Dialect::Standard,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_platform_is_answered_only_at_the_host_that_its_letter_came_from() {
+        let from = LegacySource {
+            address: IpAddr::from([10, 0, 0, 7]),
+            signature: Signature::JadeProxy,
+        };
+        let given = |address: &str| {
+            let locations = locations_given([address], from);
+            locations.first().map(ToString::to_string)
+        };
+        for (stated, expected) in [
+            ("http://10.0.0.7:7778/acc", Some("http://10.0.0.7:7778/acc")),
+            ("http://10.0.0.7/acc", Some("http://10.0.0.7:7778/acc")),
+            ("http://crex:7778/acc", Some("http://10.0.0.7:7778/acc")),
+            ("http://crex.local/x", Some("http://10.0.0.7:7778/x")),
+            ("tcp://10.0.0.7:6789", Some("tcp://10.0.0.7:6789;jade")),
+            // A third party.
+            ("http://10.0.0.8:7778/acc", None),
+            ("http://10.0.0.8/acc", None),
+            ("http://[::1]:7778/acc", None),
+            ("http://crex:0/acc", None),
+            ("http://crex:x/acc", None),
+            ("tcp://crex:6789", None),
+            ("udp://10.0.0.7:7778", None),
+        ] {
+            assert_eq!(given(stated).as_deref(), expected, "{stated}");
+        }
     }
 }

@@ -330,7 +330,7 @@ impl Core {
         }
         if let Some(known) = self.table.directory.known(&name) {
             let at = known.locations.first();
-            let address = at.and_then(|at| at.address().parse::<SocketAddr>().ok());
+            let address = at.and_then(|at| at.authority().parse::<SocketAddr>().ok());
             let same = address.is_some_and(|address| address.ip().to_canonical() == from);
             let age = now.utc.duration_since(known.registered);
             let is_due = at != Some(&location) || age.is_ok_and(|age| age >= HEARD_AGAIN_AFTER);

@@ -34,7 +34,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[transport.serial]\nlisten = []\n",
-            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic",
+            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, http",
         ),
         (
             "[mts]\nname.first = \"x\"\n",
@@ -75,12 +75,12 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
             "fipa.toml:4: `mts.transports` is invalid: \"tpc\": unknown transport \"tpc\" \
-             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\ntransports = [\"udt\"]\n",
             "fipa.toml:2: `mts.transports` is invalid: \"udt\": unknown transport \"udt\" \
-             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
@@ -175,7 +175,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, http",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -225,7 +225,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, http",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",
@@ -292,6 +292,11 @@ fn mistakes_are_reported_with_line_and_key() {
             "[platform]\nams = \"arm_.*\"\n",
             "fipa.toml:2: `platform.ams` cannot be \"arm_.*\", which is no name of an agent; \
              use true, false, or a name without any of * + ? [ ( { | ^ $ \\",
+        ),
+        (
+            "[discovery.static]\necho = [\"http://:7778/acc\"]\n",
+            "fipa.toml:2: `discovery.static.echo` lists http://:7778/acc, which has no host or a wrong \
+             port; write for example http://10.0.0.7:7778/acc",
         ),
         // Files that are not TOML.
         (

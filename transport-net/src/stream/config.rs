@@ -108,6 +108,25 @@ impl StreamConfig {
         let _anybody = ip;
         true
     }
+
+    /// Checks that letters may be sent to a legacy peer at this address.
+    ///
+    /// # Errors
+    /// When it would have to prove its identity, which it cannot.
+    #[cfg(feature = "ip")]
+    pub(crate) fn check_legacy_peer(
+        &self,
+        peer: std::net::SocketAddr,
+    ) -> Result<(), fipa_transport::TransportError> {
+        if self.gives_legacy_peers_at(peer.ip()) {
+            return Ok(());
+        }
+        let detail = format!(
+            "{peer} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
+        );
+        let fault = fipa_transport::TransportErrorKind::Refused;
+        Err(fipa_transport::TransportError::new(fault, detail))
+    }
 }
 
 /// Limits of an endpoint that sends letters over byte streams. Memory is bounded by about

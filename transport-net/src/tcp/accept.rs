@@ -7,8 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
-use fipa_transport::{LegacySource, ListenError};
-use socket2::{Domain, Protocol, SockRef, Socket, Type};
+use fipa_transport::LegacySource;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
@@ -17,9 +16,8 @@ use tokio::time::{sleep, sleep_until, timeout};
 use super::accept_queue::{self, Full, QueueTurn, TURN};
 use super::endpoint::TcpEndpoint;
 use super::unframed::{self, UnframedError};
-use crate::address::{self, AddressError};
 use crate::log_limit::warn_limited;
-use crate::stream::config::Limits;
+use crate::sockets::prepare;
 use crate::stream::counters::count;
 use crate::stream::endpoint::UnprovedSlot;
 use crate::stream::frame::{FrameReader, MAGIC};
@@ -29,50 +27,6 @@ use crate::stream::source::{Home, QuotaKey, Source};
 #[cfg(feature = "secure")]
 use crate::stream::tls;
 use crate::stream::wire;
-
-/// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
-/// while this process is stopped.
-const BACKLOG: i32 = 1024;
-
-/// Opens a listening socket, and returns the address that it is bound to. Must be called within a
-/// runtime.
-pub(crate) fn listen(text: &str) -> Result<(TcpListener, SocketAddr), ListenError> {
-    let unavailable = |error: AddressError| ListenError::Unavailable(error.to_string());
-    let failed = |source| ListenError::Bind {
-        address: text.to_owned(),
-        source,
-    };
-    let address = address::numeric(text).map_err(unavailable)?;
-    let socket = open(address).map_err(|error| address::cannot_bind(text, &error))?;
-    let bound = socket.local_addr().map_err(failed)?;
-    let socket = TcpListener::from_std(socket).map_err(failed)?;
-    Ok((socket, bound))
-}
-
-fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
-    let socket = Socket::new(
-        Domain::for_address(address),
-        Type::STREAM.nonblocking(),
-        Some(Protocol::TCP),
-    )?;
-    // A restarted process gets its port although connections linger. Two listeners on one port
-    // remain impossible.
-    socket.set_reuse_address(true)?;
-    if address.is_ipv6() {
-        socket.set_only_v6(true)?;
-    }
-    socket.bind(&address.into())?;
-    socket.listen(BACKLOG)?;
-    Ok(socket.into())
-}
-
-/// Sets the options of a connected socket.
-pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
-    stream.set_nodelay(true)?;
-    // Bounds the time without an acknowledgment of the peer's host, for example after a cable was
-    // unplugged.
-    SockRef::from(stream).set_tcp_user_timeout(Some(limits.keep_alive.saturating_mul(2)))
-}
 
 /// Accepts connections until it is aborted.
 pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {

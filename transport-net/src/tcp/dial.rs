@@ -11,11 +11,10 @@ use tokio::net::TcpStream;
 use tokio::task::JoinSet;
 use tokio::time::sleep;
 
-use super::accept::prepare;
 use super::endpoint::TcpEndpoint;
 use crate::end::ConnectionEnd;
-use crate::stream::config::Limits;
-use crate::stream::dialing::{Unreachable, addresses, first, reach};
+use crate::sockets::{connect, prepare};
+use crate::stream::dialing::{addresses, reach};
 use crate::stream::frame::FrameReader;
 use crate::stream::link::{Link, LinkTask};
 use crate::stream::proof::Proof;
@@ -93,14 +92,6 @@ async fn prove(
     Ok((wire::plain(stream), Proof::default()))
 }
 
-/// Opens a connection to the first of these addresses that accepts one.
-pub(crate) async fn open(
-    limits: &Limits,
-    addresses: Vec<String>,
-) -> Result<(TcpStream, SocketAddr), Unreachable> {
-    first(limits, addresses, connect).await
-}
-
 /// Opens a connection, and after a while another one if there is no answer: the system retransmits
 /// a lost SYN only after one second, and then after two. The first open connection is used.
 async fn connect_with_retries(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
@@ -112,13 +103,4 @@ async fn connect_with_retries(address: SocketAddr) -> io::Result<(TcpStream, Soc
             () = sleep(RETRY_AFTER), if asked.len() < MAX_CONNECTS => {}
         }
     }
-}
-
-async fn connect(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
-    let stream = TcpStream::connect(address).await?;
-    // Without a listener on an ephemeral port, a host can connect to itself.
-    if stream.local_addr()? == stream.peer_addr()? {
-        return Err(io::ErrorKind::ConnectionRefused.into());
-    }
-    Ok((stream, address))
 }

@@ -11,7 +11,7 @@ use tokio::time::sleep;
 
 use super::accept_queue::{AcceptQueue, Full};
 use super::endpoint::TcpEndpoint;
-use super::legacy_sender::LegacySenders;
+use crate::legacy::queues::LegacySenders;
 use crate::log_limit::PerSecond;
 use crate::stream::counters::count;
 

@@ -5,14 +5,13 @@
 //! * [`dial`] and [`accept`] open connections.
 //! * [`accept_queue`]: the order in which accepted connections are read.
 //! * [`unframed`]: letters from legacy peers, on the same port.
-//! * [`legacy_sender`]: letters to legacy peers, in their [`dialect`].
+//! * [`legacy_sender`]: letters to legacy peers, in their [dialect](crate::legacy::dialect).
 //! * [`legacy`]: the state of both, which an [`endpoint`] holds beside its framed connections.
 
 mod accept;
 mod accept_queue;
 mod config;
 mod dial;
-mod dialect;
 mod endpoint;
 mod legacy;
 mod legacy_sender;
@@ -22,13 +21,15 @@ use std::sync::Arc;
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, Parcel, Signature, Sink, Ticket,
-    Transport, TransportError, TransportErrorKind,
+    Transport, TransportError,
 };
 use tokio::runtime::Handle;
 
 pub use self::config::TcpConfig;
 use self::endpoint::TcpEndpoint;
+use self::legacy_sender::TcpSender;
 use crate::end::ConnectionEnd;
+use crate::sockets;
 use crate::stream::config::StreamConfig;
 use crate::stream::counters::Counters;
 use crate::stream::endpoint::Endpoint;
@@ -87,7 +88,7 @@ impl TcpTransport {
         self.endpoint.tally().read()
     }
 
-    /// Queues a letter for a legacy peer, and starts the task that sends it.
+    /// Queues a letter for a legacy peer.
     fn dispatch_legacy(
         &self,
         attempt: AttemptId,
@@ -97,16 +98,14 @@ impl TcpTransport {
         let Some(sink) = self.endpoint.sink() else {
             return Err(ConnectionEnd::Closed.after());
         };
-        let senders = &self.endpoint.legacy.senders;
-        if senders.take(&self.endpoint, attempt, to, parcel)? {
-            let run = legacy_sender::run(self.endpoint.clone(), sink, to.clone());
-            let task = self.endpoint.runtime.spawn(run);
-            if task.is_finished() && senders.take_back(attempt, to) {
-                let detail = "the runtime of this endpoint has been shut down";
-                return Err(TransportError::new(TransportErrorKind::Closed, detail));
-            }
-        }
-        Ok(())
+        let endpoint = &self.endpoint;
+        let context = (endpoint.limits(), &endpoint.runtime, sink);
+        let sender = || TcpSender {
+            endpoint: endpoint.clone(),
+            to: to.clone(),
+        };
+        let senders = &endpoint.legacy.senders;
+        senders.send(context, attempt, to, parcel, sender)
     }
 }
 
@@ -126,7 +125,7 @@ impl Transport for TcpTransport {
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let runtime = &self.endpoint.runtime;
         self.endpoint
-            .listen(sink, &self.listen, accept::listen, |socket| {
+            .listen(sink, &self.listen, sockets::listen, |socket| {
                 runtime.spawn(accept::accept(self.endpoint.clone(), socket))
             })
     }

@@ -21,6 +21,8 @@ pub(crate) enum TranslateError {
     Write(#[from] EncodeError),
     #[error("the receiver's name is not valid: {0:?}")]
     Receiver(String),
+    #[error("the message has no sender, and JADE discards such messages without a notice")]
+    NoSender,
     #[error("{0} is not the signature of a legacy peer")]
     NoDialect(Signature),
 }
@@ -29,7 +31,9 @@ impl TranslateError {
     /// Returns the fault of an attempt that ends with this error.
     pub(crate) fn fault(&self) -> TransportErrorKind {
         match self {
-            Self::Read(_) | Self::Write(_) | Self::Receiver(_) => TransportErrorKind::Inexpressible,
+            Self::Read(_) | Self::Write(_) | Self::Receiver(_) | Self::NoSender => {
+                TransportErrorKind::Inexpressible
+            }
             Self::NoDialect(_) => TransportErrorKind::Incompatible,
         }
     }
@@ -56,6 +60,9 @@ pub(crate) fn translate(
             Ok([envelope.encode(representation, dialect)?, message])
         }
         Signature::JadeProxy => {
+            if message.sender().is_none() {
+                return Err(TranslateError::NoSender);
+            }
             let message = with_address(message, here);
             let message = message.encode(Representation::String, Dialect::Jade)?;
             // JADE counts characters, in US-ASCII unless the envelope names another encoding.

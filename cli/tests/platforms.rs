@@ -1,0 +1,301 @@
+//! The commands with agents of other platforms over HTTP. A platform is a thread that reads and writes
+//! the recorded bytes of JADE.
+
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use common::{Host, Running};
+use fipa::{Message, Performative};
+use serde_json::{Value, json};
+
+macro_rules! recorded {
+    ($file:literal) => {
+        include_bytes!(concat!(
+            "../../transport-net/tests/data/jade_http/",
+            $file,
+            ".bin"
+        ))
+        .as_slice()
+    };
+}
+
+const ANSWER: &[u8] = recorded!("keepalive-http-response-from-jade");
+
+/// Requests that JADE has accepted, from `rusty@rustap` to `echo@jadetest`.
+const REQUESTS: [&[u8]; 3] = [
+    recorded!("string.1-request-to-jade"),
+    recorded!("xml.1-request-to-jade"),
+    recorded!("bitefficient.1-request-to-jade"),
+];
+
+/// Requests of JADE, from `echo@jadetest` to `rusty@rustap`.
+const REPLIES: [&[u8]; 3] = [
+    recorded!("string.3-echo-reply-from-jade"),
+    recorded!("xml.3-echo-reply-from-jade"),
+    recorded!("bitefficient.3-echo-reply-from-jade"),
+];
+
+/// JADE's report that it has no agent `nobody@jadetest`.
+const FAILURE: &[u8] = recorded!("failure-unknown-agent.3-ams-failure-from-jade");
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn replaced(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
+    let (from, mut rest, mut out) = (from.as_bytes(), bytes, Vec::new());
+    while let Some(at) = rest.windows(from.len()).position(|it| it == from) {
+        out.extend(&rest[..at]);
+        out.extend(to.as_bytes());
+        rest = &rest[at + from.len()..];
+    }
+    out.extend(rest);
+    out
+}
+
+/// Returns a recorded request with the addresses of this test instead of those of the recording.
+fn at(request: &[u8], addresses: &[(&str, &str)]) -> Vec<u8> {
+    let mut bytes = request.to_vec();
+    for (from, to) in addresses {
+        bytes = replaced(&bytes, from, to);
+    }
+    let head = bytes.windows(4).position(|it| it == b"\r\n\r\n").unwrap() + 4;
+    let text = String::from_utf8(bytes[..head].to_vec()).unwrap();
+    let (_, length) = text.split_once("Content-Length: ").unwrap();
+    let length = length.lines().next().unwrap();
+    // JADE writes two bytes behind the body.
+    let uncounted = if bytes.ends_with(b"\r\n\r\n") { 2 } else { 0 };
+    let now = (bytes.len() - head - uncounted).to_string();
+    let field = |length: &str| format!("Content-Length: {length}\r\n");
+    replaced(&bytes, &field(length), &field(&now))
+}
+
+/// Sends a request as JADE does, and checks the answer.
+fn post(request: &[u8], to: &str) {
+    let mut stream = TcpStream::connect(to).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.write_all(request).unwrap();
+    let mut answer = [0; 15];
+    stream.read_exact(&mut answer).unwrap();
+    assert_eq!(&answer, b"HTTP/1.1 200 OK");
+}
+
+/// Reads a request, answers it as JADE does, and returns its message.
+fn accept(listener: &TcpListener) -> Message {
+    listener.set_nonblocking(true).unwrap();
+    let until = Instant::now() + PATIENCE;
+    let mut stream = loop {
+        match listener.accept() {
+            Ok((stream, _)) => break stream,
+            Err(error) => assert!(Instant::now() < until, "no request came: {error}"),
+        }
+        thread::sleep(Duration::from_millis(1));
+    };
+    stream.set_nonblocking(false).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let mut bytes = Vec::new();
+    let mut more = [0; 65536];
+    let body = loop {
+        let len = stream.read(&mut more).unwrap();
+        assert!(len > 0, "the request is not complete");
+        bytes.extend(&more[..len]);
+        let Some(head) = bytes.windows(4).position(|it| it == b"\r\n\r\n") else {
+            continue;
+        };
+        let text = String::from_utf8(bytes[..head].to_vec()).unwrap();
+        let (_, length) = text.split_once("Content-Length: ").unwrap();
+        let length: usize = length.lines().next().unwrap().parse().unwrap();
+        if bytes.len() == head + 4 + length {
+            break String::from_utf8(bytes[head..].to_vec()).unwrap();
+        }
+    };
+    stream.write_all(ANSWER).unwrap();
+    let payload = body.split("\r\n\r\n").nth(3).unwrap();
+    let (payload, _) = payload.rsplit_once("\r\n--").unwrap();
+    let payload = payload.to_owned().into_bytes();
+    let payload = fipa_acl::Payload {
+        head: payload.into(),
+        ..fipa_acl::Payload::default()
+    };
+    Message::decode(&payload).unwrap()
+}
+
+/// Receives a request, and then sends this one.
+fn answers_with(listener: &TcpListener, request: Vec<u8>, to: String) -> JoinHandle<Message> {
+    let listener = listener.try_clone().unwrap();
+    thread::spawn(move || {
+        let message = accept(&listener);
+        post(&request, &to);
+        message
+    })
+}
+
+/// Starts a gateway with HTTP. Returns the address of HTTP, too.
+fn gateway(host: &Host, settings: &[&str]) -> (Running, String) {
+    let mut arguments = vec![
+        "up",
+        "--json",
+        "--set",
+        "mts.transports=[\"shm\", \"unix\", \"tcp\", \"http\"]",
+        "--set",
+        "transport.http.listen=127.0.0.1:0",
+    ];
+    for setting in settings {
+        arguments.extend(["--set", setting]);
+    }
+    let gateway = host.start(&arguments);
+    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
+    let locations = ready["locations"].as_array().unwrap();
+    let mut http = locations.iter().filter_map(|it| {
+        let address = it.as_str()?.strip_prefix("http://")?;
+        address.strip_suffix("/acc").map(str::to_owned)
+    });
+    (gateway, http.next().unwrap())
+}
+
+#[test]
+fn an_agent_answers_a_platform_at_the_address_in_the_letter() {
+    let host = Host::new();
+    let (_gateway, http) = gateway(&host, &[]);
+    let _echo = host.echo("echo@jadetest");
+    // The entries of agents have no locations that only legacy peers may use.
+    let agents = host.run(&["agents", "--json"]).done_json().to_string();
+    assert!(!agents.contains("http://"), "{agents}");
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    for request in REQUESTS {
+        post(
+            &at(
+                request,
+                &[("127.0.0.1:9901", &here), ("127.0.0.1:7778", &http)],
+            ),
+            &http,
+        );
+        let reply = accept(&platform);
+        assert_eq!(reply.receivers()[0].name(), "rusty@rustap");
+        assert_eq!(reply.content().unwrap(), "hello jade");
+        assert_eq!(reply.in_reply_to(), Some("rw-1"));
+        assert_eq!(reply.conversation_id(), Some("conv-1"));
+        let sender = reply.sender().unwrap();
+        assert_eq!(sender.name(), "echo@jadetest");
+        assert_eq!(sender.addresses(), [&*format!("http://{http}/acc")]);
+    }
+}
+
+#[test]
+fn a_platform_that_states_its_name_is_answered_at_the_address_of_its_connection() {
+    let host = Host::new();
+    let (_gateway, http) = gateway(&host, &[]);
+    let _echo = host.echo("echo@jadetest");
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = platform.local_addr().unwrap().port();
+    let named = format!("jade.example:{port}");
+    let [request, ..] = REQUESTS;
+    post(&at(request, &[("127.0.0.1:9901", &named)]), &http);
+    assert_eq!(accept(&platform).content().unwrap(), "hello jade");
+}
+
+#[test]
+fn a_platform_gets_a_failure_for_an_agent_that_does_not_exist() {
+    let host = Host::new();
+    let (_gateway, http) = gateway(&host, &[]);
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    let [request, ..] = REQUESTS;
+    post(&at(request, &[("127.0.0.1:9901", &here)]), &http);
+    let failure = accept(&platform);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.in_reply_to(), Some("rw-1"));
+    let text = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
+    assert!(
+        text.contains("(MTS-error (agent-identifier :name \"echo@jadetest\")"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_letter_is_sent_to_a_platform_and_its_reply_or_failure_is_received() {
+    let host = Host::new();
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    let peers = format!(
+        "discovery.static={{ \"echo@jadetest\" = [\"http://{here}/acc\"], \
+         \"nobody@jadetest\" = [\"http://{here}/acc\"] }}"
+    );
+    let (_gateway, http) = gateway(&host, &[&peers]);
+    let known = |name: &str| loop {
+        let all = host.run(&["agents", name, "--json"]).done_json();
+        if let agent @ Value::Object(_) = &all["agents"][0] {
+            return agent.clone();
+        }
+    };
+    known("echo@jadetest");
+    let send = |to: &'static str, conversation: &'static str| {
+        [
+            "send",
+            "--to",
+            to,
+            "--from",
+            "rusty@rustap",
+            "--conversation-id",
+            conversation,
+            "--reply-with",
+            "rw-1",
+            "--content",
+            "hello jade",
+            "--wait",
+            "--timeout",
+            "30s",
+            "--json",
+        ]
+    };
+    for reply in REPLIES {
+        let reply = at(
+            reply,
+            &[("127.0.0.1:7778", &here), ("127.0.0.1:9901", &http)],
+        );
+        let sent = answers_with(&platform, reply, http.clone());
+        let json = host.run(&send("echo@jadetest", "conv-1")).done_json();
+        assert_eq!(json["deliveries"][0]["outcome"], "sent");
+        assert_eq!(json["deliveries"][0]["via"], "http");
+        assert_eq!(json["reply"]["performative"], "inform");
+        assert_eq!(json["reply"]["content"], "hello jade");
+        let sent = sent.join().unwrap();
+        assert_eq!(sent.receivers()[0].name(), "echo@jadetest");
+        let sender = sent.sender().unwrap();
+        assert_eq!(sender.addresses(), [&*format!("http://{http}/acc")]);
+    }
+    known("nobody@jadetest");
+    let failure = at(
+        FAILURE,
+        &[("127.0.0.1:7778", &here), ("127.0.0.1:9904", &http)],
+    );
+    let sent = answers_with(&platform, failure, http.clone());
+    let (json, output) = host.run(&send("nobody@jadetest", "fail-1")).failed_json();
+    sent.join().unwrap();
+    let reason = "Agent not found: getContainerID() failed to find agent nobody@jadetest";
+    let failure =
+        json!({ "from": "ams@jadetest", "receiver": "nobody@jadetest", "reason": reason });
+    assert_eq!(json["failures"], json!([failure]));
+    assert!(
+        output.starts_with(&format!("error: not delivered: {reason}\n")),
+        "{output}"
+    );
+    // The platform ends.
+    drop(platform);
+    let (json, _) = host
+        .run(&[
+            "send",
+            "--to",
+            "echo@jadetest",
+            "--deadline",
+            "2s",
+            "--json",
+        ])
+        .failed_json();
+    assert_eq!(json["deliveries"][0]["outcome"], "failed");
+}

@@ -1,0 +1,234 @@
+//! The client: letters to platforms.
+//!
+//! Each platform has one connection at a time, which stays open between letters. A letter whose
+//! first byte was written is never repeated: the platform may have taken it, and would take a
+//! repetition for another letter.
+
+use std::io::{self, Read as _};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use fipa_acl::escape;
+use fipa_transport::{Conclusion, Location, TransportError, TransportErrorKind};
+use socket2::SockRef;
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
+use tokio::time::{Instant, timeout_at};
+
+use super::HttpEndpoint;
+use super::request;
+use super::response::{Response, ResponseReader};
+use super::url::{PATH, Url};
+use crate::legacy::dialect::translate;
+use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
+use crate::sockets::{self, prepare};
+use crate::stream::counters::count;
+use crate::stream::dialing::{Unreachable, first};
+
+/// Time for which a connection stays open without a letter: less than the 60 s after which JADE
+/// closes it, because a letter on a connection that the platform closes is unconfirmed.
+const IDLE: Duration = Duration::from_secs(20);
+
+/// Number of bytes that are read at a time.
+const READ: usize = 4096;
+
+/// Maximum length of a request that is written in one piece.
+const ONE_PIECE: usize = 64 << 10;
+
+/// Sends letters to one platform.
+pub(super) struct HttpSender {
+    endpoint: Arc<HttpEndpoint>,
+    to: Location,
+    connection: Option<Connection>,
+}
+
+/// An open connection to a platform.
+struct Connection {
+    stream: TcpStream,
+    reader: ResponseReader,
+    /// The address of this endpoint for the answers of the platform, if it listens where the
+    /// platform can reach it.
+    here: Option<String>,
+    used: Instant,
+}
+
+impl HttpSender {
+    pub(super) fn new(endpoint: Arc<HttpEndpoint>, to: Location) -> Self {
+        Self {
+            endpoint,
+            to,
+            connection: None,
+        }
+    }
+
+    async fn send(
+        &mut self,
+        delivery: &LegacyDelivery,
+        progress: &Progress<'_>,
+    ) -> Result<Conclusion, Conclusion> {
+        let endpoint = self.endpoint.clone();
+        let not_sent = |fault, detail: &dyn std::fmt::Display| {
+            Conclusion::NotSent(TransportError::new(fault, detail))
+        };
+        let url = Url::parse(self.to.address())
+            .map_err(|error| not_sent(TransportErrorKind::Unreachable, &error))?;
+        let signature = self.to.signature();
+        let in_dialect = |here: Option<&str>| {
+            translate(&delivery.letter, &delivery.receiver, signature, here)
+                .map_err(|error| not_sent(error.fault(), &error))
+        };
+        let mut connection = match self.connection.take().and_then(Connection::usable) {
+            Some(connection) => connection,
+            None => {
+                // No connection is opened for a letter that is not sent.
+                in_dialect(None)?;
+                self.open(&url).await.map_err(Conclusion::NotSent)?
+            }
+        };
+        let [envelope, message] = in_dialect(connection.here.as_deref())?;
+        let Some(boundary) = endpoint.boundary(&[&envelope, &message]) else {
+            let detail = "no boundary is absent from the letter";
+            return Err(not_sent(TransportErrorKind::Inexpressible, &detail));
+        };
+        let charset = (!message.is_ascii()).then_some("UTF-8");
+        let payload = (message.len(), charset);
+        let (head, end) = request::write(&url, &boundary, &envelope, payload, true);
+        if let Err(abandoned) = progress.begin() {
+            self.connection = Some(connection);
+            return Err(abandoned);
+        }
+        let pieces = match head.len() + message.len() <= ONE_PIECE {
+            true => vec![[&head[..], &message, end.as_bytes()].concat().into()],
+            false => vec![Bytes::from(head), message, Bytes::from(end)],
+        };
+        let patience = endpoint.stream.limits().stall_timeout;
+        for piece in pieces {
+            let written = progress
+                .write(&mut connection.stream, piece, patience)
+                .await;
+            written.map_err(|error| progress.broken(error))?;
+        }
+        let answer = connection.answer(patience).await;
+        let answer = answer.map_err(Conclusion::Unconfirmed)?;
+        connection.used = Instant::now();
+        self.connection = answer.keeps.then_some(connection);
+        if answer.status != 200 {
+            let reason = escape(&answer.reason);
+            let detail = format!("the platform answered {} {reason}", answer.status);
+            return Err(not_sent(TransportErrorKind::Refused, &detail));
+        }
+        count(&endpoint.stream.tally().unframed_out);
+        Ok(Conclusion::Handed)
+    }
+
+    /// Opens a connection to the platform.
+    async fn open(&self, url: &Url) -> Result<Connection, TransportError> {
+        let endpoint = &self.endpoint.stream;
+        let addresses = vec![url.target().to_owned()];
+        let opened = first(endpoint.limits(), addresses, sockets::connect).await;
+        let (stream, peer) = opened.map_err(|Unreachable(what)| {
+            count(&endpoint.tally().dial_failures);
+            let detail = format!("{}: {what}", url.target());
+            TransportError::new(TransportErrorKind::Unreachable, detail)
+        })?;
+        endpoint.config.check_legacy_peer(peer)?;
+        let broken = |error| TransportError::new(TransportErrorKind::Broken, error);
+        prepare(&stream, endpoint.limits()).map_err(broken)?;
+        let local = stream.local_addr().map_err(broken)?;
+        Ok(Connection {
+            stream,
+            reader: ResponseReader::default(),
+            here: here(&endpoint.listening(), local),
+            used: Instant::now(),
+        })
+    }
+}
+
+impl LegacySender for HttpSender {
+    async fn deliver(&mut self, delivery: &LegacyDelivery, progress: &Progress<'_>) -> Conclusion {
+        let sent = self.send(delivery, progress).await;
+        sent.unwrap_or_else(|conclusion| conclusion)
+    }
+
+    async fn idle(&mut self) {
+        let idle = IDLE.min(self.endpoint.stream.limits().idle_close);
+        let Some(connection) = &mut self.connection else {
+            return;
+        };
+        let until = connection.used + idle;
+        if timeout_at(until, connection.closed()).await.is_err() {
+            tracing::debug!(to = %self.to, "closing an idle connection");
+        }
+        self.connection = None;
+    }
+}
+
+impl Connection {
+    /// Reads the answer to a request.
+    async fn answer(&mut self, patience: Duration) -> Result<Response, TransportError> {
+        let until = Instant::now() + patience;
+        loop {
+            let answer = self.reader.next();
+            let incompatible = |error| TransportError::new(TransportErrorKind::Incompatible, error);
+            if let Some(answer) = answer.map_err(incompatible)? {
+                return Ok(answer);
+            }
+            let buffer = self.reader.buffer();
+            buffer.reserve(READ);
+            match timeout_at(until, self.stream.read_buf(buffer)).await {
+                Ok(Ok(0)) => {
+                    let detail = "the platform closed the connection without an answer";
+                    return Err(TransportError::new(TransportErrorKind::Broken, detail));
+                }
+                Ok(Ok(_)) => {}
+                Ok(Err(error)) => {
+                    return Err(TransportError::new(TransportErrorKind::Broken, error));
+                }
+                Err(_) => {
+                    let detail = "the platform did not answer in time (stall_timeout)";
+                    return Err(TransportError::new(TransportErrorKind::TimedOut, detail));
+                }
+            }
+        }
+    }
+
+    /// Returns the connection if the platform has not closed it. The rest of an earlier answer may
+    /// have arrived. The socket itself is queried, because the runtime learns of bytes later.
+    fn usable(mut self) -> Option<Self> {
+        let mut bytes = [0; READ];
+        loop {
+            let read = (&*SockRef::from(&self.stream)).read(&mut bytes);
+            match read {
+                Ok(len @ 1..) => self.absorb(bytes.get(..len)?).then_some(())?,
+                Ok(0) => return None,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Some(self),
+                Err(_) => return None,
+            }
+        }
+    }
+
+    /// Skips bytes that arrive between two requests. Returns whether the connection is usable.
+    fn absorb(&mut self, bytes: &[u8]) -> bool {
+        self.reader.buffer().extend_from_slice(bytes);
+        matches!(self.reader.next(), Ok(None))
+    }
+
+    /// Completes when the platform has closed the connection.
+    async fn closed(&mut self) {
+        let mut bytes = [0; READ];
+        loop {
+            match self.stream.read(&mut bytes).await {
+                Ok(len @ 1..) if self.absorb(bytes.get(..len).unwrap_or_default()) => {}
+                _ => return,
+            }
+        }
+    }
+}
+
+/// Returns the URL of this endpoint at the local address of a connection, if it listens there.
+fn here(listening: &[String], local: SocketAddr) -> Option<String> {
+    let address = sockets::listening_at(listening, local)?;
+    Some(format!("http://{address}{PATH}"))
+}

@@ -1,0 +1,599 @@
+//! Letters over HTTP, with a platform that reads and writes the recorded bytes of JADE.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread;
+use std::time::Duration;
+
+use bytes::Bytes;
+use common::{Party, Recorder, config, letter_parcel, until};
+use fipa_acl::{
+    AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
+};
+use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, TransportErrorKind};
+use fipa_transport_net::{HttpConfig, HttpTransport, Limits};
+
+const STRING: &[u8] = include_bytes!("data/jade_http/string.3-echo-reply-from-jade.bin");
+const XML: &[u8] = include_bytes!("data/jade_http/xml.3-echo-reply-from-jade.bin");
+const BIT_EFFICIENT: &[u8] =
+    include_bytes!("data/jade_http/bitefficient.3-echo-reply-from-jade.bin");
+const ONCE: &[u8] = include_bytes!("data/jade_http/string.1-request-to-jade.bin");
+const KEPT_ANSWER: &[u8] = include_bytes!("data/jade_http/keepalive-http-response-from-jade.bin");
+const LAST_ANSWER: &[u8] = include_bytes!("data/jade_http/string.4-http-response-to-jade.bin");
+const OK: &str = "HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: Keep-Alive\r\n\r\n";
+
+/// A watchdog for what never comes.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+type Platform = Party<HttpTransport>;
+
+fn with(limits: Limits) -> Platform {
+    let tcp = config(&["127.0.0.1:0"]);
+    let config = HttpConfig {
+        listen: tcp.listen,
+        identity: tcp.identity,
+        limits,
+        #[cfg(feature = "secure")]
+        security: None,
+    };
+    Party::over(Recorder::default(), |runtime| {
+        HttpTransport::new(config, runtime)
+    })
+}
+
+fn party() -> Platform {
+    with(config(&[]).limits)
+}
+
+fn connect(to: &Platform) -> TcpStream {
+    let stream = TcpStream::connect(to.location().authority()).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream
+}
+
+/// Reads an answer, which has no body.
+fn answer(stream: &mut TcpStream) -> String {
+    let mut text = Vec::new();
+    while !text.ends_with(b"\r\n\r\n") {
+        let mut byte = [0];
+        stream.read_exact(&mut byte).unwrap();
+        text.extend(byte);
+    }
+    String::from_utf8(text).unwrap()
+}
+
+/// Returns the messages that have arrived, once there are so many.
+fn messages(at: &Platform, count: usize) -> Vec<Message> {
+    until("the letters", || {
+        (at.sink.record.lock().unframed.len() >= count).then_some(())
+    });
+    let record = at.sink.record.lock();
+    assert_eq!(record.unframed.len(), count);
+    let messages = record.unframed.iter().map(|(letter, via)| {
+        assert_eq!(*via, Kind::Http);
+        let (envelope, _) = Envelope::decode(&letter.envelope()).unwrap();
+        let message = Message::decode(letter.payload()).unwrap();
+        let intended = envelope.effective().intended_receivers;
+        assert_eq!(intended, message.receivers());
+        message
+    });
+    messages.collect()
+}
+
+#[test]
+fn letters_of_jade_arrive_over_one_connection_in_all_encodings() {
+    let party = party();
+    let location = party.location().to_string();
+    assert!(location.ends_with("/acc"), "{location}");
+    let mut jade = connect(&party);
+    for bytes in [STRING, XML, BIT_EFFICIENT, XML] {
+        jade.write_all(bytes).unwrap();
+        assert_eq!(answer(&mut jade), OK);
+    }
+    for message in messages(&party, 4) {
+        assert_eq!(*message.performative(), Performative::Inform);
+        assert_eq!(message.content().unwrap(), "hello jade");
+        assert_eq!(message.sender().unwrap().name(), "echo@jadetest");
+        assert_eq!(message.in_reply_to(), Some("rw-1"));
+    }
+    assert_eq!(party.transport.counters().unframed_in, 4);
+}
+
+#[test]
+fn a_client_that_closes_gets_the_recorded_answer() {
+    let party = party();
+    let mut jade = connect(&party);
+    jade.write_all(ONCE).unwrap();
+    let mut all = Vec::new();
+    jade.read_to_end(&mut all).unwrap();
+    assert_eq!(all, LAST_ANSWER);
+    assert_eq!(messages(&party, 1)[0].content().unwrap(), "hello jade");
+}
+
+#[test]
+fn requests_that_arrive_together_or_byte_by_byte_are_answered_in_order() {
+    let party = party();
+    let mut jade = connect(&party);
+    let named = |number: usize| {
+        let text = String::from_utf8(STRING.to_vec()).unwrap();
+        // The length stays the same.
+        text.replace("hello jade", &format!("hello {number:04}"))
+    };
+    let together: String = (0..50).map(named).collect();
+    jade.write_all(together.as_bytes()).unwrap();
+    for _ in 0..50 {
+        assert_eq!(answer(&mut jade), OK);
+    }
+    for byte in named(50).as_bytes() {
+        jade.write_all(&[*byte]).unwrap();
+    }
+    assert_eq!(answer(&mut jade), OK);
+    for (number, message) in messages(&party, 51).iter().enumerate() {
+        let expected = format!("hello {number:04}");
+        assert_eq!(message.content().unwrap(), &expected);
+    }
+}
+
+#[test]
+fn a_letter_that_is_repeated_on_a_new_connection_arrives_once() {
+    let party = party();
+    let mut used = connect(&party);
+    for bytes in [XML, STRING] {
+        used.write_all(bytes).unwrap();
+        assert_eq!(answer(&mut used), OK);
+    }
+    // The client has not seen the answer to the second request, and repeats it.
+    let mut fresh = connect(&party);
+    fresh.write_all(STRING).unwrap();
+    assert_eq!(answer(&mut fresh), OK);
+    assert_eq!(messages(&party, 2).len(), 2);
+    // The next one is another letter, whatever its bytes.
+    fresh.write_all(STRING).unwrap();
+    assert_eq!(answer(&mut fresh), OK);
+    assert_eq!(messages(&party, 3).len(), 3);
+}
+
+#[test]
+fn equal_letters_on_connections_of_their_own_all_arrive() {
+    let party = party();
+    for _ in 0..3 {
+        let mut jade = connect(&party);
+        jade.write_all(ONCE).unwrap();
+        jade.read_to_end(&mut Vec::new()).unwrap();
+    }
+    assert_eq!(messages(&party, 3).len(), 3);
+}
+
+#[test]
+fn other_requests_are_answered_with_their_status_and_end_the_connection() {
+    let party = with(Limits {
+        max_letter: 100_000,
+        handshake_timeout: Duration::from_millis(500),
+        ..config(&[]).limits
+    });
+    let post = |fields: &str| format!("POST /acc HTTP/1.1\r\n{fields}\r\n");
+    let mixed = "Content-Type: multipart/mixed; boundary=\"b\"\r\n";
+    let many_parts = "--b\r\n\r\n<envelope/>\r\n".repeat(5000);
+    let cases = [
+        ("GET /acc HTTP/1.1\r\n\r\n".to_owned(), "405"),
+        ("POST /x HTTP/1.1\r\n\r\n".to_owned(), "404"),
+        (post("Content-Type: application/json\r\n"), "415"),
+        (
+            post(&format!("{mixed}Transfer-Encoding: chunked\r\n")),
+            "411",
+        ),
+        (post(&format!("{mixed}Origin: http://x\r\n")), "403"),
+        (post(&format!("{mixed}Content-Length: 99999999\r\n")), "413"),
+        (
+            post(&format!("{mixed}{}", "a: b\r\n".repeat(20_000))),
+            "431",
+        ),
+        (
+            format!(
+                "{}{many_parts}",
+                post(&format!("{mixed}Content-Length: {}\r\n", many_parts.len()))
+            ),
+            "400",
+        ),
+        (
+            format!("{}12345", post(&format!("{mixed}Content-Length: 5\r\n"))),
+            "400",
+        ),
+        // The rest of the head does not come.
+        ("POST /acc HT".to_owned(), "408"),
+    ];
+    for (request, status) in cases {
+        let mut client = connect(&party);
+        client.write_all(request.as_bytes()).unwrap();
+        let mut all = String::new();
+        client.read_to_string(&mut all).unwrap();
+        let expected = format!("HTTP/1.1 {status} ");
+        assert!(all.starts_with(&expected), "{:.80}: {all}", request);
+        assert!(all.contains("Connection: close"), "{all}");
+    }
+    assert_eq!(party.transport.counters().refused_nonsense, 10);
+    // A connection without a request is closed without an answer.
+    let mut silent = connect(&party);
+    assert_eq!(silent.read_to_end(&mut Vec::new()).unwrap(), 0);
+    let mut jade = connect(&party);
+    jade.write_all(STRING).unwrap();
+    assert_eq!(answer(&mut jade), OK);
+    assert_eq!(messages(&party, 1).len(), 1);
+}
+
+#[test]
+fn a_body_that_stops_is_given_up() {
+    let party = with(Limits {
+        stall_timeout: Duration::from_millis(300),
+        ..config(&[]).limits
+    });
+    let mut slow = connect(&party);
+    slow.write_all(&STRING[..STRING.len() - 100]).unwrap();
+    let mut all = String::new();
+    slow.read_to_string(&mut all).unwrap();
+    assert!(all.starts_with("HTTP/1.1 408 "), "{all}");
+}
+
+#[test]
+fn idle_connections_give_way_and_busy_ones_do_not() {
+    let party = with(Limits {
+        max_connections: 4,
+        ..config(&[]).limits
+    });
+    // All loopback addresses together have half of the connections.
+    let mut first = connect(&party);
+    first.write_all(STRING).unwrap();
+    assert_eq!(answer(&mut first), OK);
+    let mut busy = connect(&party);
+    busy.write_all(&STRING[..50]).unwrap();
+    until("the busy connection", || {
+        let mut third = connect(&party);
+        third.write_all(STRING).unwrap();
+        let mut all = Vec::new();
+        // While the task of the busy connection has not read its bytes, it is idle, too.
+        let _ = third.shutdown(Shutdown::Write);
+        (third.read_to_end(&mut all).is_ok() && !all.is_empty()).then_some(())
+    });
+    // The first one was evicted.
+    first.write_all(STRING).ok();
+    assert!(matches!(first.read(&mut [0]), Ok(0) | Err(_)));
+    busy.write_all(&STRING[50..]).unwrap();
+    assert_eq!(answer(&mut busy), OK);
+}
+
+fn parcel(sequence: u64, content: &str) -> Parcel {
+    let arm = AgentId::new("arm_1").unwrap();
+    let rover = AgentId::new("rover").unwrap();
+    let message = Message::builder(Performative::Inform)
+        .sender(rover.clone())
+        .receiver(arm.clone())
+        .content(content.to_owned())
+        .conversation_id("c-1")
+        .build()
+        .unwrap();
+    let base = EnvelopeParams {
+        to: vec![arm.clone()],
+        from: Some(rover),
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        date: Some("20261120T112644481Z".parse().unwrap()),
+        intended_receivers: vec![arm],
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
+    letter_parcel(sequence, letter)
+}
+
+/// A platform that reads requests, and writes an answer to each.
+struct Jade {
+    location: Location,
+    /// The number of the connection of each request, and its bytes.
+    requests: Receiver<(usize, Vec<u8>)>,
+    /// A notification for each connection that it has closed.
+    closed: Receiver<()>,
+}
+
+impl Jade {
+    /// Starts a platform. `answers` returns the bytes of the answer to a request, by the number of
+    /// the request, and whether the connection stays open.
+    fn new(answers: impl Fn(usize) -> (Vec<u8>, bool) + Send + 'static) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let location = format!("http://{}/acc", listener.local_addr().unwrap());
+        let (sender, requests) = channel();
+        let (closing, closed) = channel();
+        thread::spawn(move || {
+            let mut count = 0;
+            for (connection, stream) in listener.incoming().enumerate() {
+                serve(stream.unwrap(), connection, &mut count, &answers, &sender);
+                let _ended = closing.send(());
+            }
+        });
+        Self {
+            location: location.parse().unwrap(),
+            requests,
+            closed,
+        }
+    }
+
+    fn answering(answer: &'static [u8]) -> Self {
+        Self::new(move |_| (answer.to_vec(), true))
+    }
+
+    /// Returns the next request, as JADE reads it.
+    fn request(&self) -> (usize, Envelope, Message) {
+        let (connection, bytes) = self.requests.recv_timeout(PATIENCE).unwrap();
+        let head = position(&bytes, b"\r\n\r\n").unwrap();
+        let text = std::str::from_utf8(&bytes[..head]).unwrap();
+        let (_, behind) = text.split_once("boundary=\"").unwrap();
+        let (boundary, _) = behind.split_once('"').unwrap();
+        let delimiter = format!("\r\n--{boundary}");
+        let mut parts = Vec::new();
+        let mut rest = &bytes[head..];
+        while let Some(at) = position(rest, delimiter.as_bytes()) {
+            parts.push(&rest[..at]);
+            rest = &rest[at + delimiter.len()..];
+        }
+        assert_eq!(rest, b"--\r\n");
+        let of_part = |part: &[u8]| part[position(part, b"\r\n\r\n").unwrap() + 4..].to_vec();
+        let envelope = of_part(parts[1]);
+        let (envelope, len) = Envelope::decode(&envelope).map(|it| (it.0, it.1)).unwrap();
+        assert_eq!(len, of_part(parts[1]).len());
+        let payload = Bytes::from(of_part(parts[2]));
+        let named = envelope.effective().payload_length;
+        let characters = std::str::from_utf8(&payload).unwrap().chars().count();
+        assert_eq!(named, Some(characters as u64));
+        (
+            connection,
+            envelope,
+            Message::decode(&payload.into()).unwrap(),
+        )
+    }
+}
+
+fn position(bytes: &[u8], what: &[u8]) -> Option<usize> {
+    bytes.windows(what.len()).position(|it| it == what)
+}
+
+/// Serves one connection.
+fn serve(
+    mut stream: TcpStream,
+    connection: usize,
+    count: &mut usize,
+    answers: &impl Fn(usize) -> (Vec<u8>, bool),
+    sender: &Sender<(usize, Vec<u8>)>,
+) {
+    loop {
+        let mut bytes = Vec::new();
+        let mut more = [0; 65536];
+        let end = loop {
+            let Ok(len @ 1..) = stream.read(&mut more) else {
+                return;
+            };
+            bytes.extend(&more[..len]);
+            let Some(head) = position(&bytes, b"\r\n\r\n") else {
+                continue;
+            };
+            let text = String::from_utf8(bytes[..head].to_vec()).unwrap();
+            let (_, behind) = text.split_once("Content-Length: ").unwrap();
+            let length: usize = behind.lines().next().unwrap().parse().unwrap();
+            let end = head + 4 + length;
+            if bytes.len() >= end {
+                break end;
+            }
+        };
+        assert_eq!(bytes.len(), end, "nothing follows an unanswered request");
+        sender.send((connection, bytes)).unwrap();
+        let (answer, stays) = answers(*count);
+        *count += 1;
+        stream.write_all(&answer).unwrap();
+        if !stays {
+            return;
+        }
+    }
+}
+
+#[test]
+fn letters_leave_in_order_over_one_connection_although_answers_have_no_length() {
+    let (party, jade) = (party(), Jade::answering(KEPT_ANSWER));
+    for number in 0..20 {
+        let text = number.to_string();
+        party
+            .send(number, &jade.location, parcel(number, &text))
+            .unwrap();
+    }
+    for number in 0..20 {
+        assert_eq!(party.conclusion(number), Conclusion::Handed);
+        let (connection, envelope, message) = jade.request();
+        assert_eq!(connection, 0);
+        assert_eq!(message.content().unwrap(), &number.to_string());
+        let effective = envelope.effective();
+        assert_eq!(effective.intended_receivers[0].name(), "arm_1");
+        assert_eq!(
+            effective.acl_representation,
+            Some(AclRepresentation::String)
+        );
+        // The platform can answer.
+        let here = party.location().to_string();
+        for sender in [message.sender(), effective.from.as_ref()] {
+            assert_eq!(sender.unwrap().addresses(), [&*here]);
+        }
+    }
+    // The connection is still open for the next letter.
+    party
+        .send(20, &jade.location, parcel(20, "grüße 漢"))
+        .unwrap();
+    assert_eq!(party.conclusion(20), Conclusion::Handed);
+    let (connection, envelope, message) = jade.request();
+    assert_eq!(
+        (connection, message.content().unwrap()),
+        (0, &"grüße 漢".into())
+    );
+    assert_eq!(
+        envelope.effective().payload_encoding.as_deref(),
+        Some("UTF-8")
+    );
+    assert_eq!(party.transport.counters().unframed_out, 21);
+}
+
+#[test]
+fn a_closed_connection_is_replaced_for_the_next_letter() {
+    let party = party();
+    // The answer announces that the connection stays open, but it is closed.
+    let jade = Jade::new(|_| (KEPT_ANSWER.to_vec(), false));
+    for number in 0..5 {
+        party
+            .send(number, &jade.location, parcel(number, "x"))
+            .unwrap();
+        assert_eq!(party.conclusion(number), Conclusion::Handed);
+        assert_eq!(jade.request().0, number as usize);
+        jade.closed.recv_timeout(PATIENCE).unwrap();
+    }
+    let closing = Jade::answering(LAST_ANSWER);
+    for number in 10..13 {
+        party
+            .send(number, &closing.location, parcel(number, "x"))
+            .unwrap();
+        assert_eq!(party.conclusion(number), Conclusion::Handed);
+    }
+}
+
+#[test]
+fn an_answer_other_than_200_is_a_failed_attempt() {
+    let party = party();
+    let refusal = b"HTTP/1.1 406 Not\x1b[31m Acceptable\r\nContent-Length: 2\r\n\r\nno";
+    let jade = Jade::answering(refusal);
+    for number in 0..2 {
+        party
+            .send(number, &jade.location, parcel(number, "x"))
+            .unwrap();
+        match party.conclusion(number) {
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, TransportErrorKind::Refused, "{error}");
+                assert!(
+                    error.detail.contains("406 Not\\u{1b}[31m Acceptable"),
+                    "{error}"
+                );
+            }
+            other => panic!("{other:?}"),
+        }
+        assert_eq!(jade.request().0, 0);
+    }
+}
+
+#[test]
+fn a_letter_without_an_answer_is_unconfirmed_and_never_repeated() {
+    let party = with(Limits {
+        stall_timeout: Duration::from_millis(300),
+        ..config(&[]).limits
+    });
+    // The first request is answered, the second is not, and the connection is closed.
+    let jade = Jade::new(|number| match number {
+        1 => (Vec::new(), false),
+        _ => (KEPT_ANSWER.to_vec(), true),
+    });
+    for number in 0..3 {
+        let text = number.to_string();
+        party
+            .send(number, &jade.location, parcel(number, &text))
+            .unwrap();
+    }
+    assert_eq!(party.conclusion(0), Conclusion::Handed);
+    assert!(matches!(party.conclusion(1), Conclusion::Unconfirmed(_)));
+    assert_eq!(party.conclusion(2), Conclusion::Handed);
+    for (number, connection) in [0, 0, 1].into_iter().enumerate() {
+        let (over, _, message) = jade.request();
+        assert_eq!(over, connection);
+        assert_eq!(message.content().unwrap(), &number.to_string());
+    }
+    // A silent platform.
+    let silent = Jade::new(|_| (Vec::new(), true));
+    party.send(5, &silent.location, parcel(5, "x")).unwrap();
+    match party.conclusion(5) {
+        Conclusion::Unconfirmed(error) => {
+            assert_eq!(error.fault, TransportErrorKind::TimedOut, "{error}")
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn letters_that_jade_would_lose_are_not_sent() {
+    let (party, jade) = (party(), Jade::answering(KEPT_ANSWER));
+    let arm = AgentId::new("arm_1").unwrap();
+    let message = Message::builder(Performative::Inform).receiver(arm.clone());
+    let base = EnvelopeParams {
+        to: vec![arm],
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        from: Some(AgentId::new("rover").unwrap()),
+        date: Some("20261120T112644481Z".parse().unwrap()),
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let letter = Letter::new(
+        envelope.encode_standard().unwrap(),
+        message.build().unwrap().to_payload(),
+    );
+    party
+        .send(1, &jade.location, letter_parcel(1, letter))
+        .unwrap();
+    match party.conclusion(1) {
+        Conclusion::NotSent(error) => {
+            assert_eq!(error.fault, TransportErrorKind::Inexpressible, "{error}");
+            assert!(error.detail.contains("no sender"), "{error}");
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn large_letters_pass_in_both_directions() {
+    let (near, far) = (party(), party());
+    let content = "<a & b> \"quoted\" \\ \u{e9}\n".repeat(100_000);
+    near.send(1, far.location(), parcel(1, &content)).unwrap();
+    assert_eq!(near.conclusion(1), Conclusion::Handed);
+    let [message] = &messages(&far, 1)[..] else {
+        panic!("one message");
+    };
+    assert_eq!(message.content().unwrap(), &content);
+    // The answer to the address in it arrives.
+    let back = message.sender().unwrap().addresses()[0].parse().unwrap();
+    far.send(1, &back, parcel(1, &content)).unwrap();
+    assert_eq!(far.conclusion(1), Conclusion::Handed);
+    assert_eq!(messages(&near, 1)[0].content().unwrap(), &content);
+}
+
+#[test]
+fn a_closed_endpoint_concludes_its_letters() {
+    let party = party();
+    let silent = Jade::new(|_| (Vec::new(), true));
+    for number in 0..3 {
+        party
+            .send(number, &silent.location, parcel(number, "x"))
+            .unwrap();
+    }
+    silent.request();
+    let mut client = connect(&party);
+    client.write_all(STRING).unwrap();
+    assert_eq!(answer(&mut client), OK);
+    party.transport.close();
+    assert!(matches!(party.conclusion(0), Conclusion::Unconfirmed(_)));
+    for number in 1..3 {
+        assert!(matches!(party.conclusion(number), Conclusion::NotSent(_)));
+    }
+    assert_eq!(client.read_to_end(&mut Vec::new()).unwrap_or(0), 0);
+    let after = party.send(9, &silent.location, parcel(9, "x")).unwrap_err();
+    assert_eq!(after.fault, TransportErrorKind::Closed);
+}
