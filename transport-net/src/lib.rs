@@ -5,12 +5,14 @@
 //! * `TcpTransport` (feature `ip`) carries them in the same frames over one persistent connection
 //!   per peer, and accepts the unframed letters of legacy peers on the same port.
 //! * `UdpTransport` (feature `ip`) carries parcels over UDP, one acknowledged datagram each.
+//! * `UdtTransport` (feature `udt`) exchanges letters with legacy peers over UDT.
 //! * `QuicTransport` (feature `quic`) carries parcels in the same frames over QUIC, each in a
 //!   stream of its own.
 //!
 //! Each has a module tree of its own. They share frames and connections (`stream`), the
 //! introduction of endpoints ([`Identity`], `hello`), addresses as text (`address`), the encoding
-//! of answers (`answer`), rate limits (`rate_limit`) and the reasons for which connections end
+//! of answers (`answer`), sockets and tasks over UDP (`datagrams`), the letters of legacy peers
+//! (`legacy`), rate limits (`rate_limit`) and the reasons for which connections end
 //! (`end`). `stream` depends on none of the transports.
 //!
 //! Routes, retries, order across transports and directories do not belong here: a transport tries
@@ -19,6 +21,8 @@
 #[cfg(feature = "ip")]
 mod address;
 mod answer;
+#[cfg(feature = "ip")]
+mod datagrams;
 mod end;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
@@ -27,6 +31,8 @@ mod hello;
 mod identity;
 #[cfg(feature = "ip")]
 mod interfaces;
+#[cfg(feature = "ip")]
+mod legacy;
 #[cfg_attr(
     not(any(feature = "ip", test)),
     expect(dead_code, reason = "only TCP resets connections")
@@ -46,6 +52,8 @@ mod stream;
 mod tcp;
 #[cfg(feature = "ip")]
 mod udp;
+#[cfg(feature = "udt")]
+mod udt;
 mod unix;
 
 #[cfg(feature = "ip")]
@@ -59,4 +67,6 @@ pub use stream::counters::Counters;
 pub use tcp::{TcpConfig, TcpTransport};
 #[cfg(feature = "ip")]
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};
+#[cfg(feature = "udt")]
+pub use udt::{UdtConfig, UdtCounters, UdtLimits, UdtTransport};
 pub use unix::{UnixConfig, UnixError, UnixTransport};

@@ -23,9 +23,9 @@ use tokio::time::timeout;
 
 use super::accept::prepare;
 use super::dial;
-use super::dialect::translate;
 use super::endpoint::TcpEndpoint;
 use crate::end::ConnectionEnd;
+use crate::legacy::dialect::translate;
 use crate::stream::counters::count;
 use crate::stream::dialing::Unreachable;
 

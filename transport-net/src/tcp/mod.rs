@@ -5,14 +5,13 @@
 //! * [`dial`] and [`accept`] open connections.
 //! * [`accept_queue`]: the order in which accepted connections are read.
 //! * [`unframed`]: letters from legacy peers, on the same port.
-//! * [`legacy_sender`]: letters to legacy peers, in their [`dialect`].
+//! * [`legacy_sender`]: letters to legacy peers, in their [dialect](crate::legacy::dialect).
 //! * [`legacy`]: the state of both, which an [`endpoint`] holds beside its framed connections.
 
 mod accept;
 mod accept_queue;
 mod config;
 mod dial;
-mod dialect;
 mod endpoint;
 mod legacy;
 mod legacy_sender;
