@@ -341,7 +341,7 @@ pub(crate) fn accepted() -> Conclusion {
     Conclusion::Answered(Answer::Accepted)
 }
 
-pub(crate) fn until<T>(what: &str, condition: impl Fn() -> Option<T>) -> T {
+pub(crate) fn until<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let started = Instant::now();
     loop {
         if let Some(value) = condition() {

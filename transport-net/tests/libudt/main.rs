@@ -510,17 +510,12 @@ fn a_peer_that_does_not_read_again_is_given_up() {
             .send(number, &listener.location, parcel(number, content))
             .unwrap();
     }
-    let last = party.conclusion(19);
-    assert!(
-        matches!(&last, Conclusion::NotSent(error) if error.fault == TransportErrorKind::TimedOut),
-        "{last:?}"
-    );
     let conclusions: Vec<Conclusion> = (0..20).map(|number| party.conclusion(number)).collect();
-    let unconfirmed = conclusions
-        .iter()
-        .filter(|it| matches!(it, Conclusion::Unconfirmed(_)));
-    assert!(unconfirmed.count() >= 1, "{conclusions:?}");
     assert_eq!(conclusions[0], Conclusion::Handed);
+    let stalled = conclusions.iter().filter(
+        |it| matches!(it, Conclusion::Unconfirmed(error) if error.fault == TransportErrorKind::TimedOut),
+    );
+    assert!(stalled.count() >= 1, "{conclusions:?}");
 }
 
 #[test]
