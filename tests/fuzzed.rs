@@ -39,6 +39,8 @@ mod seeds;
 mod shm;
 #[path = "../fuzz/src/texts.rs"]
 mod texts;
+#[path = "../fuzz/src/udt.rs"]
+mod udt;
 
 use std::time::{Duration, Instant};
 
@@ -109,6 +111,6 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, config, datagrams, delivery, exchange, framed, host, mdns, shm, texts
+        access, config, datagrams, delivery, exchange, framed, host, mdns, shm, texts, udt
     );
 }

@@ -12,6 +12,7 @@ pub mod mdns;
 pub mod seeds;
 pub mod shm;
 pub mod texts;
+pub mod udt;
 
 use std::fmt::Debug;
 

@@ -54,11 +54,14 @@ pub(crate) enum Fragments {
     Allowed,
 }
 
+/// Calls a function with a protocol, under its lock.
+pub(crate) type WithProtocol<'a, P> = dyn Fn(&mut dyn FnMut(&mut P)) + 'a;
+
 /// A protocol without sockets and clock: datagrams, calls and the time in, datagrams and events out.
 ///
 /// A connection that this side opens is identified by a number until [`poll_gone`](Self::poll_gone)
 /// returns that number.
-pub(crate) trait Protocol: Send + 'static {
+pub(crate) trait Protocol: Sized + Send + 'static {
     /// An event for the sink.
     type Event: Send;
 
@@ -116,5 +119,5 @@ pub(crate) trait Protocol: Send + 'static {
 
     /// Delivers an event. It is called without a lock on the protocol; `with` calls a function with
     /// the protocol.
-    fn deliver(event: Self::Event, sink: &dyn Sink, with: &dyn Fn(&mut dyn FnMut(&mut Self)));
+    fn deliver(event: Self::Event, sink: &dyn Sink, with: &WithProtocol<'_, Self>);
 }

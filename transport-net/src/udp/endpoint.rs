@@ -7,7 +7,7 @@ use std::time::Instant;
 use fipa_transport::{Arrival, Kind, Sink, TransportError, Verdict};
 
 use super::core::{Core, CoreEvent};
-use crate::datagrams::{Fragments, Path, Protocol, Transmit};
+use crate::datagrams::{Fragments, Path, Protocol, Transmit, WithProtocol};
 
 impl Protocol for Core {
     type Event = CoreEvent;
@@ -75,7 +75,7 @@ impl Protocol for Core {
         self.close();
     }
 
-    fn deliver(event: CoreEvent, sink: &dyn Sink, with: &dyn Fn(&mut dyn FnMut(&mut Self))) {
+    fn deliver(event: CoreEvent, sink: &dyn Sink, with: &WithProtocol<'_, Self>) {
         match event {
             CoreEvent::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
             CoreEvent::Introduced(peer) => sink.introduced(&peer),

@@ -15,8 +15,8 @@ use super::packet::{
 };
 use super::receiver::{Arrived, Dropped, Receiver, WINDOW};
 use super::sender::Sender;
-use crate::datagrams::Path;
 use crate::datagrams::dialling::Greeting;
+use crate::datagrams::{Outbound, Path};
 use crate::end::ConnectionEnd;
 use crate::log_limit::warn_limited;
 
@@ -432,7 +432,7 @@ impl Connection {
         self,
         end: &ConnectionEnd,
         now: Instant,
-    ) -> (Vec<(AttemptId, Conclusion)>, Option<(Path, Vec<u8>)>) {
+    ) -> (Vec<(AttemptId, Conclusion)>, Option<Outbound>) {
         let time = self.time(now);
         let shutdown = match (self.path, end) {
             (None, _) | (_, ConnectionEnd::Hangup | ConnectionEnd::Broken(_)) => None,

@@ -7,7 +7,7 @@ use std::time::Instant;
 use fipa_transport::{Kind, LegacySource, Sink, TransportError};
 
 use super::core::{Core, CoreEvent};
-use crate::datagrams::{Fragments, Path, Protocol, Transmit};
+use crate::datagrams::{Fragments, Path, Protocol, Transmit, WithProtocol};
 use crate::legacy::letter;
 use crate::log_limit::warn_limited;
 
@@ -76,7 +76,7 @@ impl Protocol for Core {
         self.close(Instant::now());
     }
 
-    fn deliver(event: CoreEvent, sink: &dyn Sink, with: &dyn Fn(&mut dyn FnMut(&mut Self))) {
+    fn deliver(event: CoreEvent, sink: &dyn Sink, with: &WithProtocol<'_, Self>) {
         match event {
             CoreEvent::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
             // The reservation of the memory ends when the sink has the letter.

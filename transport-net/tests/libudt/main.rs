@@ -47,13 +47,17 @@ fn peer() -> Option<&'static Path> {
     static BUILT: OnceLock<Option<PathBuf>> = OnceLock::new();
     let built = BUILT.get_or_init(|| {
         let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/libudt/peer.cpp");
-        let program = Path::new(env!("CARGO_TARGET_TMPDIR"))
-            .join(format!("libudt-peer-{}", std::process::id()));
+        let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("libudt-peer");
+        // Other processes may build it at the same time.
+        let built = program.with_extension(std::process::id().to_string());
         let mut compiler = Command::new("g++");
-        compiler.args(["-std=c++17", "-O2", "-o"]).arg(&program);
+        compiler.args(["-std=c++17", "-O2", "-o"]).arg(&built);
         let output = compiler.arg(&source).args(["-ludt", "-pthread"]).output();
         let missing = match output {
-            Ok(output) if output.status.success() => return Some(program),
+            Ok(output) if output.status.success() => {
+                std::fs::rename(built, &program).unwrap();
+                return Some(program);
+            }
             Ok(output) => {
                 let errors = String::from_utf8_lossy(&output.stderr).into_owned();
                 let is_missing = errors.contains("udt/udt.h: No such file");
