@@ -30,6 +30,8 @@
 //! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
 //! [transport.quic]
 //! listen = ["127.0.0.1:0"]            # as for tcp; always encrypted; needs security.keys
+//! [transport.udt]
+//! listen = ["127.0.0.1:0"]            # as for tcp; for legacy peers; with keys, only security.legacy_peers
 //! [discovery]
 //! mdns = true
 //! interfaces = []                     # names or addresses; empty: all
@@ -146,6 +148,9 @@ pub struct Transports {
     pub udp: Listen,
     /// `[transport.quic]`; needs [`Security::keys`].
     pub quic: Listen,
+    /// `[transport.udt]`; for legacy peers only. With [`Security::keys`], letters are exchanged only
+    /// with the addresses in [`Security::legacy_peers`].
+    pub udt: Listen,
 }
 
 /// `[transport.shm]`: shared memory.
@@ -173,7 +178,7 @@ pub struct Tcp {
     pub processes: bool,
 }
 
-/// `[transport.udp]` and `[transport.quic]`: a network transport of the gateway.
+/// `[transport.udp]`, `[transport.quic]` and `[transport.udt]`: a network transport of the gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Listen {
@@ -370,7 +375,8 @@ impl Config {
                     processes: false,
                 },
                 udp: loopback.clone(),
-                quic: loopback,
+                quic: loopback.clone(),
+                udt: loopback,
             },
             discovery: Discovery {
                 mdns: true,

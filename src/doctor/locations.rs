@@ -8,13 +8,18 @@ const LOCATIONS: &str = "locations";
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let transport = &config.transport;
-    let listens: [(Kind, &[String]); 3] = [
+    let listens: [(Kind, &[String]); 4] = [
         (Kind::Tcp, &transport.tcp.listen),
         (Kind::Udp, &transport.udp.listen),
         (Kind::Quic, &transport.quic.listen),
+        (Kind::Udt, &transport.udt.listen),
     ];
     let used = |kind| config.mts.transports.contains(&kind);
-    let built = |kind| kind != Kind::Quic || cfg!(feature = "quic");
+    let built = |kind| match kind {
+        Kind::Quic => cfg!(feature = "quic"),
+        Kind::Udt => cfg!(feature = "udt"),
+        _ => true,
+    };
     let mut found = Vec::new();
     for (kind, listen) in listens {
         if !used(kind) || !built(kind) {

@@ -239,6 +239,14 @@ impl Running {
     }
 
     /// Its process identifier.
+    /// The location of this kind in the first line of a gateway, without the signature.
+    pub(crate) fn location(&self, kind: &str) -> String {
+        let scheme = format!("{kind}://");
+        let (_, rest) = self.ready.split_once(&scheme).unwrap();
+        let end = rest.find([';', '#', ' ', ',', '"', '\n']).unwrap_or(rest.len());
+        format!("{scheme}{}", &rest[..end])
+    }
+
     pub(crate) fn pid(&self) -> String {
         self.child.id().to_string()
     }

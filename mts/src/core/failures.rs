@@ -181,7 +181,7 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
 
 /// The locations that an agent of a legacy peer states as its own: of its addresses, the numeric
 /// ones of the host that its letter came from. Others could be claimed to make this service send to
-/// a third party.
+/// a third party. Locations of transports that a gateway may lack come last.
 pub(super) fn locations_given<'a>(
     addresses: impl IntoIterator<Item = &'a str>,
     from: LegacySource,
@@ -189,12 +189,14 @@ pub(super) fn locations_given<'a>(
     let locations = addresses.into_iter().filter_map(|address| {
         let location: Location = address.parse().ok()?;
         let claimed: SocketAddr = location.address().parse().ok()?;
-        if claimed.ip().to_canonical() != from.address || !location.kind().is_supported() {
+        if claimed.ip().to_canonical() != from.address {
             return None;
         }
         location.with_signature(from.signature).ok()
     });
-    locations.take(Entry::MAX_LOCATIONS).collect()
+    let mut locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
+    locations.sort_by_key(|location| !location.kind().is_supported());
+    locations
 }
 
 /// An agent that is not in the directory, with the locations that it states as its own.

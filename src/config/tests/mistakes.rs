@@ -32,7 +32,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[transport.serial]\nlisten = []\n",
-            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic",
+            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, udt",
         ),
         (
             "[mts]\nname.first = \"x\"\n",
@@ -68,12 +68,7 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
             "fipa.toml:4: `mts.transports` is invalid: \"tpc\": unknown transport \"tpc\" \
-             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
-        ),
-        (
-            "[mts]\ntransports = [\"udt\"]\n",
-            "fipa.toml:2: `mts.transports` is invalid: \"udt\": unknown transport \"udt\" \
-             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, udt); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
@@ -168,7 +163,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, udt",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -218,7 +213,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, udt",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",
