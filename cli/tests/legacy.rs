@@ -76,7 +76,7 @@ fn letters_to_an_agent_with_only_udt_locations_fail_at_once() {
 fn a_letter_reaches_an_agent_with_only_a_udt_location_if_both_gateways_use_udt() {
     let (here, there) = (Host::new(), Host::new());
     let order = "mts.transports=[\"shm\", \"unix\", \"udt\"]";
-    let gateway = there.start(&["up", "--set", order]);
+    let gateway = there.start(&["up", "--json", "--set", order]);
     let location = gateway.location("udt");
     let mut echo = there.start(&["echo", "cpp", "--count", "1"]);
     let peer = format!("discovery.static={{ cpp = [\"{location}\"] }}");
@@ -87,7 +87,6 @@ fn a_letter_reaches_an_agent_with_only_a_udt_location_if_both_gateways_use_udt()
     let delivery = &sent["deliveries"][0];
     assert_eq!(delivery["outcome"], "sent", "{sent}");
     assert_eq!(echo.end().0, Some(0));
-    assert_eq!(gateway.location("udt"), location);
 }
 
 #[test]

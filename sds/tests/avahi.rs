@@ -10,7 +10,9 @@
 mod common;
 
 use common::{eventually, registration};
-use fipa_sds::{Change, Directory, Entry, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source};
+use fipa_sds::{
+    Change, Directory, Entry, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source,
+};
 use fipa_testbed::{Avahi, Network};
 use fipa_transport::{Incarnation, Location};
 
@@ -178,7 +180,8 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     .await;
     let addresses: Vec<_> = found.locations.iter().map(ToString::to_string).collect();
     // Those of TCP come first.
-    let all = |kind| (7000..7006).map(move |port| format!("{kind}://10.99.0.2:{port};fipa-services"));
+    let all =
+        |kind| (7000..7006).map(move |port| format!("{kind}://10.99.0.2:{port};fipa-services"));
     let expected: Vec<_> = all("tcp").chain(all("udt")).take(8).collect();
     assert_eq!(addresses, expected);
     assert_eq!(found.description, description);

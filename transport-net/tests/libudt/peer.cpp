@@ -7,6 +7,12 @@
 //     Sends each message from its standard input. Prints "ready" when connected, then "sent" after
 //     the last message has been acknowledged.
 //
+//   peer discard ADDRESS PORT
+//     Prints "ready PORT" and receives messages.
+//   peer flood ADDRESS PORT COUNT
+//     Sends the message from its standard input COUNT times. Prints "ready" when connected, then the
+//     seconds until all were acknowledged, and the seconds of the processor.
+//
 // On the standard streams, a message is its length (4 bytes, little-endian) and its bytes.
 
 #include <arpa/inet.h>
@@ -16,6 +22,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <ctime>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -28,6 +35,7 @@ constexpr int most = 10'000'000;
 
 std::mutex output;
 long budget = -1;
+bool discards = false;
 
 [[noreturn]] void fail(const char* what) {
     std::fprintf(stderr, "%s: %s\n", what, UDT::getlasterror().getErrorMessage());
@@ -72,7 +80,9 @@ void receive(UDTSOCKET peer) {
             UDT::close(peer);
             return;
         }
-        print(buffer.data(), static_cast<uint32_t>(length));
+        if (!discards) {
+            print(buffer.data(), static_cast<uint32_t>(length));
+        }
     }
 }
 
@@ -102,7 +112,7 @@ int serve(const char* ip, const char* port) {
     }
 }
 
-int send(const char* ip, const char* port) {
+UDTSOCKET connected(const char* ip, const char* port) {
     const UDTSOCKET peer = UDT::socket(AF_INET, SOCK_DGRAM, 0);
     const sockaddr_in there = address(ip, port);
     if (UDT::connect(peer, reinterpret_cast<const sockaddr*>(&there), sizeof there) == UDT::ERROR) {
@@ -110,18 +120,54 @@ int send(const char* ip, const char* port) {
     }
     std::printf("ready\n");
     std::fflush(stdout);
-    std::vector<char> buffer(most);
+    return peer;
+}
+
+// Reads a message. Returns its length, or 0 at the end.
+uint32_t next(std::vector<char>& buffer) {
     unsigned char header[4];
-    while (read_exactly(reinterpret_cast<char*>(header), sizeof header)) {
-        const uint32_t length = header[0] | header[1] << 8 | header[2] << 16 |
-                                static_cast<uint32_t>(header[3]) << 24;
-        if (length > most || !read_exactly(buffer.data(), length)) {
-            return 1;
-        }
-        const int sent = UDT::sendmsg(peer, buffer.data(), static_cast<int>(length), -1, true);
-        if (sent != static_cast<int>(length)) {
-            fail("sendmsg");
-        }
+    if (!read_exactly(reinterpret_cast<char*>(header), sizeof header)) {
+        return 0;
+    }
+    const uint32_t length = header[0] | header[1] << 8 | header[2] << 16 |
+                            static_cast<uint32_t>(header[3]) << 24;
+    return length <= most && read_exactly(buffer.data(), length) ? length : 0;
+}
+
+void send_one(UDTSOCKET peer, const std::vector<char>& buffer, uint32_t length) {
+    const int sent = UDT::sendmsg(peer, buffer.data(), static_cast<int>(length), -1, true);
+    if (sent != static_cast<int>(length)) {
+        fail("sendmsg");
+    }
+}
+
+double seconds(clockid_t clock) {
+    timespec time{};
+    clock_gettime(clock, &time);
+    return static_cast<double>(time.tv_sec) + static_cast<double>(time.tv_nsec) * 1e-9;
+}
+
+int flood(const char* ip, const char* port, long count) {
+    const UDTSOCKET peer = connected(ip, port);
+    std::vector<char> buffer(most);
+    const uint32_t length = next(buffer);
+    const double begun = seconds(CLOCK_MONOTONIC);
+    const double processor = seconds(CLOCK_PROCESS_CPUTIME_ID);
+    for (long sent = 0; sent < count; ++sent) {
+        send_one(peer, buffer, length);
+    }
+    UDT::close(peer);
+    std::printf("%f %f\n", seconds(CLOCK_MONOTONIC) - begun,
+                seconds(CLOCK_PROCESS_CPUTIME_ID) - processor);
+    std::fflush(stdout);
+    return 0;
+}
+
+int send(const char* ip, const char* port) {
+    const UDTSOCKET peer = connected(ip, port);
+    std::vector<char> buffer(most);
+    while (const uint32_t length = next(buffer)) {
+        send_one(peer, buffer, length);
     }
     // Waits until everything is acknowledged.
     UDT::close(peer);
@@ -137,11 +183,13 @@ int main(int argc, char** argv) {
         return 2;
     }
     UDT::startup();
-    if (std::strcmp(argv[1], "receive") == 0) {
+    discards = std::strcmp(argv[1], "discard") == 0;
+    if (discards || std::strcmp(argv[1], "receive") == 0) {
         budget = argc > 4 ? std::atol(argv[4]) : -1;
         return serve(argv[2], argv[3]);
     }
-    const int code = send(argv[2], argv[3]);
+    const bool floods = std::strcmp(argv[1], "flood") == 0 && argc > 4;
+    const int code = floods ? flood(argv[2], argv[3], std::atol(argv[4])) : send(argv[2], argv[3]);
     UDT::cleanup();
     return code;
 }
