@@ -32,6 +32,8 @@
 //! listen = ["127.0.0.1:0"]            # as for tcp; always encrypted; needs security.keys
 //! [transport.http]
 //! listen = ["127.0.0.1:7778"]         # as for tcp; for JADE and other platforms; never encrypted
+//! [transport.udt]
+//! listen = ["127.0.0.1:0"]            # as for tcp; for legacy peers; with keys, only security.legacy_peers
 //! [discovery]
 //! mdns = true
 //! interfaces = []                     # names or addresses; empty: all
@@ -157,6 +159,9 @@ pub struct Transports {
     /// `[transport.http]`: letters of platforms such as JADE, and to them. With
     /// [`Security::keys`], only of [`Security::legacy_peers`].
     pub http: Listen,
+    /// `[transport.udt]`; for legacy peers only. With [`Security::keys`], letters are exchanged only
+    /// with the addresses in [`Security::legacy_peers`].
+    pub udt: Listen,
 }
 
 /// `[transport.shm]`: shared memory.
@@ -184,7 +189,8 @@ pub struct Tcp {
     pub processes: bool,
 }
 
-/// `[transport.udp]`, `[transport.quic]` and `[transport.http]`: a network transport of the gateway.
+/// `[transport.udp]`, `[transport.quic]`, `[transport.udt]` and `[transport.http]`: a network transport of
+/// the gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Listen {
@@ -404,7 +410,8 @@ impl Config {
                     processes: false,
                 },
                 udp: loopback.clone(),
-                quic: loopback,
+                quic: loopback.clone(),
+                udt: loopback,
                 http: Listen {
                     listen: vec!["127.0.0.1:7778".to_owned()],
                 },

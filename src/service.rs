@@ -175,6 +175,12 @@ impl Service {
         }
     }
 
+    /// Whether this service has a transport of this kind.
+    #[cfg(feature = "net")]
+    pub(crate) fn uses(&self, kind: Kind) -> bool {
+        self.mts.kinds().any(|open| open == kind)
+    }
+
     /// Applies the orders of transports and the deadline of this configuration. For the gateway only.
     #[cfg(feature = "net")]
     pub(crate) fn reorder(&self, config: &Config) {
@@ -305,6 +311,8 @@ fn transports(
             },
             #[cfg(feature = "http")]
             Kind::Http => http(config, role, &maintenance.dir, incarnation, handle),
+            #[cfg(feature = "udt")]
+            Kind::Udt => udt(config, role, &maintenance.dir, incarnation, handle),
             // One configuration serves all processes of a robot; their features may differ.
             other => {
                 tracing::debug!(kind = %other, "this program was built without a transport");
@@ -460,6 +468,36 @@ fn http(
     Ok(Arc::new(HttpTransport::new(config, handle.clone())))
 }
 
+#[cfg(feature = "udt")]
+fn udt(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{UdtConfig, UdtTransport};
+    let config = UdtConfig {
+        listen: config.transport.udt.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: udt_limits(config),
+        #[cfg(feature = "secure")]
+        security: role.security.clone(),
+    };
+    Ok(Arc::new(UdtTransport::new(config, handle.clone())))
+}
+
+/// Returns the limits of UDT, whose largest letter is that of its peers.
+#[cfg(feature = "udt")]
+fn udt_limits(config: &Config) -> fipa_transport_net::UdtLimits {
+    fipa_transport_net::UdtLimits {
+        max_per_address: config.security.peer_connections,
+        peer_letters: config.security.peer_letters as u64,
+        peer_bytes: config.security.peer_bytes,
+        ..fipa_transport_net::UdtLimits::default()
+    }
+}
+
 /// Returns the limits of the transports that carry letters of any size.
 fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
     fipa_transport_net::Limits {
@@ -525,6 +563,12 @@ mod tests {
         let config = Config::load(&sources).unwrap();
         let stream = stream_limits(&config);
         let datagram = datagram_limits(&config);
+        #[cfg(feature = "udt")]
+        {
+            let udt = udt_limits(&config);
+            let limits = (udt.max_per_address, udt.peer_letters, udt.peer_bytes);
+            assert_eq!(limits, (3, 5, 70 << 10));
+        }
         for (connections, letters, bytes) in [
             (
                 stream.max_per_address,

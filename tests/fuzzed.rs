@@ -43,6 +43,8 @@ mod seeds;
 mod shm;
 #[path = "../fuzz/src/texts.rs"]
 mod texts;
+#[path = "../fuzz/src/udt.rs"]
+mod udt;
 
 use std::time::{Duration, Instant};
 
@@ -114,6 +116,6 @@ mod bodies {
 
     bodies!(
         access, config, datagrams, delivery, exchange, framed, host, http, mdns, platform, shm,
-        texts
+        texts, udt
     );
 }

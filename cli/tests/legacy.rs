@@ -73,6 +73,23 @@ fn letters_to_an_agent_with_only_udt_locations_fail_at_once() {
 }
 
 #[test]
+fn a_letter_reaches_an_agent_with_only_a_udt_location_if_both_gateways_use_udt() {
+    let (here, there) = (Host::new(), Host::new());
+    let order = "mts.transports=[\"shm\", \"unix\", \"udt\"]";
+    let gateway = there.start(&["up", "--json", "--set", order]);
+    let location = gateway.location("udt");
+    let mut echo = there.start(&["echo", "cpp", "--count", "1"]);
+    let peer = format!("discovery.static={{ cpp = [\"{location}\"] }}");
+    let _gateway = here.start(&["up", "--set", order, "--set", &peer]);
+    let agent = known(&here, "cpp");
+    assert_eq!(agent["unsupported_transports"], Value::Null);
+    let sent = here.run(&["send", "--to", "cpp", "--json"]).done_json();
+    let delivery = &sent["deliveries"][0];
+    assert_eq!(delivery["outcome"], "sent", "{sent}");
+    assert_eq!(echo.end().0, Some(0));
+}
+
+#[test]
 fn a_failure_message_about_the_letter_is_not_a_reply() {
     let host = Host::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();

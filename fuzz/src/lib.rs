@@ -14,6 +14,7 @@ pub mod platform;
 pub mod seeds;
 pub mod shm;
 pub mod texts;
+pub mod udt;
 
 use std::fmt::Debug;
 

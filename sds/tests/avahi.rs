@@ -10,7 +10,9 @@
 mod common;
 
 use common::registration;
-use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source};
+use fipa_sds::{
+    Change, Directory, Entry, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source,
+};
 use fipa_testbed::{Avahi, Network, until_some_async};
 use fipa_transport::{Incarnation, Location};
 
@@ -139,9 +141,11 @@ async fn peers_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     assert_eq!(found.role, Role::Agent);
     assert_eq!(
         found.locations,
-        ["tcp://192.0.2.2:7788;fipa-services"
-            .parse::<Location>()
-            .unwrap()]
+        [
+            "tcp://192.0.2.2:7788;fipa-services",
+            "udt://192.0.2.2:1;fipa-services"
+        ]
+        .map(|location| location.parse::<Location>().unwrap())
     );
     drop(peer);
     gone(directory, name).await;
@@ -171,19 +175,14 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
 
     let found = until_some_async("all of the peer's locations", || {
         let found = directory.lookup("crane")?;
-        assert!(
-            found
-                .locations
-                .iter()
-                .all(|location| location.kind().name() == "tcp")
-        );
-        (found.locations.len() == 6).then_some(found)
+        (found.locations.len() == Entry::MAX_LOCATIONS).then_some(found)
     })
     .await;
     let addresses: Vec<_> = found.locations.iter().map(ToString::to_string).collect();
-    let expected: Vec<_> = (7000..7006)
-        .map(|port| format!("tcp://10.99.0.2:{port};fipa-services"))
-        .collect();
+    // Those of TCP come first.
+    let all =
+        |kind| (7000..7006).map(move |port| format!("{kind}://10.99.0.2:{port};fipa-services"));
+    let expected: Vec<_> = all("tcp").chain(all("udt")).take(8).collect();
     assert_eq!(addresses, expected);
     assert_eq!(found.description, description);
     assert_eq!(found.agent_type, "crane");

@@ -95,6 +95,10 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
         &["transport", "http", "listen"],
         &config.transport.http.listen,
     );
+    found.listen(
+        &["transport", "udt", "listen"],
+        &config.transport.udt.listen,
+    );
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
@@ -187,6 +191,7 @@ impl Findings {
             (Kind::Tcp, &config.transport.tcp.listen),
             (Kind::Udp, &config.transport.udp.listen),
             (Kind::Http, &config.transport.http.listen),
+            (Kind::Udt, &config.transport.udt.listen),
         ] {
             // `listen` reports entries that are not addresses.
             let mut addresses = listen.iter().filter(|text| is_numeric_address(text));
@@ -307,8 +312,7 @@ impl Findings {
     fn kinds(&mut self, path: &[&str], kinds: &[Kind]) -> bool {
         let before = self.0.len();
         if kinds.is_empty() {
-            let supported = Kind::ALL.into_iter().filter(|kind| kind.is_supported());
-            let names: Vec<&str> = supported.map(Kind::name).collect();
+            let names = Kind::ALL.map(Kind::name);
             let help = format!("list at least one of {}", names.join(", "));
             self.add(path, "is empty", help);
         }

@@ -173,6 +173,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.transport.http.listen),
     },
     Key {
+        path: &["transport", "udt", "listen"],
+        shape: Shape::List,
+        expected: ADDRESSES,
+        write: |config, value| addresses(value).map(|all| config.transport.udt.listen = all),
+        read: |config| Value::list(&config.transport.udt.listen),
+    },
+    Key {
         path: &["discovery", "mdns"],
         shape: Shape::Plain,
         expected: "true or false",
@@ -484,13 +491,8 @@ fn kinds(value: &Toml) -> Result<Vec<Kind>, InvalidValue> {
         let text = value
             .as_str()
             .ok_or_else(|| InvalidValue::kind_of_value(value))?;
-        match text.parse() {
-            Ok(kind) if !Kind::is_supported(kind) => {
-                let error = LocationError::UnknownKind(text.to_owned());
-                Err(InvalidValue::new(value, error))
-            }
-            parsed => parsed.map_err(|error| InvalidValue::new(value, error)),
-        }
+        text.parse()
+            .map_err(|error: LocationError| InvalidValue::new(value, error))
     })
 }
 

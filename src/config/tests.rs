@@ -109,6 +109,7 @@ fn every_key_is_read() {
         tcp.listen = ["[fe80::1%eth0]:7788", "0.0.0.0:7788"]
         udp.listen = []
         quic.listen = ["[::1]:7789"]
+        udt.listen = ["0.0.0.0:7790"]
         [discovery]
         mdns = false
         interfaces = ["wlan0", "10.0.0.7", "fe80::1"]
@@ -156,6 +157,7 @@ fn every_key_is_read() {
     );
     assert!(config.transport.udp.listen.is_empty());
     assert_eq!(config.transport.quic.listen, ["[::1]:7789"]);
+    assert_eq!(config.transport.udt.listen, ["0.0.0.0:7790"]);
     assert_eq!(config.access.rate, 100);
     assert_eq!(config.access.allow[0].sender, "rover_.*");
     assert_eq!(
@@ -324,6 +326,9 @@ listen = ["127.0.0.1:0"]             # default
 
 [transport.http]
 listen = ["127.0.0.1:7778"]          # default
+
+[transport.udt]
+listen = ["127.0.0.1:0"]             # default
 
 [discovery]
 mdns = true                          # default

@@ -15,11 +15,13 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         (Kind::Udp, &transport.udp.listen),
         (Kind::Quic, &transport.quic.listen),
         (Kind::Http, &transport.http.listen),
+        (Kind::Udt, &transport.udt.listen),
     ];
     let used = |kind| config.mts.transports.contains(&kind);
     let built = |kind| match kind {
         Kind::Quic => cfg!(feature = "quic"),
         Kind::Http => cfg!(feature = "http"),
+        Kind::Udt => cfg!(feature = "udt"),
         _ => true,
     };
     let mut found = Vec::new();

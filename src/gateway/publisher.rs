@@ -45,6 +45,12 @@ impl Publisher {
         locations
     }
 
+    /// Whether this gateway lacks the transports of an agent.
+    fn is_unsupported(&self, entry: &Entry) -> bool {
+        let used = |location: &Location| self.service.uses(location.kind());
+        entry.is_unsupported() && !entry.locations.iter().any(used)
+    }
+
     /// Publishes all agents of other hosts on this host.
     pub(super) fn publish(&self) {
         let locations = self.service.locations();
@@ -53,7 +59,7 @@ impl Publisher {
         let all = heard.iter().chain(known.iter());
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
-            .map(|entry| match entry.is_unsupported() {
+            .map(|entry| match self.is_unsupported(entry) {
                 // Its own locations show the reason why letters cannot reach it.
                 true => Entry::clone(entry),
                 false => Entry {

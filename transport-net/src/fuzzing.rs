@@ -13,3 +13,5 @@ pub use crate::secure::certified;
 pub use crate::stream::fuzzing::{Framed, answer_body, frame, hello_body, parcel_body};
 #[cfg(feature = "ip")]
 pub use crate::udp::fuzzing::{Datagrams, Written};
+#[cfg(feature = "udt")]
+pub use crate::udt::fuzzing::{UdtPacket, UdtPackets};

@@ -7,12 +7,14 @@
 //! * `HttpTransport` (feature `http`) exchanges letters with platforms that use FIPA's transport over
 //!   HTTP, such as JADE.
 //! * `UdpTransport` (feature `ip`) carries parcels over UDP, one acknowledged datagram each.
+//! * `UdtTransport` (feature `udt`) exchanges letters with legacy peers over UDT.
 //! * `QuicTransport` (feature `quic`) carries parcels in the same frames over QUIC, each in a
 //!   stream of its own.
 //!
 //! Each has a module tree of its own. They share frames and connections (`stream`), the
 //! introduction of endpoints ([`Identity`], `hello`), addresses as text (`address`), the encoding
-//! of answers (`answer`), rate limits (`rate_limit`) and the reasons for which connections end
+//! of answers (`answer`), sockets and tasks over UDP (`datagrams`), the letters of legacy peers
+//! (`legacy`), rate limits (`rate_limit`) and the reasons for which connections end
 //! (`end`). `stream` depends on none of the transports.
 //!
 //! Routes, retries, order across transports and directories do not belong here: a transport tries
@@ -21,6 +23,8 @@
 #[cfg(feature = "ip")]
 mod address;
 mod answer;
+#[cfg(feature = "ip")]
+mod datagrams;
 mod end;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
@@ -54,6 +58,8 @@ mod stream;
 mod tcp;
 #[cfg(feature = "ip")]
 mod udp;
+#[cfg(feature = "udt")]
+mod udt;
 mod unix;
 
 #[cfg(feature = "ip")]
@@ -69,4 +75,6 @@ pub use stream::counters::Counters;
 pub use tcp::{TcpConfig, TcpTransport};
 #[cfg(feature = "ip")]
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};
+#[cfg(feature = "udt")]
+pub use udt::{UdtConfig, UdtCounters, UdtLimits, UdtTransport};
 pub use unix::{UnixConfig, UnixError, UnixTransport};

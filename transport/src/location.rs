@@ -24,7 +24,7 @@ pub enum Kind {
     Quic,
     /// Framed, acknowledged letters over Unix domain sockets between processes of one host.
     Unix,
-    /// UDT, one of the transports of fipa_services. Not [supported](Kind::is_supported).
+    /// UDT, one of the transports of fipa_services: letters of legacy peers, not encrypted.
     Udt,
     /// Letters in multipart messages over HTTP (FIPA00084): JADE's transport between platforms.
     Http,
@@ -42,8 +42,9 @@ impl Kind {
         Self::Http,
     ];
 
-    /// Whether this project has a transport of this kind. The directory may contain locations of
-    /// other kinds; letters to them fail as [unsupported](crate::FailureReason::Unsupported).
+    /// Whether every gateway can use this kind. UDT is an option of the build, for legacy peers; where
+    /// it is off, letters to agents that have no other locations fail as
+    /// [unsupported](crate::FailureReason::Unsupported).
     #[must_use]
     pub const fn is_supported(self) -> bool {
         !matches!(self, Self::Udt)
@@ -295,7 +296,7 @@ pub enum LocationError {
     #[error("not a location (expected for example tcp://10.0.0.2:7788): {0:?}")]
     NoScheme(String),
     /// No transport has this name.
-    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic, http)")]
+    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic, udt, http)")]
     UnknownKind(String),
     /// The address is empty or too long.
     #[error("the address has {0} bytes; 1 to {max} are allowed", max = Location::MAX_ADDRESS)]

@@ -235,6 +235,17 @@ impl Running {
         tcp.split('#').next().unwrap().to_owned()
     }
 
+    /// Returns the location of this kind, without signature and incarnation, of a gateway that was
+    /// started with `up --json`.
+    #[track_caller]
+    pub(crate) fn location(&self, kind: &str) -> String {
+        let ready: Value = serde_json::from_str(&self.ready).unwrap();
+        let locations = ready["locations"].as_array().unwrap();
+        let mut locations = locations.iter().filter_map(Value::as_str);
+        let found = locations.find(|it| it.starts_with(&format!("{kind}://")));
+        found.unwrap().split([';', '#']).next().unwrap().to_owned()
+    }
+
     /// Its process identifier.
     pub(crate) fn pid(&self) -> String {
         self.child.id().to_string()

@@ -8,7 +8,7 @@ use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry};
 use fipa_transport::{
     Answer, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location, Outcome,
-    Parcel, Report, Stream, Ticket, TransportError, TransportErrorKind,
+    Parcel, Report, Signature, Stream, Ticket, TransportError, TransportErrorKind,
 };
 use smallvec::SmallVec;
 
@@ -217,6 +217,12 @@ const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 const FIRST_PENALTY: Duration = Duration::from_millis(100);
 /// Maximum number of failed routes that are remembered.
 const MAX_HEALTH: usize = 4096;
+
+/// Whether letters may be sent to a location. A service of this project is not reached in the dialect
+/// of legacy peers, whose letters have no number: it could not recognize one that is repeated.
+pub(super) fn leads_to_letters(location: &Location) -> bool {
+    location.signature() == Signature::Frames || !location.incarnation().is_known()
+}
 
 impl AttemptTable {
     pub(crate) fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
@@ -468,7 +474,8 @@ impl AttemptTable {
                 .iter()
                 .filter(move |location| location.kind() == *kind)
         });
-        let untried = ways.filter(|location| !tried.contains(location));
+        let untried =
+            ways.filter(|location| leads_to_letters(location) && !tried.contains(location));
         // The first healthy route; without one, the route that may be retried soonest.
         let mut fallback: Option<(&Location, Instant)> = None;
         for location in untried {

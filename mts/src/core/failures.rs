@@ -185,7 +185,8 @@ const HTTP_PORT: u16 = 7778;
 /// The locations that an agent of a legacy peer states as its own: of its addresses, the numeric
 /// ones of the host that its letter came from. Others could be claimed to make this service send to
 /// a third party. JADE states its host by name; the name is replaced by the address that the letter
-/// came from.
+/// came from. Locations of
+/// transports that a gateway may lack come last.
 pub(super) fn locations_given<'a>(
     addresses: impl IntoIterator<Item = &'a str>,
     from: LegacySource,
@@ -197,12 +198,14 @@ pub(super) fn locations_given<'a>(
             _ => location,
         };
         let claimed: SocketAddr = location.authority().parse().ok()?;
-        if claimed.ip().to_canonical() != from.address || !location.kind().is_supported() {
+        if claimed.ip().to_canonical() != from.address {
             return None;
         }
         location.with_signature(from.signature).ok()
     });
-    locations.take(Entry::MAX_LOCATIONS).collect()
+    let mut locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
+    locations.sort_by_key(|location| !location.kind().is_supported());
+    locations
 }
 
 /// A location of HTTP with a name replaced by the address of the host that states it, and with a

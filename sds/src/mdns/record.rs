@@ -21,7 +21,7 @@
 //! | `fipa-type`, `fipa-description` | full text, when the legacy key has only its beginning |
 //!
 //! Values for legacy peers stay within the limits of those: at most 200 bytes per value, only the
-//! scheme `tcp`, and numeric IPv4 addresses; other locations are left out. A longer value of this
+//! schemes `tcp` and `udt`, and numeric IPv4 addresses; other locations are left out. A longer value of this
 //! project continues in `key.1`, `key.2` and so on. No key occurs twice in a record of this
 //! project. The legacy peers split a long value over several strings with one key, which are joined
 //! when read.
@@ -289,11 +289,11 @@ fn locator(locations: &[Location]) -> String {
     let mut locator = String::new();
     for location in locations {
         let numeric: Result<std::net::SocketAddrV4, _> = location.address().parse();
-        if location.kind() != Kind::Tcp || numeric.is_err() {
+        if !matches!(location.kind(), Kind::Tcp | Kind::Udt) || numeric.is_err() {
             continue;
         }
         let signature = location.signature().signature_type();
-        let one = format!("tcp://{} {signature};", location.address());
+        let one = format!("{}://{} {signature};", location.kind(), location.address());
         if locator.len() + one.len() <= MAX_VALUE {
             locator += &one;
         }
@@ -302,8 +302,7 @@ fn locator(locations: &[Location]) -> String {
 }
 
 /// Parses `address signature[ service-signature];`, repeated. Unknown schemes and signatures are
-/// skipped. Locations without a supported transport are used only when there is no other; they then
-/// show why letters to the agent fail.
+/// skipped. Locations of transports that a gateway may lack come last.
 fn locations_of_locator(locator: &str) -> Vec<Location> {
     let location = |one: &str| {
         let mut words = one.split_ascii_whitespace();
@@ -314,13 +313,10 @@ fn locations_of_locator(locator: &str) -> Vec<Location> {
         };
         address.with_signature(signature).ok()
     };
-    let locations = || locator.split(';').filter_map(location);
-    let supported = locations().filter(|location| location.kind().is_supported());
-    let supported: Vec<Location> = supported.take(Entry::MAX_LOCATIONS).collect();
-    match supported.is_empty() {
-        true => locations().take(Entry::MAX_LOCATIONS).collect(),
-        false => supported,
-    }
+    let mut locations: Vec<Location> = locator.split(';').filter_map(location).collect();
+    locations.sort_by_key(|location| !location.kind().is_supported());
+    locations.truncate(Entry::MAX_LOCATIONS);
+    locations
 }
 
 const TIMESTAMP: &str = "%Y%m%d-%H:%M:%S";
@@ -511,7 +507,8 @@ mod tests {
         let addresses: Vec<String> = addresses.collect();
         assert_eq!(
             addresses.join(" "),
-            "10.0.0.1:7788 10.0.0.2:7788 10.0.0.3:7788 10.0.0.4:7788"
+            "10.0.0.1:7788 10.0.0.2:7788 10.0.0.3:7788 10.0.0.4:7788 \
+             10.0.0.1:1 10.0.0.2:1 10.0.0.3:1 10.0.0.4:1"
         );
     }
 

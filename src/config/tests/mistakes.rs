@@ -34,7 +34,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[transport.serial]\nlisten = []\n",
-            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, http",
+            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, http, udt",
         ),
         (
             "[mts]\nname.first = \"x\"\n",
@@ -75,12 +75,7 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
             "fipa.toml:4: `mts.transports` is invalid: \"tpc\": unknown transport \"tpc\" \
-             (known: shm, unix, tcp, udp, quic, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
-        ),
-        (
-            "[mts]\ntransports = [\"udt\"]\n",
-            "fipa.toml:2: `mts.transports` is invalid: \"udt\": unknown transport \"udt\" \
-             (known: shm, unix, tcp, udp, quic, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, udt, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
@@ -175,7 +170,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, http",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, udt, http",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -225,7 +220,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, http",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, udt, http",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",

@@ -1,9 +1,10 @@
-//! Letters of legacy peers, as far as TCP and HTTP share them.
+//! The letters of legacy peers (fipa_services and JADE), as far as their transports share them.
 //!
+//! * [`letter`]: reading a letter. [`envelope`]: its envelope in the standard dialect.
+//! * [`dialect`]: writing a letter in the dialect of the peer.
 //! * [`queues`]: the letters to each location, one after the other.
-//! * [`dialect`]: letters in the dialect of the peer.
-//! * [`envelope`]: envelopes of legacy peers in the standard dialect.
 
 pub(crate) mod dialect;
 pub(crate) mod envelope;
+pub(crate) mod letter;
 pub(crate) mod queues;

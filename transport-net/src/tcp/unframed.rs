@@ -2,14 +2,14 @@
 //! connection, without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
 use bytes::{Bytes, BytesMut};
-use fipa_acl::{DecodeError, EncodeError, Envelope, Letter};
+use fipa_acl::Letter;
 use fipa_transport::{Kind, LegacySource, Signature};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
 use super::accept_queue::{QueueTurn, TURN};
 use super::endpoint::TcpEndpoint;
-use crate::legacy::envelope::{signature_of, with_stamped_extensions};
+use crate::legacy::letter::{self, LetterError};
 use crate::stream::budget::ReservedBytes;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
@@ -33,10 +33,8 @@ pub(crate) enum UnframedError {
     NoRoom,
     #[error("the connection broke in the middle of the letter: {0}")]
     Broken(#[from] std::io::Error),
-    #[error("its envelope cannot be decoded: {0}")]
-    Envelope(#[from] DecodeError),
-    #[error("its envelope cannot be encoded in the standard dialect: {0}")]
-    Standard(#[from] EncodeError),
+    #[error(transparent)]
+    Letter(#[from] LetterError),
 }
 
 /// A letter with the dialect of its writer and the reservation of its memory.
@@ -56,13 +54,9 @@ pub(crate) async fn read(
     source: &mut (impl AsyncRead + Unpin),
 ) -> Result<Read, UnframedError> {
     let (whole, room) = read_to_end(endpoint, turn, quota_key, source).await?;
-    let (envelope, length) = Envelope::decode(&whole)?;
-    let length = length.min(whole.len());
-    let signature = signature_of(&whole[..length]);
-    let message = whole.slice(length..);
-    let envelope = with_stamped_extensions(envelope).encode_standard()?;
+    let (letter, signature) = letter::standard(&whole)?;
     Ok(Read {
-        letter: Letter::new(envelope, message),
+        letter,
         signature,
         _room: room,
     })

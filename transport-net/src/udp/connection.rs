@@ -9,7 +9,6 @@ mod receiving;
 mod sending;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
-use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -22,12 +21,13 @@ use fipa_transport::{
 
 use super::config::UdpLimits;
 use super::counters::UdpCounters;
-use super::dialling::Dialling;
+use super::dialling::{Dialling, OwnHello};
 use super::mtu::Mtu;
 use super::packet::{self, BASE, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
 use super::received::Received;
 use super::recovery::{Recovery, SentContent};
 use crate::answer;
+use crate::datagrams::{Outbound, Path};
 use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 use crate::rate_limit::PeerRateLimit;
@@ -41,19 +41,6 @@ const LOSSES_OF_LARGE: u8 = 6;
 
 /// Minimum number of retransmissions before a peer counts as silent.
 const MIN_TRIES: u32 = 3;
-
-/// The socket and addresses of a connection.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(crate) struct Path {
-    /// The number of the socket.
-    pub(crate) socket: u32,
-    pub(crate) remote: SocketAddr,
-    /// The local address that the peer sends to, if the socket has several.
-    pub(crate) local: Option<IpAddr>,
-}
-
-/// A datagram with its destination.
-pub(crate) type Outbound = (Path, Vec<u8>);
 
 /// An event of a connection. Events are delivered in order.
 #[derive(Debug)]
@@ -150,7 +137,7 @@ impl Connection {
         hello: Hello,
         now: Instant,
     ) -> Self {
-        let dialling = Dialling::new(id, hello, now + limits.connect_timeout);
+        let dialling = Dialling::new(OwnHello { id, hello }, now + limits.connect_timeout);
         Self {
             expected,
             dialling: Some(dialling),

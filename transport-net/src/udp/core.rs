@@ -23,11 +23,12 @@ use fipa_transport::{
 };
 
 use super::config::UdpLimits;
-use super::connection::{Connection, Event, MAX_ID, Outbound, Path};
-use super::cookie::Cookies;
+use super::connection::{Connection, Event, MAX_ID};
 use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
+use crate::datagrams::cookie::Cookies;
+use crate::datagrams::{Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
 use crate::log_limit::warn_limited;
 use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer};
@@ -39,9 +40,6 @@ const MAX_CONNECTIONS: u32 = 1 << 24;
 
 /// Maximum number of queued datagrams to unproved peers; further ones are dropped.
 const MAX_OUTBOX: usize = 64;
-
-/// A source of unpredictable numbers.
-pub(crate) type Random = Box<dyn FnMut() -> u64 + Send>;
 
 /// An event for the sink.
 #[derive(Debug)]
@@ -56,15 +54,6 @@ pub(crate) enum CoreEvent {
     Introduced(Introduction),
     /// The connection of an introduced peer has ended.
     Parted(Introduction),
-}
-
-/// A datagram to be sent.
-#[derive(Debug)]
-pub(crate) struct Transmit {
-    /// The connection it belongs to, if any.
-    pub(crate) connection: Option<u32>,
-    pub(crate) path: Path,
-    pub(crate) contents: Vec<u8>,
 }
 
 pub(crate) struct Core {
@@ -360,6 +349,7 @@ impl Core {
                 connection: None,
                 path,
                 contents,
+                segment: None,
             });
         }
         while let Some(number) = self.ready.front().copied() {
@@ -370,6 +360,7 @@ impl Core {
                         connection: Some(number),
                         path,
                         contents,
+                        segment: None,
                     });
                 }
                 entry.is_ready = false;

@@ -9,10 +9,10 @@ use std::time::{Duration, Instant};
 use fipa_transport::{Answer, AttemptId, Conclusion, Incarnation, Kind, Location, Parcel, Ticket};
 
 use super::config::UdpLimits;
-use super::connection::Path;
 use super::core::{Core, CoreEvent};
 use super::packet::{self, Datagram, NO_COOKIE};
 use crate::Identity;
+use crate::datagrams::Path;
 use crate::hello::Hello;
 
 /// Maximum number of datagrams sent in response to one.

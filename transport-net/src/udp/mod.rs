@@ -1,13 +1,13 @@
 //! Acknowledged letters over UDP, one datagram each.
 //!
-//! * [`packet`]: the encoding. [`cookie`]: the address validation of unproved peers.
+//! * [`packet`]: the encoding.
 //! * [`core`]: the protocol without sockets and clock, with the [`connection`]s in it. A connection
 //!   is [`dialling`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
-//! * [`endpoint`]: the tasks around the core, with their [`socket`]s.
+//! * [`endpoint`]: the core as a [`Protocol`](crate::datagrams::Protocol). The tasks around it, with
+//!   their sockets, are in [`crate::datagrams`], which it shares with UDT.
 
 mod config;
 mod connection;
-mod cookie;
 mod core;
 mod counters;
 mod dialling;
@@ -20,7 +20,6 @@ mod received;
 mod recovery;
 #[cfg(test)]
 mod simulation;
-mod socket;
 
 use std::fmt;
 use std::sync::Arc;
@@ -32,9 +31,12 @@ use fipa_transport::{
 use tokio::runtime::Handle;
 
 pub use self::config::{UdpConfig, UdpLimits};
+pub(crate) use self::core::Core;
 pub use self::counters::UdpCounters;
-use self::endpoint::Endpoint;
 use self::packet::{BASE, LARGEST, PARCEL_OVERHEAD};
+use crate::Identity;
+use crate::datagrams::Random;
+use crate::datagrams::endpoint::Endpoint;
 
 /// Bytes reserved for the receiver's name in the largest datagram.
 const NAME: usize = 255;
@@ -53,7 +55,9 @@ const NAME: usize = 255;
 /// Dropping it closes it. After [`close`](Transport::close) the threads of the runtime conclude the
 /// attempts, so the runtime must run a moment longer.
 pub struct UdpTransport {
-    endpoint: Arc<Endpoint>,
+    identity: Identity,
+    limits: UdpLimits,
+    endpoint: Arc<Endpoint<Core>>,
 }
 
 impl UdpTransport {
@@ -61,15 +65,22 @@ impl UdpTransport {
     /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: UdpConfig, runtime: Handle) -> Self {
+        let UdpConfig {
+            listen,
+            identity,
+            limits,
+        } = config;
         Self {
-            endpoint: Endpoint::new(config, runtime),
+            endpoint: Endpoint::new(listen, identity.incarnation, runtime),
+            identity,
+            limits,
         }
     }
 
     /// Returns the counters of this endpoint.
     #[must_use]
     pub fn counters(&self) -> UdpCounters {
-        self.endpoint.counters()
+        self.endpoint.read(Core::counters).unwrap_or_default()
     }
 
     fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), TransportError> {
@@ -105,7 +116,7 @@ impl Transport for UdpTransport {
     /// Returns the largest letter that fits a datagram. Paths between hosts carry less; see
     /// [`UdpLimits::max_datagram`].
     fn max_letter(&self) -> usize {
-        let datagram = self.endpoint.config.limits.max_datagram;
+        let datagram = self.limits.max_datagram;
         datagram.clamp(BASE, LARGEST) - PARCEL_OVERHEAD - NAME
     }
 
@@ -114,13 +125,15 @@ impl Transport for UdpTransport {
     }
 
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
-        let identity = &self.endpoint.config.identity;
-        if let Some(fault) = identity.fault() {
+        if let Some(fault) = self.identity.fault() {
             return Err(ListenError::Unavailable(fault));
         }
         // As unpredictable as an incarnation.
-        let random = Box::new(|| Incarnation::random().as_u64());
-        self.endpoint.open(sink, random)
+        let random: Random = Box::new(|| Incarnation::random().as_u64());
+        let (identity, limits) = (self.identity.clone(), self.limits.clone());
+        self.endpoint.open(sink, |listening, now| {
+            Core::new(identity, limits, listening, random, now)
+        })
     }
 
     fn dispatch(
@@ -130,15 +143,18 @@ impl Transport for UdpTransport {
         parcel: Parcel,
     ) -> Result<(), TransportError> {
         self.check(to, &parcel)?;
-        self.endpoint.dispatch(attempt, to, &parcel)
+        self.endpoint
+            .dispatch(to, |core, now| core.dispatch(now, attempt, to, &parcel))
     }
 
     fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.endpoint.abandon(attempt)
+        let abandoned = self.endpoint.call(|core, _| core.abandon(attempt));
+        abandoned.unwrap_or(Abandoned::Unconfirmed)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {
-        self.endpoint.answer(ticket, &answer);
+        self.endpoint
+            .call(|core, now| core.answer(now, ticket, &answer));
     }
 
     fn close(&self) {

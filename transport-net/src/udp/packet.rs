@@ -73,8 +73,7 @@ const PING: u8 = 4;
 const SKIPPED: u8 = 5;
 const GOODBYE: u8 = 6;
 
-/// Proves that a peer receives datagrams at its source address.
-pub(crate) type Cookie = [u8; 16];
+pub(crate) use crate::datagrams::cookie::Cookie;
 
 pub(crate) const NO_COOKIE: Cookie = [0; 16];
 

@@ -13,10 +13,10 @@ use fipa_transport::{
 };
 
 use super::config::UdpLimits;
-use super::connection::Path;
-use super::core::{Core, CoreEvent, Transmit};
+use super::core::{Core, CoreEvent};
 use super::packet::{self, BASE, Datagram, NO_COOKIE};
 use crate::Identity;
+use crate::datagrams::{Path, Transmit};
 
 const A: usize = 0;
 const B: usize = 1;

@@ -90,6 +90,17 @@ pub(crate) fn udp_config(listen: &[&str]) -> UdpConfig {
     }
 }
 
+#[cfg(feature = "udt")]
+pub(crate) fn udt_config(listen: &[&str]) -> fipa_transport_net::UdtConfig {
+    fipa_transport_net::UdtConfig {
+        listen: listen.iter().map(|text| (*text).into()).collect(),
+        identity: identity(),
+        limits: fipa_transport_net::UdtLimits::default(),
+        #[cfg(feature = "secure")]
+        security: None,
+    }
+}
+
 /// The configuration of an endpoint whose socket is in this directory.
 pub(crate) fn unix_config(directory: &Path) -> UnixConfig {
     UnixConfig {

@@ -73,7 +73,8 @@ fn advice(reason: FailureReason, config: &Config) -> String {
                 .to_owned()
         }
         FailureReason::Unsupported => {
-            "configure the peer to listen on TCP too; the transports named above are not supported"
+            "add the transport named above to mts.transports of the gateway, or configure the peer to \
+             listen on TCP too"
                 .to_owned()
         }
         FailureReason::TimedOut => "increase --deadline; see the attempts above".to_owned(),

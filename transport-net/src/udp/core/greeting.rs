@@ -6,10 +6,11 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{Hop, Kind, Location, Principal, quota_address};
 
-use super::super::connection::{Connection, Path};
+use super::super::connection::Connection;
 use super::super::packet::{self, NO_COOKIE};
 use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
+use crate::datagrams::Path;
 use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
 use crate::log_limit::warn_limited;

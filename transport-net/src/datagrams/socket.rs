@@ -1,14 +1,15 @@
-//! Sockets: opening them, and the thin layer over the system calls. Datagrams are never fragmented.
+//! Sockets: opening them, and the thin layer over the system calls.
 
 use std::io::{self, IoSliceMut};
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 
-use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
+use quinn_udp::{RecvMeta, UdpSocketState};
+use rustix::net::sockopt::{self, Ipv4PathMtuDiscovery, Ipv6PathMtuDiscovery};
 use socket2::{Domain, Protocol, Type};
 use tokio::io::Interest;
 use tokio::net::UdpSocket;
 
-use super::connection::Path;
+use super::{Fragments, Path, Transmit};
 
 /// Size of the receive buffer in bytes; the system may allow less.
 const BUFFER: usize = 4 << 20;
@@ -38,19 +39,30 @@ pub(crate) enum Sent {
 
 impl Socket {
     /// Opens a listening socket. Must be called within a runtime.
-    pub(crate) fn listen(number: u32, address: SocketAddr) -> io::Result<Self> {
-        Self::open(number, None, address, |socket| socket.bind(&address.into()))
+    pub(crate) fn listen(
+        number: u32,
+        address: SocketAddr,
+        fragments: Fragments,
+    ) -> io::Result<Self> {
+        Self::open(number, None, address, fragments, |socket| {
+            socket.bind(&address.into())
+        })
     }
 
     /// Opens a socket for the connection to one peer. Only for a connected socket the operating
     /// system reports that the peer is unreachable. Must be called within a runtime.
-    pub(crate) fn connect(number: u32, owner: u32, remote: SocketAddr) -> io::Result<Self> {
+    pub(crate) fn connect(
+        number: u32,
+        owner: u32,
+        remote: SocketAddr,
+        fragments: Fragments,
+    ) -> io::Result<Self> {
         let any: SocketAddr = if remote.is_ipv4() {
             (Ipv4Addr::UNSPECIFIED, 0).into()
         } else {
             (Ipv6Addr::UNSPECIFIED, 0).into()
         };
-        Self::open(number, Some(owner), remote, |socket| {
+        Self::open(number, Some(owner), remote, fragments, |socket| {
             socket.bind(&any.into())?;
             socket.connect(&remote.into())
         })
@@ -60,6 +72,7 @@ impl Socket {
         number: u32,
         owner: Option<u32>,
         address: SocketAddr,
+        fragments: Fragments,
         prepare: impl FnOnce(&socket2::Socket) -> io::Result<()>,
     ) -> io::Result<Self> {
         let socket = socket2::Socket::new(
@@ -74,6 +87,17 @@ impl Socket {
         prepare(&socket)?;
         let socket: std::net::UdpSocket = socket.into();
         let state = UdpSocketState::new((&socket).into())?;
+        if fragments == Fragments::Allowed {
+            // After `UdpSocketState::new`, which forbids fragments.
+            match address {
+                SocketAddr::V4(_) => {
+                    sockopt::set_ip_mtu_discover(&socket, Ipv4PathMtuDiscovery::WANT)?;
+                }
+                SocketAddr::V6(_) => {
+                    sockopt::set_ipv6_mtu_discover(&socket, Ipv6PathMtuDiscovery::WANT)?;
+                }
+            }
+        }
         Ok(Self {
             number,
             owner,
@@ -91,12 +115,38 @@ impl Socket {
         self.io.peer_addr()
     }
 
-    pub(crate) fn send(&self, path: Path, contents: &[u8]) -> Sent {
-        let transmit = Transmit {
+    /// Sends datagrams. Several are sent with one system call where the system can divide them.
+    pub(crate) fn send(&self, transmit: &Transmit) -> Sent {
+        let Transmit {
+            path,
+            contents,
+            segment,
+            ..
+        } = transmit;
+        let Some(segment) = segment.filter(|segment| contents.len() > *segment) else {
+            return self.send_one(*path, contents, None);
+        };
+        if self.state.max_gso_segments() >= contents.len().div_ceil(segment)
+            && let Sent::Perhaps = self.send_one(*path, contents, Some(segment))
+        {
+            return Sent::Perhaps;
+        }
+        // The system or the interface cannot divide them.
+        for datagram in contents.chunks(segment) {
+            match self.send_one(*path, datagram, None) {
+                Sent::Perhaps => {}
+                other => return other,
+            }
+        }
+        Sent::Perhaps
+    }
+
+    fn send_one(&self, path: Path, contents: &[u8], segment_size: Option<usize>) -> Sent {
+        let transmit = quinn_udp::Transmit {
             destination: path.remote,
             ecn: None,
             contents,
-            segment_size: None,
+            segment_size,
             src_ip: path.local,
         };
         // Bypasses the runtime, which learns that a new socket is writable only after a while.

@@ -1,7 +1,8 @@
 //! Cookies: a peer must return its cookie before any state about it is stored.
 //!
 //! A cookie is a keyed hash of the peer's address, its number and the time, so that checking it
-//! needs no memory of having issued it. It is valid for 15 to 30 seconds.
+//! needs no memory of having issued it. It is valid for 15 to 30 seconds. UDT has room for its first
+//! four bytes only.
 
 use std::hash::{Hash, Hasher};
 use std::net::SocketAddr;
@@ -9,7 +10,8 @@ use std::time::{Duration, Instant};
 
 use siphasher::sip128::{Hasher128, SipHasher24};
 
-use super::packet::Cookie;
+/// A cookie.
+pub(crate) type Cookie = [u8; 16];
 
 const SLOT: Duration = Duration::from_secs(15);
 
@@ -35,10 +37,20 @@ impl Cookies {
         initiator: u64,
         cookie: &Cookie,
     ) -> bool {
+        self.valid(now, from, initiator)
+            .any(|valid| valid == *cookie)
+    }
+
+    /// Returns the cookies that are valid for a peer.
+    pub(crate) fn valid(
+        &self,
+        now: Instant,
+        from: SocketAddr,
+        initiator: u64,
+    ) -> impl Iterator<Item = Cookie> {
         let slot = self.slot(now);
-        [slot, slot.wrapping_sub(1)]
-            .into_iter()
-            .any(|slot| self.of_slot(slot, from, initiator) == *cookie)
+        let slots = [slot, slot.wrapping_sub(1)].into_iter();
+        slots.map(move |slot| self.of_slot(slot, from, initiator))
     }
 
     fn slot(&self, now: Instant) -> u64 {

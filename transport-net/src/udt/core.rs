@@ -1,0 +1,651 @@
+//! The protocol of one endpoint without sockets and clock: its connections, the assignment of
+//! packets to them, and the handshakes of peers.
+//!
+//! A location has at most one connection, which carries all letters to it in order until it ends.
+//!
+//! The endpoint stores no state about a peer that has not returned a cookie, and no reply to such a
+//! peer is larger than the packet it answers: both are handshakes. A packet for a connection only
+//! counts with the number of its socket (30 random bits), from the address that the connection was
+//! opened from.
+
+use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
+use std::net::{IpAddr, SocketAddr};
+use std::time::Instant;
+
+use bytes::Bytes;
+use fipa_transport::{
+    Abandoned, AttemptId, Conclusion, Location, TransportError, TransportErrorKind,
+};
+
+use super::config::UdtLimits;
+use super::connection::Connection;
+use super::counters::UdtCounters;
+use super::packet::{
+    self, CONCLUSION, Control, DATAGRAMS, Handshake, MAX_PACKET, MIN_PACKET, Packet, REFUSAL,
+    REQUEST, VERSION,
+};
+use super::receiver::{Arrived, Receiver};
+use super::sequence;
+use crate::datagrams::cookie::Cookies;
+use crate::datagrams::{Outbound, Path, Random, Transmit};
+use crate::end::ConnectionEnd;
+use crate::log_limit::warn_limited;
+use crate::rate_limit::{PeerRateLimits, is_one_peer, quota_address};
+use crate::stream::budget::ByteBudget;
+use crate::stream::source::{Home, QuotaKey};
+
+/// Maximum number of queued datagrams to unproved peers; further ones are dropped.
+const MAX_OUTBOX: usize = 64;
+
+/// Mask of socket numbers. libudt begins with such numbers, too.
+const SOCKETS: u64 = (1 << 30) - 1;
+
+/// Whether letters may be exchanged with a peer at an address.
+pub(crate) type Access = Box<dyn Fn(IpAddr) -> bool + Send>;
+
+/// An event for the sink.
+#[derive(Debug)]
+pub(crate) enum CoreEvent {
+    /// A letter has arrived from this address.
+    Arrived(Arrived, SocketAddr),
+    Concluded(AttemptId, Conclusion),
+}
+
+pub(crate) struct Core {
+    limits: UdtLimits,
+    access: Access,
+    cookies: Cookies,
+    random: Random,
+    connections: HashMap<u32, Entry>,
+    /// Connections by the number of their socket.
+    sockets: HashMap<u32, u32>,
+    /// Connections opened by this side, by location.
+    dialled: HashMap<Location, u32>,
+    /// Connections opened by peers, by their origin.
+    accepted: HashMap<Origin, u32>,
+    ready: VecDeque<u32>,
+    timers: BTreeSet<(Instant, u32)>,
+    outbox: VecDeque<Outbound>,
+    eventful: VecDeque<u32>,
+    /// Conclusions of connections that have ended.
+    concluded: VecDeque<(AttemptId, Conclusion)>,
+    /// Removed connections.
+    gone: Vec<u32>,
+    rate_limits: PeerRateLimits,
+    byte_budget: ByteBudget,
+    counters: UdtCounters,
+    last_number: u32,
+}
+
+struct Entry {
+    connection: Connection,
+    /// The location, if this side opened the connection.
+    dialled: Option<Location>,
+    /// The origin, if the peer opened it.
+    origin: Option<Origin>,
+    timer: Option<Instant>,
+    is_ready: bool,
+    is_eventful: bool,
+}
+
+/// The handshake by which a peer opened a connection: its address, its socket and its first packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+struct Origin {
+    from: SocketAddr,
+    socket: u32,
+    initial: u32,
+}
+
+impl Core {
+    pub(crate) fn new(limits: UdtLimits, access: Access, mut random: Random, now: Instant) -> Self {
+        let cookies = Cookies::new((random(), random()), now);
+        Self {
+            limits,
+            access,
+            cookies,
+            random,
+            connections: HashMap::new(),
+            sockets: HashMap::new(),
+            dialled: HashMap::new(),
+            accepted: HashMap::new(),
+            ready: VecDeque::new(),
+            timers: BTreeSet::new(),
+            outbox: VecDeque::new(),
+            eventful: VecDeque::new(),
+            concluded: VecDeque::new(),
+            gone: Vec::new(),
+            rate_limits: PeerRateLimits::default(),
+            byte_budget: ByteBudget::default(),
+            counters: UdtCounters::default(),
+            last_number: 0,
+        }
+    }
+
+    pub(crate) fn counters(&self) -> UdtCounters {
+        UdtCounters {
+            connections: self.connections.len() as u64,
+            ..self.counters
+        }
+    }
+
+    /// Notes that bytes which had arrived as a letter are none.
+    pub(crate) fn count_nonsense(&mut self) -> u64 {
+        self.counters.refused_nonsense += 1;
+        self.counters.refused_nonsense - 1
+    }
+
+    /// Queues a letter, in the dialect of the peer. Returns the number of the connection if it is
+    /// new; the caller then calls [`begin`](Self::begin) or [`cannot_begin`](Self::cannot_begin).
+    pub(crate) fn dispatch(
+        &mut self,
+        now: Instant,
+        attempt: AttemptId,
+        to: &Location,
+        letter: [Bytes; 2],
+    ) -> Result<Option<u32>, TransportError> {
+        let there = self.dialled.get(to).copied();
+        let number = match there {
+            Some(number) => number,
+            None => self.create(now, to)?,
+        };
+        let sender = self.connections.get_mut(&number);
+        let sent = match sender.and_then(|entry| entry.connection.sender_mut()) {
+            Some(sender) => sender.send(attempt, letter),
+            None => Err(ConnectionEnd::Hangup.after()),
+        };
+        if let Err(error) = sent {
+            if there.is_none() {
+                self.remove(number);
+            }
+            return Err(error);
+        }
+        self.touch(number);
+        Ok(there.is_none().then_some(number))
+    }
+
+    /// Ends the connections that are bound to addresses that this host no longer has. `local`
+    /// returns the address of a socket that belongs to one connection.
+    pub(crate) fn lost(
+        &mut self,
+        now: Instant,
+        lost: &HashSet<IpAddr>,
+        local: impl Fn(u32) -> Option<IpAddr>,
+    ) {
+        let numbers: Vec<(u32, IpAddr)> = self
+            .connections
+            .iter()
+            .filter_map(|(number, entry)| {
+                let path = entry.connection.path()?;
+                let ip = path.local.or_else(|| local(path.socket))?;
+                lost.contains(&ip).then_some((*number, ip))
+            })
+            .collect();
+        for (number, ip) in numbers {
+            let what = format!("this host no longer has the address {ip}");
+            self.end(now, number, &ConnectionEnd::Broken(what));
+        }
+    }
+
+    /// Whether a new connection has yet to be opened.
+    pub(crate) fn is_opening(&self, number: u32) -> bool {
+        let entry = self.connections.get(&number);
+        entry.is_some_and(|entry| entry.connection.is_opening())
+    }
+
+    /// Sets the paths to the peer of a new connection.
+    pub(crate) fn begin(&mut self, now: Instant, number: u32, mut paths: Vec<Path>) {
+        let Some(remote) = paths.first().map(|path| path.remote) else {
+            return;
+        };
+        paths.retain(|path| (self.access)(path.remote.ip()));
+        if paths.is_empty() {
+            let detail = format!(
+                "{remote} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
+            );
+            let error = TransportError::new(TransportErrorKind::Refused, detail);
+            return self.end(now, number, &ConnectionEnd::NotOpened(error));
+        }
+        self.with(now, number, |connection, _| {
+            if let Some(dialling) = connection.dialling_mut() {
+                dialling.begin(paths, now);
+            }
+            Ok(())
+        });
+    }
+
+    /// Ends a new connection that cannot be opened.
+    pub(crate) fn cannot_begin(&mut self, now: Instant, number: u32, error: TransportError) {
+        self.end(now, number, &ConnectionEnd::NotOpened(error));
+    }
+
+    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
+        self.concluded.retain(|(other, _)| *other != attempt);
+        let connections = self.connections.values_mut();
+        let unsent = connections
+            .filter_map(|entry| entry.connection.sender_mut())
+            .any(|sender| sender.abandon(attempt) == Abandoned::NotSent);
+        match unsent {
+            true => Abandoned::NotSent,
+            false => Abandoned::Unconfirmed,
+        }
+    }
+
+    /// Handles a datagram. `listening` is whether the socket accepts datagrams of unproved peers.
+    pub(crate) fn handle_datagram(
+        &mut self,
+        now: Instant,
+        path: Path,
+        listening: bool,
+        bytes: &[u8],
+    ) {
+        let Some((to, packet)) = Packet::read(bytes) else {
+            self.counters.ignored += 1;
+            return;
+        };
+        if let (0, Packet::Control(Control::Handshake(handshake)), true) = (to, &packet, listening)
+        {
+            return self.greet(now, path, handshake);
+        }
+        let number = self.sockets.get(&to).copied();
+        let entry = number.and_then(|number| Some((number, self.connections.get_mut(&number)?)));
+        let Some((number, entry)) = entry else {
+            self.counters.ignored += 1;
+            return;
+        };
+        let is_its = match (entry.connection.path(), entry.connection.dialling_mut()) {
+            (Some(its), _) => its.remote == path.remote,
+            (None, Some(dialling)) => dialling.uses(path),
+            (None, None) => false,
+        };
+        if !is_its {
+            self.counters.ignored += 1;
+            return;
+        }
+        self.with(now, number, |connection, counters| match &packet {
+            Packet::Control(Control::Handshake(handshake)) => {
+                let was_opening = connection.is_opening();
+                connection.handle_handshake(path, handshake, now)?;
+                counters.dialled += u64::from(was_opening && !connection.is_opening());
+                Ok(())
+            }
+            _ if connection.is_opening() => {
+                counters.ignored += 1;
+                Ok(())
+            }
+            Packet::Data(data) => {
+                connection.handle_data(data, now, counters);
+                Ok(())
+            }
+            Packet::Control(control) => connection.handle_control(control, now, counters),
+        });
+    }
+
+    /// Handles an error of the operating system on a path.
+    pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
+        self.with(now, number, |connection, _| {
+            match connection.dialling_mut() {
+                Some(dialling) => dialling.failed(path, what, now),
+                None => Err(ConnectionEnd::Broken(what.to_owned())),
+            }
+        });
+    }
+
+    pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
+        if let Some((path, contents)) = self.outbox.pop_front() {
+            return Some(Transmit {
+                connection: None,
+                path,
+                contents,
+                segment: None,
+            });
+        }
+        while let Some(number) = self.ready.front().copied() {
+            if let Some(entry) = self.connections.get_mut(&number) {
+                let next = entry.connection.poll_transmit(now, &mut self.counters);
+                if let Some((path, contents, segment)) = next {
+                    return Some(Transmit {
+                        connection: Some(number),
+                        path,
+                        contents,
+                        segment,
+                    });
+                }
+                entry.is_ready = false;
+            }
+            self.ready.pop_front();
+            self.reschedule(number);
+        }
+        None
+    }
+
+    pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
+        if let Some((attempt, conclusion)) = self.concluded.pop_front() {
+            return Some(CoreEvent::Concluded(attempt, conclusion));
+        }
+        while let Some(number) = self.eventful.front().copied() {
+            if let Some(entry) = self.connections.get_mut(&number) {
+                if let Some((attempt, conclusion)) = entry.connection.poll_concluded() {
+                    self.counters.letters_out += 1;
+                    return Some(CoreEvent::Concluded(attempt, conclusion));
+                }
+                if let (Some(arrived), Some(path)) =
+                    (entry.connection.poll_arrived(), entry.connection.path())
+                {
+                    self.counters.letters_in += 1;
+                    return Some(CoreEvent::Arrived(arrived, path.remote));
+                }
+                entry.is_eventful = false;
+            }
+            self.eventful.pop_front();
+        }
+        None
+    }
+
+    /// Whether there are events to deliver.
+    pub(crate) fn has_events(&self) -> bool {
+        !self.concluded.is_empty() || !self.eventful.is_empty()
+    }
+
+    /// Returns the next removed connection, so that its sockets can be closed.
+    pub(crate) fn poll_gone(&mut self) -> Option<u32> {
+        self.gone.pop()
+    }
+
+    pub(crate) fn poll_timeout(&self) -> Option<Instant> {
+        self.timers.first().map(|(due, _)| *due)
+    }
+
+    pub(crate) fn handle_timeout(&mut self, now: Instant) {
+        // Each connection once: its timer stays due until its datagrams have been polled.
+        let due: Vec<u32> = self
+            .timers
+            .iter()
+            .take_while(|(due, _)| *due <= now)
+            .map(|(_, number)| *number)
+            .collect();
+        for number in due {
+            self.with(now, number, |connection, _| connection.handle_timeout(now));
+        }
+    }
+
+    /// Ends every connection.
+    pub(crate) fn close(&mut self, now: Instant) {
+        let numbers: Vec<u32> = self.connections.keys().copied().collect();
+        for number in numbers {
+            self.end(now, number, &ConnectionEnd::Closed);
+        }
+    }
+
+    /// Handles the handshake of a peer that opens a connection.
+    fn greet(&mut self, now: Instant, path: Path, handshake: &Handshake) {
+        let from = path.remote;
+        if !(self.access)(from.ip()) {
+            warn_limited(
+                self.counters.refused_unproved,
+                format_args!(
+                    "{from}: UDT connection refused: the peer cannot prove its identity over UDT, and is not \
+                     listed in security.legacy_peers"
+                ),
+            );
+            self.counters.refused_unproved += 1;
+            return;
+        }
+        let is_fit = handshake.version == VERSION
+            && handshake.kind == DATAGRAMS
+            && handshake.max_packet >= MIN_PACKET
+            && handshake.initial <= sequence::LARGEST
+            && handshake.socket != 0;
+        if !is_fit || !matches!(handshake.request, REQUEST | CONCLUSION) {
+            self.counters.ignored += 1;
+            return self.reply(path, handshake, REFUSAL, handshake.cookie);
+        }
+        let origin = Origin {
+            from,
+            socket: handshake.socket,
+            initial: handshake.initial,
+        };
+        let cookie = self.cookie(now, &origin);
+        if handshake.request == REQUEST || !self.is_valid(now, &origin, handshake.cookie) {
+            return self.reply(path, handshake, REQUEST, cookie);
+        }
+        let max_packet = handshake.max_packet.min(MAX_PACKET);
+        if let Some(number) = self.accepted.get(&origin) {
+            // The answer was lost.
+            if let Some(entry) = self.connections.get(number) {
+                let answer = entry.connection.answer(handshake, max_packet);
+                self.put_out(path, answer);
+            }
+            return;
+        }
+        if !self.makes_room(now, from.ip()) {
+            self.counters.refused_crowd += 1;
+            return self.reply(path, handshake, REFUSAL, handshake.cookie);
+        }
+        let home = quota_address(from.ip());
+        let quota_key = QuotaKey::Unproved(Home::Address(home));
+        let meter = self
+            .byte_budget
+            .meter(quota_key, self.limits.budget_of(home));
+        let rates = self.limits.rates();
+        let rate_limit = match is_one_peer(from.ip()) {
+            true => self.rate_limits.of(from.ip(), rates, now),
+            false => None,
+        };
+        let limits = self.limits.clone();
+        let receiver = Receiver::new(limits, handshake.initial, max_packet, rate_limit, meter);
+        let ids = (self.fresh_socket(), handshake.socket);
+        let limits = self.limits.clone();
+        let connection = Connection::accepted(limits, ids, handshake.initial, path, receiver, now);
+        let answer = connection.answer(handshake, max_packet);
+        let number = self.insert(connection, None, Some(origin));
+        self.counters.accepted += 1;
+        self.touch(number);
+        self.put_out(path, answer);
+    }
+
+    /// Whether a peer at this address may open another connection. Ends its connection that has been
+    /// idle for the longest time if there are too many.
+    fn makes_room(&mut self, now: Instant, ip: IpAddr) -> bool {
+        let home = quota_address(ip);
+        let of_home = |origin: &Origin| quota_address(origin.from.ip()) == home;
+        let numbers = self.accepted.iter().filter(|(origin, _)| of_home(origin));
+        let numbers: Vec<u32> = numbers.map(|(_, number)| *number).collect();
+        let greedy = numbers.len() >= self.limits.max_connections_of(home);
+        if !greedy && self.connections.len() < self.limits.max_connections {
+            return true;
+        }
+        let idle = numbers.into_iter().filter_map(|number| {
+            let entry = self.connections.get(&number)?;
+            Some((entry.connection.idle_since()?, number))
+        });
+        match idle.min() {
+            Some((since, number)) if since + self.limits.idle_close <= now => {
+                self.end(now, number, &ConnectionEnd::Idle);
+                true
+            }
+            _ => false,
+        }
+    }
+
+    /// Returns the cookie of a peer.
+    fn cookie(&self, now: Instant, origin: &Origin) -> u32 {
+        let cookie = self.cookies.give(now, origin.from, number_of(origin));
+        short(&cookie)
+    }
+
+    fn is_valid(&self, now: Instant, origin: &Origin, cookie: u32) -> bool {
+        let number = number_of(origin);
+        self.cookies
+            .valid(now, origin.from, number)
+            .any(|valid| short(&valid) == cookie)
+    }
+
+    /// Answers a handshake with one of the same length.
+    fn reply(&mut self, path: Path, handshake: &Handshake, request: i32, cookie: u32) {
+        let answer = Handshake {
+            request,
+            cookie,
+            ..*handshake
+        };
+        let answer = packet::control(&Control::Handshake(answer), 0, handshake.socket);
+        self.put_out(path, answer);
+    }
+
+    fn put_out(&mut self, path: Path, contents: Vec<u8>) {
+        if self.outbox.len() < MAX_OUTBOX {
+            self.outbox.push_back((path, contents));
+        }
+    }
+
+    /// Creates a connection for a location.
+    fn create(&mut self, now: Instant, to: &Location) -> Result<u32, TransportError> {
+        if self.connections.len() >= self.limits.max_connections {
+            return Err(ConnectionEnd::TooManyConnections.after());
+        }
+        let id = self.fresh_socket();
+        let initial = sequence::wire((self.random)());
+        let connection = Connection::dialling(self.limits.clone(), id, initial, now);
+        let number = self.insert(connection, Some(to.clone()), None);
+        self.dialled.insert(to.clone(), number);
+        Ok(number)
+    }
+
+    /// Calls `act` with a connection, and handles its result.
+    fn with(
+        &mut self,
+        now: Instant,
+        number: u32,
+        act: impl FnOnce(&mut Connection, &mut UdtCounters) -> Result<(), ConnectionEnd>,
+    ) {
+        let Some(entry) = self.connections.get_mut(&number) else {
+            return;
+        };
+        match act(&mut entry.connection, &mut self.counters) {
+            Ok(()) => self.touch(number),
+            Err(end) => self.end(now, number, &end),
+        }
+    }
+
+    /// Schedules a connection that has changed.
+    fn touch(&mut self, number: u32) {
+        if let Some(entry) = self.connections.get_mut(&number)
+            && !std::mem::replace(&mut entry.is_ready, true)
+        {
+            self.ready.push_back(number);
+        }
+        self.reschedule(number);
+    }
+
+    fn reschedule(&mut self, number: u32) {
+        let Some(entry) = self.connections.get_mut(&number) else {
+            return;
+        };
+        let due = entry.connection.poll_timeout();
+        if due != entry.timer {
+            if let Some(before) = entry.timer {
+                self.timers.remove(&(before, number));
+            }
+            if let Some(due) = due {
+                self.timers.insert((due, number));
+            }
+            entry.timer = due;
+        }
+        if entry.connection.has_events() && !std::mem::replace(&mut entry.is_eventful, true) {
+            self.eventful.push_back(number);
+        }
+    }
+
+    fn end(&mut self, now: Instant, number: u32, end: &ConnectionEnd) {
+        let Some(mut entry) = self.remove(number) else {
+            return;
+        };
+        if end.is_misbehavior() {
+            warn_limited(
+                self.counters.refused_nonsense,
+                format_args!("UDT connection closed: {}", end.after()),
+            );
+            self.counters.refused_nonsense += 1;
+        } else {
+            tracing::debug!(connection = number, "UDT connection ended: {}", end.after());
+        }
+        if let ConnectionEnd::NotOpened(_) = end {
+            self.counters.dial_failures += 1;
+        }
+        // What has arrived before the end counts.
+        while let Some(concluded) = entry.connection.poll_concluded() {
+            self.counters.letters_out += 1;
+            self.concluded.push_back(concluded);
+        }
+        let (concluded, shutdown) = entry.connection.end(end, now);
+        self.concluded.extend(concluded);
+        // Bounded by the number of connections.
+        self.outbox.extend(shutdown);
+    }
+
+    fn insert(
+        &mut self,
+        connection: Connection,
+        dialled: Option<Location>,
+        origin: Option<Origin>,
+    ) -> u32 {
+        loop {
+            self.last_number = self.last_number.wrapping_add(1);
+            if !self.connections.contains_key(&self.last_number) {
+                break;
+            }
+        }
+        let number = self.last_number;
+        self.sockets.insert(connection.id(), number);
+        self.accepted.extend(origin.map(|origin| (origin, number)));
+        let entry = Entry {
+            connection,
+            dialled,
+            origin,
+            timer: None,
+            is_ready: false,
+            is_eventful: false,
+        };
+        self.connections.insert(number, entry);
+        number
+    }
+
+    /// Removes a connection from every table.
+    fn remove(&mut self, number: u32) -> Option<Entry> {
+        let entry = self.connections.remove(&number)?;
+        self.sockets.remove(&entry.connection.id());
+        if let Some(location) = &entry.dialled {
+            self.dialled.remove(location);
+        }
+        if let Some(origin) = &entry.origin {
+            self.accepted.remove(origin);
+        }
+        if let Some(timer) = entry.timer {
+            self.timers.remove(&(timer, number));
+        }
+        self.ready.retain(|other| *other != number);
+        self.eventful.retain(|other| *other != number);
+        self.gone.push(number);
+        Some(entry)
+    }
+
+    fn fresh_socket(&mut self) -> u32 {
+        loop {
+            let socket = ((self.random)() & SOCKETS) as u32;
+            if socket != 0 && !self.sockets.contains_key(&socket) {
+                return socket;
+            }
+        }
+    }
+}
+
+/// The number that the cookie of a peer depends on.
+fn number_of(origin: &Origin) -> u64 {
+    u64::from(origin.socket) << 32 | u64::from(origin.initial)
+}
+
+/// Returns the part of a cookie that a handshake has room for.
+fn short(cookie: &[u8; 16]) -> u32 {
+    cookie
+        .first_chunk()
+        .map_or(0, |bytes| u32::from_be_bytes(*bytes))
+}

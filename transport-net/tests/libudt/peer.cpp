@@ -1,0 +1,195 @@
+// A legacy peer over UDT, with the settings of fipa_services: messages in order, one per letter.
+//
+//   peer receive ADDRESS PORT [COUNT]
+//     Prints "ready PORT", then each message. Port 0 lets the system choose. After COUNT messages it
+//     stops reading until a byte arrives on its standard input.
+//   peer send ADDRESS PORT
+//     Sends each message from its standard input. Prints "ready" when connected, then "sent" after
+//     the last message has been acknowledged.
+//
+//   peer discard ADDRESS PORT
+//     Prints "ready PORT" and receives messages.
+//   peer flood ADDRESS PORT COUNT
+//     Sends the message from its standard input COUNT times. Prints "ready" when connected, then the
+//     seconds until all were acknowledged, and the seconds of the processor.
+//
+// On the standard streams, a message is its length (4 bytes, little-endian) and its bytes.
+
+#include <arpa/inet.h>
+#include <unistd.h>
+
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <ctime>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+#include <udt/udt.h>
+
+namespace {
+
+constexpr int most = 10'000'000;
+
+std::mutex output;
+long budget = -1;
+bool discards = false;
+
+[[noreturn]] void fail(const char* what) {
+    std::fprintf(stderr, "%s: %s\n", what, UDT::getlasterror().getErrorMessage());
+    // Destructors of libudt may wait for its threads.
+    _exit(1);
+}
+
+sockaddr_in address(const char* ip, const char* port) {
+    sockaddr_in address{};
+    address.sin_family = AF_INET;
+    address.sin_port = htons(static_cast<uint16_t>(std::atoi(port)));
+    inet_pton(AF_INET, ip, &address.sin_addr);
+    return address;
+}
+
+bool read_exactly(char* to, size_t length) {
+    return std::fread(to, 1, length, stdin) == length;
+}
+
+void print(const char* bytes, uint32_t length) {
+    const unsigned char header[] = {
+        static_cast<unsigned char>(length), static_cast<unsigned char>(length >> 8),
+        static_cast<unsigned char>(length >> 16), static_cast<unsigned char>(length >> 24)};
+    std::lock_guard<std::mutex> lock(output);
+    std::fwrite(header, 1, sizeof header, stdout);
+    std::fwrite(bytes, 1, length, stdout);
+    std::fflush(stdout);
+    if (budget > 0 && --budget == 0) {
+        // No thread prints, so none reads further, until a byte arrives.
+        if (std::getchar() == EOF) {
+            _exit(0);
+        }
+        budget = -1;
+    }
+}
+
+void receive(UDTSOCKET peer) {
+    std::vector<char> buffer(most);
+    for (;;) {
+        const int length = UDT::recvmsg(peer, buffer.data(), most);
+        if (length == UDT::ERROR) {
+            UDT::close(peer);
+            return;
+        }
+        if (!discards) {
+            print(buffer.data(), static_cast<uint32_t>(length));
+        }
+    }
+}
+
+int serve(const char* ip, const char* port) {
+    const UDTSOCKET server = UDT::socket(AF_INET, SOCK_DGRAM, 0);
+    sockaddr_in here = address(ip, port);
+    if (UDT::bind(server, reinterpret_cast<sockaddr*>(&here), sizeof here) == UDT::ERROR) {
+        fail("bind");
+    }
+    if (UDT::listen(server, 50) == UDT::ERROR) {
+        fail("listen");
+    }
+    int length = sizeof here;
+    if (UDT::getsockname(server, reinterpret_cast<sockaddr*>(&here), &length) == UDT::ERROR) {
+        fail("getsockname");
+    }
+    std::printf("ready %d\n", ntohs(here.sin_port));
+    std::fflush(stdout);
+    for (;;) {
+        sockaddr_in from{};
+        int size = sizeof from;
+        const UDTSOCKET peer = UDT::accept(server, reinterpret_cast<sockaddr*>(&from), &size);
+        if (peer == UDT::INVALID_SOCK) {
+            fail("accept");
+        }
+        std::thread(receive, peer).detach();
+    }
+}
+
+UDTSOCKET connected(const char* ip, const char* port) {
+    const UDTSOCKET peer = UDT::socket(AF_INET, SOCK_DGRAM, 0);
+    const sockaddr_in there = address(ip, port);
+    if (UDT::connect(peer, reinterpret_cast<const sockaddr*>(&there), sizeof there) == UDT::ERROR) {
+        fail("connect");
+    }
+    std::printf("ready\n");
+    std::fflush(stdout);
+    return peer;
+}
+
+// Reads a message. Returns its length, or 0 at the end.
+uint32_t next(std::vector<char>& buffer) {
+    unsigned char header[4];
+    if (!read_exactly(reinterpret_cast<char*>(header), sizeof header)) {
+        return 0;
+    }
+    const uint32_t length = header[0] | header[1] << 8 | header[2] << 16 |
+                            static_cast<uint32_t>(header[3]) << 24;
+    return length <= most && read_exactly(buffer.data(), length) ? length : 0;
+}
+
+void send_one(UDTSOCKET peer, const std::vector<char>& buffer, uint32_t length) {
+    const int sent = UDT::sendmsg(peer, buffer.data(), static_cast<int>(length), -1, true);
+    if (sent != static_cast<int>(length)) {
+        fail("sendmsg");
+    }
+}
+
+double seconds(clockid_t clock) {
+    timespec time{};
+    clock_gettime(clock, &time);
+    return static_cast<double>(time.tv_sec) + static_cast<double>(time.tv_nsec) * 1e-9;
+}
+
+int flood(const char* ip, const char* port, long count) {
+    const UDTSOCKET peer = connected(ip, port);
+    std::vector<char> buffer(most);
+    const uint32_t length = next(buffer);
+    const double begun = seconds(CLOCK_MONOTONIC);
+    const double processor = seconds(CLOCK_PROCESS_CPUTIME_ID);
+    for (long sent = 0; sent < count; ++sent) {
+        send_one(peer, buffer, length);
+    }
+    UDT::close(peer);
+    std::printf("%f %f\n", seconds(CLOCK_MONOTONIC) - begun,
+                seconds(CLOCK_PROCESS_CPUTIME_ID) - processor);
+    std::fflush(stdout);
+    return 0;
+}
+
+int send(const char* ip, const char* port) {
+    const UDTSOCKET peer = connected(ip, port);
+    std::vector<char> buffer(most);
+    while (const uint32_t length = next(buffer)) {
+        send_one(peer, buffer, length);
+    }
+    // Waits until everything is acknowledged.
+    UDT::close(peer);
+    std::printf("sent\n");
+    std::fflush(stdout);
+    return 0;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    if (argc < 4) {
+        return 2;
+    }
+    UDT::startup();
+    discards = std::strcmp(argv[1], "discard") == 0;
+    if (discards || std::strcmp(argv[1], "receive") == 0) {
+        budget = argc > 4 ? std::atol(argv[4]) : -1;
+        return serve(argv[2], argv[3]);
+    }
+    const bool floods = std::strcmp(argv[1], "flood") == 0 && argc > 4;
+    const int code = floods ? flood(argv[2], argv[3], std::atol(argv[4])) : send(argv[2], argv[3]);
+    UDT::cleanup();
+    return code;
+}
