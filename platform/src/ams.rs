@@ -1,6 +1,7 @@
 //! The agent management system: the agents of the platform (FIPA00023 clause 4.2).
 
 use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -29,6 +30,14 @@ pub struct Ams {
     /// The agents that platforms of other hosts have registered.
     foreign: BTreeMap<(Platform, Arc<str>), Foreign>,
     answers: VecDeque<Answer>,
+}
+
+impl fmt::Debug for Ams {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Ams")
+            .field("id", &self.id)
+            .finish_non_exhaustive()
+    }
 }
 
 /// An agent of this host.

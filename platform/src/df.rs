@@ -1,6 +1,7 @@
 //! The directory facilitator: the services of agents (FIPA00023 clause 4.1).
 
 use std::collections::{BTreeMap, BTreeSet, HashSet, VecDeque};
+use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -33,6 +34,14 @@ pub struct Df {
     search_ids: VecDeque<Arc<str>>,
     known_search_ids: HashSet<Arc<str>>,
     answers: VecDeque<Answer>,
+}
+
+impl fmt::Debug for Df {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Df")
+            .field("id", &self.id)
+            .finish_non_exhaustive()
+    }
 }
 
 struct Entry {

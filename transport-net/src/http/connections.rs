@@ -7,10 +7,9 @@ use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
 use std::sync::Arc;
 
+use fipa_transport::quota_address;
 use parking_lot::Mutex;
 use tokio::task::AbortHandle;
-
-use crate::rate_limit::quota_address;
 
 /// The accepted connections. Clones share them.
 #[derive(Debug, Clone, Default)]

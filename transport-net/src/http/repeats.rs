@@ -8,11 +8,10 @@
 //!
 //! The module reads no clock.
 
+use fipa_transport::quota_address;
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
-
-use crate::rate_limit::quota_address;
 
 /// Time for which a letter is remembered; JADE's connections time out after the same time.
 const MEMORY: Duration = Duration::from_secs(60);

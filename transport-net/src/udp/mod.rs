@@ -102,9 +102,7 @@ impl UdpTransport {
 
 impl fmt::Debug for UdpTransport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("UdpTransport")
-            .field("limits", &self.endpoint.config.limits)
-            .finish_non_exhaustive()
+        f.debug_struct("UdpTransport").finish_non_exhaustive()
     }
 }
 

@@ -14,7 +14,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use fipa_transport::{
-    Abandoned, AttemptId, Conclusion, Location, TransportError, TransportErrorKind,
+    Abandoned, AttemptId, Conclusion, Location, TransportError, TransportErrorKind, quota_address,
 };
 
 use super::config::UdtLimits;
@@ -30,7 +30,7 @@ use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
 use crate::log_limit::warn_limited;
-use crate::rate_limit::{PeerRateLimits, is_one_peer, quota_address};
+use crate::rate_limit::{PeerRateLimits, is_one_peer};
 use crate::stream::budget::ByteBudget;
 use crate::stream::source::{Home, QuotaKey};
 
