@@ -3,7 +3,7 @@
 //! or leak.
 //!
 //! There are two gateways, one without and one with keys. `FIPA_FUZZ_SECONDS` is the duration of the
-//! attack on each, in seconds (default: 3). `FIPA_FUZZ_SEED` repeats the random decisions of a run, but
+//! attack on each, in seconds (default: 4). `FIPA_FUZZ_SEED` repeats the random decisions of a run, but
 //! not the timing.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
@@ -262,7 +262,7 @@ fn settled(gateway: &Gateway, is: impl Fn(&Usage) -> bool) -> Usage {
 }
 
 fn fuzz(secured: bool) {
-    let seconds = siege::number("FIPA_FUZZ_SECONDS").unwrap_or(3);
+    let seconds = siege::number("FIPA_FUZZ_SECONDS").unwrap_or(4);
     let seed = siege::number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
     let mode = if secured { "with keys" } else { "without keys" };
     println!("{mode}: FIPA_FUZZ_SEED={seed}, {seconds} s");
