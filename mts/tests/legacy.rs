@@ -177,6 +177,15 @@ fn a_letter_to_an_agent_that_has_unsupported_transports_only_fails_at_once() {
     assert_eq!(bench.dispatched().1, "tcp://10.0.0.3:6789;fipa-services");
 }
 
+/// Letters in the dialect of legacy peers have no number, so a repeated one would be taken twice.
+#[test]
+fn a_service_of_this_project_is_not_reached_in_the_dialect_of_legacy_peers() {
+    let known = "tcp://10.0.0.3:6789;fipa-services#00000000000000ab";
+    let mut bench = Bench::new(&[known, "tcp://10.0.0.4:6789;fipa-services"]);
+    bench.send(0);
+    assert_eq!(bench.dispatched().1, "tcp://10.0.0.4:6789;fipa-services");
+}
+
 const LEGACY: &str = "tcp://10.0.0.3:6789;fipa-services";
 
 /// The outcomes of all letters, in order.

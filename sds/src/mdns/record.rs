@@ -6,7 +6,7 @@
 //! | key | value |
 //! |---|---|
 //! | `TYPE` | the agent's type |
-//! | `LOCATOR` | `tcp://a.b.c.d:port fipa::services::transports::MessageTransport;`, repeated |
+//! | `LOCATOR` | `tcp://a.b.c.d:port fipa::services::transports::MessageTransport;`, repeated; also `udt` |
 //! | `DESCRIPTION` | the description |
 //! | `TIMESTAMP` | time of registration, `%Y%m%d-%H:%M:%S:usec` |
 //! | `fipa-version` | `1` |
@@ -467,6 +467,7 @@ mod tests {
             [
                 "tcp://10.0.0.2:7788;fipa-services".parse().unwrap(),
                 "tcp://10.0.0.3:6789;jade".parse::<Location>().unwrap(),
+                "udt://10.0.0.2:1;fipa-services".parse().unwrap(),
             ]
         );
         assert_eq!(entry.description, "");
@@ -477,6 +478,21 @@ mod tests {
         let bare = decode("bare", &strings(&[]), now).unwrap();
         assert_eq!(bare.registered, now);
         assert!(decode("", &strings(&[]), now).is_err());
+    }
+
+    #[test]
+    fn a_udt_location_is_announced_to_legacy_peers() {
+        let location = "udt://10.0.0.2:6790#00000000000000ab".parse::<Location>();
+        let entry = Entry {
+            locations: vec![location.unwrap()],
+            ..example()
+        };
+        let properties = encode(&entry);
+        let (_, locator) = &properties[1];
+        assert_eq!(
+            locator,
+            format!("udt://10.0.0.2:6790 {SIGNATURE};").as_bytes()
+        );
     }
 
     #[test]

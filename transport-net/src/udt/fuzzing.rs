@@ -35,6 +35,12 @@ pub struct UdtPackets {
     proved: BTreeSet<SocketAddr>,
 }
 
+impl std::fmt::Debug for UdtPackets {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("UdtPackets").finish_non_exhaustive()
+    }
+}
+
 /// A packet as a peer writes it.
 #[derive(Debug, Clone, Copy)]
 pub enum UdtPacket<'a> {

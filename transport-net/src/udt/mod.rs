@@ -65,6 +65,12 @@ pub struct UdtTransport {
     endpoint: Arc<Endpoint<Core>>,
 }
 
+impl std::fmt::Debug for UdtTransport {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("UdtTransport").finish_non_exhaustive()
+    }
+}
+
 impl UdtTransport {
     /// Creates an endpoint that runs its tasks on `runtime`, which must have I/O and time enabled.
     /// No socket is opened before `listen`.
