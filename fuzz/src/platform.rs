@@ -40,8 +40,8 @@ fn description(name: &str) -> AgentDescription {
 fn asker(input: &mut Input<'_>) -> Asker {
     let (name, platform) = (input.one_of(&NAMES), input.one_of(&PLATFORMS));
     let mut asker = Asker::new(id(name), u64::from(input.byte()), platform);
-    asker.is_proved = input.byte() % 4 != 0;
-    if input.byte() % 4 == 0 {
+    asker.is_proved = input.below(4) != 0;
+    if input.below(4) == 0 {
         asker.dialect = fipa_content::Dialect::Jade;
     }
     if name == HONEST && platform == Platform::Host {
@@ -52,7 +52,7 @@ fn asker(input: &mut Input<'_>) -> Asker {
 
 /// Returns the content of a valid request, with some of its bytes replaced.
 fn content(input: &mut Input<'_>) -> Vec<u8> {
-    let agent = id(if input.byte() % 2 == 0 {
+    let agent = id(if input.below(2) == 0 {
         "df@mts"
     } else {
         "ams@mts"
