@@ -46,6 +46,7 @@
 //! [monitor]
 //! check = "off"                       # or "warn", "enforce": reaction to protocol violations
 //! answer = false                      # true: violations are answered with not-understood
+//! heartbeat = "5s"                    # silence after which agents of another host are unreachable
 //! protocols = []                      # SCXML files with further protocols
 //! ```
 //!
@@ -285,6 +286,10 @@ pub struct Monitor {
     /// `answer`: whether a received message that violates its protocol is answered with
     /// `not-understood`.
     pub answer: bool,
+    /// `heartbeat`: the silence of another host after which a call that waits for an agent there reports
+    /// it as unreachable, 100 milliseconds to 1 hour. The gateways exchange signs of life five times in
+    /// this period, only while a call waits.
+    pub heartbeat: Duration,
     /// `protocols`: paths of SCXML files with further protocols, or with replacements for protocols of
     /// FIPA; at most 128.
     pub protocols: Vec<String>,
@@ -298,7 +303,8 @@ pub enum Check {
     Off,
     /// Violations are logged, and received messages carry them (`Incoming::violation`).
     Warn,
-    /// A message with a violation is not sent, and a received one is returned as an error.
+    /// A message with a violation is not sent. Received messages carry their violations, as for
+    /// [`Warn`](Self::Warn), and the application must not act on them.
     Enforce,
 }
 
@@ -390,6 +396,7 @@ impl Config {
             monitor: Monitor {
                 check: Check::Off,
                 answer: false,
+                heartbeat: Duration::from_secs(5),
                 protocols: Vec::new(),
             },
         }

@@ -3,7 +3,6 @@
 #[cfg(feature = "monitor")]
 use std::path::PathBuf;
 
-use fipa_acl::{DecodeError, Letter};
 #[cfg(feature = "monitor")]
 use fipa_monitor::LibraryFull;
 #[cfg(feature = "monitor")]
@@ -14,8 +13,6 @@ use fipa_transport::{Forked, Kind, ListenError};
 
 use crate::config::ConfigError;
 use crate::domain_dir::DomainDirError;
-#[cfg(feature = "monitor")]
-use crate::incoming::Incoming;
 
 /// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]
@@ -102,7 +99,9 @@ pub enum SendError {
     Forked(#[from] Forked),
 }
 
-/// The error if no message is received.
+/// The error if an agent can receive no further message. A mistake of another agent is no error of this
+/// kind: see [`Incoming::violation`](crate::Incoming::violation) for messages that violate their
+/// protocol. Letters that cannot be decoded are logged, and their senders get failure messages.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReceiveError {
@@ -112,23 +111,6 @@ pub enum ReceiveError {
     /// This process is a forked child of the one that registered the agent.
     #[error(transparent)]
     Forked(#[from] Forked),
-    /// The message of a received letter cannot be decoded. Its sender gets a failure message.
-    #[error("received a letter with a message that cannot be decoded: {source}")]
-    Malformed {
-        /// The error of the decoder.
-        source: DecodeError,
-        /// The letter.
-        letter: Box<Letter>,
-    },
-    /// A received message violates its protocol, and `monitor.check` is `enforce`.
-    #[cfg(feature = "monitor")]
-    #[error("{violation}")]
-    Violation {
-        /// The violation.
-        violation: Box<fipa_monitor::Violation>,
-        /// The message.
-        incoming: Box<Incoming>,
-    },
 }
 
 /// The error if a file in `monitor.protocols` cannot be used.

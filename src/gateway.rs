@@ -10,6 +10,7 @@ mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
 mod neighbours;
+mod presence;
 mod publisher;
 
 use std::sync::Arc;
@@ -158,6 +159,7 @@ impl Gateway {
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
             notices: Mutex::default(),
+            questions: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));
         let exchange = Arc::clone(&self.exchange);

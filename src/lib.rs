@@ -68,6 +68,8 @@ mod incoming;
 #[cfg(feature = "secure")]
 pub mod keys;
 mod owner;
+#[cfg(any(feature = "monitor", feature = "net"))]
+mod presence;
 #[cfg(feature = "monitor")]
 pub mod protocol;
 pub mod routes;

@@ -48,6 +48,12 @@ const MAX_LEGACY_PEERS: usize = 64;
 /// Lower bound of `security.peer_bytes`, in bytes per second: idle connections need some to stay open.
 const MIN_PEER_BYTES: u64 = 64 << 10;
 
+/// Lower bound of `monitor.heartbeat`: a fifth of it is the time between two letters.
+const MIN_HEARTBEAT: Duration = Duration::from_millis(100);
+
+/// Upper bound of `monitor.heartbeat`.
+const MAX_HEARTBEAT: Duration = Duration::from_secs(3600);
+
 /// Maximum number of entries of `monitor.protocols`.
 const MAX_PROTOCOLS: usize = 128;
 
@@ -93,6 +99,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.peers(&config.discovery.peers);
     found.security(config);
     found.access(&config.access);
+    found.heartbeat(config.monitor.heartbeat);
     found.protocols(&config.monitor.protocols);
     found.0
 }
@@ -228,6 +235,17 @@ impl Findings {
         }
         if files.iter().any(String::is_empty) {
             self.add(&path, "lists an empty path", "list paths of SCXML files");
+        }
+    }
+
+    fn heartbeat(&mut self, heartbeat: Duration) {
+        if !(MIN_HEARTBEAT..=MAX_HEARTBEAT).contains(&heartbeat) {
+            let show = humantime::format_duration;
+            self.add(
+                &["monitor", "heartbeat"],
+                format_args!("cannot be {}", show(heartbeat)),
+                format!("use {} to {}", show(MIN_HEARTBEAT), show(MAX_HEARTBEAT)),
+            );
         }
     }
 

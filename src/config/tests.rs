@@ -126,6 +126,7 @@ fn every_key_is_read() {
         [monitor]
         check = "enforce"
         answer = true
+        heartbeat = "2s"
         protocols = ["lift.scxml"]
         "#,
         &[],
@@ -168,6 +169,7 @@ fn every_key_is_read() {
     assert_eq!(security.peer_bytes, 1 << 20);
     assert_eq!(config.monitor.check, Check::Enforce);
     assert!(config.monitor.answer);
+    assert_eq!(config.monitor.heartbeat, Duration::from_secs(2));
     assert_eq!(config.monitor.protocols, ["lift.scxml"]);
     let addresses = ["10.0.0.7", "fe80::1"].map(|text| Interface::Address(text.parse().unwrap()));
     let [first, second] = addresses;
@@ -333,6 +335,7 @@ rate = 0                             # default
 [monitor]
 check = "off"                        # default
 answer = false                       # default
+heartbeat = "5s"                     # default
 protocols = []                       # default
 
 [routes]
