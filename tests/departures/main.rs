@@ -4,10 +4,6 @@
 //! Every call has a patience of one minute. A call that waits for it fails the test with another error.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
-#![expect(
-    clippy::print_stdout,
-    reason = "prints the times from a kill to the error"
-)]
 
 mod process;
 
