@@ -19,9 +19,23 @@ use crate::incoming::Incoming;
 
 /// An agent of this process. Dropping it deregisters the agent.
 pub struct Agent {
+    pub(crate) core: Arc<AgentCore>,
+    registered: bool,
+}
+
+/// The parts of an agent that its conversations share. They may outlast the [`Agent`], and end with an
+/// error once it is deregistered.
+pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
-    registered: bool,
+}
+
+#[cfg(feature = "monitor")]
+impl AgentCore {
+    /// Starts a message with this agent as its sender.
+    pub(crate) fn message(&self, performative: Performative) -> MessageBuilder {
+        Message::builder(performative).sender(self.endpoint.id.clone())
+    }
 }
 
 impl Domain {
@@ -82,8 +96,10 @@ impl Domain {
             Ok(_) => {
                 warn_of_name(&id);
                 Ok(Agent {
-                    endpoint: Endpoint::new(self.clone(), id, name, incarnation),
-                    demultiplexer: Demultiplexer::default(),
+                    core: Arc::new(AgentCore {
+                        endpoint: Endpoint::new(self.clone(), id, name, incarnation),
+                        demultiplexer: Demultiplexer::default(),
+                    }),
                     registered: true,
                 })
             }
@@ -100,44 +116,44 @@ impl Agent {
     /// Returns the name of the agent.
     #[must_use]
     pub fn name(&self) -> &str {
-        &self.endpoint.name
+        &self.core.endpoint.name
     }
 
     /// Returns the agent identifier that the agent's messages have as their sender.
     #[must_use]
     pub fn id(&self) -> &AgentId {
-        &self.endpoint.id
+        &self.core.endpoint.id
     }
 
     /// Returns the random identifier of this registration.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
-        self.endpoint.incarnation
+        self.core.endpoint.incarnation
     }
 
     /// Returns the domain in which the agent is registered.
     #[must_use]
     pub fn domain(&self) -> &Domain {
-        &self.endpoint.domain
+        &self.core.endpoint.domain
     }
 
     /// Returns a unique text for a `conversation-id` or a `reply-with`. It is one word that contains
     /// the random identifier of this registration and a counter.
     #[must_use]
     pub fn unique_id(&self) -> String {
-        self.endpoint.unique_id()
+        self.core.endpoint.unique_id()
     }
 
     /// Starts a message with this agent as its sender.
     pub fn message(&self, performative: Performative) -> MessageBuilder {
-        Message::builder(performative).sender(self.endpoint.id.clone())
+        Message::builder(performative).sender(self.core.endpoint.id.clone())
     }
 
     /// Starts an answer to a message, as FIPA00037 defines it: its receivers are the message's
     /// `reply-to`, or else its sender. It belongs to the same conversation and has a new
     /// `reply-with`.
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
-        self.endpoint.reply(to, performative)
+        self.core.endpoint.reply(to, performative)
     }
 
     /// Sends a message to its receivers, each the name of an agent or a pattern of names. Waits until
@@ -152,7 +168,7 @@ impl Agent {
         &self,
         message: Message,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        self.send_within(message, self.endpoint.domain.inner.deadline)
+        self.send_within(message, self.core.endpoint.domain.inner.deadline)
     }
 
     /// Sends a message with the given deadline instead of the configured one.
@@ -179,17 +195,20 @@ impl Agent {
     /// # Errors
     /// If the message cannot be sent at all.
     pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
-        self.endpoint.check(&message)?;
+        self.core.endpoint.check(&message)?;
         let draft = LetterDraft::new(message, len, SystemTime::now())?;
         let receivers = draft.message().receivers().iter();
         let receivers: Vec<&str> = receivers.map(AgentId::name).collect();
         let name = receivers.iter().map(|name| name.len()).max();
         let head_room = name.unwrap_or(0) + draft.head_len();
-        let incarnation = self.endpoint.incarnation;
-        let content =
-            self.endpoint
-                .mts()
-                .loan(incarnation, &receivers, head_room, len, draft.tail_len());
+        let incarnation = self.core.endpoint.incarnation;
+        let content = self.core.endpoint.mts().loan(
+            incarnation,
+            &receivers,
+            head_room,
+            len,
+            draft.tail_len(),
+        );
         Ok(Loan { draft, content })
     }
 
@@ -206,8 +225,8 @@ impl Agent {
             .complete(content.freeze(), SystemTime::now())
             .map_err(SendError::from)
             .and_then(|(message, letter)| {
-                let deadline = self.endpoint.domain.inner.deadline;
-                self.endpoint.send(&message, Ok(letter), deadline)
+                let deadline = self.core.endpoint.domain.inner.deadline;
+                self.core.endpoint.send(&message, Ok(letter), deadline)
             });
         async move { Ok(deliveries(sending?).await) }
     }
@@ -219,29 +238,34 @@ impl Agent {
         letter: Result<Letter, PostError>,
         deadline: Duration,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        let sending = self.endpoint.send(message, letter, deadline);
+        let sending = self.core.endpoint.send(message, letter, deadline);
         async move { Ok(deliveries(sending?).await) }
     }
 
     /// Waits for the next message for this agent. Dropping the future loses no message.
     ///
+    /// A message that violates its protocol is returned like others, and
+    /// [`Incoming::violation`](crate::Incoming::violation) has the violation.
+    ///
     /// # Errors
-    /// If the domain is closed, if the message of the received letter cannot be decoded, or if it
-    /// violates its protocol and `monitor.check` is `enforce`.
+    /// If the agent can receive no further message, because the domain is closed. No message of another
+    /// agent causes an error.
     pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
-        self.endpoint.domain.inner.owner.check()?;
-        self.demultiplexer.next_other(&self.endpoint).await
+        self.core.endpoint.domain.inner.owner.check()?;
+        self.core
+            .demultiplexer
+            .next_other(&self.core.endpoint)
+            .await
     }
 
     /// Returns the next message for this agent, if one is available now.
     ///
     /// # Errors
-    /// If the message of the received letter cannot be decoded, or if it violates its protocol and
-    /// `monitor.check` is `enforce`.
+    /// If this process is a forked child of the one that registered the agent.
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
-        self.endpoint.domain.inner.owner.check()?;
-        self.endpoint.mts().drive();
-        self.demultiplexer.other_now(&self.endpoint)
+        self.core.endpoint.domain.inner.owner.check()?;
+        self.core.endpoint.mts().drive();
+        self.core.demultiplexer.other_now(&self.core.endpoint)
     }
 
     /// Removes the name from the directory, and returns the messages that were delivered but not
@@ -253,10 +277,10 @@ impl Agent {
     /// the messages that were not received are dropped.
     pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
         self.registered = false;
-        let unread = self.endpoint.deregister()?;
-        let mut all = self.demultiplexer.drain();
+        let unread = self.core.endpoint.deregister()?;
+        let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
-        all.extend(unread.map(|received| self.endpoint.decode(received)));
+        all.extend(unread.filter_map(|received| self.core.endpoint.decode(received)));
         Ok(all)
     }
 }
@@ -264,25 +288,25 @@ impl Agent {
 impl fmt::Debug for Agent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Agent")
-            .field("name", &self.endpoint.name)
-            .field("incarnation", &self.endpoint.incarnation)
+            .field("name", &self.core.endpoint.name)
+            .field("incarnation", &self.core.endpoint.incarnation)
             .finish_non_exhaustive()
     }
 }
 
 /// The messages that a deregistered agent had not received, as [`Agent::receive`] would have returned
 /// them.
-pub type Unread = Vec<Result<Incoming, ReceiveError>>;
+pub type Unread = Vec<Incoming>;
 
 impl Drop for Agent {
     fn drop(&mut self) {
         // In a forked child, the agent stays registered for the parent.
-        if self.registered && self.endpoint.domain.inner.owner.is_this() {
-            match self.endpoint.deregister() {
+        if self.registered && self.core.endpoint.domain.inner.owner.is_this() {
+            match self.core.endpoint.deregister() {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(error = %ErrorChain(&error), agent = %self.endpoint.name, "cannot deregister an agent")
+                    tracing::warn!(error = %ErrorChain(&error), agent = %self.core.endpoint.name, "cannot deregister an agent")
                 }
             }
         }

@@ -4,14 +4,14 @@
 //! Not in this module: the rules of the protocols (`fipa-monitor`).
 
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Message, Performative};
 use fipa_monitor::{Header, Library, LibraryError, LibraryFull, Monitor, Verdict, Violation};
 use parking_lot::Mutex;
 
 use crate::config::{self, Check};
-use crate::error::{ProtocolError, ReceiveError, SendError};
+use crate::error::{ProtocolError, SendError};
 use crate::incoming::Incoming;
 
 /// The settings of `[monitor]` and the known protocols, for all agents of this process.
@@ -19,6 +19,7 @@ pub(crate) struct Rules {
     library: Arc<Library>,
     check: Check,
     answer: bool,
+    heartbeat: Duration,
 }
 
 impl Rules {
@@ -38,7 +39,13 @@ impl Rules {
             library: Arc::new(library),
             check: config.check,
             answer: config.answer,
+            heartbeat: config.heartbeat,
         })
+    }
+
+    /// Returns the silence of another host after which its agents count as unreachable.
+    pub(crate) fn heartbeat(&self) -> Duration {
+        self.heartbeat
     }
 
     /// Returns the known protocols.
@@ -89,12 +96,12 @@ impl Checks {
         &self,
         mut incoming: Incoming,
         answer: impl FnOnce(&Message, String) -> Option<Message>,
-    ) -> Result<Incoming, ReceiveError> {
+    ) -> Incoming {
         let Some(monitored) = &self.0 else {
-            return Ok(incoming);
+            return incoming;
         };
         let Some(violation) = monitored.violation(&incoming.message) else {
-            return Ok(incoming);
+            return incoming;
         };
         // Not-understood and failure are never answered; otherwise two agents could answer each other
         // without end.
@@ -106,16 +113,9 @@ impl Checks {
             // The answer ends the conversation in the monitor, if the sender takes part in one.
             let _ = monitored.violation(&answer);
         }
-        if monitored.enforce {
-            let incoming = Box::new(incoming);
-            return Err(ReceiveError::Violation {
-                violation,
-                incoming,
-            });
-        }
         tracing::warn!("received a message that violates its protocol: {violation}");
-        incoming.violation = Some(violation);
-        Ok(incoming)
+        incoming.violates(violation);
+        incoming
     }
 }
 

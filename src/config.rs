@@ -50,6 +50,7 @@
 //! [monitor]
 //! check = "off"                       # or "warn", "enforce": reaction to protocol violations
 //! answer = false                      # true: violations are answered with not-understood
+//! heartbeat = "5s"                    # silence after which agents of another host are unreachable
 //! protocols = []                      # SCXML files with further protocols
 //! [platform]
 //! ams = true                          # false: no agent management system; or its name
@@ -302,6 +303,10 @@ pub struct Monitor {
     /// `answer`: whether a received message that violates its protocol is answered with
     /// `not-understood`.
     pub answer: bool,
+    /// `heartbeat`: the silence of another host after which a call that waits for an agent there reports
+    /// it as unreachable, 100 milliseconds to 1 hour. The gateways exchange signs of life five times in
+    /// this period, only while a call waits.
+    pub heartbeat: Duration,
     /// `protocols`: paths of SCXML files with further protocols, or with replacements for protocols of
     /// FIPA; at most 128.
     pub protocols: Vec<String>,
@@ -315,7 +320,8 @@ pub enum Check {
     Off,
     /// Violations are logged, and received messages carry them (`Incoming::violation`).
     Warn,
-    /// A message with a violation is not sent, and a received one is returned as an error.
+    /// A message with a violation is not sent. Received messages carry their violations, as for
+    /// [`Warn`](Self::Warn), and the application must not act on them.
     Enforce,
 }
 
@@ -434,6 +440,7 @@ impl Config {
             monitor: Monitor {
                 check: Check::Off,
                 answer: false,
+                heartbeat: Duration::from_secs(5),
                 protocols: Vec::new(),
             },
             platform: Platform::default(),

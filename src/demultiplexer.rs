@@ -1,19 +1,30 @@
-//! Hands received messages to their readers: a call that leads a conversation, or `receive`.
+//! Hands received messages to their readers: a call that leads a conversation, a server of a protocol,
+//! or `receive`.
+//!
+//! A message belongs to a conversation if it has the conversation's id and is from one of its
+//! parties, as far as the connection proves its sender. Every agent can choose any conversation id, so
+//! an agent that takes no part cannot put a message into the conversation of others.
 
 use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
 
+use fipa_acl::{Message, Performative};
+use fipa_sds::Entry;
+use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use crate::endpoint::Endpoint;
 use crate::error::ReceiveError;
 use crate::incoming::Incoming;
+use crate::presence;
 
 /// Maximum number of messages that are set aside for one reader while another reader receives.
 /// Beyond it letters stay in the agent's queue, and their senders wait.
 const MAX_SET_ASIDE: usize = 1_024;
 
-type Received = Result<Incoming, ReceiveError>;
+/// The ontology of the messages of a message transport service about undelivered letters (FIPA00067).
+const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
 /// The messages that one reader received for another.
 #[derive(Default)]
@@ -24,66 +35,234 @@ pub(crate) struct Demultiplexer {
 
 #[derive(Default)]
 struct State {
-    /// Messages of the led conversations, by conversation id.
-    led: HashMap<String, VecDeque<Received>>,
-    others: VecDeque<Received>,
+    /// The led conversations, by conversation id. Several agents may have begun one with the same id.
+    led: HashMap<Arc<str>, Vec<Conversation>>,
+    served: Vec<Served>,
+    others: VecDeque<Incoming>,
+    /// Whether the application has ever read the other messages.
+    is_read: bool,
+    readers: u64,
+}
+
+struct Conversation {
+    number: u64,
+    from: Admitted,
+    /// Whether messages that are left at the end are discarded.
+    is_internal: bool,
+    queue: VecDeque<Incoming>,
+}
+
+struct Served {
+    number: u64,
+    opens: Opens,
+    queue: VecDeque<Incoming>,
+}
+
+/// Decides whether a message is for a server.
+pub(crate) type Opens = Box<dyn Fn(&Message) -> bool + Send + Sync>;
+
+/// The agents whose messages belong to a conversation.
+#[derive(Debug, Clone)]
+pub(crate) enum Admitted {
+    /// These agents, and the services that deliver to them.
+    Parties(Vec<Party>),
+    /// Every agent.
+    All,
+}
+
+/// An agent that takes part in a conversation.
+#[derive(Debug, Clone)]
+pub(crate) struct Party {
+    pub(crate) name: Arc<str>,
+    /// Its registration; unknown for an agent of a legacy peer.
+    pub(crate) agent: Incarnation,
+    /// The service that delivers to it.
+    pub(crate) mts: Incarnation,
+}
+
+impl Party {
+    /// Creates a party with the registration that the directory has.
+    pub(crate) fn new(name: &str, entry: Option<&Entry>) -> Self {
+        Self {
+            name: name.into(),
+            agent: entry.map_or(Incarnation::UNKNOWN, |entry| entry.incarnation),
+            mts: entry.map_or(Incarnation::UNKNOWN, |entry| entry.mts.incarnation),
+        }
+    }
+}
+
+/// A conversation that a call leads, or a server.
+#[derive(Debug, Clone)]
+pub(crate) struct ReaderKey {
+    id: Arc<str>,
+    number: u64,
 }
 
 /// A reader that waits for a message.
 #[derive(Clone, Copy)]
 enum Reader<'a> {
-    Conversation(&'a str),
+    Conversation(&'a ReaderKey),
+    Server(&'a ReaderKey),
     Others,
 }
 
 impl Demultiplexer {
     /// Starts a queue for a conversation that a call leads.
-    pub(crate) fn begin(&self, id: &str) {
-        let queues = &mut self.state.lock().led;
-        queues.insert(id.to_owned(), VecDeque::new());
+    pub(crate) fn begin(&self, id: &str, from: Admitted) -> ReaderKey {
+        self.lead(id, from, false)
+    }
+
+    /// Starts a queue for a conversation with a service, whose messages the application never reads.
+    pub(crate) fn begin_internal(&self, id: &str, from: Admitted) -> ReaderKey {
+        self.lead(id, from, true)
+    }
+
+    fn lead(&self, id: &str, from: Admitted, is_internal: bool) -> ReaderKey {
+        let mut state = self.state.lock();
+        let key = state.key(id);
+        let conversations = state.led.entry(Arc::clone(&key.id)).or_default();
+        conversations.push(Conversation {
+            number: key.number,
+            from,
+            is_internal,
+            queue: VecDeque::new(),
+        });
+        key
+    }
+
+    /// Adds an agent to a conversation.
+    pub(crate) fn admit(&self, key: &ReaderKey, party: Party) {
+        if let Some(conversation) = self.state.lock().conversation(key)
+            && let Admitted::Parties(parties) = &mut conversation.from
+        {
+            parties.retain(|known| known.name != party.name);
+            parties.push(party);
+        }
+    }
+
+    /// Adds every agent to a conversation.
+    pub(crate) fn admit_all(&self, key: &ReaderKey) {
+        if let Some(conversation) = self.state.lock().conversation(key) {
+            conversation.from = Admitted::All;
+        }
     }
 
     /// Ends a conversation. Its unread messages go to `receive`.
-    pub(crate) fn end(&self, id: &str) {
+    pub(crate) fn end(&self, key: &ReaderKey) {
         let mut state = self.state.lock();
-        let left = state.led.remove(id).unwrap_or_default();
-        state.others.extend(left);
+        let Some(conversations) = state.led.get_mut(&key.id) else {
+            return;
+        };
+        let at = conversations.iter().position(|it| it.number == key.number);
+        let ended = at.map(|at| conversations.remove(at));
+        if conversations.is_empty() {
+            state.led.remove(&key.id);
+        }
+        if let Some(ended) = ended.filter(|ended| !ended.is_internal) {
+            state.others.extend(ended.queue);
+        }
+        drop(state);
+        self.changed.notify_waiters();
+    }
+
+    /// Starts a queue for the messages that a server handles: those for which `opens` returns true and
+    /// that belong to no led conversation.
+    pub(crate) fn serve(&self, opens: Opens) -> ReaderKey {
+        let mut state = self.state.lock();
+        let key = state.key("");
+        let number = key.number;
+        let queue = VecDeque::new();
+        state.served.push(Served {
+            number,
+            opens,
+            queue,
+        });
+        key
+    }
+
+    /// Ends a server. Its unread messages go to `receive`.
+    pub(crate) fn end_serving(&self, key: &ReaderKey) {
+        let mut state = self.state.lock();
+        if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
+            let left = state.served.remove(at).queue;
+            state.others.extend(left);
+        }
         drop(state);
         self.changed.notify_waiters();
     }
 
     /// Waits for the next message of a conversation.
-    pub(crate) async fn next_of(&self, endpoint: &Endpoint, id: &str) -> Received {
-        self.next(endpoint, Reader::Conversation(id)).await
+    pub(crate) async fn next_of(
+        &self,
+        endpoint: &Endpoint,
+        key: &ReaderKey,
+    ) -> Result<Incoming, ReceiveError> {
+        self.next(endpoint, Reader::Conversation(key)).await
+    }
+
+    /// Returns the next message of a conversation, if one is available now.
+    pub(crate) fn now_of(&self, endpoint: &Endpoint, key: &ReaderKey) -> Option<Incoming> {
+        loop {
+            let room = {
+                let mut state = self.state.lock();
+                if let Some(set_aside) = state.take(Reader::Conversation(key)) {
+                    return Some(set_aside);
+                }
+                state.has_room()
+            };
+            self.put(endpoint, room.then(|| endpoint.letter_now())??);
+        }
+    }
+
+    /// Waits for the next message for a server.
+    pub(crate) async fn next_served(
+        &self,
+        endpoint: &Endpoint,
+        key: &ReaderKey,
+    ) -> Result<Incoming, ReceiveError> {
+        self.next(endpoint, Reader::Server(key)).await
     }
 
     /// Waits for the next message of no led conversation.
-    pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Received {
+    pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {
+        self.state.lock().is_read = true;
         self.next(endpoint, Reader::Others).await
     }
 
     /// Returns the next message of no led conversation, if one is available now.
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
+        self.state.lock().is_read = true;
         loop {
             if let Some(set_aside) = self.state.lock().take(Reader::Others) {
-                return set_aside.map(Some);
+                return Ok(Some(set_aside));
             }
             match endpoint.letter_now() {
                 None => return Ok(None),
-                Some(received) => self.put(received),
+                Some(received) => self.put(endpoint, received),
             }
         }
     }
 
     /// Removes and returns all messages that were set aside.
-    pub(crate) fn drain(&self) -> Vec<Received> {
+    pub(crate) fn drain(&self) -> Vec<Incoming> {
         let mut state = self.state.lock();
-        let mut all: Vec<Received> = state.others.drain(..).collect();
-        all.extend(state.led.drain().flat_map(|(_, queue)| queue));
+        let mut all: Vec<Incoming> = state.others.drain(..).collect();
+        let led = state
+            .led
+            .drain()
+            .flat_map(|(_, conversations)| conversations);
+        let led = led.filter(|conversation| !conversation.is_internal);
+        all.extend(led.flat_map(|conversation| conversation.queue));
+        let served = state.served.iter_mut();
+        all.extend(served.flat_map(|server| std::mem::take(&mut server.queue)));
         all
     }
 
-    async fn next(&self, endpoint: &Endpoint, reader: Reader<'_>) -> Received {
+    async fn next(
+        &self,
+        endpoint: &Endpoint,
+        reader: Reader<'_>,
+    ) -> Result<Incoming, ReceiveError> {
         loop {
             // Created before the check, so that no change after the check is missed.
             let changed = self.changed.notified();
@@ -93,53 +272,277 @@ impl Demultiplexer {
                     drop(state);
                     // Readers that wait for room may receive again.
                     self.changed.notify_waiters();
-                    return set_aside;
+                    return Ok(set_aside);
                 }
                 state.has_room()
             };
             tokio::select! {
                 biased;
                 () = changed => {}
-                received = endpoint.next_letter(), if room => {
-                    if let Err(ReceiveError::Closed) = received {
-                        return received;
-                    }
-                    self.put(received);
-                }
+                received = endpoint.next_letter(), if room => self.put(endpoint, received?),
                 () = endpoint.closed(), if !room => return Err(ReceiveError::Closed),
             }
         }
     }
 
-    fn put(&self, received: Received) {
-        self.state.lock().put(received);
+    fn put(&self, endpoint: &Endpoint, received: Incoming) {
+        let id = received.message.conversation_id();
+        let is_led = id.is_some_and(|id| self.state.lock().led.contains_key(id));
+        let sender = received.sender;
+        // Outside of the lock, because a miss reads the files of the directory.
+        let registered = match is_led && sender.is_known() {
+            true => endpoint.domain.directory().by_incarnation(sender),
+            false => None,
+        };
+        self.state.lock().put(received, registered.as_deref());
         self.changed.notify_waiters();
     }
 }
 
 impl State {
-    fn take(&mut self, reader: Reader<'_>) -> Option<Received> {
+    fn key(&mut self, id: &str) -> ReaderKey {
+        self.readers += 1;
+        ReaderKey {
+            id: id.into(),
+            number: self.readers,
+        }
+    }
+
+    fn conversation(&mut self, key: &ReaderKey) -> Option<&mut Conversation> {
+        let mut conversations = self.led.get_mut(&key.id)?.iter_mut();
+        conversations.find(|conversation| conversation.number == key.number)
+    }
+
+    fn take(&mut self, reader: Reader<'_>) -> Option<Incoming> {
         match reader {
-            Reader::Conversation(id) => self.led.get_mut(id)?.pop_front(),
+            Reader::Conversation(key) => self.conversation(key)?.queue.pop_front(),
+            Reader::Server(key) => {
+                let mut served = self.served.iter_mut();
+                let server = served.find(|server| server.number == key.number)?;
+                server.queue.pop_front()
+            }
             Reader::Others => self.others.pop_front(),
         }
     }
 
     fn has_room(&self) -> bool {
-        let led = self.led.values().map(VecDeque::len).max().unwrap_or(0);
-        self.others.len().max(led) < MAX_SET_ASIDE
+        let led = self.led.values().flatten().map(|it| it.queue.len());
+        let served = self.served.iter().map(|server| server.queue.len());
+        let longest = led.chain(served).max().unwrap_or(0);
+        // An application that only serves reads no other messages.
+        let others = match self.is_read || self.served.is_empty() {
+            true => self.others.len(),
+            false => 0,
+        };
+        others.max(longest) < MAX_SET_ASIDE
     }
 
-    fn put(&mut self, received: Received) {
-        let message = match &received {
-            Ok(incoming) => Some(&incoming.message),
-            Err(ReceiveError::Violation { incoming, .. }) => Some(&incoming.message),
-            Err(_) => None,
-        };
-        let id = message.and_then(|message| message.conversation_id());
-        match id.and_then(|id| self.led.get_mut(id)) {
-            Some(queue) => queue.push_back(received),
-            None => self.others.push_back(received),
+    /// Adds a message to the queue of its reader. `registered` is the directory's entry of the sender.
+    fn put(&mut self, received: Incoming, registered: Option<&Entry>) {
+        let message = &received.message;
+        let id = message.conversation_id();
+        if let Some(conversations) = id.and_then(|id| self.led.get_mut(id)) {
+            // The conversation that began last is the first choice.
+            let mut admitting = conversations.iter_mut().rev();
+            let admitting = admitting.find(|it| it.from.admits(&received, registered));
+            if let Some(conversation) = admitting {
+                conversation.queue.push_back(received);
+                return;
+            }
         }
+        // An answer of the gateway, or the report of an undelivered question, after the end of the call.
+        let is_about_presence = message.ontology() == Some(presence::ONTOLOGY)
+            || id.is_some_and(|id| id.starts_with(presence::CONVERSATION));
+        if is_about_presence {
+            return;
+        }
+        let mut served = self.served.iter_mut();
+        let is_legal = received.violation().is_none();
+        if let Some(server) = served.find(|server| is_legal && (server.opens)(message)) {
+            server.queue.push_back(received);
+            return;
+        }
+        if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {
+            let dropped = self.others.pop_front();
+            tracing::warn!(
+                message = dropped.map(|it| it.message.to_string()),
+                "dropped a message: this agent serves protocols and reads no other messages; call \
+                 Agent::receive to read them"
+            );
+        }
+        self.others.push_back(received);
+    }
+}
+
+impl Admitted {
+    /// Whether a message with the id of the conversation belongs to it.
+    fn admits(&self, incoming: &Incoming, registered: Option<&Entry>) -> bool {
+        let Self::Parties(parties) = self else {
+            return true;
+        };
+        let message = &incoming.message;
+        let Some(sender) = message.sender().map(|sender| sender.name()) else {
+            return false;
+        };
+        let is_own = incoming.via.is_none();
+        let agent = incoming.sender;
+        if let Some(party) = parties.iter().find(|party| *party.name == *sender) {
+            return match registered {
+                _ if is_own => true,
+                Some(registered) => *registered.name == *sender,
+                None => party.agent == agent,
+            };
+        }
+        let reports = *message.performative() == Performative::Failure
+            && message.ontology() == Some(MANAGEMENT_ONTOLOGY);
+        // The service of this process, of a party, or of a legacy peer if a party is at one.
+        reports
+            && (is_own
+                || parties.iter().any(|party| match agent.is_known() {
+                    true => party.mts == agent,
+                    false => !party.agent.is_known(),
+                }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::SystemTime;
+
+    use fipa_acl::AgentId;
+    use fipa_mts::core::Received;
+    use fipa_mts::letter_for;
+    use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+    use fipa_transport::Kind;
+
+    use super::*;
+
+    const ARM: Incarnation = Incarnation::from_u64(7);
+    const MALLORY: Incarnation = Incarnation::from_u64(8);
+    const ARMS_MTS: Incarnation = Incarnation::from_u64(9);
+
+    /// Creates a received message with the conversation id `c`.
+    fn message(sender: &str, from: Incarnation, act: Performative) -> Incoming {
+        let message = Message::builder(act)
+            .sender(AgentId::new(sender).unwrap())
+            .receiver(AgentId::new("rover").unwrap())
+            .ontology(MANAGEMENT_ONTOLOGY)
+            .conversation_id("c")
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, SystemTime::UNIX_EPOCH).unwrap();
+        let received = Received {
+            letter,
+            sender: from,
+            via: Some(Kind::Shm),
+            service: Incarnation::from_u64(1),
+            remote: false,
+        };
+        Incoming::new(message, received)
+    }
+
+    fn entry(name: &str, incarnation: Incarnation) -> Arc<Entry> {
+        let directory = MemoryDirectory::new(Mts::new("mts", ARMS_MTS));
+        let agent = Registration::new(name, incarnation, Vec::new());
+        directory.register(agent).unwrap()
+    }
+
+    fn state() -> (Demultiplexer, ReaderKey) {
+        let demultiplexer = Demultiplexer::default();
+        let arm = Party::new("arm", Some(&entry("arm", ARM)));
+        let key = demultiplexer.begin("c", Admitted::Parties(vec![arm]));
+        (demultiplexer, key)
+    }
+
+    #[test]
+    fn a_message_of_an_outsider_goes_to_receive_also_under_the_name_of_a_party() {
+        let (demultiplexer, key) = state();
+        let mut state = demultiplexer.state.lock();
+        let mallory = entry("mallory", MALLORY);
+        state.put(
+            message("mallory", MALLORY, Performative::Inform),
+            Some(&mallory),
+        );
+        state.put(
+            message("arm", MALLORY, Performative::Inform),
+            Some(&mallory),
+        );
+        // A letter of a legacy peer proves nothing.
+        let unknown = Incarnation::UNKNOWN;
+        state.put(message("arm", unknown, Performative::Inform), None);
+        // A report about a letter is believed from the services involved.
+        state.put(message("mts", MALLORY, Performative::Failure), None);
+        state.put(message("mts", unknown, Performative::Failure), None);
+        assert!(state.take(Reader::Conversation(&key)).is_none());
+        assert_eq!(state.others.len(), 5);
+    }
+
+    #[test]
+    fn messages_of_the_parties_and_of_their_services_reach_the_conversation() {
+        let (demultiplexer, key) = state();
+        demultiplexer.admit(&key, Party::new("legacy", None));
+        let mut state = demultiplexer.state.lock();
+        let unknown = Incarnation::UNKNOWN;
+        let arm = entry("arm", ARM);
+        state.put(message("arm", ARM, Performative::Inform), Some(&arm));
+        // The registration has left the directory.
+        state.put(message("arm", ARM, Performative::Inform), None);
+        // A new registration of the name.
+        let again = entry("arm", MALLORY);
+        state.put(message("arm", MALLORY, Performative::Inform), Some(&again));
+        state.put(message("legacy", unknown, Performative::Inform), None);
+        state.put(message("mts", ARMS_MTS, Performative::Failure), None);
+        state.put(message("ams", unknown, Performative::Failure), None);
+        assert_eq!(state.others.len(), 0);
+        let taken = std::iter::from_fn(|| state.take(Reader::Conversation(&key)));
+        assert_eq!(taken.count(), 6);
+    }
+
+    #[test]
+    fn conversations_with_one_id_and_different_parties_coexist() {
+        let (demultiplexer, with_arm) = state();
+        let leg_entry = entry("leg", MALLORY);
+        let leg = Party::new("leg", Some(&leg_entry));
+        let with_leg = demultiplexer.begin("c", Admitted::Parties(vec![leg]));
+        {
+            let mut state = demultiplexer.state.lock();
+            let arm = entry("arm", ARM);
+            state.put(message("arm", ARM, Performative::Inform), Some(&arm));
+            state.put(
+                message("leg", MALLORY, Performative::Inform),
+                Some(&leg_entry),
+            );
+            let name = |taken: Option<Incoming>| {
+                let message = taken.unwrap().message;
+                message.sender().unwrap().name().to_owned()
+            };
+            assert_eq!(name(state.take(Reader::Conversation(&with_arm))), "arm");
+            assert_eq!(name(state.take(Reader::Conversation(&with_leg))), "leg");
+        }
+        demultiplexer.end(&with_arm);
+        let mut state = demultiplexer.state.lock();
+        state.put(
+            message("leg", MALLORY, Performative::Inform),
+            Some(&leg_entry),
+        );
+        assert!(state.take(Reader::Conversation(&with_leg)).is_some());
+    }
+
+    #[test]
+    fn an_agent_that_only_serves_does_not_wait_for_a_reader_of_other_messages() {
+        let demultiplexer = Demultiplexer::default();
+        let query = Performative::QueryIf;
+        let key = demultiplexer.serve(Box::new(move |message| *message.performative() == query));
+        let mut state = demultiplexer.state.lock();
+        let other = || message("arm", ARM, Performative::Inform);
+        for _ in 0..MAX_SET_ASIDE + 10 {
+            assert!(state.has_room());
+            state.put(other(), None);
+        }
+        assert_eq!(state.others.len(), MAX_SET_ASIDE);
+        state.put(message("arm", ARM, Performative::QueryIf), None);
+        assert!(state.take(Reader::Server(&key)).is_some());
+        state.is_read = true;
+        assert!(!state.has_room());
     }
 }

@@ -14,10 +14,10 @@ impl Demultiplexer {
     }
 
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
-        endpoint.letter_now().transpose()
+        Ok(endpoint.letter_now())
     }
 
-    pub(crate) fn drain(&self) -> Vec<Result<Incoming, ReceiveError>> {
+    pub(crate) fn drain(&self) -> Vec<Incoming> {
         Vec::new()
     }
 }

@@ -116,19 +116,29 @@ impl Endpoint {
         }))
     }
 
-    /// Waits for the next message of any conversation.
+    /// Waits for the next message of any conversation. Skips letters that cannot be decoded.
     pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
         self.domain.inner.owner.check()?;
-        match self.mts().receive(self.incarnation).await {
-            Some(received) => self.decode(received),
-            None => Err(ReceiveError::Closed),
+        loop {
+            match self.mts().receive(self.incarnation).await {
+                Some(received) => {
+                    if let Some(incoming) = self.decode(received) {
+                        return Ok(incoming);
+                    }
+                }
+                None => return Err(ReceiveError::Closed),
+            }
         }
     }
 
-    /// Returns the next message, if one is available now.
-    pub(crate) fn letter_now(&self) -> Option<Result<Incoming, ReceiveError>> {
-        let received = self.mts().try_receive(self.incarnation);
-        received.map(|received| self.decode(received))
+    /// Returns the next message, if one is available now. Skips letters that cannot be decoded.
+    pub(crate) fn letter_now(&self) -> Option<Incoming> {
+        loop {
+            let received = self.mts().try_receive(self.incarnation)?;
+            if let Some(incoming) = self.decode(received) {
+                return Some(incoming);
+            }
+        }
     }
 
     /// Waits until the domain is closed.
@@ -137,20 +147,25 @@ impl Endpoint {
         self.mts().gone(self.incarnation).await;
     }
 
-    /// Decodes and checks a received letter.
-    pub(crate) fn decode(&self, received: Received) -> Result<Incoming, ReceiveError> {
-        let message = Message::decode(received.letter.payload()).map_err(|source| {
-            self.mts()
-                .handle_undecodable(&self.name, &received, source.to_string());
-            ReceiveError::Malformed {
-                source,
-                letter: Box::new(received.letter.clone()),
+    /// Decodes and checks a received letter. Returns `None` if the message cannot be decoded; the sender
+    /// then gets a failure message.
+    pub(crate) fn decode(&self, received: Received) -> Option<Incoming> {
+        let message = match Message::decode(received.letter.payload()) {
+            Ok(message) => message,
+            Err(error) => {
+                tracing::warn!(
+                    agent = %self.name, %error,
+                    "ignored a received letter: its message cannot be decoded"
+                );
+                self.mts()
+                    .handle_undecodable(&self.name, &received, error.to_string());
+                return None;
             }
-        })?;
-        let incoming = Incoming::new(message, received.letter, received.via);
-        self.checks.arrived(incoming, |message, reason| {
+        };
+        let incoming = Incoming::new(message, received);
+        Some(self.checks.arrived(incoming, |message, reason| {
             self.not_understood(message, reason)
-        })
+        }))
     }
 
     /// Answers a message that violates its protocol. Returns the answer if it was sent.

@@ -3,7 +3,6 @@
 #[cfg(feature = "monitor")]
 use std::path::PathBuf;
 
-use fipa_acl::{DecodeError, Letter};
 #[cfg(feature = "monitor")]
 use fipa_monitor::LibraryFull;
 #[cfg(feature = "monitor")]
@@ -16,8 +15,6 @@ use fipa_transport::{Forked, Kind, ListenError};
 
 use crate::config::{ConfigError, RuleError};
 use crate::domain_dir::DomainDirError;
-#[cfg(feature = "monitor")]
-use crate::incoming::Incoming;
 #[cfg(feature = "secure")]
 use crate::keys::KeysError;
 
@@ -119,7 +116,9 @@ pub enum SendError {
     Forked(#[from] Forked),
 }
 
-/// The error if no message is received.
+/// The error if an agent can receive no further message. A mistake of another agent is no error of this
+/// kind: see [`Incoming::violation`](crate::Incoming::violation) for messages that violate their
+/// protocol. Letters that cannot be decoded are logged, and their senders get failure messages.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReceiveError {
@@ -129,23 +128,6 @@ pub enum ReceiveError {
     /// This process is a forked child of the one that registered the agent.
     #[error(transparent)]
     Forked(#[from] Forked),
-    /// The message of a received letter cannot be decoded. Its sender gets a failure message.
-    #[error("received a letter with a message that cannot be decoded")]
-    Malformed {
-        /// The error of the decoder.
-        source: DecodeError,
-        /// The letter.
-        letter: Box<Letter>,
-    },
-    /// A received message violates its protocol, and `monitor.check` is `enforce`.
-    #[cfg(feature = "monitor")]
-    #[error("{violation}")]
-    Violation {
-        /// The violation.
-        violation: Box<fipa_monitor::Violation>,
-        /// The message.
-        incoming: Box<Incoming>,
-    },
 }
 
 /// The error if a file in `monitor.protocols` cannot be used.

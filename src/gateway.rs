@@ -11,6 +11,7 @@ mod gateway_agent;
 mod guard;
 mod neighbours;
 mod platform_agents;
+mod presence;
 mod publisher;
 
 use std::fmt;
@@ -179,6 +180,7 @@ impl Gateway {
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
             notices: Mutex::default(),
+            questions: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));
         let platform_agents = PlatformAgents {

@@ -83,6 +83,8 @@ pub mod keys;
 mod owner;
 #[cfg(feature = "monitor")]
 pub mod platform;
+#[cfg(any(feature = "monitor", feature = "net"))]
+mod presence;
 #[cfg(feature = "monitor")]
 pub mod protocol;
 pub mod routes;

@@ -437,7 +437,7 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
             .all_succeeded()
     );
     let unread = arm.deregister().unwrap();
-    let [Ok(unread)] = &unread[..] else {
+    let [unread] = &unread[..] else {
         panic!("one message waited: {unread:?}");
     };
     assert_eq!(unread.message.content().unwrap(), "first");

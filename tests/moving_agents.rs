@@ -112,7 +112,7 @@ async fn every_letter_to_a_moving_agent_has_one_correct_outcome() {
             }
         }
         for unread in arm.deregister().unwrap() {
-            taken.take(&unread.unwrap());
+            taken.take(&unread);
         }
         arm = hosts[next % hosts.len()].register_when_free("arm").await;
         moved.store(next, Ordering::Relaxed);
@@ -128,7 +128,7 @@ async fn every_letter_to_a_moving_agent_has_one_correct_outcome() {
         }
     };
     for unread in arm.deregister().unwrap() {
-        taken.take(&unread.unwrap());
+        taken.take(&unread);
     }
     check(&outcomes, &taken.numbers.lock());
     for host in [first, second, third] {

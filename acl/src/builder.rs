@@ -75,6 +75,12 @@ impl MessageBuilder {
         self
     }
 
+    /// Sets the receivers, and removes those that were set before.
+    pub fn replace_receivers(mut self, receivers: impl IntoIterator<Item = AgentId>) -> Self {
+        self.message.receivers.clear();
+        self.receivers(receivers)
+    }
+
     /// Adds an agent that receives replies instead of the sender.
     pub fn reply_to(mut self, agent: AgentId) -> Self {
         self.message.reply_to.push(agent);

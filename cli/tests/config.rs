@@ -131,6 +131,7 @@ rate = 0                             # default
 [monitor]
 check = \"off\"                        # default
 answer = false                       # default
+heartbeat = \"5s\"                     # default
 protocols = []                       # default
 
 [platform]

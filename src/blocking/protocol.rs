@@ -1,29 +1,33 @@
 //! The calls of [`crate::protocol`] under the same names, blocking.
 
+use std::fmt::Display;
 use std::ops::Deref;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::{Message, MessageBuilder, Performative};
-use tokio::runtime::Runtime;
+use tokio::runtime::Handle;
 
-use super::Agent;
+use super::{Agent, Background};
 use crate::AgentId;
 use crate::protocol::{
-    Auction, Awarded, Bids, ContractNet, Decision, DialogueError, Proxied, Reply, Request,
-    Subscription, Task,
+    Auction, Awarded, Bids, ContractNet, Decision, DialogueError, PartnerEvent, PartnerWatch,
+    Proxied, Publisher, Reply, Request, Server, Subscription, Task,
 };
 
 /// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
-/// [`Auction`], [`Proxied`] or [`Task`]. Dereferences to that type for the calls that do not wait.
+/// [`Auction`], [`Proxied`] or [`Task`], or a [`Server`], [`Publisher`] or [`PartnerWatch`]. Dereferences to that type for the calls that do not wait.
 #[derive(Debug)]
 #[must_use = "the conversation goes on with the calls of the inner type"]
-pub struct Side<'a, T> {
+pub struct Side<T> {
     inner: T,
-    runtime: &'a Runtime,
+    runtime: Handle,
+    /// Keeps the background thread running; `None` for a conversation that runs on it.
+    _background: Option<Background>,
 }
 
-impl<T> Deref for Side<'_, T> {
+impl<T> Deref for Side<T> {
     type Target = T;
 
     fn deref(&self) -> &T {
@@ -35,11 +39,17 @@ impl Agent {
     fn side<T>(
         &self,
         begin: impl Future<Output = Result<T, DialogueError>>,
-    ) -> Result<Side<'_, T>, DialogueError> {
-        Ok(Side {
-            inner: self.runtime.block_on(begin)?,
-            runtime: &self.runtime,
-        })
+    ) -> Result<Side<T>, DialogueError> {
+        let inner = self.runtime.block_on(begin)?;
+        Ok(self.side_of(inner))
+    }
+
+    fn side_of<T>(&self, inner: T) -> Side<T> {
+        Side {
+            inner,
+            runtime: self.runtime.handle().clone(),
+            _background: Some(self.runtime.clone()),
+        }
     }
 
     /// See [`crate::Agent::request`].
@@ -64,7 +74,7 @@ impl Agent {
         &self,
         request: MessageBuilder,
         patience: Duration,
-    ) -> Result<Side<'_, Request<'_>>, DialogueError> {
+    ) -> Result<Side<Request>, DialogueError> {
         self.side(self.agent.request(request, patience))
     }
 
@@ -76,7 +86,7 @@ impl Agent {
         &self,
         query: MessageBuilder,
         patience: Duration,
-    ) -> Result<Side<'_, Request<'_>>, DialogueError> {
+    ) -> Result<Side<Request>, DialogueError> {
         self.side(self.agent.query(query, patience))
     }
 
@@ -88,7 +98,7 @@ impl Agent {
         &self,
         request: MessageBuilder,
         patience: Duration,
-    ) -> Result<Side<'_, Request<'_>>, DialogueError> {
+    ) -> Result<Side<Request>, DialogueError> {
         self.side(self.agent.request_when(request, patience))
     }
 
@@ -113,7 +123,7 @@ impl Agent {
         &self,
         subscribe: MessageBuilder,
         patience: Duration,
-    ) -> Result<Side<'_, Subscription<'_>>, DialogueError> {
+    ) -> Result<Side<Subscription>, DialogueError> {
         self.side(self.agent.subscribe(subscribe, patience))
     }
 
@@ -126,7 +136,7 @@ impl Agent {
         call: MessageBuilder,
         receivers: &[AgentId],
         patience: Duration,
-    ) -> Result<Side<'_, ContractNet<'_>>, DialogueError> {
+    ) -> Result<Side<ContractNet>, DialogueError> {
         self.side(self.agent.contract_net(call, receivers, patience))
     }
 
@@ -139,7 +149,7 @@ impl Agent {
         call: MessageBuilder,
         receivers: &[AgentId],
         patience: Duration,
-    ) -> Result<Side<'_, ContractNet<'_>>, DialogueError> {
+    ) -> Result<Side<ContractNet>, DialogueError> {
         self.side(self.agent.iterated_contract_net(call, receivers, patience))
     }
 
@@ -151,7 +161,7 @@ impl Agent {
         &self,
         opening: MessageBuilder,
         bidders: &[AgentId],
-    ) -> Result<Side<'_, Auction<'_>>, DialogueError> {
+    ) -> Result<Side<Auction>, DialogueError> {
         self.side(self.agent.english_auction(opening, bidders))
     }
 
@@ -163,7 +173,7 @@ impl Agent {
         &self,
         opening: MessageBuilder,
         bidders: &[AgentId],
-    ) -> Result<Side<'_, Auction<'_>>, DialogueError> {
+    ) -> Result<Side<Auction>, DialogueError> {
         self.side(self.agent.dutch_auction(opening, bidders))
     }
 
@@ -175,7 +185,7 @@ impl Agent {
         &self,
         proxy: MessageBuilder,
         patience: Duration,
-    ) -> Result<Side<'_, Proxied<'_>>, DialogueError> {
+    ) -> Result<Side<Proxied>, DialogueError> {
         self.side(self.agent.brokering(proxy, patience))
     }
 
@@ -187,7 +197,7 @@ impl Agent {
         &self,
         proxy: MessageBuilder,
         patience: Duration,
-    ) -> Result<Side<'_, Proxied<'_>>, DialogueError> {
+    ) -> Result<Side<Proxied>, DialogueError> {
         self.side(self.agent.recruiting(proxy, patience))
     }
 
@@ -195,10 +205,120 @@ impl Agent {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn take_part(&self, first: &Message) -> Result<Side<'_, Task<'_>>, DialogueError> {
-        Ok(Side {
-            inner: self.agent.take_part(first)?,
-            runtime: &self.runtime,
+    pub fn take_part(&self, first: &Message) -> Result<Side<Task>, DialogueError> {
+        Ok(self.side_of(self.agent.take_part(first)?))
+    }
+
+    /// Serves a protocol like [`crate::Agent::serve`]. The handler runs in a thread of its own for each
+    /// conversation.
+    ///
+    /// ```no_run
+    /// # fn example(agent: fipa::blocking::Agent) -> Result<(), Box<dyn std::error::Error>> {
+    /// use fipa::blocking::Side;
+    /// use fipa::protocol::{DialogueError, Reply, Task};
+    ///
+    /// let mut server = agent.serve("fipa-request", |mut task: Side<Task>| {
+    ///     task.agree("")?;
+    ///     Ok::<_, DialogueError>(Reply::Inform("done".into()))
+    /// })?;
+    /// server.ended();
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
+    /// # Errors
+    /// As for the async call.
+    pub fn serve<H, E>(&self, protocol: &str, handler: H) -> Result<Side<Server>, DialogueError>
+    where
+        H: Fn(Side<Task>) -> Result<Reply, E> + Send + Sync + 'static,
+        E: Display + Send + 'static,
+    {
+        let handler = Arc::new(handler);
+        let runtime = self.runtime.handle().clone();
+        let _context = self.runtime.enter();
+        let server = self.agent.serve(protocol, move |task| {
+            let (handler, side) = (Arc::clone(&handler), of_served(task, &runtime));
+            let handled = tokio::task::spawn_blocking(move || handler(side));
+            async move {
+                match handled.await {
+                    Ok(handled) => handled.map_err(|error| error.to_string()),
+                    Err(error) => Err(error.to_string()),
+                }
+            }
+        })?;
+        Ok(self.side_of(server))
+    }
+
+    /// See [`crate::Agent::publisher`].
+    ///
+    /// # Errors
+    /// As for the async call.
+    pub fn publisher(&self, topic: impl Into<Bytes>) -> Result<Side<Publisher>, DialogueError> {
+        let _context = self.runtime.enter();
+        Ok(self.side_of(self.agent.publisher(topic)?))
+    }
+
+    /// See [`crate::Agent::watch_partners`].
+    pub fn watch_partners(&self) -> Side<PartnerWatch> {
+        self.side_of(self.agent.watch_partners())
+    }
+}
+
+/// Creates the side of a handler, which must not keep the runtime that it runs on.
+fn of_served(task: Task, runtime: &Handle) -> Side<Task> {
+    Side {
+        inner: task,
+        runtime: runtime.clone(),
+        _background: None,
+    }
+}
+
+impl Side<Server> {
+    /// See [`Server::ended`].
+    pub fn ended(&mut self) {
+        self.runtime.block_on(self.inner.ended());
+    }
+}
+
+impl Side<Publisher> {
+    /// See [`Publisher::publish`].
+    pub fn publish(&self, content: impl Into<Bytes>) -> usize {
+        self.runtime.block_on(self.inner.publish(content))
+    }
+}
+
+impl Side<PartnerWatch> {
+    /// See [`PartnerWatch::add`].
+    pub fn add(&mut self, agent: &str) {
+        self.inner.add(agent);
+    }
+
+    /// See [`PartnerWatch::remove`].
+    pub fn remove(&mut self, agent: &str) {
+        self.inner.remove(agent);
+    }
+
+    /// Waits up to `patience` for the next event; see [`PartnerWatch::next`].
+    pub fn next_within(&mut self, patience: Duration) -> Option<PartnerEvent> {
+        let inner = &mut self.inner;
+        self.runtime
+            .block_on(async { tokio::time::timeout(patience, inner.next()).await.ok() })
+    }
+}
+
+impl Side<Subscription> {
+    /// Waits up to `patience` for the next notification; returns `None` if none arrives. See
+    /// [`Subscription::next`].
+    ///
+    /// # Errors
+    /// As for the async call.
+    pub fn next_within(&mut self, patience: Duration) -> Result<Option<Message>, DialogueError> {
+        let inner = &mut self.inner;
+        self.runtime.block_on(async {
+            match tokio::time::timeout(patience, inner.next()).await {
+                Ok(received) => received.map(Some),
+                Err(_) => Ok(None),
+            }
         })
     }
 }
@@ -209,7 +329,7 @@ macro_rules! blocking {
         $(#[$kind:ident])? fn $name:ident($($argument:ident: $type:ty),*) -> $output:ty;
     )*) => {
         #[allow(clippy::should_implement_trait, reason = "unlike an iterator, it goes on after an error")]
-        impl Side<'_, $side<'_>> {
+        impl Side<$side> {
             $(blocking!(@ $($kind)? $side $name ($($argument: $type),*) $output);)*
         }
     };
@@ -277,7 +397,7 @@ blocking! { Task:
     #[last] fn reply(reply: Reply) -> ();
 }
 
-impl Side<'_, Task<'_>> {
+impl Side<Task> {
     /// Waits up to `patience` for a cancel of the initiator, and returns whether it came. For a
     /// participant that checks between two steps of its work; see [`Task::cancelled`].
     ///

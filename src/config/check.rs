@@ -50,6 +50,12 @@ const MAX_LEGACY_PEERS: usize = 64;
 /// Lower bound of `security.peer_bytes`, in bytes per second: idle connections need some to stay open.
 const MIN_PEER_BYTES: u64 = 64 << 10;
 
+/// Lower bound of `monitor.heartbeat`: a fifth of it is the time between two letters.
+const MIN_HEARTBEAT: Duration = Duration::from_millis(100);
+
+/// Upper bound of `monitor.heartbeat`.
+const MAX_HEARTBEAT: Duration = Duration::from_secs(3600);
+
 /// Maximum number of entries of `monitor.protocols`.
 const MAX_PROTOCOLS: usize = 128;
 
@@ -103,6 +109,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.peers(&config.discovery.peers);
     found.security(config);
     found.access(&config.access);
+    found.heartbeat(config.monitor.heartbeat);
     found.protocols(&config.monitor.protocols);
     found.platform(&config.platform);
     found.0
@@ -261,6 +268,17 @@ impl Findings {
         {
             let what = format_args!("is {df:?}, which is the name of platform.ams, too");
             self.add(&["platform", "df"], what, "use another name");
+        }
+    }
+
+    fn heartbeat(&mut self, heartbeat: Duration) {
+        if !(MIN_HEARTBEAT..=MAX_HEARTBEAT).contains(&heartbeat) {
+            let show = humantime::format_duration;
+            self.add(
+                &["monitor", "heartbeat"],
+                format_args!("cannot be {}", show(heartbeat)),
+                format!("use {} to {}", show(MIN_HEARTBEAT), show(MAX_HEARTBEAT)),
+            );
         }
     }
 

@@ -264,6 +264,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Truth(config.monitor.answer),
     },
     Key {
+        path: &["monitor", "heartbeat"],
+        shape: Shape::Text,
+        expected: r#"a duration such as "5s""#,
+        write: |config, value| duration(value).map(|time| config.monitor.heartbeat = time),
+        read: |config| duration_text(config.monitor.heartbeat),
+    },
+    Key {
         path: &["monitor", "protocols"],
         shape: Shape::List,
         expected: r#"a list of SCXML files such as ["protocols/lift.scxml"]"#,

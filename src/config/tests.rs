@@ -129,6 +129,7 @@ fn every_key_is_read() {
         [monitor]
         check = "enforce"
         answer = true
+        heartbeat = "2s"
         protocols = ["lift.scxml"]
         [platform]
         ams = false
@@ -175,6 +176,7 @@ fn every_key_is_read() {
     assert_eq!(security.peer_bytes, 1 << 20);
     assert_eq!(config.monitor.check, Check::Enforce);
     assert!(config.monitor.answer);
+    assert_eq!(config.monitor.heartbeat, Duration::from_secs(2));
     assert_eq!(config.monitor.protocols, ["lift.scxml"]);
     assert_eq!(config.platform.ams, PlatformAgent::Off);
     let named = PlatformAgent::Named("yellow pages".to_owned());
@@ -349,6 +351,7 @@ rate = 0                             # default
 [monitor]
 check = "off"                        # default
 answer = false                       # default
+heartbeat = "5s"                     # default
 protocols = []                       # default
 
 [platform]

@@ -10,7 +10,7 @@ const LOCATIONS: &str = "locations";
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let transport = &config.transport;
-    let listens: [(Kind, &[String]); 4] = [
+    let listens: [(Kind, &[String]); 5] = [
         (Kind::Tcp, &transport.tcp.listen),
         (Kind::Udp, &transport.udp.listen),
         (Kind::Quic, &transport.quic.listen),

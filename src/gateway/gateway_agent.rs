@@ -19,6 +19,8 @@ use parking_lot::Mutex;
 
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::neighbours::Neighbours;
+use super::presence::Questions;
+use crate::presence;
 use crate::routes;
 use crate::service::Service;
 
@@ -37,6 +39,8 @@ pub(crate) struct GatewayAgent {
     pub(super) exchange: Arc<Exchanging>,
     /// Time of the last logged notice of each gateway.
     pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
+    /// The questions of agents of this host about agents of other hosts.
+    pub(super) questions: Mutex<Questions>,
 }
 
 impl GatewayAgent {
@@ -71,6 +75,9 @@ impl GatewayAgent {
             && received.service == sender
         {
             return self.log_notice(sender, message);
+        }
+        if message.ontology() == Some(presence::ONTOLOGY) {
+            return self.handle_presence(message, received);
         }
         let asked = matches!(
             message.performative(),
@@ -146,7 +153,7 @@ impl GatewayAgent {
     }
 
     /// Sends an answer to exactly the incarnation of the agent that asked.
-    fn answer(
+    pub(super) fn answer(
         &self,
         message: &Message,
         sender: Incarnation,

@@ -1,18 +1,24 @@
 //! The auctioneer's side of the English auction (FIPA00031) and the Dutch auction (FIPA00032).
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_mts::Sending;
 
-use super::bids::Bids;
+use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, settle, unreached};
-use crate::agent::Agent;
+use super::reachability::Reachability;
+use super::receivers::expand;
+use crate::agent::{Agent, AgentCore};
 
 impl Agent {
     /// Opens an English auction (FIPA00031), in which the price rises. The message, an `inform`,
-    /// announces it to the bidders. Bidders that cannot be reached are left out.
+    /// announces it to the bidders. Bidders that cannot be reached, or are gone, are left out.
+    ///
+    /// A pattern or a coalition among the bidders stands for the agents known now, which
+    /// [`Auction::bidders`] returns. A name that is given twice counts once.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -42,8 +48,8 @@ impl Agent {
         &self,
         opening: MessageBuilder,
         bidders: &[AgentId],
-    ) -> Result<Auction<'_>, DialogueError> {
-        Auction::open(self, "fipa-auction-english", opening, bidders).await
+    ) -> Result<Auction, DialogueError> {
+        Auction::open(&self.core, "fipa-auction-english", opening, bidders).await
     }
 
     /// Opens a Dutch auction (FIPA00032), in which the price falls until an agent bids, and which
@@ -55,8 +61,8 @@ impl Agent {
         &self,
         opening: MessageBuilder,
         bidders: &[AgentId],
-    ) -> Result<Auction<'_>, DialogueError> {
-        Auction::open(self, "fipa-auction-dutch", opening, bidders).await
+    ) -> Result<Auction, DialogueError> {
+        Auction::open(&self.core, "fipa-auction-dutch", opening, bidders).await
     }
 }
 
@@ -66,8 +72,8 @@ impl Agent {
 /// FIPA defines no cancel for auctions.
 #[derive(Debug)]
 #[must_use = "an auction goes on until it is closed"]
-pub struct Auction<'a> {
-    dialogue: Dialogue<'a>,
+pub struct Auction {
+    dialogue: Dialogue,
     /// The bidders that can be called.
     bidders: Vec<AgentId>,
     /// Bids of the last call without a decision.
@@ -76,18 +82,19 @@ pub struct Auction<'a> {
     leader: Option<Message>,
 }
 
-impl<'a> Auction<'a> {
+impl Auction {
     async fn open(
-        agent: &'a Agent,
+        core: &Arc<AgentCore>,
         protocol: &str,
         opening: MessageBuilder,
         bidders: &[AgentId],
     ) -> Result<Self, DialogueError> {
-        let opening = opening.receivers(bidders.to_vec());
-        let (dialogue, sent) = Dialogue::open(agent, protocol, opening, None).await?;
+        let bidders = expand(core, bidders).agents;
+        let opening = opening.receivers(bidders.clone());
+        let (dialogue, sent) = Dialogue::open(core, protocol, opening, None).await?;
         let mut auction = Self {
             dialogue,
-            bidders: bidders.to_vec(),
+            bidders,
             undecided: Vec::new(),
             leader: None,
         };
@@ -105,6 +112,12 @@ impl<'a> Auction<'a> {
     #[must_use]
     pub fn bidders(&self) -> &[AgentId] {
         &self.bidders
+    }
+
+    /// Returns a receiver of changes of the reachability of the bidders.
+    #[must_use]
+    pub fn reachability(&self) -> Reachability {
+        self.dialogue.reachability()
     }
 
     /// Returns the bidder of the last accepted bid.
@@ -138,8 +151,21 @@ impl<'a> Auction<'a> {
         let names = self.bidders.iter().map(|bidder| bidder.name().to_owned());
         let mut called: Vec<String> = names.collect();
         while !called.is_empty() {
-            let Some((answer, over)) = bids.next(&mut self.dialogue, due).await? else {
-                break;
+            let (answer, over) = match bids.next(&mut self.dialogue, due).await? {
+                Next::Answer(answer, over) => (*answer, over),
+                Next::TimedOut => break,
+                Next::Gone(agent) => {
+                    self.lose([agent.as_str()].into_iter());
+                    // Its bid can no longer be accepted.
+                    self.undecided.retain(|bid| name_of(bid) != agent);
+                    bids.proposals.retain(|bid| name_of(bid) != agent);
+                    called.retain(|name| *name != agent);
+                    bids.lose(&agent);
+                    if self.dialogue.all_gone() {
+                        break;
+                    }
+                    continue;
+                }
             };
             let from = name_of(&answer);
             if over {

@@ -18,28 +18,36 @@ pub struct Bids {
     pub proposals: Vec<Message>,
     /// The `refuse` and `not-understood` messages.
     pub refusals: Vec<Message>,
-    /// The names of the agents that did not answer in time or could not be reached.
+    /// The names of the agents that did not answer in time, could not be reached, or are gone.
     pub silent: Vec<String>,
+    /// The names of the agents that are gone: of those in `silent`, the ones that received the call and
+    /// then left or died.
+    pub gone: Vec<String>,
     /// The first 64 violations of the protocol. An agent that violates it can still make a proposal,
     /// and other agents are not affected.
     pub violations: Vec<Violation>,
 }
 
 impl Bids {
-    /// Waits for the next answer. Returns it with whether its sender can send nothing more, or `None`
-    /// at the time limit.
+    /// Waits for the next answer.
     pub(super) async fn next(
         &mut self,
-        dialogue: &mut Dialogue<'_>,
+        dialogue: &mut Dialogue,
         due: Option<Instant>,
-    ) -> Result<Option<(Message, bool)>, DialogueError> {
+    ) -> Result<Next, DialogueError> {
         loop {
             return match dialogue.receive(due).await {
                 // An answer to an earlier call.
                 Ok(received) if received.meaning.void => continue,
-                Ok(received) => Ok(Some((received.message, received.meaning.over))),
-                Err(DialogueError::NotUnderstood(message)) => Ok(Some((*message, true))),
-                Err(DialogueError::TimedOut) => Ok(None),
+                Ok(received) => {
+                    let message = Box::new(received.message);
+                    Ok(Next::Answer(message, received.meaning.over))
+                }
+                Err(DialogueError::NotUnderstood(message)) => Ok(Next::Answer(message, true)),
+                Err(DialogueError::Gone { agent }) => Ok(Next::Gone(agent)),
+                Err(DialogueError::TimedOut | DialogueError::Unreachable { .. }) => {
+                    Ok(Next::TimedOut)
+                }
                 // The outcomes of the call already have its receiver.
                 Err(DialogueError::Undelivered(_)) => continue,
                 Err(DialogueError::Violation { violation, .. }) => {
@@ -53,10 +61,26 @@ impl Bids {
         }
     }
 
+    /// Adds an agent that is gone.
+    pub(super) fn lose(&mut self, agent: &str) {
+        self.silent.push(agent.to_owned());
+        self.gone.push(agent.to_owned());
+    }
+
     pub(super) fn add(&mut self, answer: Message) {
         match answer.performative() {
             Performative::Propose => self.proposals.push(answer),
             _ => self.refusals.push(answer),
         }
     }
+}
+
+/// The next event of a call for proposals.
+pub(super) enum Next {
+    /// An answer, and whether its sender can send nothing more.
+    Answer(Box<Message>, bool),
+    /// This agent is gone.
+    Gone(String),
+    /// The time of the call is over.
+    TimedOut,
 }

@@ -1,19 +1,25 @@
 //! The initiator's side of the contract net (FIPA00029) and the iterated contract net (FIPA00030).
 
 use std::fmt;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_mts::Sending;
 
-use super::bids::Bids;
+use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, settle, unreached};
-use crate::agent::Agent;
+use super::reachability::Reachability;
+use super::receivers::expand;
+use crate::agent::{Agent, AgentCore};
 use crate::delivery::deliveries;
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have
-    /// answered, at most for `patience`. Receivers that cannot be reached count as silent.
+    /// answered, at most for `patience`. Receivers that cannot be reached, or are gone, count as silent.
+    ///
+    /// A pattern or a coalition among the receivers stands for the agents known now, which
+    /// [`ContractNet::called`] returns. A name that is given twice counts once.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -39,8 +45,8 @@ impl Agent {
         call: MessageBuilder,
         receivers: &[AgentId],
         patience: Duration,
-    ) -> Result<ContractNet<'_>, DialogueError> {
-        ContractNet::begin(self, "fipa-contract-net", call, receivers, patience).await
+    ) -> Result<ContractNet, DialogueError> {
+        ContractNet::begin(&self.core, "fipa-contract-net", call, receivers, patience).await
     }
 
     /// Calls for proposals like [`contract_net`](Self::contract_net), with the iterated protocol
@@ -53,17 +59,19 @@ impl Agent {
         call: MessageBuilder,
         receivers: &[AgentId],
         patience: Duration,
-    ) -> Result<ContractNet<'_>, DialogueError> {
+    ) -> Result<ContractNet, DialogueError> {
         let protocol = "fipa-iterated-contract-net";
-        ContractNet::begin(self, protocol, call, receivers, patience).await
+        ContractNet::begin(&self.core, protocol, call, receivers, patience).await
     }
 }
 
 /// A call for proposals whose answers are collected. [`award`](Self::award) decides on the proposals.
 #[must_use = "award() decides on the proposals"]
-pub struct ContractNet<'a> {
-    dialogue: Dialogue<'a>,
+pub struct ContractNet {
+    dialogue: Dialogue,
     bids: Bids,
+    /// The agents that received or were to receive the first call.
+    called: Vec<AgentId>,
     /// The agents with which the conversation has not ended.
     open: Vec<AgentId>,
     /// Rejections in transit.
@@ -80,7 +88,7 @@ pub struct Awarded {
     pub result: Result<Message, DialogueError>,
 }
 
-impl fmt::Debug for ContractNet<'_> {
+impl fmt::Debug for ContractNet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("ContractNet")
             .field("dialogue", &self.dialogue)
@@ -90,21 +98,26 @@ impl fmt::Debug for ContractNet<'_> {
     }
 }
 
-impl<'a> ContractNet<'a> {
+impl ContractNet {
     async fn begin(
-        agent: &'a Agent,
+        core: &Arc<AgentCore>,
         protocol: &str,
         call: MessageBuilder,
         receivers: &[AgentId],
         patience: Duration,
     ) -> Result<Self, DialogueError> {
         let due = after(patience);
-        let call = call.receivers(receivers.to_vec());
-        let (dialogue, sent) = Dialogue::open(agent, protocol, call, due).await?;
+        let expanded = expand(core, receivers);
+        let call = call.receivers(expanded.agents.clone());
+        let (dialogue, sent) = Dialogue::open(core, protocol, call, due).await?;
         let mut net = Self {
             dialogue,
-            bids: Bids::default(),
-            open: receivers.to_vec(),
+            bids: Bids {
+                silent: expanded.missing,
+                ..Bids::default()
+            },
+            open: expanded.agents.clone(),
+            called: expanded.agents,
             rejections: Vec::new(),
         };
         net.lose(unreached(&sent));
@@ -112,6 +125,19 @@ impl<'a> ContractNet<'a> {
         let called = called.collect();
         net.collect(called, due).await?;
         Ok(net)
+    }
+
+    /// Returns the agents that were called first: the given ones, with the members of coalitions and
+    /// the agents that matched patterns.
+    #[must_use]
+    pub fn called(&self) -> &[AgentId] {
+        &self.called
+    }
+
+    /// Returns a receiver of changes of the reachability of the called agents.
+    #[must_use]
+    pub fn reachability(&self) -> Reachability {
+        self.dialogue.reachability()
     }
 
     /// Returns the answers to the last call.
@@ -170,7 +196,8 @@ impl<'a> ContractNet<'a> {
         Ok(())
     }
 
-    /// Accepts these proposals, rejects all others, and waits for the results of the accepted ones.
+    /// Accepts these proposals, rejects all others, and waits for the results of the accepted ones. An
+    /// agent that leaves or dies has the result [`DialogueError::Gone`] at once.
     /// `content` is the content of acceptances and rejections. All of them are sent before the first
     /// outcome is awaited, so that an unreachable agent does not delay the others.
     ///
@@ -231,7 +258,13 @@ impl<'a> ContractNet<'a> {
                     let agent = name_of(&message);
                     (agent, Err(DialogueError::Violation { violation, message }))
                 }
-                Err(DialogueError::TimedOut) => break,
+                Err(DialogueError::Gone { agent }) => {
+                    let gone = DialogueError::Gone {
+                        agent: agent.clone(),
+                    };
+                    (agent, Err(gone))
+                }
+                Err(DialogueError::TimedOut | DialogueError::Unreachable { .. }) => break,
                 Err(DialogueError::Undelivered(_)) => continue,
                 Err(other) => return Err(other),
             };
@@ -241,10 +274,12 @@ impl<'a> ContractNet<'a> {
                     self.open.retain(|open| open.name() != agent);
                 }
                 results.push(Awarded { agent, result });
+            } else if self.dialogue.all_gone() {
+                break;
             }
         }
         for agent in working {
-            let result = Err(DialogueError::TimedOut);
+            let result = Err(self.dialogue.timed_out(Some(&agent)));
             results.push(Awarded { agent, result });
         }
         self.settle(due).await;
@@ -268,8 +303,19 @@ impl<'a> ContractNet<'a> {
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
         while !called.is_empty() {
-            let Some((answer, over)) = self.bids.next(&mut self.dialogue, due).await? else {
-                break;
+            let (answer, over) = match self.bids.next(&mut self.dialogue, due).await? {
+                Next::Answer(answer, over) => (*answer, over),
+                Next::TimedOut => break,
+                Next::Gone(agent) => {
+                    self.open.retain(|open| open.name() != agent);
+                    if let Some(at) = called.iter().position(|name| *name == agent) {
+                        called.swap_remove(at);
+                        self.bids.lose(&agent);
+                    } else if self.dialogue.all_gone() {
+                        break;
+                    }
+                    continue;
+                }
             };
             let from = name_of(&answer);
             if over {

@@ -5,13 +5,21 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time, escape};
-use fipa_monitor::{Header, Monitor, Unchecked, Verdict, Violation};
+use fipa_monitor::{Header, Library, Monitor, Unchecked, Verdict, Violation, ViolationKind};
 use fipa_mts::{Sending, letter_for};
 use fipa_transport::{FailureReason, Incarnation, Outcome};
 
-use crate::agent::Agent;
+use super::partners::PartnerEvent;
+use super::reachability::{Reachability, ReachabilitySender};
+use super::watching::PartnerWatch;
+use crate::agent::AgentCore;
 use crate::delivery::{Deliveries, Delivery, deliveries};
+use crate::demultiplexer::{Admitted, Party, ReaderKey};
 use crate::error::{ReceiveError, SendError};
+use crate::incoming::Incoming;
+
+/// Maximum number of `reply-to` names of a participant that are followed.
+const MAX_DELEGATES: usize = 16;
 
 /// The error of a conversation.
 #[derive(Debug, thiserror::Error)]
@@ -43,6 +51,42 @@ pub enum DialogueError {
     /// No message arrived within the given time.
     #[error("no answer arrived in time")]
     TimedOut,
+    /// The other agent is gone: it left, died, or has registered again without having moved. Its own
+    /// host reports this.
+    #[error(
+        "the agent {} is gone: it has left, or its process has ended; start it again, or choose \
+         another agent",
+        escape(agent)
+    )]
+    Gone {
+        /// The name of the agent.
+        agent: String,
+    },
+    /// The host of the other agent gives no sign of life. The agent may still run.
+    #[error(
+        "the host of the agent {} has been silent for {} s; check the network and the gateway there",
+        escape(agent),
+        since.elapsed().as_secs()
+    )]
+    Unreachable {
+        /// The name of the agent.
+        agent: String,
+        /// The time of the last sign of life.
+        since: Instant,
+    },
+    /// The receivers of the message stand for several agents, and the call needs one. Holds their
+    /// names.
+    #[error("the receivers stand for {} agents, and this call needs one: {}", agents.len(), listed(agents))]
+    Several {
+        /// The names of the agents.
+        agents: Vec<String>,
+    },
+    /// The message does not begin a conversation of a known protocol with this agent.
+    #[error("the message does not begin a protocol: {0}")]
+    NotOpening(Box<Message>),
+    /// The call was made outside a tokio runtime.
+    #[error("no tokio runtime is running; call this within one, or use fipa::blocking")]
+    NoRuntime,
     /// The other side sent a message that the protocol allows but the call does not expect.
     #[error("received a message that this call does not expect: {0}")]
     Unexpected(Box<Message>),
@@ -88,6 +132,8 @@ pub(super) struct Meaning {
     pub(super) over: bool,
     /// Whether it answers a message that a later one has replaced, and so has no effect.
     pub(super) void: bool,
+    /// Whether it begins the conversation.
+    opened: bool,
 }
 
 /// The state of a conversation after a message.
@@ -103,53 +149,164 @@ pub(super) enum DialogueState {
     Undelivered,
 }
 
-/// A conversation. After dropping it, its further messages go to [`Agent::receive`].
-pub(super) struct Dialogue<'a> {
-    agent: &'a Agent,
+/// A conversation. After dropping it, its further messages go to [`Agent::receive`](crate::Agent::receive).
+pub(super) struct Dialogue {
+    speaker: Speaker,
+    key: ReaderKey,
+    partners: PartnerWatch,
+    reachability: ReachabilitySender,
+    /// Number of followed `reply-to` names.
+    delegates: usize,
+}
+
+/// The sending side of a conversation, and its state.
+pub(super) struct Speaker {
+    core: Arc<AgentCore>,
     protocol: String,
     id: String,
     monitor: Monitor,
     /// The state of its own protocol, with the agent of the last message.
     state: String,
+    /// Whether only an answer to the last message can follow.
+    over: bool,
+    /// Number of sent messages.
     replies: u32,
 }
 
-impl<'a> Dialogue<'a> {
-    /// Begins a conversation of this protocol. The first answer must arrive by `due`.
+impl Dialogue {
+    /// Begins a conversation of this protocol. The first answer must arrive by `due`. The receivers of
+    /// the message are single agents.
     pub(super) async fn open(
-        agent: &'a Agent,
+        core: &Arc<AgentCore>,
         protocol: &str,
         first: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<(Self, Deliveries), DialogueError> {
-        let id = format!("{}--{}", agent.name(), Incarnation::random());
-        let mut dialogue = Self::led(agent, protocol, id);
+        let id = format!("{}--{}", core.endpoint.name, Incarnation::random());
+        let built = first.clone().build()?;
+        let with = built.receivers().iter().map(AgentId::name);
+        let mut dialogue = Self::led(core, protocol, id, with);
+        if dialogue.follows("fipa-recruiting") {
+            // The recruiter chooses the agents that answer.
+            dialogue.agent().demultiplexer.admit_all(&dialogue.key);
+        }
         let deliveries = dialogue.send(first, due).await?;
+        for delivery in deliveries.0.iter().filter(|it| it.outcome.is_success()) {
+            // The delivery may have found a later registration of the name.
+            dialogue.readmit(&delivery.receiver);
+            dialogue.partners.add(&delivery.receiver);
+        }
         Ok((dialogue, deliveries))
     }
 
     /// Takes part in the conversation that a message has begun.
-    pub(super) fn join(agent: &'a Agent, first: &Message) -> Result<Self, DialogueError> {
+    pub(super) fn join(core: &Arc<AgentCore>, first: &Message) -> Result<Self, DialogueError> {
         let id = first.conversation_id();
         let id = id.ok_or(DialogueError::Unchecked(Unchecked::NoConversation))?;
-        let mut dialogue = Self::led(agent, first.protocol().unwrap_or_default(), id.to_owned());
-        dialogue
-            .check(first)
-            .map_err(|failure| failure.on_received(first))?;
+        let initiator = name_of(first);
+        if initiator == *core.endpoint.name {
+            return Err(DialogueError::NotOpening(Box::new(first.clone())));
+        }
+        let mut speaker = Speaker::new(core, first.protocol().unwrap_or_default(), id.to_owned());
+        match speaker.check(first) {
+            Ok(meaning) if meaning.opened => {}
+            Ok(_) => return Err(DialogueError::NotOpening(Box::new(first.clone()))),
+            Err(CheckFailure::Violation(violation))
+                if violation.kind == ViolationKind::NotOpened =>
+            {
+                return Err(DialogueError::NotOpening(Box::new(first.clone())));
+            }
+            Err(failure) => return Err(failure.on_received(first)),
+        }
+        let mut dialogue = Self::of(speaker, std::iter::once(initiator.as_str()));
+        dialogue.partners.add(&initiator);
+        dialogue.follow_delegates(first);
         Ok(dialogue)
     }
 
-    fn led(agent: &'a Agent, protocol: &str, id: String) -> Self {
-        agent.demultiplexer.begin(&id);
-        let library = Arc::clone(agent.domain().inner.rules.library());
+    fn led<'n>(
+        core: &Arc<AgentCore>,
+        protocol: &str,
+        id: String,
+        with: impl Iterator<Item = &'n str>,
+    ) -> Self {
+        Self::of(Speaker::new(core, protocol, id), with)
+    }
+
+    fn of<'n>(speaker: Speaker, with: impl Iterator<Item = &'n str>) -> Self {
+        let core = &speaker.core;
+        // Before the first message is sent, so that no departure is missed.
+        let partners = PartnerWatch::new(Arc::clone(core));
+        let directory = core.endpoint.domain.directory();
+        // A known entry may be that of an earlier registration. The answers of an agent that leaves after
+        // its last message are recognized by its registration.
+        directory.refresh();
+        let parties = with.map(|name| Party::new(name, directory.lookup(name).as_deref()));
+        let parties = Admitted::Parties(parties.collect());
         Self {
-            agent,
-            protocol: protocol.to_owned(),
-            id,
-            monitor: Monitor::agent(library, agent.name()),
-            state: String::new(),
-            replies: 0,
+            key: core.demultiplexer.begin(&speaker.id, parties),
+            speaker,
+            partners,
+            reachability: ReachabilitySender::default(),
+            delegates: 0,
         }
+    }
+
+    /// Adds an agent to the conversation.
+    pub(super) fn admit(&mut self, name: &str) {
+        let core = &self.speaker.core;
+        let entry = core.endpoint.domain.directory().lookup(name);
+        let party = Party::new(name, entry.as_deref());
+        core.demultiplexer.admit(&self.key, party);
+    }
+
+    /// Updates the registration of a party, if the directory has it.
+    fn readmit(&mut self, name: &str) {
+        let core = &self.speaker.core;
+        if let Some(entry) = core.endpoint.domain.directory().lookup(name) {
+            let party = Party::new(name, Some(&entry));
+            core.demultiplexer.admit(&self.key, party);
+        }
+    }
+
+    /// Watches whether an agent is gone.
+    pub(super) fn watch(&mut self, name: &str) {
+        self.partners.add(name);
+    }
+
+    /// Stops watching an agent, because no message of it is expected.
+    pub(super) fn unwatch(&mut self, name: &str) {
+        self.partners.remove(name);
+    }
+
+    /// Adds the agents that are to get the further messages to the sender (FIPA00061, `reply-to`).
+    fn follow_delegates(&mut self, message: &Message) {
+        for delegate in message.reply_to() {
+            if self.delegates >= MAX_DELEGATES {
+                return;
+            }
+            if delegate.name() != &*self.agent().endpoint.name {
+                self.delegates += 1;
+                self.admit(delegate.name());
+            }
+        }
+    }
+
+    /// Whether every partner is gone.
+    pub(super) fn all_gone(&self) -> bool {
+        self.partners.all_gone().is_some()
+    }
+
+    /// Returns a receiver of changes of the reachability of the partners.
+    pub(super) fn reachability(&self) -> Reachability {
+        self.reachability.subscribe()
+    }
+
+    /// Ends the conversation, except for one last message.
+    pub(super) fn take_speaker(&mut self) -> Speaker {
+        let core = Arc::clone(self.agent());
+        let ended = Speaker::new(&core, "", String::new());
+        std::mem::replace(&mut self.speaker, ended)
     }
 
     /// Sends a message in this conversation, with `due` as its `reply-by`, and waits for the outcomes.
@@ -167,8 +324,7 @@ impl<'a> Dialogue<'a> {
         message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Sending, DialogueError> {
-        let message = message.protocol(self.protocol.as_str());
-        self.post_within(message, due)
+        self.speaker.post(message, due)
     }
 
     /// Sends a message like [`post`](Self::post), in the protocol that the message names, which runs
@@ -178,23 +334,7 @@ impl<'a> Dialogue<'a> {
         message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Sending, DialogueError> {
-        self.replies += 1;
-        let mut message = message
-            .conversation_id(self.id.as_str())
-            .reply_with(format!("{}--{}", self.id, self.replies));
-        let mut deadline = self.agent.domain().inner.deadline;
-        if let Some(due) = due {
-            let left = due.saturating_duration_since(Instant::now());
-            deadline = deadline.min(left);
-            let by = SystemTime::now().checked_add(left);
-            if let Some(by) = by.and_then(|by| Time::from_system_time(by).ok()) {
-                message = message.reply_by(by);
-            }
-        }
-        let message = message.build()?;
-        self.check(&message).map_err(CheckFailure::on_sent)?;
-        let letter = letter_for(&message, SystemTime::now());
-        Ok(self.agent.endpoint.send(&message, letter, deadline)?)
+        self.speaker.post_within(message, due)
     }
 
     /// Answers a message of this conversation, and waits for the outcome.
@@ -218,7 +358,7 @@ impl<'a> Dialogue<'a> {
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
     ) -> Result<Sending, DialogueError> {
-        self.post(self.agent.reply(to, act).content(content), due)
+        self.speaker.post_answer(to, act, content, due)
     }
 
     /// Answers a message of a protocol that runs within this one, in that protocol.
@@ -229,40 +369,95 @@ impl<'a> Dialogue<'a> {
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
-        let answer = self.agent.reply(to, act).content(content);
+        let answer = self.agent().endpoint.reply(to, act).content(content);
         let sending = self.post_within(answer, due)?;
         only_delivered(&deliveries(sending).await)
     }
 
     /// Waits for the next message until `due`. A message that violates the protocol is an error, and so
-    /// are not-understood, cancel and the report of an undelivered message.
+    /// are not-understood, cancel and the report of an undelivered message. An agent that is gone is an
+    /// error once, and on every call if no agent is left.
     pub(super) async fn receive(
         &mut self,
         due: Option<Instant>,
     ) -> Result<Interpreted, DialogueError> {
-        let next = self
-            .agent
-            .demultiplexer
-            .next_of(&self.agent.endpoint, &self.id);
-        let received = match due {
-            None => next.await,
-            Some(due) => tokio::time::timeout_at(due.into(), next)
-                .await
-                .map_err(|_| DialogueError::TimedOut)?,
-        };
-        let message = match received {
-            Ok(incoming) => incoming.message,
-            Err(ReceiveError::Violation {
-                violation,
-                incoming,
-            }) => {
-                let message = Box::new(incoming.message);
-                return Err(DialogueError::Violation { violation, message });
+        let incoming = self.next_incoming(due, Silence::Waits).await?;
+        self.interpret(incoming)
+    }
+
+    /// Waits for the next message without a time limit. An agent that becomes unreachable is an error
+    /// once.
+    pub(super) async fn receive_or_silence(&mut self) -> Result<Interpreted, DialogueError> {
+        let incoming = self.next_incoming(None, Silence::Ends).await?;
+        self.interpret(incoming)
+    }
+
+    async fn next_incoming(
+        &mut self,
+        due: Option<Instant>,
+        silence: Silence,
+    ) -> Result<Incoming, DialogueError> {
+        loop {
+            let core = &self.speaker.core;
+            if let Some(agent) = self.partners.all_gone() {
+                let agent = agent.to_owned();
+                let left = core.demultiplexer.now_of(&core.endpoint, &self.key);
+                return left.ok_or(DialogueError::Gone { agent });
             }
-            Err(other) => return Err(DialogueError::Receive(other)),
-        };
-        let meaning = self.check(&message);
+            let until = due.unwrap_or_else(Instant::now);
+            tokio::select! {
+                // A message that has arrived precedes the end of its sender.
+                biased;
+                received = core.demultiplexer.next_of(&core.endpoint, &self.key) => {
+                    return received.map_err(DialogueError::Receive);
+                }
+                event = self.partners.next() => {
+                    self.reachability.set(self.partners.unreachable());
+                    match event {
+                        PartnerEvent::Gone { agent } => return Err(DialogueError::Gone { agent }),
+                        PartnerEvent::Unreachable { agent, since } => {
+                            tracing::warn!(agent = %escape(&agent), "the host of an agent is silent");
+                            if silence == Silence::Ends {
+                                return Err(DialogueError::Unreachable { agent, since });
+                            }
+                        }
+                        PartnerEvent::Returned { agent } => {
+                            tracing::info!(agent = %escape(&agent), "the host of an agent answers again");
+                        }
+                    }
+                }
+                () = tokio::time::sleep_until(until.into()), if due.is_some() => {
+                    return Err(self.timed_out(None));
+                }
+            }
+        }
+    }
+
+    /// Returns the error for an agent that has not answered in time, or for any of the agents.
+    pub(super) fn timed_out(&self, agent: Option<&str>) -> DialogueError {
+        let mut unreachable = self.partners.unreachable();
+        let silent = unreachable.find(|(name, _)| agent.is_none_or(|agent| agent == *name));
+        match silent {
+            Some((agent, since)) => DialogueError::Unreachable {
+                agent: agent.to_owned(),
+                since,
+            },
+            None => DialogueError::TimedOut,
+        }
+    }
+
+    fn interpret(&mut self, incoming: Incoming) -> Result<Interpreted, DialogueError> {
+        let (message, violation) = incoming.into_parts();
+        if let Some(sender) = message.sender() {
+            self.partners.handle_message(sender.name());
+        }
+        if let Some(violation) = violation {
+            let message = Box::new(message);
+            return Err(DialogueError::Violation { violation, message });
+        }
+        let meaning = self.speaker.check(&message);
         let meaning = meaning.map_err(|failure| failure.on_received(&message))?;
+        self.follow_delegates(&message);
         match meaning.state {
             DialogueState::NotUnderstood => Err(DialogueError::NotUnderstood(Box::new(message))),
             DialogueState::Cancelling => Err(DialogueError::Cancelled(Box::new(message))),
@@ -281,7 +476,7 @@ impl<'a> Dialogue<'a> {
         if with.is_empty() {
             return Ok(());
         }
-        let cancel = self.agent.message(Performative::Cancel);
+        let cancel = self.agent().message(Performative::Cancel);
         let sent = self.send(cancel.receivers(with.clone()), due).await?;
         let mut result = only_delivered(&sent);
         with.retain(|agent| !unreached(&sent).any(|name| name == agent.name()));
@@ -298,6 +493,12 @@ impl<'a> Dialogue<'a> {
                     let from = name_of(&message);
                     (from, Err(DialogueError::NotUnderstood(message)))
                 }
+                Err(DialogueError::Gone { agent }) => {
+                    let gone = DialogueError::Gone {
+                        agent: agent.clone(),
+                    };
+                    (agent, Err(gone))
+                }
                 // A cancel that crossed this one, or an outcome that is known already.
                 Err(DialogueError::Cancelled(_) | DialogueError::Undelivered(_)) => continue,
                 Err(other) => return Err(other),
@@ -311,22 +512,117 @@ impl<'a> Dialogue<'a> {
     }
 
     pub(super) fn id(&self) -> &str {
-        &self.id
+        &self.speaker.id
     }
 
     /// Returns the agent whose side of the conversation this is.
-    pub(super) fn agent(&self) -> &'a Agent {
-        self.agent
+    pub(super) fn agent(&self) -> &Arc<AgentCore> {
+        &self.speaker.core
     }
 
     pub(super) fn state(&self) -> &str {
-        &self.state
+        &self.speaker.state
+    }
+
+    /// Whether only an answer to the last message can follow.
+    pub(super) fn is_over(&self) -> bool {
+        self.speaker.over
     }
 
     /// Whether the conversation follows the protocol of this name, including its aliases.
     pub(super) fn follows(&self, protocol: &str) -> bool {
-        let machine = self.monitor.library().find(&self.protocol);
+        let machine = self.speaker.monitor.library().find(&self.speaker.protocol);
         machine.is_some_and(|machine| machine.is_called(protocol))
+    }
+}
+
+/// The effect of an agent that becomes unreachable on a call that waits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Silence {
+    Waits,
+    Ends,
+}
+
+impl Speaker {
+    fn new(core: &Arc<AgentCore>, protocol: &str, id: String) -> Self {
+        let library = Arc::clone(core.endpoint.domain.inner.rules.library());
+        Self {
+            monitor: Monitor::agent(library, &core.endpoint.name),
+            core: Arc::clone(core),
+            protocol: protocol.to_owned(),
+            id,
+            state: String::new(),
+            over: false,
+            replies: 0,
+        }
+    }
+
+    /// Sends a message in the protocol of the conversation, without waiting for the outcomes.
+    fn post(
+        &mut self,
+        message: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<Sending, DialogueError> {
+        let message = message.protocol(self.protocol.as_str());
+        self.post_within(message, due)
+    }
+
+    fn post_within(
+        &mut self,
+        message: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<Sending, DialogueError> {
+        let mut message = message
+            .conversation_id(self.id.as_str())
+            .reply_with(format!("{}--{}", self.id, self.replies + 1));
+        let mut deadline = self.core.endpoint.domain.inner.deadline;
+        if let Some(due) = due {
+            let left = due.saturating_duration_since(Instant::now());
+            deadline = deadline.min(left);
+            let by = SystemTime::now().checked_add(left);
+            if let Some(by) = by.and_then(|by| Time::from_system_time(by).ok()) {
+                message = message.reply_by(by);
+            }
+        }
+        let message = message.build()?;
+        self.check(&message).map_err(CheckFailure::on_sent)?;
+        self.replies += 1;
+        let letter = letter_for(&message, SystemTime::now());
+        Ok(self.core.endpoint.send(&message, letter, deadline)?)
+    }
+
+    /// Answers a message without waiting for the outcome.
+    pub(super) fn post_answer(
+        &mut self,
+        to: &Message,
+        act: Performative,
+        content: impl Into<bytes::Bytes>,
+        due: Option<Instant>,
+    ) -> Result<Sending, DialogueError> {
+        self.post(self.core.endpoint.reply(to, act).content(content), due)
+    }
+
+    /// Ends the conversation for this participant, unless it is over: with `failure`, or with
+    /// `not-understood` if no message was sent or the protocol does not allow `failure`.
+    pub(super) fn abandon(&mut self, last: &Message, reason: &str) {
+        if self.over || !self.core.endpoint.domain.inner.owner.is_this() {
+            return;
+        }
+        let acts = match self.replies {
+            0 => [Performative::NotUnderstood, Performative::Failure],
+            _ => [Performative::Failure, Performative::NotUnderstood],
+        };
+        for act in acts {
+            match self.post_answer(last, act, reason.to_owned(), None) {
+                // The letter is sent although its outcome is not awaited.
+                Ok(sending) => return drop(sending),
+                Err(DialogueError::WouldViolate(_)) => {}
+                Err(error) => {
+                    let id = escape(&self.id);
+                    return tracing::debug!(%error, conversation = %id, "cannot end a conversation");
+                }
+            }
+        }
     }
 
     fn check(&mut self, message: &Message) -> Result<Meaning, CheckFailure> {
@@ -335,11 +631,13 @@ impl<'a> Dialogue<'a> {
             state: DialogueState::Own,
             over: false,
             void: false,
+            opened: false,
         };
         match self.monitor.check(&Header::from(message), now) {
             Verdict::Accepted(accepted) => {
                 if message.protocol().is_none_or(|name| name == self.protocol) {
                     accepted.state.clone_into(&mut self.state);
+                    self.over = accepted.over;
                 }
                 Ok(Meaning {
                     state: match accepted.state {
@@ -353,6 +651,7 @@ impl<'a> Dialogue<'a> {
                     },
                     over: accepted.over,
                     void: accepted.void,
+                    opened: accepted.opened && accepted.own && !accepted.elsewhere,
                 })
             }
             Verdict::Violation(violation) => Err(CheckFailure::Violation(violation)),
@@ -366,20 +665,28 @@ impl<'a> Dialogue<'a> {
     }
 }
 
-impl fmt::Debug for Dialogue<'_> {
+impl fmt::Debug for Dialogue {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Dialogue")
-            .field("protocol", &self.protocol)
-            .field("id", &self.id)
-            .field("state", &self.state)
+            .field("protocol", &self.speaker.protocol)
+            .field("id", &self.speaker.id)
+            .field("state", &self.speaker.state)
             .finish_non_exhaustive()
     }
 }
 
-impl Drop for Dialogue<'_> {
+impl Drop for Dialogue {
     fn drop(&mut self) {
-        self.agent.demultiplexer.end(&self.id);
+        self.agent().demultiplexer.end(&self.key);
     }
+}
+
+/// Whether a message begins a conversation of a known protocol with the agent of this name.
+pub(super) fn opens(library: &Arc<Library>, agent: &str, message: &Message) -> bool {
+    let mut monitor = Monitor::agent(Arc::clone(library), agent);
+    let verdict = monitor.check(&Header::from(message), SystemTime::now());
+    name_of(message) != agent
+        && matches!(verdict, Verdict::Accepted(accepted) if accepted.opened && accepted.own)
 }
 
 /// The failure of the check of a message.
@@ -452,4 +759,12 @@ pub(super) fn name_of(message: &Message) -> String {
 /// Returns the time after this span from now, or `None` if it cannot be represented.
 pub(super) fn after(span: Duration) -> Option<Instant> {
     Instant::now().checked_add(span)
+}
+
+/// Lists the first of these names.
+fn listed(names: &[String]) -> String {
+    const SHOWN: usize = 8;
+    let more = if names.len() > SHOWN { ", …" } else { "" };
+    let shown: Vec<_> = names.iter().take(SHOWN).map(|name| escape(name)).collect();
+    format!("{}{more}", shown.join(", "))
 }

@@ -1,16 +1,24 @@
 //! The initiator's side of request, query, request-when and propose, with one participant.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 
 use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
-use crate::agent::Agent;
+use super::reachability::Reachability;
+use super::receivers::single;
+use crate::agent::{Agent, AgentCore};
 
 impl Agent {
     /// Requests an action from an agent (FIPA00026). The message is a `request` with one receiver. The
     /// call sets its protocol, conversation id, `reply-with` and `reply-by`. All answers must arrive
     /// within `patience`.
+    ///
+    /// The receiver may be a pattern, or a coalition with a leader, that stands for one agent now. The
+    /// request ends with [`DialogueError::Gone`] as soon as the host of the agent reports that it has left
+    /// or died. Without a sign of life of that host, [`Request::reachability`] reports this, and the
+    /// request goes on.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -36,8 +44,8 @@ impl Agent {
         &self,
         request: MessageBuilder,
         patience: Duration,
-    ) -> Result<Request<'_>, DialogueError> {
-        Request::begin(self, "fipa-request", request, patience).await
+    ) -> Result<Request, DialogueError> {
+        Request::begin(&self.core, "fipa-request", request, patience).await
     }
 
     /// Queries an agent for the truth of a proposition (`query-if`) or for an object (`query-ref`)
@@ -49,8 +57,8 @@ impl Agent {
         &self,
         query: MessageBuilder,
         patience: Duration,
-    ) -> Result<Request<'_>, DialogueError> {
-        Request::begin(self, "fipa-query", query, patience).await
+    ) -> Result<Request, DialogueError> {
+        Request::begin(&self.core, "fipa-query", query, patience).await
     }
 
     /// Requests an action from an agent once a condition holds (`request-when`, FIPA00028); see
@@ -62,8 +70,8 @@ impl Agent {
         &self,
         request: MessageBuilder,
         patience: Duration,
-    ) -> Result<Request<'_>, DialogueError> {
-        Request::begin(self, "fipa-request-when", request, patience).await
+    ) -> Result<Request, DialogueError> {
+        Request::begin(&self.core, "fipa-request-when", request, patience).await
     }
 
     /// Proposes an action of this agent to another agent (`propose`, FIPA00036), and waits for the
@@ -78,7 +86,9 @@ impl Agent {
         patience: Duration,
     ) -> Result<Decision, DialogueError> {
         let due = after(patience);
-        let (mut dialogue, sent) = Dialogue::open(self, "fipa-propose", proposal, due).await?;
+        let (proposal, _) = single(&self.core, proposal)?;
+        let opened = Dialogue::open(&self.core, "fipa-propose", proposal, due);
+        let (mut dialogue, sent) = opened.await?;
         only_delivered(&sent)?;
         let message = dialogue.receive(due).await?.message;
         Ok(match message.performative() {
@@ -101,8 +111,8 @@ pub enum Decision {
 /// A request or query. Dropping it does not cancel it; further answers go to [`Agent::receive`].
 #[derive(Debug)]
 #[must_use = "result() returns the answer"]
-pub struct Request<'a> {
-    dialogue: Dialogue<'a>,
+pub struct Request {
+    dialogue: Dialogue,
     receivers: Vec<AgentId>,
     due: Option<Instant>,
     /// A message that arrived before the caller asked for it.
@@ -110,16 +120,16 @@ pub struct Request<'a> {
     agreed: bool,
 }
 
-impl<'a> Request<'a> {
+impl Request {
     async fn begin(
-        agent: &'a Agent,
+        core: &Arc<AgentCore>,
         protocol: &str,
         request: MessageBuilder,
         patience: Duration,
     ) -> Result<Self, DialogueError> {
         let due = after(patience);
-        let receivers = request.clone().build()?.receivers().to_vec();
-        let (dialogue, sent) = Dialogue::open(agent, protocol, request, due).await?;
+        let (request, receivers) = single(core, request)?;
+        let (dialogue, sent) = Dialogue::open(core, protocol, request, due).await?;
         only_delivered(&sent)?;
         Ok(Self {
             dialogue,
@@ -136,11 +146,17 @@ impl<'a> Request<'a> {
         self.dialogue.id()
     }
 
+    /// Returns a receiver of changes of the reachability of the other agent.
+    #[must_use]
+    pub fn reachability(&self) -> Reachability {
+        self.dialogue.reachability()
+    }
+
     /// Waits for the first answer, and returns whether it is an `agree`. If it is the result itself,
     /// [`result`](Self::result) returns it.
     ///
     /// # Errors
-    /// If the other side refuses, fails, or does not answer in time.
+    /// If the other side refuses, fails, is gone, or does not answer in time.
     pub async fn agreed(&mut self) -> Result<bool, DialogueError> {
         if !self.agreed && self.early.is_none() {
             let message = self.dialogue.receive(self.due).await?.message;
@@ -157,7 +173,7 @@ impl<'a> Request<'a> {
     /// Waits for the result, an `inform`.
     ///
     /// # Errors
-    /// If the other side refuses, fails, or does not answer in time.
+    /// If the other side refuses, fails, is gone, or does not answer in time.
     pub async fn result(mut self) -> Result<Message, DialogueError> {
         self.agreed().await?;
         if let Some(early) = self.early.take() {

@@ -4,16 +4,42 @@
 //! [`Agent::propose`], [`Agent::subscribe`], [`Agent::contract_net`],
 //! [`Agent::iterated_contract_net`], [`Agent::english_auction`], [`Agent::dutch_auction`],
 //! [`Agent::brokering`] or [`Agent::recruiting`], and gets the result of the protocol. A participant
-//! passes a received opening message to [`Agent::take_part`], agrees, works and replies. Messages of
-//! other conversations still go to [`Agent::receive`]. [`blocking`](crate::blocking) has the same calls
-//! for processes without an async runtime.
+//! passes a received opening message to [`Agent::take_part`], agrees, works and replies;
+//! [`Agent::serve`] runs a handler for each opening message, and [`Agent::publisher`] notifies all
+//! subscribers to a topic. Messages of other conversations still go to [`Agent::receive`].
+//! [`blocking`](crate::blocking) has the same calls for processes without an async runtime.
+//!
+//! # Partners that are gone or unreachable
+//!
+//! Every call that waits for an agent ends with [`DialogueError::Gone`] when the agent's own host proves
+//! that the agent has left, has died, or has registered again without having moved. Between the proof
+//! and the error are at most 100 ms, during which letters that the agent sent before still arrive. An
+//! agent that leaves one host and has not registered on another within 50 ms counts as gone.
+//!
+//! The silence of a host proves nothing. While a call waits for an agent of another host, the gateways
+//! exchange signs of life. After a silence of `monitor.heartbeat` (default 5 s), the agent is
+//! *unreachable*: `reachability()` of the conversation reports this, the call goes on within its
+//! patience, and ends with [`DialogueError::Unreachable`] instead of [`DialogueError::TimedOut`] if no
+//! answer arrives. A subscription, which has no patience, returns this error once and goes on. A process
+//! that is stopped but not ended is not detected. Agents of legacy peers have no signs of life.
+//!
+//! Applications that lead a conversation without these calls use [`Agent::watch_partners`].
+//!
+//! # Conversation ids
+//!
+//! A message belongs to a conversation if it has the conversation's id and comes from one of its
+//! parties. A message of another agent with this id goes to [`Agent::receive`].
+//!
+//! # Modules
 //!
 //! * `dialogue.rs` is one conversation: it assigns the conversation id, sets `reply-with`,
 //!   `in-reply-to` and `reply-by`, and checks every message with the state machine of the protocol,
 //!   independently of `monitor.check`.
+//! * `partners.rs` decides, without I/O, whether a partner is gone or unreachable; `watching.rs` is the
+//!   shell around it; `reachability.rs` reports it. `receivers.rs` expands patterns and coalitions.
 //! * `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are the sides
 //!   of initiators; `bids.rs` collects the answers to a call for proposals. `participant.rs` is the
-//!   side of participants.
+//!   side of participants; `serving.rs` and `publisher.rs` lead many of them.
 //!
 //! Not in this module: the rules of the protocols (`fipa-monitor`).
 
@@ -23,8 +49,14 @@ mod contract_net;
 mod dialogue;
 mod initiator;
 mod participant;
+mod partners;
 mod proxied;
+mod publisher;
+mod reachability;
+mod receivers;
+mod serving;
 mod subscription;
+mod watching;
 
 pub use auction::Auction;
 pub use bids::Bids;
@@ -32,8 +64,13 @@ pub use contract_net::{Awarded, ContractNet};
 pub use dialogue::DialogueError;
 pub use initiator::{Decision, Request};
 pub use participant::{Reply, Task};
+pub use partners::PartnerEvent;
 pub use proxied::Proxied;
+pub use publisher::Publisher;
+pub use reachability::{Reachability, Unreachable};
+pub use serving::Server;
 pub use subscription::Subscription;
+pub use watching::PartnerWatch;
 
 #[cfg(doc)]
 use crate::Agent;

@@ -1,12 +1,17 @@
 //! The participant's side of a conversation.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fipa_acl::{Message, MessageBuilder, Performative};
+use parking_lot::Mutex;
 
-use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, unreached};
-use crate::agent::Agent;
+use super::dialogue::{
+    Dialogue, DialogueError, Speaker, after, name_of, only_delivered, unreached,
+};
+use super::receivers::expand;
+use crate::agent::{Agent, AgentCore};
 use crate::delivery::deliveries;
 
 /// The last message of a participant.
@@ -34,7 +39,7 @@ impl Agent {
     /// ```no_run
     /// use fipa::protocol::{DialogueError, Reply, Task};
     ///
-    /// async fn lift(task: &mut Task<'_>) -> Result<Reply, DialogueError> {
+    /// async fn lift(task: &mut Task) -> Result<Reply, DialogueError> {
     ///     if task.message().content().is_none() {
     ///         return Ok(Reply::Refuse("lift what?".into()));
     ///     }
@@ -52,36 +57,130 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// If the message does not begin a known protocol.
-    pub fn take_part(&self, first: &Message) -> Result<Task<'_>, DialogueError> {
-        Ok(Task {
-            dialogue: Dialogue::join(self, first)?,
-            first: first.clone(),
-            last: first.clone(),
-            over: false,
-            early: None,
-            asked: Vec::new(),
-        })
+    /// If the message does not begin a known protocol ([`DialogueError::NotOpening`] or
+    /// [`DialogueError::Unchecked`]), for example because it is an answer.
+    pub fn take_part(&self, first: &Message) -> Result<Task, DialogueError> {
+        Task::join(&self.core, first, None)
     }
 }
 
-/// The participant's side of a conversation. Dropping it without a reply sends nothing to the
-/// initiator.
+/// The participant's side of a conversation.
+///
+/// Dropping it before the conversation is over tells the initiator: with `failure`, or with
+/// `not-understood` if nothing was sent yet.
 #[derive(Debug)]
-pub struct Task<'a> {
-    dialogue: Dialogue<'a>,
+pub struct Task {
+    dialogue: Dialogue,
     first: Message,
     /// The last message of the initiator, which the next message answers.
     last: Message,
-    /// Whether the last message of the initiator ended the conversation.
-    over: bool,
     /// A message that arrived instead of a decision.
     early: Option<Message>,
     /// The agents to which a message was passed on and that may still answer.
     asked: Vec<String>,
+    /// Whether the initiator expects no further message: the last one was sent.
+    is_done: bool,
+    /// Receives the right to send the last message when the task is dropped.
+    home: Option<Home>,
 }
 
-impl Task<'_> {
+/// The place of the [`Farewell`] of a dropped task.
+pub(super) type Home = Arc<Mutex<Option<Farewell>>>;
+
+/// The right to send the last message of a task that was dropped.
+pub(super) struct Farewell {
+    speaker: Speaker,
+    last: Message,
+}
+
+impl std::fmt::Debug for Farewell {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Farewell").finish_non_exhaustive()
+    }
+}
+
+impl Farewell {
+    /// Sends the last message of the participant.
+    pub(super) async fn reply(mut self, reply: Reply) -> Result<(), DialogueError> {
+        let Some((act, content)) = reply.into_parts() else {
+            return Ok(());
+        };
+        let sent = self.speaker.post_answer(&self.last, act, content, None);
+        match sent {
+            Ok(sending) => only_delivered(&deliveries(sending).await),
+            Err(error) => {
+                self.fail(&error.to_string());
+                Err(error)
+            }
+        }
+    }
+
+    /// Refuses a conversation in which nothing was sent.
+    pub(super) fn refuse(mut self, reason: &str) {
+        let act = Performative::Refuse;
+        match self
+            .speaker
+            .post_answer(&self.last, act, reason.to_owned(), None)
+        {
+            // The letter is sent although its outcome is not awaited.
+            Ok(sending) => drop(sending),
+            Err(_) => self.fail(reason),
+        }
+    }
+
+    /// Tells the initiator that the task has failed.
+    pub(super) fn fail(mut self, reason: &str) {
+        self.speaker.abandon(&self.last, reason);
+    }
+}
+
+impl Drop for Task {
+    fn drop(&mut self) {
+        if self.is_done {
+            return;
+        }
+        let farewell = Farewell {
+            speaker: self.dialogue.take_speaker(),
+            last: self.last.clone(),
+        };
+        match &self.home {
+            Some(home) => *home.lock() = Some(farewell),
+            None => farewell.fail("the participant has dropped the task"),
+        }
+    }
+}
+
+impl Reply {
+    /// Returns the performative and the content of the message, if there is one.
+    fn into_parts(self) -> Option<(Performative, Bytes)> {
+        Some(match self {
+            Self::Refuse(content) => (Performative::Refuse, content),
+            Self::Inform(content) => (Performative::Inform, content),
+            Self::Failure(content) => (Performative::Failure, content),
+            Self::Accept(content) => (Performative::AcceptProposal, content),
+            Self::Reject(content) => (Performative::RejectProposal, content),
+            Self::Nothing => return None,
+        })
+    }
+}
+
+impl Task {
+    pub(super) fn join(
+        core: &Arc<AgentCore>,
+        first: &Message,
+        home: Option<Home>,
+    ) -> Result<Self, DialogueError> {
+        Ok(Self {
+            dialogue: Dialogue::join(core, first)?,
+            first: first.clone(),
+            last: first.clone(),
+            early: None,
+            asked: Vec::new(),
+            is_done: false,
+            home,
+        })
+    }
+
     /// Returns the last message of the initiator.
     #[must_use]
     pub fn message(&self) -> &Message {
@@ -148,7 +247,7 @@ impl Task<'_> {
     /// const PATIENCE: Duration = Duration::from_secs(60);
     ///
     /// /// Bids up to 20 in an English auction, and returns whether it has won.
-    /// async fn bid(task: &mut Task<'_>) -> Result<bool, DialogueError> {
+    /// async fn bid(task: &mut Task) -> Result<bool, DialogueError> {
     ///     while let Some(call) = task.next_call(PATIENCE).await? {
     ///         let price = String::from_utf8_lossy(call.content().map_or(b"", |c| c)).into_owned();
     ///         // The leading bidder gains nothing from a higher bid.
@@ -167,7 +266,7 @@ impl Task<'_> {
         &mut self,
         patience: Duration,
     ) -> Result<Option<Message>, DialogueError> {
-        if self.over {
+        if self.early.is_none() && self.dialogue.is_over() {
             return Ok(None);
         }
         let message = self.next(patience).await?;
@@ -201,7 +300,7 @@ impl Task<'_> {
     /// # use fipa::{Agent, AgentId, Performative};
     /// use std::time::Duration;
     ///
-    /// async fn broker(agent: &Agent, task: &mut Task<'_>) -> Result<Reply, DialogueError> {
+    /// async fn broker(agent: &Agent, task: &mut Task) -> Result<Reply, DialogueError> {
     ///     task.agree("").await?;
     ///     let Ok(arm) = AgentId::new("arm_1") else {
     ///         return Ok(Reply::Failure("no match".into()));
@@ -228,12 +327,20 @@ impl Task<'_> {
     ) -> Result<(), DialogueError> {
         let recruits = self.dialogue.follows("fipa-recruiting");
         let mut message = message;
-        let built = message.clone().build()?;
+        let mut built = message.clone().build()?;
+        let expanded = expand(self.dialogue.agent(), built.receivers()).agents;
+        if !expanded.is_empty() {
+            message = message.replace_receivers(expanded);
+            built = message.clone().build()?;
+        }
+        if !recruits {
+            for receiver in built.receivers() {
+                self.dialogue.admit(receiver.name());
+            }
+        }
         if recruits && built.reply_to().is_empty() {
-            let to_initiator = self
-                .dialogue
-                .agent()
-                .reply(&self.first, Performative::Inform);
+            let endpoint = &self.dialogue.agent().endpoint;
+            let to_initiator = endpoint.reply(&self.first, Performative::Inform);
             let to_initiator = to_initiator.build()?;
             let agents = to_initiator.receivers().iter().cloned();
             message = agents.fold(message, MessageBuilder::reply_to);
@@ -250,6 +357,9 @@ impl Task<'_> {
             return only_delivered(&sent);
         }
         if !recruits {
+            for name in &reached {
+                self.dialogue.watch(name);
+            }
             self.asked.extend(reached);
         }
         Ok(())
@@ -259,7 +369,8 @@ impl Task<'_> {
     /// further agent can answer.
     ///
     /// # Errors
-    /// If no answer arrives within `patience`, or the initiator cancels.
+    /// If no answer arrives within `patience`, if the initiator cancels, or if the initiator or an agent
+    /// that was to answer is gone.
     pub async fn next_answer(
         &mut self,
         patience: Duration,
@@ -271,6 +382,10 @@ impl Task<'_> {
                 Err(DialogueError::NotUnderstood(message)) => (*message, true),
                 // `pass_on` has already left out its receiver.
                 Err(DialogueError::Undelivered(_)) => continue,
+                Err(DialogueError::Gone { agent }) => {
+                    self.asked.retain(|name| *name != agent);
+                    return Err(DialogueError::Gone { agent });
+                }
                 Err(other) => return Err(self.noted(other)),
             };
             let from = name_of(&answer);
@@ -292,8 +407,8 @@ impl Task<'_> {
     /// If the protocol does not allow the message in this state, for example before
     /// [`inform`](Self::inform), or if it is not delivered.
     pub async fn forward(&mut self, answer: &Message) -> Result<(), DialogueError> {
-        let agent = self.dialogue.agent();
-        let mut message = agent.reply(&self.first, answer.performative().clone());
+        let endpoint = &self.dialogue.agent().endpoint;
+        let mut message = endpoint.reply(&self.first, answer.performative().clone());
         message = match answer.content() {
             Some(content) => message.content(content.clone()),
             None => message,
@@ -314,7 +429,7 @@ impl Task<'_> {
     /// cancel with [`confirm_cancel`](Self::confirm_cancel).
     ///
     /// # Errors
-    /// If another message arrives.
+    /// If another message arrives, or the initiator is gone ([`DialogueError::Gone`]).
     pub async fn cancelled(&mut self) -> Result<(), DialogueError> {
         match self.receive(None).await {
             Err(DialogueError::Cancelled(_)) => Ok(()),
@@ -337,15 +452,11 @@ impl Task<'_> {
     /// # Errors
     /// See [`agree`](Self::agree).
     pub async fn reply(mut self, reply: Reply) -> Result<(), DialogueError> {
-        let (act, content) = match reply {
-            Reply::Refuse(content) => (Performative::Refuse, content),
-            Reply::Inform(content) => (Performative::Inform, content),
-            Reply::Failure(content) => (Performative::Failure, content),
-            Reply::Accept(content) => (Performative::AcceptProposal, content),
-            Reply::Reject(content) => (Performative::RejectProposal, content),
-            Reply::Nothing => return Ok(()),
-        };
-        self.send(act, content).await
+        if let Some((act, content)) = reply.into_parts() {
+            self.send(act, content).await?;
+        }
+        self.is_done = true;
+        Ok(())
     }
 
     async fn send(
@@ -361,7 +472,6 @@ impl Task<'_> {
         match self.dialogue.receive(due).await {
             Ok(received) => {
                 self.last = received.message.clone();
-                self.over = received.meaning.over;
                 Ok(received.message)
             }
             Err(error) => Err(self.noted(error)),

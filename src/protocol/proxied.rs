@@ -1,12 +1,15 @@
 //! The initiator's side of brokering (FIPA00033) and recruiting (FIPA00034).
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 
 use super::dialogue::{Dialogue, DialogueError, DialogueState, Interpreted, after, only_delivered};
-use crate::agent::Agent;
+use super::reachability::Reachability;
+use super::receivers::single;
+use crate::agent::{Agent, AgentCore};
 
 impl Agent {
     /// Requests a broker to pass a message on to suitable agents and to forward their answers (`proxy`,
@@ -35,8 +38,8 @@ impl Agent {
         &self,
         proxy: MessageBuilder,
         patience: Duration,
-    ) -> Result<Proxied<'_>, DialogueError> {
-        Proxied::begin(self, "fipa-brokering", proxy, patience).await
+    ) -> Result<Proxied, DialogueError> {
+        Proxied::begin(&self.core, "fipa-brokering", proxy, patience).await
     }
 
     /// Requests a recruiter to pass a message on to suitable agents (FIPA00034), which answer this agent
@@ -50,8 +53,8 @@ impl Agent {
         &self,
         proxy: MessageBuilder,
         patience: Duration,
-    ) -> Result<Proxied<'_>, DialogueError> {
-        Proxied::begin(self, "fipa-recruiting", proxy, patience).await
+    ) -> Result<Proxied, DialogueError> {
+        Proxied::begin(&self.core, "fipa-recruiting", proxy, patience).await
     }
 }
 
@@ -59,8 +62,8 @@ impl Agent {
 /// [`Agent::receive`].
 #[derive(Debug)]
 #[must_use = "next() returns the answers"]
-pub struct Proxied<'a> {
-    dialogue: Dialogue<'a>,
+pub struct Proxied {
+    dialogue: Dialogue,
     receivers: Vec<AgentId>,
     /// Answers that arrived before the report that the message was passed on.
     early: VecDeque<Message>,
@@ -69,16 +72,16 @@ pub struct Proxied<'a> {
 /// Maximum number of early answers.
 const MAX_EARLY: usize = 1_024;
 
-impl<'a> Proxied<'a> {
+impl Proxied {
     async fn begin(
-        agent: &'a Agent,
+        core: &Arc<AgentCore>,
         protocol: &str,
         proxy: MessageBuilder,
         patience: Duration,
     ) -> Result<Self, DialogueError> {
         let due = after(patience);
-        let receivers = proxy.clone().build()?.receivers().to_vec();
-        let (dialogue, sent) = Dialogue::open(agent, protocol, proxy, due).await?;
+        let (proxy, receivers) = single(core, proxy)?;
+        let (dialogue, sent) = Dialogue::open(core, protocol, proxy, due).await?;
         only_delivered(&sent)?;
         let mut proxied = Self {
             dialogue,
@@ -86,6 +89,12 @@ impl<'a> Proxied<'a> {
             early: VecDeque::new(),
         };
         proxied.passed_on(due).await?;
+        if proxied.dialogue.follows("fipa-recruiting") {
+            // The answers do not depend on the recruiter any more.
+            for recruiter in &proxied.receivers {
+                proxied.dialogue.unwatch(recruiter.name());
+            }
+        }
         Ok(proxied)
     }
 
@@ -107,6 +116,13 @@ impl<'a> Proxied<'a> {
         Ok(())
     }
 
+    /// Returns a receiver of changes of the reachability of the broker, and of the recruited agents that
+    /// were answered.
+    #[must_use]
+    pub fn reachability(&self) -> Reachability {
+        self.dialogue.reachability()
+    }
+
     /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
@@ -117,7 +133,8 @@ impl<'a> Proxied<'a> {
     /// the last answer.
     ///
     /// # Errors
-    /// If no answer arrives in time, or the broker sends `failure`.
+    /// If no answer arrives in time, if the broker sends `failure` or is gone, or if a recruited agent
+    /// that was [answered](Self::answer) is gone.
     pub async fn next(&mut self, patience: Duration) -> Result<Message, DialogueError> {
         if let Some(early) = self.early.pop_front() {
             return Ok(early);
@@ -142,7 +159,7 @@ impl<'a> Proxied<'a> {
     /// # use std::time::Duration;
     /// # use fipa::Performative;
     /// # use fipa::protocol::{DialogueError, Proxied};
-    /// # async fn example(mut answers: Proxied<'_>) -> Result<(), DialogueError> {
+    /// # async fn example(mut answers: Proxied) -> Result<(), DialogueError> {
     /// let patience = Duration::from_secs(5);
     /// let proposal = answers.next(patience).await?;
     /// let accept = Performative::AcceptProposal;
@@ -163,7 +180,11 @@ impl<'a> Proxied<'a> {
         patience: Duration,
     ) -> Result<(), DialogueError> {
         let due = after(patience);
-        self.dialogue.answer_within(to, act, content, due).await
+        self.dialogue.answer_within(to, act, content, due).await?;
+        if let Some(agent) = to.sender().filter(|_| to.reply_to().is_empty()) {
+            self.dialogue.watch(agent.name());
+        }
+        Ok(())
     }
 
     /// Cancels the request and waits for the confirmation of the broker or recruiter.
@@ -171,6 +192,9 @@ impl<'a> Proxied<'a> {
     /// # Errors
     /// If it does not cancel ([`DialogueError::Failed`]), or does not answer within `patience`.
     pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
+        for receiver in &self.receivers {
+            self.dialogue.watch(receiver.name());
+        }
         self.dialogue.cancel(self.receivers, after(patience)).await
     }
 }

@@ -13,10 +13,11 @@ use std::thread;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, Recorder, config, letter_parcel, until};
+use common::{Party, Recorder, config, letter_parcel};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
+use fipa_testbed::until_some;
 use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, TransportErrorKind};
 use fipa_transport_net::{HttpConfig, HttpTransport, Limits};
 
@@ -71,7 +72,7 @@ fn answer(stream: &mut TcpStream) -> String {
 
 /// Returns the messages that have arrived, once there are so many.
 fn messages(at: &Platform, count: usize) -> Vec<Message> {
-    until("the letters", || {
+    until_some("the letters", || {
         (at.sink.record.lock().unframed.len() >= count).then_some(())
     });
     let record = at.sink.record.lock();
@@ -253,7 +254,7 @@ fn idle_connections_give_way_and_busy_ones_do_not() {
     assert_eq!(answer(&mut first), OK);
     let mut busy = connect(&party);
     busy.write_all(&STRING[..50]).unwrap();
-    until("the busy connection", || {
+    until_some("the busy connection", || {
         let mut third = connect(&party);
         third.write_all(STRING).unwrap();
         let mut all = Vec::new();

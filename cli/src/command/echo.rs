@@ -1,10 +1,7 @@
 //! `fipa echo`: an agent that answers.
 
 use clap::Args;
-use fipa::{
-    Agent, AgentId, Config, ErrorChain, Incoming, Message, Performative, ReceiveError,
-    RegisterOptions,
-};
+use fipa::{Agent, AgentId, Config, Incoming, Message, Performative, RegisterOptions};
 use fipa_acl::escape;
 
 use crate::membership::{self, Stop};
@@ -19,6 +16,9 @@ use crate::report::{self, Failure};
 /// The agent answers every message except replies (messages with in-reply-to), failure and
 /// not-understood. It answers an inform only if that has reply-with. Its own answers have no
 /// reply-with, so two echo agents cannot answer each other endlessly.
+///
+/// With monitor.check, a message that violates its protocol is logged and not answered. It does not count
+/// for --count, and neither does a letter that cannot be decoded.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -77,16 +77,15 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
     let mut received = 0;
     while count.is_none_or(|count| received < count) {
         match agent.receive().await {
+            // The library has logged the violation. An answer would continue a conversation that the
+            // sender has broken.
+            Ok(incoming) if incoming.violation().is_some() => {}
             Ok(incoming) => {
                 received += 1;
                 output::text(&line(&incoming))?;
                 if requires_answer(&incoming.message) {
                     answer(agent, &incoming).await;
                 }
-            }
-            Err(error @ ReceiveError::Malformed { .. }) => {
-                received += 1;
-                report::warn(&ErrorChain(&error).to_string());
             }
             Err(error) => {
                 return Err(Failure::failed(

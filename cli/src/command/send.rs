@@ -6,10 +6,12 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
+use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
-    Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
-    Message, Performative, ReceiveError, RegisterOptions, Time,
+    Agent, AgentId, Config, Deliveries, DeliveryFailure, Incarnation, Incoming, Message,
+    Performative, RegisterOptions, Time,
 };
+use fipa_acl::escape;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
@@ -26,7 +28,7 @@ use crate::{input, membership, output};
 ///
 /// Works with and without a gateway; agents on other hosts are reachable while a gateway is running
 /// (`fipa up`). The exit code is 0 only if no outcome is failed and, with --wait, a reply was
-/// received. A FIPA failure message about the letter from a message transport service does not count
+/// received. The wait ends at once when the receiver leaves or dies. A FIPA failure message about the letter from a message transport service does not count
 /// as a reply.
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -43,7 +45,8 @@ JSON:
                       \"attempts\": [ { \"via\", \"location\", \"error\" } ] } ],
     \"reply\": the reply as `fipa decode` prints it, if one was received,
     \"failures\": [ { \"from\": name, \"receiver\": name or null, \"reason\": text } ], the failure
-                messages about the letter, if any were received with --wait }")]
+                messages about the letter, if any were received with --wait,
+    \"gone\": [ name ], the receivers that left or died before they replied, if there are any }")]
 pub(crate) struct Arguments {
     /// Name of the receiver, or a pattern such as 'arm_.*'; repeatable
     #[arg(long, required = true, value_name = "NAME")]
@@ -162,6 +165,8 @@ async fn converse(
 ) -> Result<(), Failure> {
     let message = message(agent, arguments, content)?;
     let deadline = arguments.deadline.unwrap_or(config.mts.deadline);
+    // Before the message is sent, so that no departure is missed.
+    let partners = agent.watch_partners();
     let sent = agent.send_within(message.clone(), deadline).await;
     let deliveries = sent.map_err(|error| {
         Failure::failed(
@@ -177,7 +182,8 @@ async fn converse(
     let mut answers = Answers::default();
     if arguments.wait && any_succeeded {
         let sent = deliveries.0.iter().filter(|one| one.outcome.is_success());
-        answers = wait(agent, &message, sent.count(), arguments.timeout).await?;
+        let reached: Vec<&str> = sent.map(|one| &*one.receiver).collect();
+        answers = wait(agent, &message, partners, &reached, arguments.timeout).await?;
     }
     match &answers.reply {
         _ if arguments.json => {
@@ -189,6 +195,9 @@ async fn converse(
                 let failures = answers.failures.iter().map(FailureMessage::json);
                 json["failures"] = failures.collect();
             }
+            if !answers.gone.is_empty() {
+                json["gone"] = json!(answers.gone);
+            }
             output::json(&json)?;
         }
         Some(reply) => output::text(&format!("reply: {}\n", reply.message))?,
@@ -198,7 +207,9 @@ async fn converse(
     let no_reply = without_reply.then(|| no_reply(&deliveries, arguments.timeout));
     let failures = advice::failures(&deliveries, agent, config);
     let reported = answers.failures.iter().map(FailureMessage::failure);
-    Failure::all(failures.into_iter().chain(reported).chain(no_reply))
+    let gone = answers.reply.is_none().then(|| gone(&answers.gone));
+    let all = failures.into_iter().chain(reported);
+    Failure::all(all.chain(gone.flatten()).chain(no_reply))
 }
 
 /// The messages received during the wait for a reply.
@@ -206,6 +217,8 @@ async fn converse(
 struct Answers {
     reply: Option<Incoming>,
     failures: Vec<FailureMessage>,
+    /// The receivers that left or died before they replied.
+    gone: Vec<String>,
     timed_out: bool,
 }
 
@@ -288,18 +301,33 @@ fn message(
     })
 }
 
-/// Waits for the first reply and collects failure messages about the letter. The wait ends early when
-/// there is one failure message for each of the `sent` letters.
+/// Waits for the first reply of the `reached` receivers, and collects failure messages about the letter.
+/// The wait ends early when each receiver is gone or has a failure message.
 async fn wait(
     agent: &Agent,
     message: &Message,
-    sent: usize,
+    mut partners: PartnerWatch,
+    reached: &[&str],
     timeout: Duration,
 ) -> Result<Answers, Failure> {
     let mut answers = Answers::default();
+    for receiver in reached {
+        partners.add(receiver);
+    }
     let first = async {
-        while answers.failures.len() < sent {
-            match agent.receive().await {
+        while answers.failures.len() + answers.gone.len() < reached.len() {
+            let received = tokio::select! {
+                // A reply that has arrived precedes the end of its sender.
+                biased;
+                received = agent.receive() => received,
+                event = partners.next() => {
+                    answers.note(event);
+                    continue;
+                }
+            };
+            match received {
+                // The library has logged the violation.
+                Ok(incoming) if incoming.violation().is_some() => {}
                 // A message of this process to its own agent; the outcomes have it already.
                 Ok(incoming) if incoming.via.is_none() => {}
                 Ok(incoming) if incoming.message.is_reply_to(message) => {
@@ -312,9 +340,6 @@ async fn wait(
                     }
                 }
                 Ok(other) => report::warn(&format!("ignored, not a reply: {}", other.message)),
-                Err(error @ ReceiveError::Malformed { .. }) => {
-                    report::warn(&ErrorChain(&error).to_string())
-                }
                 Err(error) => {
                     return Err(Failure::failed(
                         format!("cannot wait for a reply: {}", ErrorChain(&error)),
@@ -331,6 +356,35 @@ async fn wait(
         Err(_) => answers.timed_out = true,
     }
     Ok(answers)
+}
+
+impl Answers {
+    /// Notes an event of a receiver, and prints it unless the command ends with it.
+    fn note(&mut self, event: PartnerEvent) {
+        match event {
+            PartnerEvent::Gone { agent } => self.gone.push(agent),
+            PartnerEvent::Unreachable { agent, since } => report::warn(&format!(
+                "the host of {agent:?} has been silent for {} s; still waiting",
+                since.elapsed().as_secs()
+            )),
+            PartnerEvent::Returned { agent } => {
+                report::warn(&format!("the host of {agent:?} answers again"));
+            }
+            other => report::warn(&escape(&format!("{other:?}"))),
+        }
+    }
+}
+
+/// The failure of receivers that are gone, if there are any.
+fn gone(names: &[String]) -> Option<Failure> {
+    let quoted: Vec<&str> = names.iter().map(String::as_str).collect();
+    (!names.is_empty()).then(|| {
+        Failure::failed(
+            "gone before it replied: it has left, or its process has ended",
+            advice::receivers(&quoted),
+            "start the agent again, and check its log",
+        )
+    })
 }
 
 fn no_reply(deliveries: &Deliveries, timeout: Duration) -> Failure {

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
 use fipa::keys::{Keys, VALID};
-use fipa::{Agent, AgentId, Config, Domain, Incarnation, Outcome, Performative, ReceiveError};
+use fipa::{Agent, AgentId, Config, Domain, Incarnation, Outcome, Performative};
 use fipa_testbed::{ChildGuard, until};
 use parking_lot::Mutex;
 use serde_json::Value;
@@ -320,7 +320,6 @@ impl Party {
             loop {
                 let content = match agent.receive().await {
                     Ok(incoming) => honest(&incoming.message).map(|it| (it, incoming)),
-                    Err(ReceiveError::Malformed { .. }) => None,
                     Err(_) => return,
                 };
                 let Some((content, incoming)) = content else {

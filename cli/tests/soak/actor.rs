@@ -227,7 +227,7 @@ async fn agent(
     drop(sender.agent.lock().take());
     let agent = Arc::into_inner(agent).expect("nothing else uses the agent");
     for unread in agent.deregister().unwrap() {
-        take(&shared, incarnation, &unread.unwrap());
+        take(&shared, incarnation, &unread);
     }
     shared.journal.note(&Event::Left { agent: incarnation });
 }

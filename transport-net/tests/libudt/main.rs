@@ -21,11 +21,12 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, Recorder, letter_parcel, udt_config, until};
+use common::{Party, Recorder, letter_parcel, udt_config};
 use fipa_acl::{
     AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, Letter, Message, Performative,
     Representation,
 };
+use fipa_testbed::until_some;
 use fipa_transport::{Conclusion, Kind, Location, Transport as _, TransportErrorKind};
 use fipa_transport_net::{UdtConfig, UdtTransport};
 
@@ -264,7 +265,7 @@ fn parcel(sequence: u64, content: Vec<u8>) -> fipa_transport::Parcel {
 
 /// Waits for letters, and returns their contents in the order of arrival.
 fn arrived(party: &Party<UdtTransport>, count: usize) -> Vec<Vec<u8>> {
-    until("the letters", || {
+    until_some("the letters", || {
         let record = party.sink.record.lock();
         (record.unframed.len() >= count).then_some(())
     });
@@ -282,7 +283,7 @@ fn assert_exchanged(program: &Path, contents: &[Vec<u8>]) {
     for (number, content) in (0..).zip(contents) {
         let parcel = parcel(number, content.clone());
         // Not more than may wait.
-        until("room for the letter", || {
+        until_some("room for the letter", || {
             let sent = party.send(number, &listener.location, parcel.clone());
             match sent {
                 Ok(()) => Some(()),
@@ -411,7 +412,7 @@ fn a_receiver_that_restarts_unnoticed_is_reached_again() {
     drop(listener);
     let listener = Listener::with(program, &port, &[]);
     let mut attempt = 2;
-    until("a letter to the new process", || {
+    until_some("a letter to the new process", || {
         party
             .send(attempt, &location, parcel(attempt, text(attempt, 10)))
             .unwrap();
@@ -446,7 +447,7 @@ fn this_side_closes_and_returns_at_the_same_port() {
     let address = first.location().address().to_owned();
     first.transport.close();
     // libudt closes the connection, so that the application gets an error.
-    let code = until("the end of the sender", || {
+    let code = until_some("the end of the sender", || {
         let next = letter(text(2, 10));
         let len = u32::try_from(next.len()).unwrap();
         let stdin = sender.0.stdin.as_mut().unwrap();
@@ -482,7 +483,7 @@ fn a_peer_that_stops_reading_gets_the_rest_when_it_reads_again() {
         record.concluded.len()
     };
     let mut before = 0;
-    until("the buffer of the peer is full", || {
+    until_some("the buffer of the peer is full", || {
         std::thread::sleep(Duration::from_millis(500));
         let now = handed();
         (std::mem::replace(&mut before, now) == now).then_some(())

@@ -1,0 +1,340 @@
+//! Partners that leave or die, and hosts that become silent, during a conversation. The partners are
+//! processes of their own, which the tests kill with SIGKILL or stop with SIGSTOP.
+//!
+//! Every call has a patience of one minute. A call that waits for it fails the test with another error.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+mod process;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use fipa::protocol::{DialogueError, PartnerEvent};
+use fipa::{Agent, AgentId, Domain, Gateway, Message, MessageBuilder, Performative};
+use process::{Process, config};
+use rustix::process::Signal;
+
+/// Time limit of all calls, which a passing test does not reach.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[test]
+#[ignore = "started by the other tests"]
+fn process_entry() {
+    process::run();
+}
+
+/// Returns the settings of a host that no other test uses.
+fn host(set: &[&str]) -> Vec<String> {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let mark = format!(
+        "{}-{}",
+        std::process::id(),
+        NEXT.fetch_add(1, Ordering::Relaxed)
+    );
+    let own = [
+        format!("domain=gone-{mark}"),
+        format!("mts.name=gateway-{mark}"),
+        "discovery.mdns=false".to_owned(),
+        "mts.deadline=1min".to_owned(),
+    ];
+    let set = set.iter().map(|setting| (*setting).to_owned());
+    own.into_iter().chain(set).collect()
+}
+
+fn to(agent: &Agent, act: Performative, receiver: &str) -> MessageBuilder {
+    agent.message(act).receiver(AgentId::new(receiver).unwrap())
+}
+
+fn text(message: &Message) -> &str {
+    std::str::from_utf8(message.content().unwrap()).unwrap()
+}
+
+/// Requires that this result is the end of an agent.
+#[track_caller]
+fn gone<T: std::fmt::Debug>(result: &Result<T, DialogueError>, name: &str) {
+    match result {
+        Err(DialogueError::Gone { agent }) if agent == name => {}
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_partner_ends_every_call_that_waits_for_it() {
+    let host = host(&[]);
+    let domain = Domain::open(&config(&host)).await.unwrap();
+    let rover = Arc::new(domain.register("rover").unwrap());
+    let mut arm = Process::start("arm", &host);
+    let ask = |act| to(&rover, act, "arm");
+
+    let request = rover.request(ask(Performative::Request), PATIENCE).await;
+    let mut request = request.unwrap();
+    assert!(request.agreed().await.unwrap());
+    let query = rover.query(ask(Performative::QueryRef), PATIENCE).await;
+    let when = rover.request_when(ask(Performative::RequestWhen), PATIENCE);
+    let when = when.await.unwrap();
+    let charge = rover
+        .subscribe(ask(Performative::Subscribe), PATIENCE)
+        .await;
+    let mut charge = charge.unwrap();
+    assert_eq!(text(&charge.next().await.unwrap()), "first");
+    let proxy = rover.brokering(ask(Performative::Proxy), PATIENCE).await;
+    let mut proxied = proxy.unwrap();
+    let arms = [AgentId::new("arm").unwrap()];
+    let call = rover.message(Performative::Cfp);
+    let mut net = rover.contract_net(call, &arms, PATIENCE).await.unwrap();
+    let bid = net.bids().proposals[0].clone();
+    let opening = rover.message(Performative::Inform);
+    let mut auction = rover.english_auction(opening, &arms).await.unwrap();
+    let to_cancel = rover.request(ask(Performative::Request), PATIENCE).await;
+    let mut to_cancel = to_cancel.unwrap();
+    assert!(to_cancel.agreed().await.unwrap());
+
+    let proposing = Arc::clone(&rover);
+    let proposed = tokio::spawn(async move {
+        let proposal = to(&proposing, Performative::Propose, "arm");
+        let decided = proposing.propose(proposal, PATIENCE).await;
+        (decided, Instant::now())
+    });
+    let awarded = tokio::spawn(async move {
+        let awarded = net.award(&[bid], "", PATIENCE).await;
+        (awarded, Instant::now())
+    });
+    let called = tokio::spawn(async move {
+        let bids = auction.call("10", PATIENCE).await;
+        (bids, Instant::now(), auction)
+    });
+    let notified = tokio::spawn(async move {
+        let notified = charge.next().await;
+        (notified, Instant::now(), charge)
+    });
+    let answered = tokio::spawn(async move {
+        let answered = proxied.next(PATIENCE).await;
+        (answered, Instant::now())
+    });
+    let informed = tokio::spawn(async move {
+        let result = request.result().await;
+        (result, Instant::now())
+    });
+    arm.got(&["propose", "accept-proposal", "call", "subscribe", "proxy"]);
+    arm.kill();
+    let killed = Instant::now();
+
+    let mut times = Vec::new();
+    let (result, at) = informed.await.unwrap();
+    gone(&result, "arm");
+    times.push(("request", at));
+    let (decided, at) = proposed.await.unwrap();
+    gone(&decided, "arm");
+    times.push(("propose", at));
+    let (awarded, at) = awarded.await.unwrap();
+    let awarded = awarded.unwrap();
+    assert_eq!(awarded[0].agent, "arm");
+    gone(&awarded[0].result, "arm");
+    times.push(("award", at));
+    let (bids, at, auction) = called.await.unwrap();
+    let bids = bids.unwrap();
+    assert_eq!(
+        (&bids.gone[..], &bids.silent[..]),
+        (&["arm".to_owned()][..], &["arm".to_owned()][..])
+    );
+    assert!(auction.bidders().is_empty());
+    times.push(("auction", at));
+    let (notified, at, mut charge) = notified.await.unwrap();
+    gone(&notified, "arm");
+    times.push(("subscription", at));
+    // A later call ends at once, too.
+    gone(&charge.next().await, "arm");
+    let (answered, at) = answered.await.unwrap();
+    gone(&answered, "arm");
+    times.push(("proxied", at));
+    gone(&query.unwrap().result().await, "arm");
+    gone(&when.result().await, "arm");
+    assert!(to_cancel.cancel(PATIENCE).await.is_err());
+    for (call, at) in times {
+        println!(
+            "{call}: {:?} after the kill",
+            at.saturating_duration_since(killed)
+        );
+    }
+}
+
+#[test]
+fn a_killed_partner_ends_a_blocking_call() {
+    let host = host(&[]);
+    let domain = fipa::blocking::Domain::open(&config(&host)).unwrap();
+    let rover = domain.register("rover").unwrap();
+    let mut arm = Process::start("arm", &host);
+    let receiver = AgentId::new("arm").unwrap();
+    let lift = rover
+        .message(Performative::Request)
+        .receiver(receiver.clone());
+    let mut request = rover.request(lift, PATIENCE).unwrap();
+    assert!(request.agreed().unwrap());
+    let charge = rover.message(Performative::Subscribe).receiver(receiver);
+    let mut charge = rover.subscribe(charge, PATIENCE).unwrap();
+    assert_eq!(text(&charge.next().unwrap()), "first");
+    let waiting = std::thread::spawn(move || charge.next());
+    arm.kill();
+    gone(&request.result(), "arm");
+    gone(&waiting.join().unwrap(), "arm");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_participant_learns_that_its_initiator_was_killed() {
+    let host = host(&[]);
+    let domain = Domain::open(&config(&host)).await.unwrap();
+    let rover = domain.register("rover").unwrap();
+    let mut starter = Process::start("starter", &host);
+    let first = rover.receive().await.unwrap().message;
+    let mut task = rover.take_part(&first).unwrap();
+    task.agree("").await.unwrap();
+    starter.kill();
+    let cancelled = tokio::time::timeout(PATIENCE, task.cancelled()).await;
+    gone(&cancelled.unwrap(), "starter");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_leaves_or_registers_again_is_gone() {
+    let host = host(&[]);
+    let (here, there) = (config(&host), config(&host));
+    let here = Domain::open(&here).await.unwrap();
+    let there = Domain::open(&there).await.unwrap();
+    let rover = here.register("rover").unwrap();
+    for registers_again in [false, true] {
+        let arm = there.register("arm").unwrap();
+        let request = to(&rover, Performative::Request, "arm");
+        let mut request = rover.request(request, PATIENCE).await.unwrap();
+        let first = arm.receive().await.unwrap().message;
+        let mut task = arm.take_part(&first).unwrap();
+        task.agree("").await.unwrap();
+        assert!(request.agreed().await.unwrap());
+        // The agent is deregistered before its task is dropped.
+        drop(arm);
+        let again = registers_again.then(|| there.register("arm").unwrap());
+        gone(&request.result().await, "arm");
+        drop((again, task));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
+    let host = host(&[]);
+    let here = Domain::open(&config(&host)).await.unwrap();
+    let there = Domain::open(&config(&host)).await.unwrap();
+    let rover = here.register("rover").unwrap();
+    for _ in 0..20 {
+        let arm = there.register("arm").unwrap();
+        let request = to(&rover, Performative::Request, "arm");
+        let request = rover.request(request, PATIENCE).await.unwrap();
+        let first = arm.receive().await.unwrap().message;
+        let done = arm.reply(&first, Performative::Inform).content("done");
+        arm.send(done.build().unwrap()).await.unwrap();
+        drop(arm);
+        assert_eq!(text(&request.result().await.unwrap()), "done");
+    }
+}
+
+/// Two hosts: a gateway and a domain of this process, and a gateway process of another host.
+struct TwoHosts {
+    _near: Gateway,
+    domain: Domain,
+    far: Process,
+    there: Vec<String>,
+}
+
+impl TwoHosts {
+    async fn start(set: &[&str]) -> Self {
+        let there = host(set);
+        let far = Process::start("gateway", &there);
+        let address = far.address.clone().unwrap();
+        let knows = format!("discovery.static={{ far = [\"tcp://{address}\"] }}");
+        let here = config(&host(&[set, &[&knows]].concat()));
+        Self {
+            _near: Gateway::open(&here).await.unwrap(),
+            domain: Domain::open(&here).await.unwrap(),
+            far,
+            there,
+        }
+    }
+
+    /// Starts an agent on the other host, and waits until this host knows it.
+    async fn agent(&self, name: &str) -> Process {
+        let process = Process::start(name, &self.there);
+        let started = Instant::now();
+        while self.domain.directory().lookup(name).is_none() {
+            assert!(started.elapsed() < PATIENCE, "{name} was not found");
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        process
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_partner_on_another_host_ends_the_call() {
+    let hosts = TwoHosts::start(&[]).await;
+    let mut arm = hosts.agent("arm").await;
+    let rover = hosts.domain.register("rover").unwrap();
+    let request = to(&rover, Performative::Request, "arm");
+    let mut request = rover.request(request, PATIENCE).await.unwrap();
+    assert!(request.agreed().await.unwrap());
+    let charge = to(&rover, Performative::Subscribe, "arm");
+    let mut charge = rover.subscribe(charge, PATIENCE).await.unwrap();
+    assert_eq!(text(&charge.next().await.unwrap()), "first");
+    let waiting = tokio::spawn(async move { charge.next().await });
+    let mut partners = rover.watch_partners();
+    partners.add("arm");
+    arm.kill();
+    let killed = Instant::now();
+    gone(&request.result().await, "arm");
+    println!("request: {:?} after the kill", killed.elapsed());
+    gone(&waiting.await.unwrap(), "arm");
+    let event = tokio::time::timeout(PATIENCE, partners.next()).await;
+    let agent = "arm".to_owned();
+    assert_eq!(event.unwrap(), PartnerEvent::Gone { agent });
+    // The letters about the agent never reach the application.
+    drop(partners);
+    assert!(rover.try_receive().unwrap().is_none());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
+    let hosts = TwoHosts::start(&["monitor.heartbeat=1s"]).await;
+    let mut arm = hosts.agent("arm").await;
+    let rover = Arc::new(hosts.domain.register("rover").unwrap());
+    let request = to(&rover, Performative::Request, "arm");
+    let mut request = rover.request(request, PATIENCE).await.unwrap();
+    assert!(request.agreed().await.unwrap());
+    let mut reachability = request.reachability();
+    assert!(reachability.unreachable().is_empty());
+    let short = to(&rover, Performative::Request, "arm");
+    let short = rover.request(short, Duration::from_secs(5)).await.unwrap();
+    let charge = to(&rover, Performative::Subscribe, "arm");
+    let mut charge = rover.subscribe(charge, PATIENCE).await.unwrap();
+    assert_eq!(text(&charge.next().await.unwrap()), "first");
+
+    hosts.far.signal(Signal::STOP);
+    let result = tokio::spawn(request.result());
+    let impatient = tokio::spawn(short.result());
+    assert!(reachability.changed().await);
+    let silent = reachability.unreachable();
+    assert_eq!(silent[0].agent, "arm");
+    assert!(silent[0].since <= Instant::now());
+    let silence = charge.next().await;
+    let is_silence =
+        matches!(&silence, Err(DialogueError::Unreachable { agent, .. }) if agent == "arm");
+    assert!(is_silence, "{silence:?}");
+    // The patience of this request ends first.
+    let impatient = impatient.await.unwrap();
+    let is_silence = matches!(impatient, Err(DialogueError::Unreachable { .. }));
+    assert!(is_silence, "{impatient:?}");
+    assert!(!result.is_finished());
+
+    hosts.far.signal(Signal::CONT);
+    assert!(reachability.changed().await);
+    assert!(reachability.unreachable().is_empty());
+    arm.finish();
+    assert_eq!(text(&result.await.unwrap().unwrap()), "done");
+    assert_eq!(text(&charge.next().await.unwrap()), "second");
+}
