@@ -475,7 +475,7 @@ fn several_participants_have_independent_states() {
     for table in &TABLES {
         let paths = timeless_paths(table);
         let mut walked = 0;
-        for (number, first) in paths.iter().enumerate() {
+        'paths: for (number, first) in paths.iter().enumerate() {
             // The first message goes to all three. Each then takes another path.
             let [second, third] = [1, 3].map(|other| &paths[(number + other) % paths.len()]);
             if first[0] != second[0] || first[0] != third[0] {
@@ -496,7 +496,7 @@ fn several_participants_have_independent_states() {
                 }
             };
             say(&mut walk, "ann", &["ben", "cid", "dan"], first[0].2);
-            let mut ends = [false; 3];
+            let (mut ends, mut leads) = ([false; 3], [false; 3]);
             for at in 1..first.len().max(second.len()).max(third.len()) {
                 for (index, path) in [first, second, third].into_iter().enumerate() {
                     let Some((_, side, act, to)) = path.get(at) else {
@@ -508,6 +508,11 @@ fn several_participants_have_independent_states() {
                     } else {
                         (peer, "ann")
                     };
+                    // Only one bidder leads.
+                    leads[index] = *to == "leads";
+                    if leads.iter().filter(|leads| **leads).count() > 1 {
+                        continue 'paths;
+                    }
                     let (ended, complete) = say(&mut walk, from, &[receiver], act);
                     ends[index] = to.starts_with('F');
                     assert_eq!((ended, complete), (ends[index], ends == [true; 3]));

@@ -7,8 +7,9 @@ use super::document::{self, Document};
 use super::{Ambiguity, Mistake, Problem};
 use crate::act::{Acts, is_word, whole};
 use crate::machine::{
-    After, Cancel, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
+    After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
+use crate::policy::one_edit_apart;
 
 /// Maximum number of transitions of a state, including those behind optional transitions.
 const MAX_STEPS: usize = 100;
@@ -176,13 +177,35 @@ impl<'d> Builder<'d> {
         let acts = acts.and_then(|text| self.acts(read.line, text));
         let from = from.and_then(|text| self.roles(read.line, "from", text));
         let to = to.and_then(|text| self.roles(read.line, "to", text));
+        let guard = self.guard(read);
         Some(Transition {
             acts: acts?,
             from: from?,
             to: to?,
             target: target?,
             optional,
+            guard,
         })
+    }
+
+    fn guard(&mut self, read: &'d document::Transition) -> Guard {
+        let mut guard = Guard::default();
+        if let Some(text) = &read.at_most {
+            match text.parse::<u16>() {
+                Ok(most @ 1..) => guard.at_most = most,
+                _ => self.value(read.line, "at-most", text, "a number from 1 to 65535"),
+            }
+        }
+        match read.when.as_deref() {
+            None => {}
+            Some("all") => guard.when_all = true,
+            Some(other) => self.value(read.line, "when", other, "all"),
+        }
+        let per_participant = self.document.scope.as_deref() == Some("participant");
+        if guard != Guard::default() && !per_participant {
+            self.wrong(read.line, Problem::GuardOfScope);
+        }
+        guard
     }
 
     fn timeout(&mut self, read: &'d document::Transition, after: &str) -> Option<Timeout> {
@@ -542,24 +565,4 @@ fn duration(text: &str) -> Option<Duration> {
     };
     let ms = number.parse::<u64>().ok()?.checked_mul(factor)?;
     (1..=DAY).contains(&ms).then_some(Duration::from_millis(ms))
-}
-
-/// Whether the texts differ in one inserted, omitted or changed character.
-fn one_edit_apart(one: &str, other: &str) -> bool {
-    let (short, long): (Vec<char>, Vec<char>) = if one.len() <= other.len() {
-        (one.chars().collect(), other.chars().collect())
-    } else {
-        (other.chars().collect(), one.chars().collect())
-    };
-    let same = short.iter().zip(&long).take_while(|(a, b)| a == b).count();
-    // All names of one or two characters would be near.
-    if short.len() < 3 {
-        return false;
-    }
-    let (short_rest, long_rest) = (short.get(same + 1..), long.get(same + 1..));
-    match long.len().checked_sub(short.len()) {
-        Some(0) => short_rest == long_rest,
-        Some(1) => short.get(same..) == long_rest,
-        _ => false,
-    }
 }

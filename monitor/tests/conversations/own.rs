@@ -71,14 +71,28 @@ fn answers_are_not_checked_for_an_agent_that_a_reply_to_names() {
     // Not an answer in any state, or only a message of the initiator, or a message of dan.
     for (protocol, words) in [
         ("fipa-query", "propose ben>dan"),
-        ("fipa-query", "cancel ben>dan"),
-        ("fipa-contract-net", "accept-proposal ben>dan"),
         ("fipa-query", "inform dan>ben"),
-        ("fipa-query", "not-understood dan>ben"),
     ] {
         let wrong = stage.wrong(say_in(protocol, words));
         assert_eq!(wrong.kind, Kind::NotOpened, "{words}");
     }
+    // It may answer these.
+    assert_eq!(
+        stage.check(&say_in("fipa-query", "not-understood dan>ben")),
+        Verdict::Unchecked(Unchecked::AnswersViolation)
+    );
+    // Another agent may have named dan in a reply-to, or dan has forgotten the conversation.
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    for (protocol, words) in [
+        ("fipa-query", "cancel ben>dan"),
+        ("fipa-contract-net", "accept-proposal ben>dan"),
+    ] {
+        let header = say_in(protocol, words).conversation_id("e");
+        assert_eq!(stage.check(&header), unknown, "{words}");
+    }
+    // So its answer is not checked either.
+    let answer = say_in("fipa-contract-net", "inform dan>ben").conversation_id("e");
+    assert_eq!(stage.check(&answer), unknown);
     // A message that begins a conversation is checked.
     stage.right(say_in("fipa-query", "query-ref ben>dan"));
     let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
