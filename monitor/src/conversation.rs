@@ -483,8 +483,12 @@ fn after_crossing(
         (FAILURE, _) if answers => Ok(NextState::to(party.resume)),
         (_, Ok(next_state)) if !(told_apart && answers) => Ok(match next_state.state {
             AFTER_NOT_UNDERSTOOD => next_state,
-            resume => NextState {
-                resume,
+            state => NextState {
+                resume: match state {
+                    // Two cancels crossed, or a failure crossed one.
+                    CANCELLING | FAILED => party.resume,
+                    own => own,
+                },
                 echo: true,
                 ..NextState::to(CANCELLED)
             },
@@ -539,6 +543,7 @@ fn while_cancelling(
         _ => NextState {
             state: CANCELLING,
             crossed: true,
+            guard: Guard::default(),
             ..next_state
         },
     })

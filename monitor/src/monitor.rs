@@ -412,16 +412,14 @@ impl Monitor {
     /// Finds the conversation of a message among those with its identifier: the one in which sender and
     /// receiver take part. Otherwise, an agent that does not lead one of them can begin another.
     fn place(&self, id: &str, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<u32> {
-        let mut best: Option<(u8, u32)> = None;
-        for at in self.table.find_all(id) {
-            let rank = self.rank(at, observed);
-            if best.is_none_or(|(known, _)| known < rank) {
-                best = Some((rank, at));
-            }
-        }
-        match best? {
-            (2, at) => Some(at),
-            (_, at) => (!self.begins_another(at, header, observed)).then_some(at),
+        let ranked = self.table.find_all(id).map(|at| {
+            let serial = self.table.slot(at).map_or(0, |slot| slot.serial);
+            (self.rank(at, observed), serial, at)
+        });
+        // Of several, the last that began.
+        match ranked.max()? {
+            (2, _, at) => Some(at),
+            (_, _, at) => (!self.begins_another(at, header, observed)).then_some(at),
         }
     }
 
@@ -767,7 +765,7 @@ impl Monitor {
             .iter()
             .filter_map(|at| Some((*at, self.table.slot(*at)?)));
         let of_peers = slots.filter(|(_, slot)| slot.peer != NONE || self.agent.is_none());
-        let oldest = of_peers.min_by_key(|(_, slot)| slot.touched);
+        let oldest = of_peers.min_by_key(|(_, slot)| (slot.touched, slot.serial));
         match oldest.map(|(at, _)| at) {
             Some(at) => {
                 self.forgotten += 1;

@@ -36,6 +36,7 @@ pub(crate) struct Table {
     accounts: HashTable<Account>,
     len: usize,
     bytes: usize,
+    begun: u64,
 }
 
 /// The conversations of one peer.
@@ -63,6 +64,8 @@ pub(crate) struct Slot {
     pub(crate) peer: Name,
     /// Bytes with which the peer is charged.
     cost: usize,
+    /// Number of conversations that began before this one.
+    pub(crate) serial: u64,
     used: bool,
     list: List,
     /// Value of `touched` when the conversation got its position in the lists.
@@ -115,6 +118,7 @@ impl Table {
             accounts: HashTable::new(),
             len: 0,
             bytes: 0,
+            begun: 0,
         }
     }
 
@@ -183,12 +187,14 @@ impl Table {
         if let Some(slot) = self.slots.get_mut(at as usize) {
             slot.used = true;
             slot.generation = slot.generation.wrapping_add(1);
+            slot.serial = self.begun;
             slot.touched = now;
             (slot.child, slot.sibling, slot.parent) = (NONE, NONE, parent);
             (slot.peer, slot.cost) = (peer, 0);
             slot.conversation.machine = machine;
         }
         self.len += 1;
+        self.begun += 1;
         self.account(peer).len += 1;
         if parent == NONE {
             let (slots, hasher) = (&self.slots, &self.hasher);
@@ -269,6 +275,7 @@ impl Table {
             parent: NONE,
             peer: NONE,
             cost: 0,
+            serial: 0,
             used: false,
             list: List::Open,
             listed: 0,

@@ -12,9 +12,8 @@ pub(super) enum Spot {
     At(String),
     NotUnderstood,
     Cancelling(String),
-    Cancelled {
-        one_more: bool,
-    },
+    /// The state behind a message that may have crossed the cancel: its answer may still come.
+    Cancelled(Option<String>),
     Undelivered(Box<Spot>),
     /// The monitored agent does not know the state.
     Elsewhere,
@@ -43,8 +42,12 @@ pub(super) struct Step {
     pub(super) spot: Spot,
     pub(super) roles: Option<(String, String)>,
     pub(super) crossed: bool,
-    /// Answers the message before the last one.
+    /// Answers a message before the last one.
     pub(super) void: bool,
+    /// The transition has a rule about all participants.
+    pub(super) guard: (Option<u16>, bool),
+    /// The state that allows the message, after an undelivered one.
+    pub(super) before: Option<Spot>,
 }
 
 pub(super) fn to(spot: Spot) -> Step {
@@ -53,6 +56,8 @@ pub(super) fn to(spot: Spot) -> Step {
         roles: None,
         crossed: false,
         void: false,
+        guard: (None, false),
+        before: None,
     }
 }
 
@@ -121,10 +126,12 @@ impl Talk {
         said.find(|said| said.by_initiator == initiator && !said.cancels)
     }
 
-    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&SentMessage> {
+    /// Whether one of the six questions before the last message has this `reply-with`.
+    pub(super) fn asked_earlier(&self, initiator: bool, text: &str) -> bool {
         let said = self.said.iter().rev();
-        let mut own = said.filter(|said| said.by_initiator == initiator && !said.cancels);
-        own.nth(1)
+        let own = said.filter(|said| said.by_initiator == initiator && !said.cancels);
+        let mut asked = own.skip(1).filter_map(|said| said.reply_with.as_deref());
+        asked.by_ref().take(6).any(|asked| asked == text)
     }
 
     pub(super) fn cancel(&self) -> Option<&SentMessage> {
@@ -186,7 +193,7 @@ impl Talk {
             Spot::At(id) => id.clone(),
             Spot::NotUnderstood => "not-understood".into(),
             Spot::Cancelling(_) => "cancelling".into(),
-            Spot::Cancelled { .. } => "cancelled".into(),
+            Spot::Cancelled(_) => "cancelled".into(),
             Spot::Undelivered(_) => "undelivered".into(),
             Spot::Elsewhere => "elsewhere".into(),
         }
@@ -255,16 +262,43 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                 // Only the protocol's own states.
                 _ => Err("unexpected"),
             };
-            at(before).or_else(|wrong| at(&talk.previous).map_err(|_| wrong))
+            let in_spot = |spot: &Spot| {
+                let step = at(spot)?;
+                Ok(Step {
+                    before: Some(spot.clone()),
+                    ..step
+                })
+            };
+            in_spot(before).or_else(|wrong| in_spot(&talk.previous).map_err(|_| wrong))
         }
         Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
-        Spot::Cancelled { one_more } => {
-            let canceling_side = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
-            if *one_more && view.by_initiator != canceling_side && answers_cancel {
-                return Ok(to(Spot::Cancelled { one_more: false }));
+        Spot::Cancelled(back) => {
+            let wrong = Err(if repeated { "repeated" } else { "ended" });
+            let cancel = talk.cancel().expect("a cancel was sent");
+            let Some(back) = back else { return wrong };
+            if view.by_initiator == cancel.by_initiator {
+                return wrong;
             }
-            Err(if repeated { "repeated" } else { "ended" })
+            let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
+            let answers = answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to);
+            let on_its_way = judge_at(machine, talk, back, view);
+            if act == "failure" && answers {
+                return Ok(to(Spot::At(back.clone())));
+            }
+            if let Ok(step) = on_its_way
+                && !(both && answers)
+            {
+                return Ok(to(match step.spot {
+                    Spot::At(id) => Spot::Cancelled(Some(id)),
+                    Spot::NotUnderstood => Spot::NotUnderstood,
+                    _ => Spot::Cancelled(Some(back.clone())),
+                }));
+            }
+            match answers {
+                true => Ok(to(Spot::Cancelled(None))),
+                false => wrong,
+            }
         }
         Spot::Cancelling(back) => {
             let cancel = talk.cancel().expect("a cancel was sent");
@@ -279,9 +313,12 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let on_its_way = judge_at(machine, talk, back, view);
             if answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to) {
                 return Ok(to(match act {
-                    "inform" => Spot::Cancelled {
-                        one_more: !both && on_its_way.is_ok(),
-                    },
+                    "inform" => Spot::Cancelled(match on_its_way {
+                        Ok(Step {
+                            spot: Spot::At(id), ..
+                        }) if !both => Some(id),
+                        _ => None,
+                    }),
                     "failure" => Spot::At(back.clone()),
                     _ => Spot::NotUnderstood,
                 }));
@@ -292,6 +329,8 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     crossed: true,
                     roles: step.roles,
                     void: step.void,
+                    guard: (None, false),
+                    before: None,
                 },
                 // During a cancel, a failure counts as a crossing message too.
                 Spot::Undelivered(_) => Step {
@@ -320,9 +359,8 @@ pub(super) fn judge_at(
         if let (true, Some(asked), Some(answer)) = (view.compares, asked, &words.in_reply_to)
             && asked != answer
         {
-            let earlier = talk.earlier_of(!view.by_initiator);
-            return match earlier.and_then(|said| said.reply_with.as_ref()) {
-                Some(earlier) if earlier == answer && !view.own => Ok(Step {
+            return match talk.asked_earlier(!view.by_initiator, answer) {
+                true if !view.own => Ok(Step {
                     void: true,
                     ..to(Spot::At(id.to_owned()))
                 }),
@@ -331,6 +369,7 @@ pub(super) fn judge_at(
         }
         return Ok(Step {
             roles: Some((taken.from().to_owned(), taken.to().to_owned())),
+            guard: (taken.at_most(), taken.needs_all()),
             ..to(Spot::At(machine.target(taken).to_owned()))
         });
     }
@@ -435,9 +474,7 @@ impl Talk {
         }
         let cancels =
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
-        if !matches!(self.spot, Spot::Undelivered(_)) {
-            self.previous = self.spot.clone();
-        }
+        self.previous = step.before.clone().unwrap_or_else(|| self.spot.clone());
         self.said.push(SentMessage {
             by_initiator,
             act: words.act,
