@@ -110,7 +110,7 @@ impl Change<'_> {
         if cancels {
             party.canceling_side = side;
             party.cancel = self.observed.reply_with;
-        } else {
+        } else if !next_state.answers_cancel {
             let index = side_index(side);
             party.acts[index] = act_number(self.observed.act);
             party.ask(

@@ -7,8 +7,9 @@ use hashbrown::HashTable;
 use smallvec::SmallVec;
 
 use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
-use crate::machine::{Cancel, Guard, Machine, Roles, Scope, Transition, step};
+use crate::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
 use crate::names::{Name, Names};
+use crate::projection::LocalRun;
 use crate::table::spread;
 use crate::verdict::ViolationKind as Kind;
 
@@ -77,7 +78,7 @@ pub(crate) struct Party {
     /// The participant, or [`NONE`].
     pub(crate) peer: Name,
     pub(crate) state: u16,
-    /// During a cancel or after a failure: the state before it.
+    /// During a cancel, or after a failure or a not-understood: the state before it.
     pub(crate) resume: u16,
     /// The state before the last message.
     pub(crate) before: u16,
@@ -86,7 +87,8 @@ pub(crate) struct Party {
     /// The side that canceled.
     pub(crate) canceling_side: Side,
     /// Whether the answer to the cancel may still come, because the message that was taken for it may
-    /// have been sent before the cancel arrived. `resume` is then the state after that message.
+    /// have been sent before the cancel arrived. After an `inform`, `resume` is the state after that
+    /// message.
     pub(crate) echo: bool,
     /// [`act_number`] of the last message of each side; 0 for none.
     pub(crate) acts: [u8; 2],
@@ -216,6 +218,8 @@ pub(crate) struct Rare {
     /// Other states to which the first message may have led, if the conversation may have begun before
     /// the monitor.
     pub(crate) alternatives: Vec<u16>,
+    /// The conversation as the role of the monitored agent sees it.
+    pub(crate) local: Option<LocalRun>,
     /// The last messages of which an observer gets each copy by itself.
     pub(crate) copied: Vec<Copied>,
     /// The parties by their peers, if there are more than [`FEW`].
@@ -271,6 +275,13 @@ impl Conversation {
     pub(crate) fn acquire(&mut self, names: &mut Names, text: &str) -> Name {
         self.charged_names += Names::cost(text.len());
         names.acquire(text)
+    }
+
+    /// Whether it is checked as the role of the monitored agent sees it.
+    pub(crate) fn is_local(&self) -> bool {
+        self.rare
+            .as_deref()
+            .is_some_and(|rare| rare.local.is_some())
     }
 
     pub(crate) fn rare(&mut self) -> &mut Rare {
@@ -405,6 +416,8 @@ pub(crate) struct NextState {
     pub(crate) guard: Guard,
     /// The state in which the message fits, if it is not the present one.
     pub(crate) before: Option<u16>,
+    /// Whether the message answers a cancel, and is no step of the protocol itself.
+    pub(crate) answers_cancel: bool,
 }
 
 impl NextState {
@@ -418,6 +431,14 @@ impl NextState {
             roles: (0, 0),
             guard: Guard::default(),
             before: None,
+            answers_cancel: false,
+        }
+    }
+
+    fn not_understood_in(state: u16) -> Self {
+        Self {
+            resume: state,
+            ..Self::to(AFTER_NOT_UNDERSTOOD)
         }
     }
 
@@ -442,6 +463,17 @@ pub(crate) fn next_state(
         CANCELLED if party.echo && message.side != party.canceling_side => {
             after_crossing(machine, party, message)
         }
+        // A message that was sent before the not-understood arrived changes nothing.
+        AFTER_NOT_UNDERSTOOD if !message.own && message.side != party.last => {
+            match in_state(machine, party, party.resume, message) {
+                Ok(NextState { state, .. }) => Ok(NextState {
+                    resume: machine.state(state).map_or(party.resume, |_| state),
+                    void: true,
+                    ..NextState::to(AFTER_NOT_UNDERSTOOD)
+                }),
+                Err(_) => Err(ended(party, message)),
+            }
+        }
         AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
         // A message that was reported as failed may have arrived, or is sent again.
         FAILED => {
@@ -452,7 +484,29 @@ pub(crate) fn next_state(
                     ..taken
                 })
             };
-            in_state(party.resume).or_else(|kind| in_state(party.before).map_err(|_| kind))
+            // If the last message did not arrive, the protocol has not ended, and can be canceled.
+            let over = machine.state(party.resume).is_some_and(State::is_over);
+            let (first, second) = match message.act == CANCEL && over {
+                true => (party.before, party.resume),
+                false => (party.resume, party.before),
+            };
+            in_state(first).or_else(|kind| in_state(second).map_err(|_| kind))
+        }
+        // What was taken for the failure of a cancel was a failure of the protocol.
+        own if party.echo
+            && message.side != party.canceling_side
+            && is_told_apart(party, message)
+            && message.in_reply_to == party.cancel
+            && is_cancel_answer(message) =>
+        {
+            Ok(NextState {
+                answers_cancel: true,
+                ..match message.act {
+                    INFORM => NextState::to(CANCELLED),
+                    FAILURE => NextState::to(own),
+                    _ => NextState::not_understood_in(own),
+                }
+            })
         }
         own => in_state(machine, party, own, message),
     }
@@ -480,7 +534,11 @@ fn after_crossing(
     match (message.act, crossing) {
         // The cancel failed, so the conversation continues. If this is a failure of the protocol
         // itself, the answer to the cancel fits too.
-        (FAILURE, _) if answers => Ok(NextState::to(party.resume)),
+        (FAILURE, crossing) if answers => Ok(NextState {
+            echo: !told_apart && crossing.is_ok(),
+            answers_cancel: true,
+            ..NextState::to(party.resume)
+        }),
         (_, Ok(next_state)) if !(told_apart && answers) => Ok(match next_state.state {
             AFTER_NOT_UNDERSTOOD => next_state,
             state => NextState {
@@ -493,7 +551,10 @@ fn after_crossing(
                 ..NextState::to(CANCELLED)
             },
         }),
-        _ if answers => Ok(NextState::to(CANCELLED)),
+        _ if answers => Ok(NextState {
+            answers_cancel: true,
+            ..NextState::to(CANCELLED)
+        }),
         _ => Err(ended(party, message)),
     }
 }
@@ -514,7 +575,7 @@ fn while_cancelling(
     let group = machine.scope == Scope::Conversation;
     if message.side == party.canceling_side && !group {
         return match message.act {
-            NOT_UNDERSTOOD => Ok(NextState::to(AFTER_NOT_UNDERSTOOD)),
+            NOT_UNDERSTOOD => Ok(NextState::not_understood_in(party.resume)),
             _ if is_repeated(party, message) => Err(Kind::Repeated),
             _ => Err(Kind::Unexpected),
         };
@@ -523,7 +584,7 @@ fn while_cancelling(
     let answers = !told_apart || message.in_reply_to == party.cancel;
     let crossing = in_state(machine, party, party.resume, message);
     if answers && is_cancel_answer(message) {
-        return Ok(match message.act {
+        let next_state = match message.act {
             INFORM => match crossing {
                 Ok(crossing) if !told_apart => NextState {
                     resume: crossing.state,
@@ -533,8 +594,15 @@ fn while_cancelling(
                 _ => NextState::to(CANCELLED),
             },
             // The cancel failed, and the conversation continues.
-            FAILURE => NextState::to(party.resume),
-            _ => NextState::to(AFTER_NOT_UNDERSTOOD),
+            FAILURE => NextState {
+                echo: !told_apart && crossing.is_ok(),
+                ..NextState::to(party.resume)
+            },
+            _ => NextState::not_understood_in(party.resume),
+        };
+        return Ok(NextState {
+            answers_cancel: true,
+            ..next_state
         });
     }
     // If the cancel fails, the conversation continues in the state after the crossing message.
@@ -582,7 +650,38 @@ fn in_state(
     if let Some(next_state) = by_default(machine, party, state, message) {
         return Ok(next_state);
     }
+    if has_crossed(machine, party, state, message) {
+        return Ok(NextState {
+            void: true,
+            ..NextState::to(state)
+        });
+    }
     Err(wrong(machine, party, state, message))
+}
+
+/// Whether a message that does not fit the state was sent before its sender had received the last
+/// messages of the other side, as a bid that arrives after the end of an auction. It changes nothing.
+fn has_crossed(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_>) -> bool {
+    if message.own || !message.answers {
+        return false;
+    }
+    let fits = |state: &State| step(&state.steps, message.act, message.from, message.to).is_some();
+    let other = side_index(message.side.opposite());
+    match message.in_reply_to {
+        // Without `in-reply-to`, only one message of the other side may have crossed it. A timeout
+        // does not cross messages.
+        0 => {
+            let before = machine.state(party.before).filter(|before| fits(before));
+            let mut led = before.into_iter().flat_map(|before| &before.steps);
+            party.last != message.side
+                && led.any(|step| step.target == state && step.from.includes(message.to))
+        }
+        answered => {
+            answered != party.asked[other]
+                && party.earlier[other].contains(&short(answered))
+                && machine.states.iter().any(fits)
+        }
+    }
 }
 
 /// Returns the state after a message that every protocol allows, as in figure 6 of the paper about
@@ -602,7 +701,7 @@ fn by_default(
     // `not-understood`.
     let answers_last = party.last != message.side;
     match message.act {
-        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| NextState::to(AFTER_NOT_UNDERSTOOD)),
+        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| NextState::not_understood_in(state)),
         CANCEL => {
             let may = match machine.cancel {
                 Cancel::Initiator => message.side == Side::Initiator,

@@ -15,10 +15,10 @@
 
 use std::sync::Arc;
 
-use crate::act::Act;
+use crate::act::{Act, FAILURE, INFORM};
 use crate::conversation::{Conversation, ELSEWHERE, NONE, Party, Side, act_number, side_index};
 use crate::judge::ObservedMessage;
-use crate::machine::{Machine, Scope, step};
+use crate::machine::{Cancel, Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 use crate::{Header, Now};
@@ -110,8 +110,10 @@ impl Monitor {
             self.infer_state(at, machine, observed, now);
             true
         } else {
-            // Other agents may begin the protocol with the monitored agent too.
-            joined && step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
+            // Other agents may begin the protocol with the monitored agent too, or answer a cancel.
+            let begins = step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX);
+            let cancels = machine.cancel != Cancel::Nobody;
+            joined && (begins.is_some() || cancels && [INFORM, FAILURE].contains(&observed.act))
         };
         if not_known {
             return Denied::Unchecked(Unchecked::BegunElsewhere);
@@ -135,7 +137,13 @@ impl Monitor {
         let (known, state) = match machine.scope {
             Scope::Participant => {
                 let known = conversation.party(&self.names, observed.sender);
-                (known.map(|(at, _)| at), after(machine, observed.act))
+                // It may also answer a cancel that the monitor has not seen.
+                let cancels = conversation.joined && machine.cancel != Cancel::Nobody;
+                let state = match observed.act {
+                    INFORM | FAILURE if cancels => ELSEWHERE,
+                    act => after(machine, act),
+                };
+                (known.map(|(at, _)| at), state)
             }
             // The roles of the agents are unknown too.
             Scope::Conversation => (conversation.parties.len().checked_sub(1), ELSEWHERE),

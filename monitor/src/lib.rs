@@ -1,6 +1,7 @@
 //! Interaction protocols as state machines, and a monitor that checks conversations at run time.
 //!
 //! * [`Machine`]: a protocol, read from an SCXML file (see [`scxml`] for the format).
+//! * [`projection`]: protocols with three or more roles, as each role sees them.
 //! * [`Library`]: protocols by name. [`Library::standard`] has those of FIPA.
 //! * [`Monitor`]: checks the messages of any number of conversations, as an observer or for one
 //!   participating agent, and returns a [`Verdict`] for each. It reads a [`Header`], without the
@@ -30,7 +31,9 @@ mod memory;
 mod monitor;
 mod names;
 mod policy;
+pub mod projection;
 mod report;
+mod roles;
 pub mod scxml;
 mod table;
 mod verdict;

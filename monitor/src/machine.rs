@@ -1,10 +1,13 @@
 //! Protocols as checked state machines. [`crate::scxml`] reads them.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use regex::Regex;
 
 use crate::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+
+use crate::projection::Projection;
 
 /// Maximum number of roles of a protocol.
 pub(crate) const MAX_ROLES: usize = 32;
@@ -29,6 +32,8 @@ pub struct Machine {
     pub(crate) initiator: u8,
     pub(crate) initial: u16,
     pub(crate) states: Vec<State>,
+    /// The protocol as each role sees it, if it has three or more roles and can be projected.
+    pub(crate) projection: Option<Arc<Projection>>,
 }
 
 /// The scope of the state of a protocol.
@@ -172,6 +177,14 @@ impl Machine {
     pub fn initial(&self) -> &State {
         // `scxml::build` ensures that `initial` is the index of a state.
         self.state(self.initial).unwrap_or(&self.states[0])
+    }
+
+    /// The protocol as each role sees it, if it has three or more roles: see
+    /// [`projection`](crate::projection). `None` if it has two roles, which see all messages, or if
+    /// it cannot be projected. [`Projection::defects`] has the reasons.
+    #[must_use]
+    pub fn projection(&self) -> Option<&Projection> {
+        self.projection.as_deref()
     }
 
     /// The states, in the order of the file.

@@ -11,7 +11,7 @@ use crate::act::NOT_UNDERSTOOD;
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
-    CANCELLING, Conversation, Copied, Holders, NONE, Party, RoleBinding, Side, act_number,
+    CANCELLING, Conversation, Copied, FAILED, Holders, NONE, Party, RoleBinding, Side, act_number,
     is_final, is_over, side_index, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
@@ -92,14 +92,14 @@ pub(crate) enum Denied {
 }
 
 /// The result of an accepted message.
-struct Passed {
-    machine: u16,
-    state: u16,
-    opened: bool,
-    complete: bool,
-    late: bool,
-    void: bool,
-    elsewhere: bool,
+pub(crate) struct Passed {
+    pub(crate) machine: u16,
+    pub(crate) state: u16,
+    pub(crate) opened: bool,
+    pub(crate) complete: bool,
+    pub(crate) late: bool,
+    pub(crate) void: bool,
+    pub(crate) elsewhere: bool,
 }
 
 impl Monitor {
@@ -354,6 +354,14 @@ impl Monitor {
         let machine = self.machine_of(&self.library, main);
         let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
         if header.protocol_name().is_none_or(follows) {
+            let projection = machine.and_then(|machine| machine.projection.clone());
+            let slot = self.table.slot(main);
+            let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
+            if let Some(projection) = projection
+                && rare.is_some_and(|rare| rare.local.is_some())
+            {
+                return self.advance_local(main, &projection, &observed, now);
+            }
             let passed = self.advance(main, header, &observed, now);
             return passed.map_err(|denied| {
                 let denied = self.recheck_delegated(main, &observed, denied, now);
@@ -413,14 +421,43 @@ impl Monitor {
     /// receiver take part. Otherwise, an agent that does not lead one of them can begin another.
     fn place(&self, id: &str, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<u32> {
         let ranked = self.table.find_all(id).map(|at| {
-            let serial = self.table.slot(at).map_or(0, |slot| slot.serial);
-            (self.rank(at, observed), serial, at)
+            let rank = self.rank(at, observed);
+            let slot = self.table.slot(at);
+            // Other agents may take part in a conversation that began elsewhere.
+            let joined = rank == 0 && slot.is_some_and(|slot| slot.conversation.joined);
+            let serial = slot.map_or(0, |slot| slot.serial);
+            (
+                rank,
+                joined,
+                self.has_protocol(at, header, observed),
+                serial,
+                at,
+            )
         });
         // Of several, the last that began.
-        match ranked.max()? {
-            (2, _, at) => Some(at),
-            (_, _, at) => (!self.begins_another(at, header, observed)).then_some(at),
+        let best = ranked.max();
+        let local = self
+            .table
+            .find_all(id)
+            .find(|at| self.fits_role(*at, header, observed));
+        if local.is_some() {
+            return local;
         }
+        let (rank, .., at) = best?;
+        if rank == 2 {
+            return Some(at);
+        }
+        let begins = |machine: &Machine| {
+            step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
+        };
+        let named = header.protocol_name();
+        let machine = named.and_then(|name| self.library.find(name));
+        let stays = match machine {
+            Some(machine) if begins(machine) => !self.begins_another(at, machine, observed),
+            // The monitor may have removed the conversation of the message.
+            _ => self.is_certain(id),
+        };
+        stays.then_some(at)
     }
 
     /// 2 if the sender and a receiver take part in the conversation or in one within it, 1 if the
@@ -440,7 +477,8 @@ impl Monitor {
             false
         };
         let has = |conversation: &Conversation, agent: &str| {
-            conversation.takes_part(&self.names, agent)
+            conversation.is_local() && self.agent.as_deref() == Some(agent)
+                || conversation.takes_part(&self.names, agent)
                 || conversation.is_designated(&self.names, agent)
         };
         let sends = |conversation: &Conversation| {
@@ -450,33 +488,59 @@ impl Monitor {
             let mut receivers = observed.receivers.iter().take(MAX_LOOKED_AT);
             receivers.any(|receiver| has(conversation, receiver))
         };
-        match any(&sends) {
-            true if any(&receives) => 2,
-            true => 1,
-            false => 0,
+        // With a state for each participant, these exchange messages with the initiator only.
+        let linked = |conversation: &Conversation| {
+            let machine = self.library.machine(conversation.machine);
+            if machine.is_none_or(|machine| machine.scope == Scope::Conversation) {
+                return sends(conversation) && receives(conversation);
+            }
+            let names = &self.names;
+            let leads = |agent: &str| {
+                names.is(conversation.initiator, agent) || conversation.is_designated(names, agent)
+            };
+            let answers = |agent: &str| {
+                conversation.unnamed.is_some() || conversation.party(names, agent).is_some()
+            };
+            let receivers = || observed.receivers.iter().take(MAX_LOOKED_AT);
+            leads(observed.sender) && receivers().any(|receiver| answers(receiver))
+                || answers(observed.sender) && receivers().any(|receiver| leads(receiver))
+        };
+        let embeds = self.table.slot(main).is_some_and(|slot| slot.child != NONE);
+        if any(&linked) || embeds && any(&sends) && any(&receives) {
+            return 2;
         }
+        u8::from(any(&sends))
     }
 
-    /// Whether the message begins another conversation than this one.
-    fn begins_another(&self, at: u32, header: &Header<'_>, observed: &ObservedMessage<'_>) -> bool {
+    /// Whether the protocol of a message is that of the conversation or of one within it, or may begin
+    /// within it.
+    fn has_protocol(&self, at: u32, header: &Header<'_>, observed: &ObservedMessage<'_>) -> bool {
         let Some(name) = header.protocol_name() else {
-            return false;
+            return true;
         };
-        let begins = |machine: &Machine| {
-            step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
-        };
-        if !self.library.find(name).is_some_and(begins) {
-            return false;
+        let mut part = at;
+        while let Some(slot) = self.table.slot(part) {
+            let machine = self.machine_of(&self.library, part);
+            if machine.is_some_and(|machine| machine.is_called(name))
+                || self.may_begin(&self.library, part, name, observed.sender)
+            {
+                return true;
+            }
+            part = if part == at { slot.child } else { slot.sibling };
         }
+        false
+    }
+
+    /// Whether the first message of a protocol begins another conversation than this one.
+    fn begins_another(&self, at: u32, machine: &Machine, observed: &ObservedMessage<'_>) -> bool {
+        let name = machine.name();
         let mut part = at;
         while let Some(slot) = self.table.slot(part) {
             let conversation = &slot.conversation;
             let initiates = part == at && self.names.is(conversation.initiator, observed.sender);
             let leads = !conversation.joined
                 && (initiates || conversation.is_designated(&self.names, observed.sender));
-            // An agent cannot keep the monitored one from using its own identifiers.
-            let ever = !observed.own && self.may_ever_begin(part, name, observed.sender);
-            if leads || ever || self.may_begin(&self.library, part, name, observed.sender) {
+            if leads || self.may_begin(&self.library, part, name, observed.sender) {
                 return false;
             }
             part = if part == at { slot.child } else { slot.sibling };
@@ -569,30 +633,6 @@ impl Monitor {
         self.is_begun(library, at, protocol, |roles| roles.of(sender))
     }
 
-    /// Whether the agent may begin a conversation of this protocol within another conversation in any
-    /// state of that one.
-    fn may_ever_begin(&self, at: u32, protocol: &str, sender: &str) -> bool {
-        let machine = self.machine_of(&self.library, at);
-        let Some((slot, machine)) = self.table.slot(at).zip(machine) else {
-            return false;
-        };
-        let conversation = &slot.conversation;
-        let roles = match machine.scope {
-            Scope::Participant => match conversation.party(&self.names, sender) {
-                Some(_) => !(1_u32 << machine.initiator),
-                None => 0,
-            },
-            Scope::Conversation => {
-                let bound = conversation.bound.iter();
-                let held = bound.filter(|bound| self.names.is(bound.agent, sender));
-                held.fold(0, |mask, bound| mask | (1 << bound.role))
-            }
-        };
-        let inner = self.library.find(protocol);
-        let mut all = machine.states.iter().flat_map(|state| &state.subprotocols);
-        all.any(|sub| sub.from.mask & roles != 0 && inner.is_some_and(|inner| sub.admits(inner)))
-    }
-
     /// Whether another agent than the monitored one may have begun a conversation of this protocol
     /// within its conversation, so that an unknown agent sends messages to it. Recruited agents do so.
     fn began_elsewhere(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
@@ -651,6 +691,12 @@ impl Monitor {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
         // Checked before eviction, so that an invalid message evicts no conversation.
+        if parent == NONE
+            && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
+        {
+            let machine = (machine, protocol);
+            return self.open_local(id, machine, &projection, (header, observed), now);
+        }
         let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
         let Some(begins) = begins else {
             return Err(match parent {
@@ -935,7 +981,11 @@ impl Monitor {
     /// receivers.
     fn copied(&self, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<(u64, u64)> {
         let addressed = header.addressed();
-        let receiver = observed.receivers.first().filter(|_| addressed.len() > 1)?;
+        let first = addressed.first()?;
+        let receiver = observed.receivers.first()?;
+        if addressed.len() == 1 && first == receiver {
+            return None;
+        }
         let message = (
             header.act().name(),
             observed.sender,
@@ -1031,7 +1081,13 @@ impl Monitor {
                         conversation_id: slot.conversation.id.clone(),
                     });
                 }
-                self.forget(at);
+                // After an undelivered message, a conversation may continue.
+                let undelivered = |party: &Party| party.state == FAILED;
+                if list == List::Ended && !conversation.parties.iter().any(undelivered) {
+                    self.remove_all(at);
+                } else {
+                    self.forget(at);
+                }
             }
         }
         events
@@ -1071,14 +1127,19 @@ impl Monitor {
         complete.then_some(event)
     }
 
-    /// Removes a main conversation with its embedded conversations.
+    /// Removes a main conversation with its embedded conversations before its time. Messages to it may
+    /// still come.
     fn forget(&mut self, at: u32) {
-        let slot = self.table.slot(at);
-        // A message to a conversation that is over is a violation also after its removal.
-        if let Some(slot) = slot.filter(|slot| slot.list() == List::Open) {
+        if let Some(slot) = self.table.slot(at) {
             let id = self.hasher.hash_one(slot.conversation.id.as_str());
             self.removed.add(id);
         }
+        self.remove_all(at);
+    }
+
+    /// Removes a main conversation with its embedded conversations, without remembering that the
+    /// monitor had it. A further message to it is a violation.
+    fn remove_all(&mut self, at: u32) {
         while let Some(slot) = self.table.slot(at) {
             let child = slot.child;
             if child == NONE {
@@ -1128,7 +1189,7 @@ impl Monitor {
 
 impl Passed {
     /// The result of a message that changes nothing.
-    fn in_state_of(conversation: &Conversation, machine: &Machine, index: u16) -> Self {
+    pub(crate) fn in_state_of(conversation: &Conversation, machine: &Machine, index: u16) -> Self {
         let parties = &conversation.parties;
         Self {
             machine: index,
@@ -1296,6 +1357,10 @@ fn take_back(
             made.next_state.resume,
             made.next_state.echo,
         );
+        // The other side answers the message before it, and need not be told which.
+        if act != act_number(crate::act::CANCEL) {
+            party.asked[index] = 0;
+        }
     }
     is_last
 }

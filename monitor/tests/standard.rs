@@ -264,6 +264,8 @@ struct Walk<'t> {
     monitor: Monitor,
     now: SystemTime,
     state: &'static str,
+    /// The state before.
+    before: &'static str,
     last: char,
 }
 
@@ -274,6 +276,7 @@ impl<'t> Walk<'t> {
             monitor: Monitor::observer(Arc::clone(library)),
             now: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
             state: "0",
+            before: "-",
             last: '-',
         }
     }
@@ -291,6 +294,8 @@ impl<'t> Walk<'t> {
         let before = self.state;
         if side == '!' {
             self.now += Duration::from_secs(10);
+            // A timeout does not cross messages.
+            self.before = "-";
             self.state = to;
             return;
         }
@@ -312,6 +317,7 @@ impl<'t> Walk<'t> {
             }
             other => panic!("{name}: {before} {side}{act}: {other:?}"),
         }
+        self.before = before;
         self.state = to;
         self.last = side;
     }
@@ -351,7 +357,12 @@ impl<'t> Walk<'t> {
             "not-understood" => !ended || side != self.last,
             // Allowed for the initiator before it has received the end.
             "cancel" => self.table.cancel && side == '>' && (!over || self.last == '<'),
-            _ => false,
+            _ => {
+                // A message that crossed the last one of the other side.
+                let mut rows = self.table.rows.iter();
+                let allows = |row: &Row| (row.0, row.1, row.2) == (self.before, side, act);
+                side != self.last && rows.any(allows)
+            }
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Builds a machine from a document: resolves all names, makes all checks, collects all mistakes.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::document::{self, Document};
@@ -10,6 +11,7 @@ use crate::machine::{
     After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
 use crate::policy::one_edit_apart;
+use crate::projection::Projection;
 
 /// Maximum number of transitions of a state, including those behind optional transitions.
 const MAX_STEPS: usize = 100;
@@ -79,12 +81,19 @@ impl<'d> Builder<'d> {
             initiator: 0,
             initial: initial?,
             states,
+            projection: None,
         };
         self.bound_roles(&machine);
         self.skip_optional(&mut machine);
         self.reachable(&machine);
         self.unambiguous(&machine);
         machine.initiator = self.beginner(&machine)?;
+        if machine.scope == Scope::Conversation
+            && machine.roles.len() > 2
+            && self.mistakes.is_empty()
+        {
+            machine.projection = Projection::new(&machine).ok().map(Arc::new);
+        }
         Some(machine)
     }
 

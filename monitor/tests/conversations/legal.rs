@@ -175,7 +175,7 @@ fn an_undelivered_message_can_be_sent_again() {
         assert_eq!(stage.right(request("agree ben>ann")), "agreed");
         // The answer proves the delivery, so a later report changes nothing.
         stage.monitor.undelivered(&ask(), "ben", now);
-        assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+        assert_eq!(stage.wrong(ask()).kind, Kind::Unexpected);
         // So it is with an answer, with a cancel, and with one of several receivers.
         stage
             .monitor

@@ -457,10 +457,8 @@ fn brokers_run_embedded_protocols() {
     let broker = |words| say_in("fipa-brokering", words);
     let mut stage = Stage::observer();
     stage.right(broker("proxy ann>bro"));
-    assert_eq!(
-        stage.wrong(say_in("fipa-query", "query-ref bro>ben")).kind,
-        Kind::WrongProtocol
-    );
+    // Too early: this is another conversation with the same identifier.
+    stage.right(say_in("fipa-propose", "propose bro>zoe"));
     stage.right(broker("agree bro>ann"));
     stage.right(say_in("fipa-query", "query-ref bro>ben,cid"));
     stage.right(say_in("fipa-request", "request bro>dan"));
@@ -488,7 +486,7 @@ fn brokers_run_embedded_protocols() {
     assert_eq!(stage.wrong(broker("inform bro>ann")).kind, Kind::Ended);
     assert_eq!(
         stage.monitor.len(),
-        3,
+        4,
         "eve came into the query that was there"
     );
     stage.pass(100_000);

@@ -7,7 +7,7 @@ use fipa_monitor::{Cancel, Library, Machine, Scope};
 
 mod talk;
 
-use talk::{Spot, Step, Talk, View, is_answered, is_over, judge, state};
+use talk::{Spot, Step, Talk, View, is_answered, judge, state};
 pub(crate) use talk::{matches, options};
 
 /// The parameters of a message.
@@ -141,11 +141,18 @@ impl<'l> Reference<'l> {
         let alike = self.talks.entry(words.id.clone()).or_default();
         let ranked = alike.iter().enumerate();
         let best = ranked
-            .map(|(at, conversation)| (conversation.rank(words), at))
+            .map(|(at, conversation)| {
+                let rank = conversation.rank(words);
+                let joined = rank == 0 && conversation.joined;
+                (rank, joined, conversation.has_protocol(library, words), at)
+            })
             .max();
         let at = match best {
-            Some((2, at)) => Some(at),
-            Some((_, at)) => Some(at).filter(|at| !alike[*at].is_another(library, words)),
+            Some((2, .., at)) => Some(at),
+            Some((.., at)) if !words.begins_in(library) => {
+                Some(at).filter(|_| !self.removed.contains(&words.id))
+            }
+            Some((.., at)) => Some(at).filter(|at| !alike[*at].is_another(library, words)),
             None => None,
         };
         if let Some(at) = at {
@@ -200,6 +207,15 @@ impl<'l> Reference<'l> {
     }
 }
 
+impl Words {
+    /// Whether the message can begin its protocol.
+    fn begins_in(&self, library: &Library) -> bool {
+        let named = self.protocol.as_ref();
+        let machine = named.and_then(|name| library.find(name));
+        machine.is_some_and(|machine| begins(machine, self.act))
+    }
+}
+
 /// Keeps at most eight conversations with one identifier.
 fn evict_alike(
     alike: &mut Vec<Conversation<'_>>,
@@ -223,9 +239,7 @@ fn evict_alike(
         }
     });
     let at = oldest.0;
-    if !alike[at].is_over() {
-        removed.insert(words.id.clone());
-    }
+    removed.insert(words.id.clone());
     alike.remove(at);
 }
 
@@ -333,8 +347,27 @@ impl<'l> Conversation<'l> {
         if !all().any(|one| one.multicast.is_some() || has(one, words.from)) {
             return 0;
         }
-        let mut receivers = words.to.iter();
-        1 + u8::from(receivers.any(|name| all().any(|one| has(one, name))))
+        let receives = |one: &Self| words.to.iter().any(|name| has(one, name));
+        let linked = |one: &Self| {
+            let multicast = one.multicast.is_some();
+            if one.machine.scope() == Scope::Conversation {
+                return (multicast || has(one, words.from)) && receives(one);
+            }
+            let leads = |name: &str| one.initiator == name || one.designated.contains(&name);
+            let answers = |name: &str| multicast || one.place(name).is_some();
+            leads(words.from) && words.to.iter().any(|name| answers(name))
+                || answers(words.from) && words.to.iter().any(|name| leads(name))
+        };
+        let across = !self.inner.is_empty() && all().any(receives);
+        1 + u8::from(all().any(linked) || across)
+    }
+
+    fn has_protocol(&self, library: &'l Library, words: &Words) -> bool {
+        let Some(name) = &words.protocol else {
+            return true;
+        };
+        let mut all = std::iter::once(self).chain(&self.inner);
+        all.any(|one| one.machine.is_called(name) || one.may_begin(library, name, words.from))
     }
 
     /// Whether the message begins another conversation.
@@ -349,46 +382,12 @@ impl<'l> Conversation<'l> {
             !one.joined
                 && (main && one.initiator == words.from || one.designated.contains(&words.from))
         };
-        let own = self.agent == Some(words.from);
         let held_back = leads(self, true)
             || self.inner.iter().any(|inner| leads(inner, false))
-            || std::iter::once(self).chain(&self.inner).any(|one| {
-                one.may_begin(library, name, words.from)
-                    || !own && one.may_ever_begin(machine, words.from)
-            });
+            || std::iter::once(self)
+                .chain(&self.inner)
+                .any(|one| one.may_begin(library, name, words.from));
         begins(machine, words.act) && !held_back
-    }
-
-    fn may_ever_begin(&self, inner: &Machine, from: &str) -> bool {
-        let roles = match self.machine.scope() {
-            Scope::Participant if self.place(from).is_some() => {
-                self.roles_but(&[self.machine.initiator()])
-            }
-            Scope::Participant => Vec::new(),
-            _ => {
-                let held = self.roles.iter().filter(|(_, agent)| *agent == from);
-                held.map(|(role, _)| role.as_str()).collect()
-            }
-        };
-        let states = self.machine.states().iter();
-        states.flat_map(|state| state.subprotocols()).any(|sub| {
-            let aliases = inner.aliases().iter().map(String::as_str);
-            let mut names = aliases.chain([inner.name()]);
-            roles.iter().any(|role| matches(sub.from(), role))
-                && names.any(|name| matches(sub.name(), name))
-        })
-    }
-
-    /// Whether no further message can follow, in any part.
-    fn is_over(&self) -> bool {
-        let over = |(_, talk): &(&str, Talk)| match &talk.spot {
-            Spot::At(id) => is_over(self.machine, id),
-            Spot::Cancelling(_) | Spot::Elsewhere => false,
-            _ => true,
-        };
-        self.multicast.is_none()
-            && self.talks.iter().all(over)
-            && self.inner.iter().all(Self::is_over)
     }
 
     fn place(&self, name: &str) -> Option<usize> {
@@ -401,7 +400,7 @@ impl<'l> Conversation<'l> {
 
     fn learn(&mut self, words: &Words, now: u64) {
         self.touched = now;
-        let talk = Talk::joined(self.machine, words);
+        let talk = Talk::joined(self.machine, words, self.joined);
         let peer = match self.machine.scope() {
             Scope::Participant => match self.place(words.from) {
                 Some(at) => self.talks[at].0,
@@ -451,7 +450,10 @@ impl<'l> Conversation<'l> {
             self.learn(words, now);
             true
         } else {
-            self.joined && begins(machine, words.act)
+            let cancels = machine.cancel() != Cancel::Nobody;
+            self.joined
+                && (begins(machine, words.act)
+                    || cancels && ["inform", "failure"].contains(&words.act))
         };
         if excused {
             Ok(ReferenceVerdict::Unchecked)

@@ -10,7 +10,8 @@ use super::Words;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Spot {
     At(String),
-    NotUnderstood,
+    /// The state before.
+    NotUnderstood(String),
     Cancelling(String),
     /// The state behind a message that may have crossed the cancel: its answer may still come.
     Cancelled(Option<String>),
@@ -25,6 +26,8 @@ pub(super) struct Talk {
     pub(super) previous: Spot,
     pub(super) said: Vec<SentMessage>,
     pub(super) due: Option<u64>,
+    /// Whether a failure that may have crossed a cancel was taken for the answer to it.
+    pub(super) echo: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -36,6 +39,8 @@ pub(super) struct SentMessage {
     pub(super) cancels: bool,
     /// Sent before the cancel of the other side was received.
     pub(super) crossed: bool,
+    /// The answer to a cancel.
+    pub(super) answers_cancel: bool,
 }
 
 pub(super) struct Step {
@@ -48,6 +53,9 @@ pub(super) struct Step {
     pub(super) guard: (Option<u16>, bool),
     /// The state that allows the message, after an undelivered one.
     pub(super) before: Option<Spot>,
+    pub(super) echo: bool,
+    /// Answers a cancel, and is no step of the protocol itself.
+    pub(super) answers_cancel: bool,
 }
 
 pub(super) fn to(spot: Spot) -> Step {
@@ -58,6 +66,8 @@ pub(super) fn to(spot: Spot) -> Step {
         void: false,
         guard: (None, false),
         before: None,
+        echo: false,
+        answers_cancel: false,
     }
 }
 
@@ -112,6 +122,7 @@ impl Talk {
             spot,
             said: Vec::new(),
             due: None,
+            echo: false,
         }
     }
 
@@ -123,13 +134,14 @@ impl Talk {
 
     pub(super) fn last_of(&self, initiator: bool) -> Option<&SentMessage> {
         let mut said = self.said.iter().rev();
-        said.find(|said| said.by_initiator == initiator && !said.cancels)
+        said.find(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel)
     }
 
     /// Whether one of the six questions before the last message has this `reply-with`.
     pub(super) fn asked_earlier(&self, initiator: bool, text: &str) -> bool {
         let said = self.said.iter().rev();
-        let own = said.filter(|said| said.by_initiator == initiator && !said.cancels);
+        let own = said
+            .filter(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel);
         let mut asked = own.skip(1).filter_map(|said| said.reply_with.as_deref());
         asked.by_ref().take(6).any(|asked| asked == text)
     }
@@ -145,7 +157,7 @@ impl Talk {
     }
 
     /// Creates the state of an agent that joined with an answer: known if only one state can follow.
-    pub(super) fn joined(machine: &Machine, words: &Words) -> Self {
+    pub(super) fn joined(machine: &Machine, words: &Words, elsewhere: bool) -> Self {
         let mut in_time = vec![machine.initial().id()];
         for at in 0.. {
             let Some(id) = in_time.get(at) else { break };
@@ -163,6 +175,12 @@ impl Talk {
         targets.sort_unstable();
         targets.dedup();
         let spot = match targets[..] {
+            _ if elsewhere
+                && machine.cancel() != Cancel::Nobody
+                && ["inform", "failure"].contains(&words.act) =>
+            {
+                Spot::Elsewhere
+            }
             [only] if machine.scope() == Scope::Participant => Spot::At(only.to_owned()),
             _ => Spot::Elsewhere,
         };
@@ -175,8 +193,10 @@ impl Talk {
                 reply_with: words.reply_with.clone(),
                 cancels: false,
                 crossed: false,
+                answers_cancel: false,
             }],
             due: None,
+            echo: false,
         }
     }
 
@@ -191,7 +211,7 @@ impl Talk {
     pub(super) fn name(&self) -> String {
         match &self.spot {
             Spot::At(id) => id.clone(),
-            Spot::NotUnderstood => "not-understood".into(),
+            Spot::NotUnderstood(_) => "not-understood".into(),
             Spot::Cancelling(_) => "cancelling".into(),
             Spot::Cancelled(_) => "cancelled".into(),
             Spot::Undelivered(_) => "undelivered".into(),
@@ -255,7 +275,26 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
     let answers_cancel = ["inform", "failure", "not-understood"].contains(&act);
     let repeated = talk.is_repeated(view.words, view.by_initiator);
     match &talk.spot {
-        Spot::At(id) => judge_at(machine, talk, id, view),
+        Spot::At(id) => {
+            if talk.echo
+                && answers_cancel
+                && let Some(cancel) = talk.cancel()
+                && cancel.by_initiator != view.by_initiator
+                && cancel.reply_with.is_some()
+                && cancel.reply_with == view.words.in_reply_to
+            {
+                let next = to(match act {
+                    "inform" => Spot::Cancelled(None),
+                    "failure" => Spot::At(id.clone()),
+                    _ => Spot::NotUnderstood(id.clone()),
+                });
+                return Ok(Step {
+                    answers_cancel: true,
+                    ..next
+                });
+            }
+            judge_at(machine, talk, id, view)
+        }
         Spot::Undelivered(before) => {
             let at = |spot: &Spot| match spot {
                 Spot::At(id) => judge_at(machine, talk, id, view),
@@ -269,10 +308,31 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     ..step
                 })
             };
-            in_spot(before).or_else(|wrong| in_spot(&talk.previous).map_err(|_| wrong))
+            let over = matches!(&**before, Spot::At(id) if is_over(machine, id));
+            let (first, second) = match act == "cancel" && over {
+                true => (&talk.previous, &**before),
+                false => (&**before, &talk.previous),
+            };
+            in_spot(first).or_else(|wrong| in_spot(second).map_err(|_| wrong))
         }
         Spot::Elsewhere => Err("unexpected"),
-        Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
+        Spot::NotUnderstood(back) => {
+            let last = talk.said.last().expect("a not-understood was sent");
+            if !view.own
+                && last.by_initiator != view.by_initiator
+                && let Ok(step) = judge_at(machine, talk, back, view)
+            {
+                let back = match step.spot {
+                    Spot::At(id) => id,
+                    _ => back.clone(),
+                };
+                return Ok(Step {
+                    void: true,
+                    ..to(Spot::NotUnderstood(back))
+                });
+            }
+            Err(if repeated { "repeated" } else { "ended" })
+        }
         Spot::Cancelled(back) => {
             let wrong = Err(if repeated { "repeated" } else { "ended" });
             let cancel = talk.cancel().expect("a cancel was sent");
@@ -284,19 +344,26 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let answers = answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to);
             let on_its_way = judge_at(machine, talk, back, view);
             if act == "failure" && answers {
-                return Ok(to(Spot::At(back.clone())));
+                return Ok(Step {
+                    echo: !both && on_its_way.is_ok(),
+                    answers_cancel: true,
+                    ..to(Spot::At(back.clone()))
+                });
             }
             if let Ok(step) = on_its_way
                 && !(both && answers)
             {
                 return Ok(to(match step.spot {
                     Spot::At(id) => Spot::Cancelled(Some(id)),
-                    Spot::NotUnderstood => Spot::NotUnderstood,
+                    Spot::NotUnderstood(back) => Spot::NotUnderstood(back),
                     _ => Spot::Cancelled(Some(back.clone())),
                 }));
             }
             match answers {
-                true => Ok(to(Spot::Cancelled(None))),
+                true => Ok(Step {
+                    answers_cancel: true,
+                    ..to(Spot::Cancelled(None))
+                }),
                 false => wrong,
             }
         }
@@ -304,7 +371,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let cancel = talk.cancel().expect("a cancel was sent");
             if machine.scope() == Scope::Participant && view.by_initiator == cancel.by_initiator {
                 return match act {
-                    "not-understood" => Ok(to(Spot::NotUnderstood)),
+                    "not-understood" => Ok(to(Spot::NotUnderstood(back.clone()))),
                     _ if repeated => Err("repeated"),
                     _ => Err("unexpected"),
                 };
@@ -312,7 +379,8 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
             let on_its_way = judge_at(machine, talk, back, view);
             if answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to) {
-                return Ok(to(match act {
+                let echo = act == "failure" && !both && on_its_way.is_ok();
+                let next = to(match act {
                     "inform" => Spot::Cancelled(match on_its_way {
                         Ok(Step {
                             spot: Spot::At(id), ..
@@ -320,8 +388,13 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                         _ => None,
                     }),
                     "failure" => Spot::At(back.clone()),
-                    _ => Spot::NotUnderstood,
-                }));
+                    _ => Spot::NotUnderstood(back.clone()),
+                });
+                return Ok(Step {
+                    echo,
+                    answers_cancel: true,
+                    ..next
+                });
             }
             on_its_way.map(|step| match step.spot {
                 Spot::At(id) | Spot::Cancelling(id) => Step {
@@ -331,6 +404,8 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     void: step.void,
                     guard: (None, false),
                     before: None,
+                    echo: false,
+                    answers_cancel: false,
                 },
                 // During a cancel, a failure counts as a crossing message too.
                 Spot::Undelivered(_) => Step {
@@ -394,7 +469,7 @@ pub(super) fn judge_at(
         };
         match words.act {
             "not-understood" if !here.is_final() || received_last => {
-                return Ok(to(Spot::NotUnderstood));
+                return Ok(to(Spot::NotUnderstood(id.to_owned())));
             }
             "cancel" if may_cancel && (!over || (received_last && !view.own)) => {
                 return Ok(to(Spot::Cancelling(id.to_owned())));
@@ -405,6 +480,12 @@ pub(super) fn judge_at(
             }
             _ => {}
         }
+    }
+    if has_crossed(machine, talk, id, view) {
+        return Ok(Step {
+            void: true,
+            ..to(Spot::At(id.to_owned()))
+        });
     }
     Err(if talk.is_repeated(words, view.by_initiator) {
         "repeated"
@@ -420,6 +501,34 @@ pub(super) fn judge_at(
     } else {
         "unexpected"
     })
+}
+
+/// Whether the message was sent before its sender had received the last ones.
+fn has_crossed(machine: &Machine, talk: &Talk, now: &str, view: &View<'_>) -> bool {
+    if view.own || !view.compares {
+        return false;
+    }
+    let fits = |id: &str| options(machine, id).iter().any(|step| view.fits(step));
+    let other = !view.by_initiator;
+    match &view.words.in_reply_to {
+        None => {
+            let sends = |step: &&Transition| {
+                step.from() == ".*" || view.to.iter().any(|role| matches(step.from(), role))
+            };
+            let led = |id: &str| {
+                let mut steps = options(machine, id).into_iter().filter(sends);
+                steps.any(|step| machine.target(step) == now)
+            };
+            talk.last_by_initiator() == other
+                && matches!(&talk.previous, Spot::At(id) if fits(id) && led(id))
+        }
+        Some(answer) => {
+            let asked = talk.last_of(other);
+            asked.is_none_or(|asked| asked.reply_with.as_ref() != Some(answer))
+                && talk.asked_earlier(other, answer)
+                && machine.states().iter().any(|state| fits(state.id()))
+        }
+    }
 }
 
 pub(super) fn comes_later(
@@ -460,6 +569,7 @@ impl Talk {
         now: u64,
     ) -> (bool, bool) {
         let opened = !self.said.iter().any(|said| !said.cancels);
+        self.echo = step.echo;
         if let Spot::Undelivered(_) = &step.spot {
             self.spot = step.spot;
             let late =
@@ -481,6 +591,7 @@ impl Talk {
             reply_with: words.reply_with.clone(),
             cancels,
             crossed: step.crossed,
+            answers_cancel: step.answers_cancel,
         });
         self.spot = step.spot;
         self.due = words.reply_by;
