@@ -47,6 +47,9 @@
 //! check = "off"                       # or "warn", "enforce": reaction to protocol violations
 //! answer = false                      # true: violations are answered with not-understood
 //! protocols = []                      # SCXML files with further protocols
+//! idle = "24h"                        # a conversation without a message is kept for this time
+//! conversations = 100000              # maximum number of conversations of an agent
+//! bytes = "64MiB"                     # of them; a peer has at most an eighth
 //! ```
 //!
 //! Not in this module: opening anything that the configuration names. A transport that this process
@@ -288,6 +291,13 @@ pub struct Monitor {
     /// `protocols`: paths of SCXML files with further protocols, or with replacements for protocols of
     /// FIPA; at most 128.
     pub protocols: Vec<String>,
+    /// `idle`: the time for which the conversation of an agent is kept without a message.
+    pub idle: Duration,
+    /// `conversations`: the maximum number of conversations of an agent.
+    pub conversations: usize,
+    /// `bytes`: the maximum size of the conversations of an agent. Those of one peer have at most an
+    /// eighth of it.
+    pub bytes: u64,
 }
 
 /// The reaction to messages that violate their protocol.
@@ -391,6 +401,9 @@ impl Config {
                 check: Check::Off,
                 answer: false,
                 protocols: Vec::new(),
+                idle: Duration::from_secs(24 * 60 * 60),
+                conversations: 100_000,
+                bytes: 64 << 20,
             },
         }
     }

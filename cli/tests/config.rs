@@ -129,6 +129,9 @@ rate = 0                             # default
 check = \"off\"                        # default
 answer = false                       # default
 protocols = []                       # default
+idle = \"1day\"                        # default
+conversations = 100000               # default
+bytes = \"64MiB\"                      # default
 
 [routes]
 \"arm_.*\" = [\"tcp\"]                   # fipa.toml:5

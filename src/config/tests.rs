@@ -334,6 +334,9 @@ rate = 0                             # default
 check = "off"                        # default
 answer = false                       # default
 protocols = []                       # default
+idle = "1day"                        # default
+conversations = 100000               # default
+bytes = "64MiB"                      # default
 
 [routes]
 "a b" = ["tcp"]                      # --set
@@ -419,6 +422,8 @@ prop_compose! {
             .collect();
         config.monitor.check = check;
         config.monitor.answer = answer;
+        config.monitor.idle = Duration::from_nanos(deadline);
+        config.monitor.bytes = queue_bytes;
         config
     }
 }
