@@ -40,8 +40,8 @@ fn a_coalition_is_resolved_as_of_the_sending() {
     // A group without another member.
     let alone = say("cfp ann>platoon").group("platoon", ["ann"]);
     let alone = alone.conversation_id("alone");
-    let nobody = Verdict::Unchecked(Unchecked::NoReceiver);
-    assert_eq!(stage.check(&alone), nobody);
+    let alone_unchecked = Verdict::Unchecked(Unchecked::NoReceiver);
+    assert_eq!(stage.check(&alone), alone_unchecked);
 }
 
 #[test]
