@@ -7,7 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Message, Performative};
-use fipa_monitor::{Header, Library, LibraryError, LibraryFull, Monitor, Verdict, Violation};
+use fipa_monitor::{
+    Header, Library, LibraryError, LibraryFull, Limits, Monitor, Now, Verdict, Violation,
+};
 use parking_lot::Mutex;
 
 use crate::config::{self, Check};
@@ -20,6 +22,7 @@ pub(crate) struct Rules {
     check: Check,
     answer: bool,
     heartbeat: Duration,
+    limits: Limits,
 }
 
 impl Rules {
@@ -35,7 +38,12 @@ impl Rules {
                 _ => ProtocolError::Full(LibraryFull),
             })?;
         }
+        let mut limits = Limits::default();
+        limits.idle = config.idle;
+        limits.conversations = config.conversations;
+        limits.bytes = usize::try_from(config.bytes).unwrap_or(usize::MAX);
         Ok(Self {
+            limits,
             library: Arc::new(library),
             check: config.check,
             answer: config.answer,
@@ -56,7 +64,9 @@ impl Rules {
     /// Creates the checks of an agent.
     pub(crate) fn checks(&self, agent: &str) -> Checks {
         let monitored = (self.check != Check::Off).then(|| Monitored {
-            monitor: Mutex::new(Monitor::agent(Arc::clone(&self.library), agent)),
+            monitor: Mutex::new(
+                Monitor::agent(Arc::clone(&self.library), agent).with_limits(self.limits),
+            ),
             enforce: self.check == Check::Enforce,
             answer: self.answer,
         });
@@ -121,9 +131,9 @@ impl Checks {
 
 impl Monitored {
     fn violation(&self, message: &Message) -> Option<Box<Violation>> {
-        let now = SystemTime::now();
+        let now = now();
         let mut monitor = self.monitor.lock();
-        if monitor.poll_timeout().is_some_and(|due| due <= now) {
+        if monitor.poll_elapsed().is_some_and(|due| due <= now.elapsed) {
             for event in monitor.handle_timeout(now) {
                 tracing::debug!(?event, "conversation");
             }
@@ -140,4 +150,11 @@ impl Monitored {
             _ => None,
         }
     }
+}
+
+/// Returns the current time. The monotonic clock counts while the machine is suspended.
+fn now() -> Now {
+    let elapsed = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
+    let elapsed = Duration::try_from(elapsed).unwrap_or_default();
+    Now::new(SystemTime::now(), elapsed)
 }

@@ -52,6 +52,9 @@
 //! answer = false                      # true: violations are answered with not-understood
 //! heartbeat = "5s"                    # silence after which agents of another host are unreachable
 //! protocols = []                      # SCXML files with further protocols
+//! idle = "24h"                        # a conversation without a message is kept for this time
+//! conversations = 100000              # maximum number of conversations of an agent
+//! bytes = "64MiB"                     # of them; a peer has at most an eighth
 //! [platform]
 //! ams = true                          # false: no agent management system; or its name
 //! df = true                           # false: no directory facilitator; or its name
@@ -310,6 +313,13 @@ pub struct Monitor {
     /// `protocols`: paths of SCXML files with further protocols, or with replacements for protocols of
     /// FIPA; at most 128.
     pub protocols: Vec<String>,
+    /// `idle`: the time for which the conversation of an agent is kept without a message.
+    pub idle: Duration,
+    /// `conversations`: the maximum number of conversations of an agent.
+    pub conversations: usize,
+    /// `bytes`: the maximum size of the conversations of an agent. Those of one peer have at most an
+    /// eighth of it.
+    pub bytes: u64,
 }
 
 /// The reaction to messages that violate their protocol.
@@ -442,6 +452,9 @@ impl Config {
                 answer: false,
                 heartbeat: Duration::from_secs(5),
                 protocols: Vec::new(),
+                idle: Duration::from_secs(24 * 60 * 60),
+                conversations: 100_000,
+                bytes: 64 << 20,
             },
             platform: Platform::default(),
         }

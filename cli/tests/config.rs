@@ -133,6 +133,9 @@ check = \"off\"                        # default
 answer = false                       # default
 heartbeat = \"5s\"                     # default
 protocols = []                       # default
+idle = \"1day\"                        # default
+conversations = 100000               # default
+bytes = \"64MiB\"                      # default
 
 [platform]
 ams = true                           # default

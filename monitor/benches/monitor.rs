@@ -1,6 +1,6 @@
 //! Time of a verdict, and memory of a conversation.
 //!
-//! `raw` is the lower bound for any monitor of 10,000 conversations: hash the identifier of the
+//! `raw` is the lower bound for any monitor of 100,000 conversations: hash the identifier of the
 //! conversation and find it in a table.
 
 #![expect(clippy::unwrap_used, reason = "a bench that cannot go on has failed")]
@@ -15,7 +15,7 @@ use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_monitor::{Header, Library, Limits, Monitor};
 
-const OPEN: usize = 10_000;
+const OPEN: usize = 100_000;
 
 fn now() -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000)
@@ -39,6 +39,7 @@ fn message(act: Performative, from: &str, to: &str, protocol: &str, id: String) 
 fn with_open(count: usize) -> (Monitor, Vec<Message>) {
     let mut limits = Limits::default();
     limits.conversations = 2_000_000;
+    limits.bytes = usize::MAX;
     let library = Arc::new(Library::standard());
     let mut monitor = Monitor::observer(library).with_limits(limits);
     let mut informs = Vec::new();
@@ -158,6 +159,7 @@ fn memory(_: &mut Criterion) {
     const MANY: usize = 1_000_000;
     let mut limits = Limits::default();
     limits.conversations = MANY;
+    limits.bytes = usize::MAX;
     let library = Arc::new(Library::standard());
     let mut monitor = Monitor::observer(library).with_limits(limits);
     let info = allocation_counter::measure(|| {

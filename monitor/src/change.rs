@@ -1,14 +1,13 @@
 //! Changes of a conversation by an accepted message or by a timeout.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
-
 use crate::Header;
+use crate::clock::span_millis;
 use crate::conversation::{
     CANCELLING, Conversation, FAILED, NONE, Party, RoleBinding, Side, act_number, side_index,
 };
 use crate::deadlines::{Deadline, Deadlines};
 use crate::judge::{Move, MoveTarget, ObservedMessage, unbound};
-use crate::machine::{After, Machine};
+use crate::machine::{After, Machine, Scope};
 use crate::names::Names;
 
 /// Applies the timeouts that are due.
@@ -52,16 +51,14 @@ impl Change<'_> {
             MoveTarget::Party(index) => index,
             MoveTarget::Receiver(number) => {
                 let receiver = self.observed.receivers.get(number);
-                let peer = self.names.acquire(receiver.map_or("", |name| name));
-                conversation.parties.push(fresh(peer));
-                conversation.parties.len() - 1
+                let peer = conversation.acquire(self.names, receiver.map_or("", |name| name));
+                conversation.add(fresh(peer))
             }
             MoveTarget::Sender => {
-                let peer = self.names.acquire(self.observed.sender);
+                let peer = conversation.acquire(self.names, self.observed.sender);
                 let unnamed = conversation.unnamed.as_deref().cloned();
                 let party = unnamed.unwrap_or_else(|| fresh(peer));
-                conversation.parties.push(Party { peer, ..party });
-                conversation.parties.len() - 1
+                conversation.add(Party { peer, ..party })
             }
             MoveTarget::Unnamed => {
                 self.opened |= conversation.unnamed.is_none();
@@ -109,18 +106,18 @@ impl Change<'_> {
             self.state = self.state.or(Some(party.state));
             return;
         }
-        party.before = match party.state {
-            FAILED => party.before,
-            state => state,
-        };
+        party.before = next_state.before.unwrap_or(party.state);
         if cancels {
             party.canceling_side = side;
             party.cancel = self.observed.reply_with;
-        } else {
+        } else if !next_state.answers_cancel {
             let index = side_index(side);
             party.acts[index] = act_number(self.observed.act);
-            party.asked_before[index] = party.asked[index];
-            party.asked[index] = self.observed.reply_with;
+            party.ask(
+                side,
+                self.observed.reply_with,
+                self.observed.reply_with_text,
+            );
         }
         (party.state, party.resume, party.echo) =
             (next_state.state, next_state.resume, next_state.echo);
@@ -141,9 +138,10 @@ impl Change<'_> {
     /// Binds free roles of a step to the sender and the receivers.
     pub(crate) fn bind(&mut self, conversation: &mut Conversation, (from, to): (u32, u32)) {
         let free = unbound(self.machine, conversation);
+        let names = &mut *self.names;
         let mut give = |role: u32, agent: &str| {
             if role & free != 0 && role.count_ones() == 1 {
-                let agent = self.names.acquire(agent);
+                let agent = conversation.acquire(names, agent);
                 let role = u8::try_from(role.trailing_zeros()).unwrap_or(0);
                 conversation.bound.push(RoleBinding { role, agent });
             }
@@ -163,29 +161,63 @@ impl Change<'_> {
                 && moves.iter().any(|made| made.side == Side::Initiator)
     }
 
+    /// Adds the agents of the `reply-to`: they receive replies instead of the initiator.
     pub(crate) fn designate(&mut self, conversation: &mut Conversation, header: &Header<'_>) {
         for name in header.reply_to_names() {
             let known = conversation.reply_to.iter();
             let known = known.chain([&conversation.initiator]);
-            if !known.into_iter().any(|agent| self.names.is(*agent, name))
-                && conversation.reply_to.len() < MAX_DESIGNATED
-            {
-                let name = self.names.acquire(name);
+            if !known.into_iter().any(|agent| self.names.is(*agent, name)) {
+                let name = conversation.acquire(self.names, name);
                 conversation.reply_to.push(name);
             }
         }
     }
-}
 
-/// Maximum number of agents that receive replies instead of the initiator.
-const MAX_DESIGNATED: usize = 64;
-
-/// Milliseconds since 1970, at least 1.
-pub(crate) fn millis(time: SystemTime) -> u64 {
-    let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
-    span_millis(since).max(1)
-}
-
-pub(crate) fn span_millis(span: Duration) -> u64 {
-    u64::try_from(span.as_millis()).unwrap_or(u64::MAX)
+    /// Adds the agents of the `reply-to` of a participant: they receive messages instead of it
+    /// (FIPA00061), and may continue in its place.
+    pub(crate) fn delegate(
+        &mut self,
+        conversation: &mut Conversation,
+        moves: &[Move],
+        header: &Header<'_>,
+    ) {
+        if header.reply_to_names().is_empty() {
+            return;
+        }
+        if self.machine.scope == Scope::Conversation {
+            let sender = self.observed.sender;
+            let bound = conversation.bound.iter();
+            let held = bound.filter(|bound| self.names.is(bound.agent, sender));
+            let held: Vec<u8> = held.map(|bound| bound.role).collect();
+            for (name, role) in header
+                .reply_to_names()
+                .iter()
+                .flat_map(|name| held.iter().map(move |role| (name, *role)))
+            {
+                let mut bound = conversation.bound.iter();
+                if !bound.any(|bound| bound.role == role && self.names.is(bound.agent, name)) {
+                    let agent = conversation.acquire(self.names, name);
+                    conversation.bound.push(RoleBinding { role, agent });
+                }
+            }
+            return;
+        }
+        let sender = conversation.party(self.names, self.observed.sender);
+        let Some(at) = sender.map(|(at, _)| at) else {
+            return;
+        };
+        let answers = |made: &Move| made.side == Side::Other;
+        if !moves.iter().any(answers) {
+            return;
+        }
+        let index = u32::try_from(at).unwrap_or(NONE);
+        for name in header.reply_to_names() {
+            let known = self.names.is(conversation.initiator, name)
+                || conversation.party(self.names, name).is_some();
+            if !known {
+                let name = conversation.acquire(self.names, name);
+                conversation.rare().delegates.push((index, name));
+            }
+        }
+    }
 }

@@ -3,11 +3,14 @@
 //! With [`Scope::Participant`], each participant has a [`Party`] with a state of its own. With
 //! [`Scope::Conversation`], there is one party without a participant, and a list of role bindings.
 
+use hashbrown::HashTable;
 use smallvec::SmallVec;
 
 use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
-use crate::machine::{Cancel, Machine, Roles, Scope, Transition, step};
+use crate::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
 use crate::names::{Name, Names};
+use crate::projection::LocalRun;
+use crate::table::spread;
 use crate::verdict::ViolationKind as Kind;
 
 /// The absence of a name or an index.
@@ -75,7 +78,7 @@ pub(crate) struct Party {
     /// The participant, or [`NONE`].
     pub(crate) peer: Name,
     pub(crate) state: u16,
-    /// During a cancel or after a failure: the state before it.
+    /// During a cancel, or after a failure or a not-understood: the state before it.
     pub(crate) resume: u16,
     /// The state before the last message.
     pub(crate) before: u16,
@@ -84,17 +87,20 @@ pub(crate) struct Party {
     /// The side that canceled.
     pub(crate) canceling_side: Side,
     /// Whether the answer to the cancel may still come, because the message that was taken for it may
-    /// have been sent before the cancel arrived.
+    /// have been sent before the cancel arrived. After an `inform`, `resume` is the state after that
+    /// message.
     pub(crate) echo: bool,
     /// [`act_number`] of the last message of each side; 0 for none.
     pub(crate) acts: [u8; 2],
     /// Fingerprint of the last `reply-with` of each side; 0 for none.
     pub(crate) asked: [u64; 2],
-    /// Fingerprint of the `reply-with` before that.
-    pub(crate) asked_before: [u64; 2],
+    /// [`short`] fingerprints of each side's `reply-with` before that, the last first; 0 for none.
+    pub(crate) earlier: [[u32; EARLIER]; 2],
+    /// Text of the last `reply-with` of each side.
+    pub(crate) asked_text: [Tail; 2],
     /// Fingerprint of the `reply-with` of the cancel.
     pub(crate) cancel: u64,
-    /// Deadline of the next message in milliseconds since 1970; 0 for none.
+    /// Deadline of the next message in milliseconds of the monotonic clock; 0 for none.
     pub(crate) deadline: u64,
 }
 
@@ -110,7 +116,8 @@ impl Party {
             echo: false,
             acts: [0; 2],
             asked: [0; 2],
-            asked_before: [0; 2],
+            earlier: [[0; EARLIER]; 2],
+            asked_text: [Tail::default(); 2],
             cancel: 0,
             deadline: 0,
         }
@@ -119,6 +126,59 @@ impl Party {
     /// Whether no message was sent yet.
     fn is_fresh(&self) -> bool {
         self.acts == [0; 2]
+    }
+
+    /// Records the `reply-with` of a message, of which `text` is the text.
+    pub(crate) fn ask(&mut self, side: Side, reply_with: u64, text: &str) {
+        let index = side_index(side);
+        if self.asked[index] != 0 {
+            self.earlier[index].rotate_right(1);
+            self.earlier[index][0] = short(self.asked[index]);
+        }
+        self.asked[index] = reply_with;
+        self.asked_text[index] = Tail::of(text);
+    }
+}
+
+/// Number of messages before the last one that an answer may belong to. Messages that cross on slow
+/// routes answer an earlier one.
+pub(crate) const EARLIER: usize = 6;
+
+/// Shortens a fingerprint other than 0 to another one that is not 0.
+fn short(fingerprint: u64) -> u32 {
+    let folded = fingerprint ^ (fingerprint >> 32);
+    u32::try_from(folded & u64::from(u32::MAX))
+        .unwrap_or(1)
+        .max(1)
+}
+
+/// The last bytes of a text, for descriptions.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Tail {
+    len: u8,
+    bytes: [u8; Self::MAX],
+}
+
+impl Tail {
+    const MAX: usize = 32;
+
+    pub(crate) fn of(text: &str) -> Self {
+        let mut from = text.len().saturating_sub(Self::MAX);
+        while !text.is_char_boundary(from) {
+            from += 1;
+        }
+        let mut tail = Self::default();
+        let kept = text.as_bytes().get(from..).unwrap_or_default();
+        for (to, byte) in tail.bytes.iter_mut().zip(kept) {
+            *to = *byte;
+        }
+        tail.len = u8::try_from(kept.len()).unwrap_or(0);
+        tail
+    }
+
+    pub(crate) fn text(&self) -> &str {
+        let kept = self.bytes.get(..usize::from(self.len));
+        std::str::from_utf8(kept.unwrap_or_default()).unwrap_or_default()
     }
 }
 
@@ -144,15 +204,144 @@ pub(crate) struct Conversation {
     pub(crate) reply_to: Vec<Name>,
     /// State of the members of a multicast. Their names are unknown until they answer.
     pub(crate) unnamed: Option<Box<Party>>,
+    pub(crate) rare: Option<Box<Rare>>,
+    /// Bytes that the names of the conversation are charged with.
+    pub(crate) charged_names: usize,
 }
 
+/// The parts of a conversation that most conversations do not have.
+#[derive(Debug, Default)]
+pub(crate) struct Rare {
+    /// Agents that receive messages instead of a participant, and may continue in its place: the index
+    /// of the party and the agent.
+    pub(crate) delegates: Vec<(u32, Name)>,
+    /// Other states to which the first message may have led, if the conversation may have begun before
+    /// the monitor.
+    pub(crate) alternatives: Vec<u16>,
+    /// The conversation as the role of the monitored agent sees it.
+    pub(crate) local: Option<LocalRun>,
+    /// The last messages of which an observer gets each copy by itself.
+    pub(crate) copied: Vec<Copied>,
+    /// The parties by their peers, if there are more than [`FEW`].
+    index: HashTable<(Name, u32)>,
+}
+
+/// A message of which an observer gets each copy by itself.
+#[derive(Debug)]
+pub(crate) struct Copied {
+    pub(crate) fingerprint: u64,
+    /// Fingerprints of the receivers of the copies.
+    pub(crate) seen: Vec<u64>,
+    /// Roles of the sender and the receivers.
+    pub(crate) roles: (u32, u32),
+}
+
+/// Number of parties that are searched one by one.
+const FEW: usize = 8;
+
 impl Conversation {
-    /// Whether the agent has sent or received a message of this conversation.
+    /// Bytes that the conversation has allocated.
+    pub(crate) fn allocated(&self) -> usize {
+        let parties = match self.parties.spilled() {
+            true => self.parties.capacity() * size_of::<Party>(),
+            false => 0,
+        };
+        let bound = match self.bound.spilled() {
+            true => self.bound.capacity() * size_of::<RoleBinding>(),
+            false => 0,
+        };
+        let unnamed = self.unnamed.as_ref().map_or(0, |_| size_of::<Party>());
+        let rare = self.rare.as_deref().map_or(0, |rare| {
+            let copies = rare.copied.iter();
+            size_of::<Rare>()
+                + rare.delegates.capacity() * size_of::<(u32, Name)>()
+                + rare.alternatives.capacity() * size_of::<u16>()
+                + rare.copied.capacity() * size_of::<Copied>()
+                + copies
+                    .map(|copied| 8 * copied.seen.capacity())
+                    .sum::<usize>()
+                + rare.index.allocation_size()
+        });
+        self.id.capacity()
+            + parties
+            + bound
+            + self.reply_to.capacity() * size_of::<Name>()
+            + unnamed
+            + rare
+            + self.charged_names
+    }
+
+    /// Takes a reference to a name for this conversation.
+    pub(crate) fn acquire(&mut self, names: &mut Names, text: &str) -> Name {
+        self.charged_names += Names::cost(text.len());
+        names.acquire(text)
+    }
+
+    /// Whether it is checked as the role of the monitored agent sees it.
+    pub(crate) fn is_local(&self) -> bool {
+        self.rare
+            .as_deref()
+            .is_some_and(|rare| rare.local.is_some())
+    }
+
+    pub(crate) fn rare(&mut self) -> &mut Rare {
+        self.rare.get_or_insert_default()
+    }
+
+    /// Adds a party. Returns its index.
+    pub(crate) fn add(&mut self, party: Party) -> usize {
+        self.parties.push(party);
+        let count = self.parties.len();
+        // The index is made when there are many parties, and kept from then on.
+        if count == FEW + 1 {
+            for at in 0..count {
+                self.index(at);
+            }
+        } else if count > FEW {
+            self.index(count - 1);
+        }
+        count - 1
+    }
+
+    fn index(&mut self, at: usize) {
+        let Some(peer) = self.parties.get(at).map(|party| party.peer) else {
+            return;
+        };
+        let entry = (peer, u32::try_from(at).unwrap_or(NONE));
+        let index = &mut self.rare().index;
+        index.insert_unique(spread(peer), entry, |(peer, _)| spread(*peer));
+    }
+
+    /// Finds the party of an agent: a participant, or an agent that continues in its place.
+    pub(crate) fn party(&self, names: &Names, agent: &str) -> Option<(usize, &Party)> {
+        let found = if self.parties.len() <= FEW {
+            let mut parties = self.parties.iter();
+            parties.position(|party| names.is(party.peer, agent))
+        } else {
+            let index = self.rare.as_deref().map(|rare| &rare.index);
+            names.known(agent).zip(index).and_then(|(peer, index)| {
+                let found = index.find(spread(peer), |(known, _)| *known == peer);
+                found.and_then(|(_, at)| usize::try_from(*at).ok())
+            })
+        };
+        let found = found.or_else(|| {
+            let mut delegates = self.delegates().iter();
+            let delegate = delegates.find(|(_, delegate)| names.is(*delegate, agent));
+            delegate.and_then(|(at, _)| usize::try_from(*at).ok())
+        })?;
+        self.parties.get(found).map(|party| (found, party))
+    }
+
+    pub(crate) fn delegates(&self) -> &[(u32, Name)] {
+        let rare = self.rare.as_deref();
+        rare.map_or(&[], |rare| &rare.delegates)
+    }
+
+    /// Whether the agent has sent or received a message of this conversation, or may.
     pub(crate) fn takes_part(&self, names: &Names, agent: &str) -> bool {
-        let peers = self.parties.iter().map(|party| party.peer);
         let bound = self.bound.iter().map(|bound| bound.agent);
-        let mut known = peers.chain(bound).chain([self.initiator]);
-        known.any(|name| names.is(name, agent))
+        let mut known = bound.chain([self.initiator]);
+        self.party(names, agent).is_some() || known.any(|name| names.is(name, agent))
     }
 
     /// Whether a `reply-to` names the agent instead of the initiator.
@@ -224,6 +413,11 @@ pub(crate) struct NextState {
     pub(crate) void: bool,
     /// Roles of the sender and the receivers in the transition; 0 for none.
     pub(crate) roles: (u32, u32),
+    pub(crate) guard: Guard,
+    /// The state in which the message fits, if it is not the present one.
+    pub(crate) before: Option<u16>,
+    /// Whether the message answers a cancel, and is no step of the protocol itself.
+    pub(crate) answers_cancel: bool,
 }
 
 impl NextState {
@@ -235,6 +429,16 @@ impl NextState {
             crossed: false,
             void: false,
             roles: (0, 0),
+            guard: Guard::default(),
+            before: None,
+            answers_cancel: false,
+        }
+    }
+
+    fn not_understood_in(state: u16) -> Self {
+        Self {
+            resume: state,
+            ..Self::to(AFTER_NOT_UNDERSTOOD)
         }
     }
 
@@ -242,6 +446,7 @@ impl NextState {
         let single = |roles: &Roles| if roles.anyone { 0 } else { roles.mask };
         Self {
             roles: (single(&step.from), single(&step.to)),
+            guard: step.guard,
             ..Self::to(step.target)
         }
     }
@@ -255,21 +460,103 @@ pub(crate) fn next_state(
 ) -> Result<NextState, Kind> {
     match party.state {
         CANCELLING => while_cancelling(machine, party, message),
-        CANCELLED
-            if party.echo && message.side != party.canceling_side && is_cancel_answer(message) =>
-        {
-            Ok(NextState::to(CANCELLED))
+        CANCELLED if party.echo && message.side != party.canceling_side => {
+            after_crossing(machine, party, message)
+        }
+        // A message that was sent before the not-understood arrived changes nothing.
+        AFTER_NOT_UNDERSTOOD if !message.own && message.side != party.last => {
+            match in_state(machine, party, party.resume, message) {
+                Ok(NextState { state, .. }) => Ok(NextState {
+                    resume: machine.state(state).map_or(party.resume, |_| state),
+                    void: true,
+                    ..NextState::to(AFTER_NOT_UNDERSTOOD)
+                }),
+                Err(_) => Err(ended(party, message)),
+            }
         }
         AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
         // A message that was reported as failed may have arrived, or is sent again.
-        FAILED => in_state(machine, party, party.resume, message)
-            .or_else(|kind| in_state(machine, party, party.before, message).map_err(|_| kind)),
+        FAILED => {
+            let in_state = |state| {
+                let taken = in_state(machine, party, state, message)?;
+                Ok(NextState {
+                    before: Some(state),
+                    ..taken
+                })
+            };
+            // If the last message did not arrive, the protocol has not ended, and can be canceled.
+            let over = machine.state(party.resume).is_some_and(State::is_over);
+            let (first, second) = match message.act == CANCEL && over {
+                true => (party.before, party.resume),
+                false => (party.resume, party.before),
+            };
+            in_state(first).or_else(|kind| in_state(second).map_err(|_| kind))
+        }
+        // What was taken for the failure of a cancel was a failure of the protocol.
+        own if party.echo
+            && message.side != party.canceling_side
+            && is_told_apart(party, message)
+            && message.in_reply_to == party.cancel
+            && is_cancel_answer(message) =>
+        {
+            Ok(NextState {
+                answers_cancel: true,
+                ..match message.act {
+                    INFORM => NextState::to(CANCELLED),
+                    FAILURE => NextState::to(own),
+                    _ => NextState::not_understood_in(own),
+                }
+            })
+        }
         own => in_state(machine, party, own, message),
     }
 }
 
 fn is_cancel_answer(message: &PartyMessage<'_>) -> bool {
     [INFORM, FAILURE, NOT_UNDERSTOOD].contains(&message.act)
+}
+
+/// Whether `in-reply-to` distinguishes the answer to a cancel from other messages.
+fn is_told_apart(party: &Party, message: &PartyMessage<'_>) -> bool {
+    message.in_reply_to != 0 && party.cancel != 0
+}
+
+/// Returns the state after a message of the canceled side. The message that was taken for the answer to
+/// the cancel may have crossed it, and so may this one.
+fn after_crossing(
+    machine: &Machine,
+    party: &Party,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
+    let told_apart = is_told_apart(party, message);
+    let answers = is_cancel_answer(message) && (!told_apart || message.in_reply_to == party.cancel);
+    let crossing = in_state(machine, party, party.resume, message);
+    match (message.act, crossing) {
+        // The cancel failed, so the conversation continues. If this is a failure of the protocol
+        // itself, the answer to the cancel fits too.
+        (FAILURE, crossing) if answers => Ok(NextState {
+            echo: !told_apart && crossing.is_ok(),
+            answers_cancel: true,
+            ..NextState::to(party.resume)
+        }),
+        (_, Ok(next_state)) if !(told_apart && answers) => Ok(match next_state.state {
+            AFTER_NOT_UNDERSTOOD => next_state,
+            state => NextState {
+                resume: match state {
+                    // Two cancels crossed, or a failure crossed one.
+                    CANCELLING | FAILED => party.resume,
+                    own => own,
+                },
+                echo: true,
+                ..NextState::to(CANCELLED)
+            },
+        }),
+        _ if answers => Ok(NextState {
+            answers_cancel: true,
+            ..NextState::to(CANCELLED)
+        }),
+        _ => Err(ended(party, message)),
+    }
 }
 
 fn ended(party: &Party, message: &PartyMessage<'_>) -> Kind {
@@ -288,24 +575,34 @@ fn while_cancelling(
     let group = machine.scope == Scope::Conversation;
     if message.side == party.canceling_side && !group {
         return match message.act {
-            NOT_UNDERSTOOD => Ok(NextState::to(AFTER_NOT_UNDERSTOOD)),
+            NOT_UNDERSTOOD => Ok(NextState::not_understood_in(party.resume)),
             _ if is_repeated(party, message) => Err(Kind::Repeated),
             _ => Err(Kind::Unexpected),
         };
     }
-    // `in-reply-to` distinguishes the answer from a message that crossed the cancel.
-    let told_apart = message.in_reply_to != 0 && party.cancel != 0;
+    let told_apart = is_told_apart(party, message);
     let answers = !told_apart || message.in_reply_to == party.cancel;
     let crossing = in_state(machine, party, party.resume, message);
     if answers && is_cancel_answer(message) {
-        return Ok(match message.act {
-            INFORM => NextState {
-                echo: !told_apart && crossing.is_ok(),
-                ..NextState::to(CANCELLED)
+        let next_state = match message.act {
+            INFORM => match crossing {
+                Ok(crossing) if !told_apart => NextState {
+                    resume: crossing.state,
+                    echo: true,
+                    ..NextState::to(CANCELLED)
+                },
+                _ => NextState::to(CANCELLED),
             },
             // The cancel failed, and the conversation continues.
-            FAILURE => NextState::to(party.resume),
-            _ => NextState::to(AFTER_NOT_UNDERSTOOD),
+            FAILURE => NextState {
+                echo: !told_apart && crossing.is_ok(),
+                ..NextState::to(party.resume)
+            },
+            _ => NextState::not_understood_in(party.resume),
+        };
+        return Ok(NextState {
+            answers_cancel: true,
+            ..next_state
         });
     }
     // If the cancel fails, the conversation continues in the state after the crossing message.
@@ -314,6 +611,7 @@ fn while_cancelling(
         _ => NextState {
             state: CANCELLING,
             crossed: true,
+            guard: Guard::default(),
             ..next_state
         },
     })
@@ -352,7 +650,38 @@ fn in_state(
     if let Some(next_state) = by_default(machine, party, state, message) {
         return Ok(next_state);
     }
+    if has_crossed(machine, party, state, message) {
+        return Ok(NextState {
+            void: true,
+            ..NextState::to(state)
+        });
+    }
     Err(wrong(machine, party, state, message))
+}
+
+/// Whether a message that does not fit the state was sent before its sender had received the last
+/// messages of the other side, as a bid that arrives after the end of an auction. It changes nothing.
+fn has_crossed(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_>) -> bool {
+    if message.own || !message.answers {
+        return false;
+    }
+    let fits = |state: &State| step(&state.steps, message.act, message.from, message.to).is_some();
+    let other = side_index(message.side.opposite());
+    match message.in_reply_to {
+        // Without `in-reply-to`, only one message of the other side may have crossed it. A timeout
+        // does not cross messages.
+        0 => {
+            let before = machine.state(party.before).filter(|before| fits(before));
+            let mut led = before.into_iter().flat_map(|before| &before.steps);
+            party.last != message.side
+                && led.any(|step| step.target == state && step.from.includes(message.to))
+        }
+        answered => {
+            answered != party.asked[other]
+                && party.earlier[other].contains(&short(answered))
+                && machine.states.iter().any(fits)
+        }
+    }
 }
 
 /// Returns the state after a message that every protocol allows, as in figure 6 of the paper about
@@ -372,7 +701,7 @@ fn by_default(
     // `not-understood`.
     let answers_last = party.last != message.side;
     match message.act {
-        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| NextState::to(AFTER_NOT_UNDERSTOOD)),
+        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| NextState::not_understood_in(state)),
         CANCEL => {
             let may = match machine.cancel {
                 Cancel::Initiator => message.side == Side::Initiator,
@@ -399,17 +728,17 @@ fn by_default(
 enum Reply {
     /// The last message of the other side, or unspecified.
     ToLast,
-    /// The message before the last one. The answer and the last message have crossed, as a bid and
-    /// the next call of an auction may.
+    /// A message before the last one. The answer and the later messages have crossed, as a bid and
+    /// the next calls of an auction may.
     ToEarlier,
 }
 
 fn in_reply(party: &Party, message: &PartyMessage<'_>) -> Result<Reply, Kind> {
     let other = side_index(message.side.opposite());
-    let (asked, before) = (party.asked[other], party.asked_before[other]);
+    let (asked, earlier) = (party.asked[other], &party.earlier[other]);
     if !message.answers || [0, asked].contains(&message.in_reply_to) || asked == 0 {
         Ok(Reply::ToLast)
-    } else if message.in_reply_to == before && !message.own {
+    } else if earlier.contains(&short(message.in_reply_to)) && !message.own {
         Ok(Reply::ToEarlier)
     } else {
         Err(Kind::WrongReply)
@@ -465,4 +794,46 @@ fn wrong(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_
         next.extend(later.transitions.iter().map(|step| step.target));
     }
     Kind::Unexpected
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tail_of_a_text_has_whole_characters() {
+        assert_eq!(Tail::of("").text(), "");
+        assert_eq!(Tail::of("rover--1").text(), "rover--1");
+        let long = "x".repeat(40);
+        assert_eq!(Tail::of(&long).text(), &long[8..]);
+        let wide = "ä".repeat(17);
+        assert_eq!(
+            Tail::of(&format!("{wide}b")).text(),
+            format!("{}b", "ä".repeat(15))
+        );
+    }
+
+    #[test]
+    fn a_party_is_found_among_few_and_many() {
+        let mut names = Names::new(std::hash::RandomState::new());
+        let mut table = crate::table::Table::new(std::hash::RandomState::new());
+        let at = table.insert("c", NONE, NONE, 0, 1);
+        let conversation = &mut table.slot_mut(at).unwrap().conversation;
+        for number in 0..40 {
+            let peer = conversation.acquire(&mut names, &number.to_string());
+            conversation.add(Party::new(peer, 0));
+            for known in 0..=number {
+                let found = conversation.party(&names, &known.to_string());
+                assert_eq!(found.map(|(at, _)| at), Some(known));
+            }
+            assert!(conversation.party(&names, "other").is_none());
+        }
+        let delegate = conversation.acquire(&mut names, "other");
+        conversation.rare().delegates.push((17, delegate));
+        assert_eq!(
+            conversation.party(&names, "other").map(|(at, _)| at),
+            Some(17)
+        );
+        assert!(conversation.allocated() > 40 * size_of::<Party>());
+    }
 }

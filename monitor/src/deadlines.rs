@@ -6,7 +6,7 @@ use std::collections::BinaryHeap;
 /// The deadline of a message: its time, its conversation and its party.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Deadline {
-    /// Milliseconds since 1970.
+    /// Milliseconds of the monotonic clock.
     pub(crate) due: u64,
     /// Slot of the conversation.
     pub(crate) at: u32,

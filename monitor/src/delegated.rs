@@ -14,15 +14,14 @@
 //! The rules of conversations with a known beginning do not belong here.
 
 use std::sync::Arc;
-use std::time::SystemTime;
 
-use crate::act::Act;
-use crate::change::millis;
+use crate::act::{Act, FAILURE, INFORM};
 use crate::conversation::{Conversation, ELSEWHERE, NONE, Party, Side, act_number, side_index};
 use crate::judge::ObservedMessage;
-use crate::machine::{Machine, Scope, step};
+use crate::machine::{Cancel, Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
+use crate::{Header, Now};
 
 impl Monitor {
     /// Whether the conversation began between other agents.
@@ -53,23 +52,23 @@ impl Monitor {
         id: &str,
         parent: u32,
         machine: u16,
-        observed: &ObservedMessage<'_>,
-        now: SystemTime,
-    ) {
+        (header, observed): (&Header<'_>, &ObservedMessage<'_>),
+        now: Now,
+    ) -> Result<(), Denied> {
         let library = Arc::clone(&self.library);
         let protocol = library.machine(machine);
         let Some(protocol) = protocol.filter(|protocol| protocol.is_answer(observed.act)) else {
-            return;
+            return Ok(());
         };
-        self.evict(parent);
-        let at = self.table.insert(id, parent, machine, millis(now));
+        let at = self.insert(id, parent, machine, (header, observed), now)?;
         let agent = self.agent.as_deref().unwrap_or_default();
-        let initiator = self.names.acquire(agent);
         if let Some(slot) = self.table.slot_mut(at) {
-            slot.conversation.initiator = initiator;
-            slot.conversation.joined = true;
+            let conversation = &mut slot.conversation;
+            conversation.initiator = conversation.acquire(&mut self.names, agent);
+            conversation.joined = true;
         }
         self.infer_state(at, protocol, observed, now);
+        Ok(())
     }
 
     /// Reconsiders the refusal of a message in a conversation that may continue elsewhere.
@@ -78,7 +77,7 @@ impl Monitor {
         at: u32,
         observed: &ObservedMessage<'_>,
         denied: Denied,
-        now: SystemTime,
+        now: Now,
     ) -> Denied {
         let library = Arc::clone(&self.library);
         let slot = self
@@ -111,8 +110,10 @@ impl Monitor {
             self.infer_state(at, machine, observed, now);
             true
         } else {
-            // Other agents may begin the protocol with the monitored agent too.
-            joined && step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
+            // Other agents may begin the protocol with the monitored agent too, or answer a cancel.
+            let begins = step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX);
+            let cancels = machine.cancel != Cancel::Nobody;
+            joined && (begins.is_some() || cancels && [INFORM, FAILURE].contains(&observed.act))
         };
         if not_known {
             return Denied::Unchecked(Unchecked::BegunElsewhere);
@@ -126,36 +127,45 @@ impl Monitor {
         at: u32,
         machine: &Machine,
         observed: &ObservedMessage<'_>,
-        now: SystemTime,
+        now: Now,
     ) {
         let Some(slot) = self.table.slot_mut(at) else {
             return;
         };
         let main = if slot.parent == NONE { at } else { slot.parent };
-        let parties = &mut slot.conversation.parties;
+        let conversation = &mut slot.conversation;
         let (known, state) = match machine.scope {
             Scope::Participant => {
-                let by = |party: &Party| self.names.is(party.peer, observed.sender);
-                (parties.iter().position(by), after(machine, observed.act))
+                let known = conversation.party(&self.names, observed.sender);
+                // It may also answer a cancel that the monitor has not seen.
+                let cancels = conversation.joined && machine.cancel != Cancel::Nobody;
+                let state = match observed.act {
+                    INFORM | FAILURE if cancels => ELSEWHERE,
+                    act => after(machine, act),
+                };
+                (known.map(|(at, _)| at), state)
             }
             // The roles of the agents are unknown too.
-            Scope::Conversation => (parties.len().checked_sub(1), ELSEWHERE),
+            Scope::Conversation => (conversation.parties.len().checked_sub(1), ELSEWHERE),
         };
-        let peer = match known.and_then(|known| parties.get(known)) {
+        let peer = match known.and_then(|known| conversation.parties.get(known)) {
             Some(party) => party.peer,
-            None if parties.len() == self.limits.participants => return,
+            None if conversation.parties.len() == self.limits.participants => return,
+            None if conversation.allocated() > self.limits.share_of_bytes() => return,
             None if machine.scope == Scope::Conversation => NONE,
-            None => self.names.acquire(observed.sender),
+            None => conversation.acquire(&mut self.names, observed.sender),
         };
-        let index = side_index(Side::Other);
         let mut party = Party::new(peer, state);
-        party.acts[index] = act_number(observed.act);
-        party.asked[index] = observed.reply_with;
-        match known.and_then(|known| parties.get_mut(known)) {
+        party.acts[side_index(Side::Other)] = act_number(observed.act);
+        party.ask(Side::Other, observed.reply_with, observed.reply_with_text);
+        match known.and_then(|known| conversation.parties.get_mut(known)) {
             Some(known) => *known = party,
-            None => parties.push(party),
+            None => {
+                conversation.add(party);
+            }
         }
-        self.touch(main, millis(now));
+        self.charge(at);
+        self.touch(main, now.millis());
     }
 }
 

@@ -1,6 +1,7 @@
 //! The parameters of a message that a monitor reads: all but the content.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::time::SystemTime;
 
 use fipa_acl::{Message, MessageView, Performative};
@@ -24,6 +25,11 @@ pub struct Header<'a> {
     reply_with: Option<Cow<'a, str>>,
     in_reply_to: Option<Cow<'a, str>>,
     reply_by: Option<fipa_acl::Time>,
+    /// Receivers that stand for several agents, and these agents.
+    groups: Vec<(Cow<'a, str>, Vec<Cow<'a, str>>)>,
+    /// All receivers of the message, if this is the copy for one of them.
+    addressed: SmallVec<[Cow<'a, str>; 2]>,
+    peer: Option<Cow<'a, str>>,
 }
 
 impl<'a> Header<'a> {
@@ -44,6 +50,9 @@ impl<'a> Header<'a> {
             reply_with: None,
             in_reply_to: None,
             reply_by: None,
+            groups: Vec::new(),
+            addressed: SmallVec::new(),
+            peer: None,
         }
     }
 
@@ -61,6 +70,41 @@ impl<'a> Header<'a> {
         receivers: impl IntoIterator<Item = N>,
     ) -> Self {
         self.receivers = receivers.into_iter().map(Into::into).collect();
+        self
+    }
+
+    /// Resolves a receiver that stands for several agents, a coalition or a pattern of names: these
+    /// agents receive the message. The caller resolves it as of the time of the sending. The sender is
+    /// not among the receivers of its own message.
+    ///
+    /// Without this, the members of a pattern are those that answer, and a coalition counts as an
+    /// agent. The monitor of an agent needs it only for the messages that the agent sends.
+    #[must_use]
+    pub fn group<N: Into<Cow<'a, str>>>(
+        mut self,
+        receiver: impl Into<Cow<'a, str>>,
+        members: impl IntoIterator<Item = N>,
+    ) -> Self {
+        let members = members.into_iter().map(Into::into).collect();
+        self.groups.push((receiver.into(), members));
+        self
+    }
+
+    /// Makes this the copy of the message for one receiver. An observer that gets each copy of a
+    /// message by itself then knows that they are one message.
+    #[must_use]
+    pub fn copy_for(mut self, receiver: impl Into<Cow<'a, str>>) -> Self {
+        self.addressed = std::mem::take(&mut self.receivers);
+        self.receivers.push(receiver.into());
+        self
+    }
+
+    /// Sets the peer to which a conversation belongs that this message begins. Without it, this is the
+    /// sender. A caller that knows the connection of the message names it here, so that the memory of
+    /// a peer with many agent names is bounded too: see [`Limits::bytes`](crate::Limits::bytes).
+    #[must_use]
+    pub fn peer(mut self, peer: impl Into<Cow<'a, str>>) -> Self {
+        self.peer = Some(peer.into());
         self
     }
 
@@ -116,6 +160,49 @@ impl<'a> Header<'a> {
 
     pub(crate) fn receiver_names(&self) -> &[Cow<'a, str>] {
         &self.receivers
+    }
+
+    /// Number of the receivers with the members of groups.
+    pub(crate) fn receiver_count(&self) -> usize {
+        let members = self.groups.iter().map(|(_, members)| members.len());
+        self.receivers.len() + members.sum::<usize>()
+    }
+
+    pub(crate) fn group_members(&self) -> impl Iterator<Item = &Cow<'a, str>> {
+        self.groups.iter().flat_map(|(_, members)| members)
+    }
+
+    /// Returns the receivers, if these are not the names in the header: groups are replaced by their
+    /// members, and names that occur twice are left out.
+    pub(crate) fn other_receivers(&self) -> Option<Vec<Cow<'_, str>>> {
+        if self.groups.is_empty() && !has_duplicates(&self.receivers) {
+            return None;
+        }
+        let mut known = HashSet::new();
+        let mut all = Vec::new();
+        for receiver in &self.receivers {
+            let mut groups = self.groups.iter();
+            let group = groups.find(|(name, _)| name == receiver);
+            let members = match group {
+                Some((_, members)) => &members[..],
+                None => std::slice::from_ref(receiver),
+            };
+            for member in members {
+                let own = group.is_some() && self.sender.as_ref() == Some(member);
+                if !own && known.insert(&**member) {
+                    all.push(Cow::Borrowed(&**member));
+                }
+            }
+        }
+        Some(all)
+    }
+
+    pub(crate) fn addressed(&self) -> &[Cow<'a, str>] {
+        &self.addressed
+    }
+
+    pub(crate) fn peer_name(&self) -> Option<&str> {
+        self.peer.as_deref()
     }
 
     pub(crate) fn reply_to_names(&self) -> &[Cow<'a, str>] {
@@ -181,6 +268,18 @@ impl<'a> From<&MessageView<'a>> for Header<'a> {
     }
 }
 
+/// Whether a name occurs twice. The time is linear in the names.
+fn has_duplicates(names: &[Cow<'_, str>]) -> bool {
+    const FEW: usize = 8;
+    if names.len() <= FEW {
+        let mut names = names.iter().enumerate();
+        let all = names.clone();
+        return names.any(|(at, name)| all.clone().take(at).any(|(_, other)| other == name));
+    }
+    let mut known = HashSet::with_capacity(names.len());
+    !names.iter().all(|name| known.insert(&**name))
+}
+
 #[cfg(test)]
 mod tests {
     use std::time::Duration;
@@ -218,5 +317,22 @@ mod tests {
             assert_eq!(header.in_reply_to_text(), Some("r"));
             assert_eq!(header.reply_by_time(now), Some(now));
         }
+    }
+
+    #[test]
+    fn groups_are_replaced_by_their_members_without_the_sender() {
+        let header = Header::new(Performative::Cfp)
+            .sender("ann")
+            .receivers(["platoon", "ben", "dan"])
+            .group("platoon", ["ann", "ben", "cid"]);
+        assert_eq!(header.receiver_count(), 6);
+        assert_eq!(header.other_receivers().unwrap(), ["ben", "cid", "dan"]);
+        let twice = Header::new(Performative::Cfp).receivers(["ben", "cid", "ben"]);
+        assert_eq!(twice.other_receivers().unwrap(), ["ben", "cid"]);
+        let many: Vec<String> = (0..20).map(|number| number.to_string()).collect();
+        let all = Header::new(Performative::Cfp).receivers(many.clone());
+        assert_eq!(all.other_receivers(), None);
+        let again = all.receivers(many.iter().chain([&many[3]]).cloned());
+        assert_eq!(again.other_receivers().unwrap().len(), 20);
     }
 }

@@ -2,13 +2,14 @@
 //! module does not change the conversation.
 
 use std::borrow::Cow;
+use std::collections::HashMap;
 
 use crate::act::{Act, FAILURE};
 use crate::conversation::{
     AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, FAILED, NONE, NextState, Party,
     PartyMessage, Side, next_state, side_index,
 };
-use crate::machine::{Machine, Scope};
+use crate::machine::{Guard, Machine, Scope, step};
 use crate::names::{Name, Names};
 use crate::verdict::ViolationKind as Kind;
 
@@ -16,8 +17,10 @@ use crate::verdict::ViolationKind as Kind;
 pub(crate) struct ObservedMessage<'a> {
     pub(crate) act: Act<'a>,
     pub(crate) sender: &'a str,
+    /// The receivers, each once.
     pub(crate) receivers: &'a [Cow<'a, str>],
     pub(crate) reply_with: u64,
+    pub(crate) reply_with_text: &'a str,
     pub(crate) in_reply_to: u64,
     /// Whether the sender is the monitored agent.
     pub(crate) own: bool,
@@ -82,7 +85,10 @@ pub(crate) fn judge(
         observed,
     };
     match machine.scope {
-        Scope::Participant => judge.per_participant(moves),
+        Scope::Participant => {
+            judge.per_participant(moves)?;
+            judge.guards(moves)
+        }
         Scope::Conversation => judge.per_conversation(moves),
     }
 }
@@ -165,11 +171,9 @@ impl Judge<'_> {
                 led = answer.map(|next_state| (Side::Other, next_state)).or(led);
             }
             let (side, next_state) = led.map_err(|kind| self.fault(kind, party, receiver))?;
-            // An agent that is named twice receives the message once.
-            let again = match target {
-                MoveTarget::Receiver(_) => self.observed.receivers[..number].contains(receiver),
-                target => moves.iter().any(|made| made.target == target),
-            };
+            // Several patterns have one state, and so have a participant and its delegates.
+            let shared = target == MoveTarget::Unnamed || !conversation.delegates().is_empty();
+            let again = shared && moves.iter().any(|made| made.target == target);
             if !again {
                 let reported = false;
                 moves.push(Move {
@@ -264,10 +268,18 @@ impl Judge<'_> {
             Side::Other
         };
         let unbound = unbound(self.machine, conversation);
+        let known_roles = self.known_roles();
         let has = self.roles_of(sender);
         let (mut to, mut all_bound, mut stranger) = (u32::MAX, has != 0, false);
         for receiver in self.observed.receivers {
-            let roles = self.roles_of(receiver);
+            let roles = match &known_roles {
+                None => self.roles_of(receiver),
+                Some(known) => {
+                    let name = self.names.known(receiver);
+                    let roles = name.and_then(|name| known.get(&name));
+                    roles.copied().unwrap_or(0)
+                }
+            };
             to &= roles | unbound;
             all_bound &= roles != 0;
             stranger |= roles | unbound == 0;
@@ -339,16 +351,86 @@ impl Judge<'_> {
         }
     }
 
-    fn party(&self, name: &str) -> Option<(usize, &Party)> {
+    /// The roles of all agents, if the message has so many receivers that a search for each takes
+    /// longer.
+    fn known_roles(&self) -> Option<HashMap<Name, u32>> {
         const FEW: usize = 8;
-        let parties = &self.conversation.parties;
-        if parties.len() <= FEW {
-            let mut parties = parties.iter().enumerate();
-            return parties.find(|(_, party)| self.names.is(party.peer, name));
+        if self.observed.receivers.len() <= FEW {
+            return None;
         }
-        let known: Name = self.names.known(name)?;
-        let mut parties = parties.iter().enumerate();
-        parties.find(|(_, party)| party.peer == known)
+        let mut known = HashMap::new();
+        for bound in &self.conversation.bound {
+            *known.entry(bound.agent).or_insert(0) |= 1 << bound.role;
+        }
+        for agent in &self.conversation.reply_to {
+            *known.entry(*agent).or_insert(0) |= 1 << self.machine.initiator;
+        }
+        Some(known)
+    }
+
+    /// Checks the rules about several participants.
+    fn guards(&self, moves: &[Move]) -> Result<(), Fault> {
+        let Some(guarded) = moves
+            .iter()
+            .find(|made| made.next_state.guard != Guard::default())
+        else {
+            return Ok(());
+        };
+        let conversation = self.conversation;
+        // The states of the others are unknown, if their messages go to another agent.
+        let others_known = !conversation.joined && conversation.reply_to.is_empty();
+        if !others_known {
+            return Ok(());
+        }
+        // One message leads to one guarded state: its performative and roles are the same for all.
+        let NextState {
+            state: target,
+            guard,
+            ..
+        } = guarded.next_state;
+        let mut moved = vec![false; conversation.parties.len()];
+        for made in moves {
+            if let MoveTarget::Party(at) = made.target
+                && let Some(moved) = moved.get_mut(at)
+            {
+                *moved = true;
+            }
+        }
+        let parties = conversation.parties.iter().zip(&moved);
+        let others = || parties.clone().filter(|(_, moved)| !**moved);
+        let refuse = |party: &Party| {
+            let peer = self.names.text(party.peer);
+            Err(self.fault(Kind::Guard, party, peer))
+        };
+        if guard.at_most > 0 {
+            let reach = moves.iter().filter(|made| made.next_state.state == target);
+            let there = others().filter(|(party, _)| party.state == target);
+            if reach.count() + there.clone().count() > usize::from(guard.at_most) {
+                let mut blocking = there.map(|(party, _)| party).chain(&conversation.parties);
+                if let Some(party) = blocking.next() {
+                    return refuse(party);
+                }
+                return Err(Fault::plain(Kind::Guard));
+            }
+        }
+        if guard.when_all {
+            let message = self.message(guarded.side);
+            let ready = |party: &Party| match self.machine.state(party.state) {
+                Some(own) => {
+                    let step = step(&own.steps, message.act, message.from, message.to);
+                    party.state == target || step.is_some_and(|step| step.guard.when_all)
+                }
+                None => true,
+            };
+            if let Some((party, _)) = others().find(|(party, _)| !ready(party)) {
+                return refuse(party);
+            }
+        }
+        Ok(())
+    }
+
+    fn party(&self, name: &str) -> Option<(usize, &Party)> {
+        self.conversation.party(self.names, name)
     }
 
     fn fault(&self, kind: Kind, party: &Party, participant: &str) -> Fault {
@@ -369,7 +451,7 @@ pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
 }
 
 /// Returns the move of a party with an undelivered last message.
-fn failed(at: usize, party: &Party) -> Move {
+pub(crate) fn failed(at: usize, party: &Party) -> Move {
     let failed = |resume| NextState {
         resume,
         ..NextState::to(FAILED)
@@ -377,6 +459,7 @@ fn failed(at: usize, party: &Party) -> Move {
     let next_state = match party.state {
         // An ended conversation does not continue.
         ended @ (AFTER_NOT_UNDERSTOOD | CANCELLED) => NextState {
+            resume: party.resume,
             echo: party.echo,
             ..NextState::to(ended)
         },

@@ -1,18 +1,24 @@
 //! Interaction protocols as state machines, and a monitor that checks conversations at run time.
 //!
 //! * [`Machine`]: a protocol, read from an SCXML file (see [`scxml`] for the format).
+//! * [`projection`]: protocols with three or more roles, as each role sees them.
 //! * [`Library`]: protocols by name. [`Library::standard`] has those of FIPA.
 //! * [`Monitor`]: checks the messages of any number of conversations, as an observer or for one
 //!   participating agent, and returns a [`Verdict`] for each. It reads a [`Header`], without the
 //!   content.
 //!
 //! The crate has no input or output, no clocks and no threads: the caller passes messages and the
-//! current time, and gets verdicts.
+//! current time ([`Now`]), and gets verdicts.
+//!
+//! A message that continues a conversation of which the monitor does not know the beginning is
+//! *unchecked*, and no violation. [`History`] tells the monitor how much it knows, and [`Policy`]
+//! refuses messages that no conversation shows to be wrong.
 //!
 //! Files and messages may be hostile: every size has a bound, and [`Limits`] bounds the memory.
 
 mod act;
 mod change;
+mod clock;
 mod conversation;
 mod deadlines;
 mod delegated;
@@ -21,16 +27,24 @@ mod judge;
 mod library;
 mod limits;
 mod machine;
+mod memory;
 mod monitor;
 mod names;
+mod policy;
+pub mod projection;
 mod report;
+mod roles;
 pub mod scxml;
 mod table;
 mod verdict;
 
+pub use clock::Now;
 pub use header::Header;
 pub use library::{Library, LibraryError, LibraryFull};
 pub use limits::Limits;
 pub use machine::{After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition};
 pub use monitor::{Event, Monitor};
-pub use verdict::{Accepted, Expected, Unchecked, Verdict, Violation, ViolationKind};
+pub use policy::{History, Policy};
+pub use verdict::{
+    Accepted, Expected, ReplyMismatch, Unchecked, Verdict, Violation, ViolationKind,
+};

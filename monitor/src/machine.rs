@@ -1,10 +1,13 @@
 //! Protocols as checked state machines. [`crate::scxml`] reads them.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use regex::Regex;
 
-use crate::act::{Act, Acts, CANCEL, NOT_UNDERSTOOD};
+use crate::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+
+use crate::projection::Projection;
 
 /// Maximum number of roles of a protocol.
 pub(crate) const MAX_ROLES: usize = 32;
@@ -29,6 +32,8 @@ pub struct Machine {
     pub(crate) initiator: u8,
     pub(crate) initial: u16,
     pub(crate) states: Vec<State>,
+    /// The protocol as each role sees it, if it has three or more roles and can be projected.
+    pub(crate) projection: Option<Arc<Projection>>,
 }
 
 /// The scope of the state of a protocol.
@@ -75,6 +80,16 @@ pub struct Transition {
     pub(crate) to: Roles,
     pub(crate) target: u16,
     pub(crate) optional: bool,
+    pub(crate) guard: Guard,
+}
+
+/// The conditions of a transition about the other participants. There are none by default.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Guard {
+    /// Maximum number of participants in the target state; 0 for any number.
+    pub(crate) at_most: u16,
+    /// Whether all participants must be in a state with the same transition, or in its target.
+    pub(crate) when_all: bool,
 }
 
 /// A protocol that may run within a state of another protocol.
@@ -164,6 +179,14 @@ impl Machine {
         self.state(self.initial).unwrap_or(&self.states[0])
     }
 
+    /// The protocol as each role sees it, if it has three or more roles: see
+    /// [`projection`](crate::projection). `None` if it has two roles, which see all messages, or if
+    /// it cannot be projected. [`Projection::defects`] has the reasons.
+    #[must_use]
+    pub fn projection(&self) -> Option<&Projection> {
+        self.projection.as_deref()
+    }
+
     /// The states, in the order of the file.
     #[must_use]
     pub fn states(&self) -> &[State] {
@@ -197,6 +220,40 @@ impl Machine {
         let initiator = 1_u32 << self.initiator;
         let sends = |state: &State| step(&state.transitions, act, initiator, !initiator).is_some();
         [CANCEL, NOT_UNDERSTOOD].contains(&act) || self.states.iter().any(sends)
+    }
+
+    /// Whether any agent may send this after the first message.
+    pub(crate) fn may_follow(&self, act: Act<'_>) -> bool {
+        let contains = |state: &State| {
+            let proxied = state.embedded.iter().any(|sub| sub.proxied_to.is_some());
+            proxied || state.steps.iter().any(|step| step.acts.contains(act))
+        };
+        let later = (0_u16..).zip(&self.states).any(|(at, state)| {
+            // The transitions of the initial state follow only if another state leads back to it.
+            (at != self.initial || self.returns()) && contains(state)
+        });
+        let cancels = act == CANCEL && self.cancel != Cancel::Nobody;
+        later || cancels || [NOT_UNDERSTOOD, FAILURE, INFORM].contains(&act)
+    }
+
+    /// The states to which a message that looks like the first one leads later: see [`step`].
+    pub(crate) fn later_targets(&self, act: Act<'_>, first: &Transition) -> Vec<u16> {
+        let later = (0_u16..).zip(&self.states);
+        let later = later.filter(|(at, _)| *at != self.initial);
+        let mut targets: Vec<u16> = later
+            .flat_map(|(_, state)| &state.transitions)
+            .filter(|step| step.acts.contains(act) && step.from.overlaps(&first.from))
+            .map(|step| step.target)
+            .filter(|target| *target != first.target)
+            .collect();
+        targets.sort_unstable();
+        targets.dedup();
+        targets
+    }
+
+    fn returns(&self) -> bool {
+        let mut all = self.states.iter().flat_map(|state| &state.transitions);
+        all.any(|step| step.target == self.initial)
     }
 
     /// Whether another agent may send this to the initiator in any state.
@@ -273,6 +330,20 @@ impl Transition {
     #[must_use]
     pub fn is_optional(&self) -> bool {
         self.optional
+    }
+
+    /// The maximum number of participants that may be in the target state at the same time.
+    #[must_use]
+    pub fn at_most(&self) -> Option<u16> {
+        Some(self.guard.at_most).filter(|most| *most > 0)
+    }
+
+    /// Whether the transition needs all participants: each is in a state with the same transition, or
+    /// in its target. A participant in a state common to all protocols, for example `undelivered`,
+    /// does not count.
+    #[must_use]
+    pub fn needs_all(&self) -> bool {
+        self.guard.when_all
     }
 }
 

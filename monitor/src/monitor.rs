@@ -1,20 +1,30 @@
 //! The monitor of conversations.
 
+use std::borrow::Cow;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use crate::change::{Change, expire, expire_party, millis, span_millis};
-use crate::conversation::{Holders, NONE, Party, is_final, is_over, state_name};
+use smallvec::SmallVec;
+
+use crate::act::NOT_UNDERSTOOD;
+use crate::change::{Change, expire, expire_party};
+use crate::clock::span_millis;
+use crate::conversation::{
+    CANCELLING, Conversation, Copied, FAILED, Holders, NONE, Party, RoleBinding, Side, act_number,
+    is_final, is_over, side_index, state_name,
+};
 use crate::deadlines::{Deadline, Deadlines};
-use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge};
-use crate::limits::MAX_TEXT;
+use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, failed, judge};
+use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope, step};
-use crate::names::Names;
+use crate::memory::{Refused, Removed};
+use crate::names::{Name, Names};
+use crate::policy::one_edit_apart;
 use crate::report::violation;
 use crate::table::{List, Table};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
-use crate::{Header, Library, Limits};
+use crate::{Header, History, Library, Limits, Now, Policy};
 
 /// Checks messages against the protocols of their conversations.
 ///
@@ -22,19 +32,27 @@ use crate::{Header, Library, Limits};
 /// returns a verdict. A message that violates its protocol changes nothing. The monitor has no clock:
 /// the caller passes the current time. [`handle_timeout`](Self::handle_timeout) reports overdue
 /// messages, and removes conversations that are over or abandoned.
+///
+/// Several conversations may have one identifier: a message belongs to the one in which its sender and
+/// its receivers take part.
 #[derive(Debug)]
 pub struct Monitor {
     pub(crate) library: Arc<Library>,
     pub(crate) limits: Limits,
+    policy: Policy,
+    history: History,
     /// The monitored agent; none for an observer.
-    pub(crate) agent: Option<String>,
+    pub(crate) agent: Option<Arc<str>>,
     pub(crate) names: Names,
     pub(crate) table: Table,
+    pub(crate) removed: Removed,
+    refused: Refused,
     deadlines: Deadlines,
     hasher: RandomState,
     /// Buffer that is reused.
     moves: Vec<Move>,
     forgotten: u64,
+    last: Now,
 }
 
 /// An event that has no message.
@@ -68,18 +86,20 @@ pub enum Event {
 pub(crate) enum Denied {
     Fault(Fault, u32),
     NotOpened(u16),
+    /// Refused without a conversation; with a similar protocol, if there is one.
+    Refused(Kind, Option<u16>),
     Unchecked(Unchecked),
 }
 
 /// The result of an accepted message.
-struct Passed {
-    machine: u16,
-    state: u16,
-    opened: bool,
-    complete: bool,
-    late: bool,
-    void: bool,
-    elsewhere: bool,
+pub(crate) struct Passed {
+    pub(crate) machine: u16,
+    pub(crate) state: u16,
+    pub(crate) opened: bool,
+    pub(crate) complete: bool,
+    pub(crate) late: bool,
+    pub(crate) void: bool,
+    pub(crate) elsewhere: bool,
 }
 
 impl Monitor {
@@ -91,26 +111,32 @@ impl Monitor {
 
     /// Creates a monitor of the conversations of one agent.
     ///
-    /// The caller passes all messages that the agent sends and receives, in their order. So a message
-    /// of the agent cannot have crossed a message that was passed before it, and the monitor is
-    /// stricter than an observer.
+    /// The caller passes all messages that the agent sends and receives, in their order, and no other
+    /// ones. So a message of the agent cannot have crossed a message that was passed before it, and the
+    /// monitor is stricter than an observer. A message of another agent that does not name the agent
+    /// was sent to a group of which it is a member.
     #[must_use]
     pub fn agent(library: Arc<Library>, name: &str) -> Self {
-        Self::with(library, Some(name.to_owned()))
+        Self::with(library, Some(name.into()))
     }
 
-    fn with(library: Arc<Library>, agent: Option<String>) -> Self {
+    fn with(library: Arc<Library>, agent: Option<Arc<str>>) -> Self {
         let hasher = RandomState::new();
         Self {
             library,
             limits: Limits::default(),
+            policy: Policy::default(),
+            history: History::Complete,
             agent,
             names: Names::new(hasher.clone()),
             table: Table::new(hasher.clone()),
+            removed: Removed::default(),
+            refused: Refused::default(),
             deadlines: Deadlines::default(),
             hasher,
             moves: Vec::new(),
             forgotten: 0,
+            last: Now::from(UNIX_EPOCH),
         }
     }
 
@@ -118,6 +144,20 @@ impl Monitor {
     #[must_use]
     pub fn with_limits(mut self, limits: Limits) -> Self {
         self.limits = limits;
+        self
+    }
+
+    /// Sets the messages that are refused without a conversation. By default, there are none.
+    #[must_use]
+    pub fn with_policy(mut self, policy: Policy) -> Self {
+        self.policy = policy;
+        self
+    }
+
+    /// Sets the extent of the knowledge of the monitor. By default, it is complete.
+    #[must_use]
+    pub fn with_history(mut self, history: History) -> Self {
+        self.history = history;
         self
     }
 
@@ -140,22 +180,103 @@ impl Monitor {
     }
 
     /// Number of conversations that were evicted before their end because of
-    /// [`Limits::conversations`].
+    /// [`Limits::conversations`] or [`Limits::bytes`].
     #[must_use]
     pub fn forgotten(&self) -> u64 {
         self.forgotten
     }
 
+    /// Bytes of all conversations: see [`Limits::bytes`].
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.table.bytes()
+    }
+
     /// Checks a message. If it fits its conversation, updates the conversation.
-    pub fn check(&mut self, header: &Header<'_>, now: SystemTime) -> Verdict<'_> {
+    pub fn check(&mut self, header: &Header<'_>, now: impl Into<Now>) -> Verdict<'_> {
+        let now = now.into();
+        self.last = now;
         match self.take(header, now) {
             Ok(passed) => self.accepted(&passed),
             Err(Denied::Unchecked(why)) => Verdict::Unchecked(why),
             Err(denied) => {
+                let key = |from, to: &str| self.key_of_refused(header, from, to);
+                let sender = header.sender_name().unwrap_or_default();
+                if header.act() == NOT_UNDERSTOOD {
+                    let receivers = header.receiver_names().iter().take(MAX_LOOKED_AT);
+                    let answered: SmallVec<[u64; 2]> =
+                        receivers.map(|receiver| key(receiver, sender)).collect();
+                    if self.refused.take(&answered) {
+                        return Verdict::Unchecked(Unchecked::AnswersViolation);
+                    }
+                } else {
+                    let receivers = header.receiver_names().iter().take(MAX_LOOKED_AT);
+                    let refused: SmallVec<[u64; 2]> =
+                        receivers.map(|receiver| key(sender, receiver)).collect();
+                    self.refused.add(&refused);
+                }
                 let violation = violation(&self.library, &self.table, &self.names, header, denied);
                 Verdict::Violation(Box::new(violation))
             }
         }
+    }
+
+    fn key_of_refused(&self, header: &Header<'_>, from: &str, to: &str) -> u64 {
+        self.hasher.hash_one((header.conversation(), from, to))
+    }
+
+    /// Reports that a message, which was accepted, was not delivered to a receiver, or that this is
+    /// uncertain. If it is the last message of its conversation, it may be sent again.
+    pub fn undelivered(&mut self, header: &Header<'_>, receiver: &str, now: impl Into<Now>) {
+        let now = now.into();
+        self.last = now;
+        let (Some(id), Some(sender)) = (header.conversation(), header.sender_name()) else {
+            return;
+        };
+        let act = header.act();
+        let reply_with = self.fingerprint(header.reply_with_text());
+        let library = Arc::clone(&self.library);
+        let mains: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
+        for main in mains {
+            let mut at = main;
+            let mut next = self.table.slot(main).map_or(NONE, |slot| slot.child);
+            loop {
+                let machine = self.machine_of(&library, at);
+                let named = header.protocol_name();
+                let called = |machine: &&Machine| named.is_none_or(|name| machine.is_called(name));
+                if let Some(machine) = machine.filter(called)
+                    && let Some(slot) = self.table.slot_mut(at)
+                    && take_back(
+                        machine,
+                        &mut slot.conversation,
+                        &self.names,
+                        (sender, receiver),
+                        (act_number(act), act == crate::act::CANCEL, reply_with),
+                    )
+                {
+                    self.touch(main, now.millis());
+                    return;
+                }
+                let Some(slot) = self.table.slot(next) else {
+                    break;
+                };
+                (at, next) = (next, slot.sibling);
+            }
+        }
+    }
+
+    fn fingerprint(&self, text: Option<&str>) -> u64 {
+        text.map_or(0, |text| self.hasher.hash_one(text))
+    }
+
+    /// Whether a conversation with this identifier that the monitor does not have did not begin.
+    pub(crate) fn is_certain(&self, id: &str) -> bool {
+        self.history == History::Complete && !self.removed.contains(self.hasher.hash_one(id))
+    }
+
+    /// Records that the monitor does not know the conversations with this identifier any more.
+    pub(crate) fn remember_removed(&mut self, id: &str) {
+        self.removed.add(self.hasher.hash_one(id));
     }
 
     fn accepted(&self, passed: &Passed) -> Verdict<'_> {
@@ -176,58 +297,270 @@ impl Monitor {
         })
     }
 
-    fn take(&mut self, header: &Header<'_>, now: SystemTime) -> Result<Passed, Denied> {
+    fn take(&mut self, header: &Header<'_>, now: Now) -> Result<Passed, Denied> {
         let unchecked = |why| Err(Denied::Unchecked(why));
         let Some(id) = header.conversation() else {
-            return unchecked(Unchecked::NoConversation);
+            return Err(self.without_conversation(header));
         };
         let Some(sender) = header.sender_name() else {
             return unchecked(Unchecked::NoSender);
         };
-        let receivers = header.receiver_names();
+        if header.receiver_names().is_empty() {
+            return unchecked(Unchecked::NoReceiver);
+        }
+        if self.is_too_large(header, id, sender) {
+            return Err(match self.agent {
+                // Otherwise a large message would evade the checks.
+                Some(_) => Denied::Refused(Kind::TooLarge, None),
+                None => Denied::Unchecked(Unchecked::TooLarge),
+            });
+        }
+        let agent = self.agent.clone();
+        let agent = agent.as_deref();
+        let own = agent == Some(sender);
+        let other = header.other_receivers();
+        let mut receivers = other.as_deref().unwrap_or(header.receiver_names());
+        let mut own_receiver = None;
+        let member;
+        if let Some(agent) = agent.filter(|_| !own) {
+            own_receiver = receivers.iter().position(|receiver| *receiver == agent);
+            if own_receiver.is_none() {
+                member = [Cow::Borrowed(agent)];
+                (receivers, own_receiver) = (&member, Some(0));
+            }
+        }
         if receivers.is_empty() {
             return unchecked(Unchecked::NoReceiver);
         }
-        let named = receivers.iter().chain(header.reply_to_names());
-        let too_long = |text: &str| text.len() > MAX_TEXT;
-        if too_long(id)
-            || too_long(sender)
-            || receivers.len() + header.reply_to_names().len() > self.limits.participants
-            || named.into_iter().any(|name| too_long(name))
-        {
-            return unchecked(Unchecked::TooLarge);
-        }
-        let agent = self.agent.as_deref();
-        let fingerprint = |text: Option<&str>| text.map_or(0, |text| self.hasher.hash_one(text));
         let observed = ObservedMessage {
             act: header.act(),
             sender,
             receivers,
-            reply_with: fingerprint(header.reply_with_text()),
-            in_reply_to: fingerprint(header.in_reply_to_text()),
-            own: agent == Some(sender),
-            own_receiver: agent.filter(|agent| *agent != sender).and_then(|agent| {
-                let mut receivers = receivers.iter();
-                receivers.position(|receiver| *receiver == agent)
-            }),
+            reply_with: self.fingerprint(header.reply_with_text()),
+            reply_with_text: header.reply_with_text().unwrap_or_default(),
+            in_reply_to: self.fingerprint(header.in_reply_to_text()),
+            own,
+            own_receiver,
         };
-        let Some(main) = self.table.find(id) else {
+        let Some(main) = self.place(id, header, &observed) else {
             let Some(protocol) = header.protocol_name() else {
                 return unchecked(Unchecked::NoProtocol);
             };
             let Some(machine) = self.library.index_of(protocol) else {
-                return unchecked(Unchecked::UnknownProtocol);
+                return Err(self.unknown_protocol(protocol));
             };
             return self.open(id, NONE, machine, header, &observed, now);
         };
         let machine = self.machine_of(&self.library, main);
         let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
         if header.protocol_name().is_none_or(follows) {
+            let projection = machine.and_then(|machine| machine.projection.clone());
+            let slot = self.table.slot(main);
+            let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
+            if let Some(projection) = projection
+                && rare.is_some_and(|rare| rare.local.is_some())
+            {
+                return self.advance_local(main, &projection, &observed, now);
+            }
             let passed = self.advance(main, header, &observed, now);
-            return passed.map_err(|denied| self.recheck_delegated(main, &observed, denied, now));
+            return passed.map_err(|denied| {
+                let denied = self.recheck_delegated(main, &observed, denied, now);
+                self.recheck_beginning(main, denied)
+            });
         }
         let library = Arc::clone(&self.library);
         self.embedded(&library, main, header, &observed, now)
+    }
+
+    fn is_too_large(&self, header: &Header<'_>, id: &str, sender: &str) -> bool {
+        let too_long = |text: &str| text.len() > MAX_TEXT;
+        let (receivers, reply_to) = (header.receiver_names(), header.reply_to_names());
+        let named = receivers.iter().chain(reply_to);
+        too_long(id)
+            || too_long(sender)
+            || header.peer_name().is_some_and(too_long)
+            || header.receiver_count() > self.limits.participants
+            || header.addressed().len() > self.limits.participants
+            || reply_to.len() > MAX_DESIGNATED
+            || named
+                .chain(header.group_members())
+                .any(|name| too_long(name))
+    }
+
+    fn without_conversation(&self, header: &Header<'_>) -> Denied {
+        let named = header.protocol_name();
+        let machine = named.and_then(|name| self.library.find(name));
+        if machine.is_some_and(|known| !self.policy.exempts(known.name()))
+            && self.policy.conversation_id
+        {
+            return Denied::Refused(Kind::NoConversation, None);
+        }
+        Denied::Unchecked(Unchecked::NoConversation)
+    }
+
+    fn unknown_protocol(&self, name: &str) -> Denied {
+        /// Maximum length of a name that is compared with the known ones.
+        const MAX_COMPARED: usize = 128;
+        if self.policy.spelling && name.len() <= MAX_COMPARED {
+            let name = name.to_ascii_lowercase();
+            let near = |machine: &Machine| {
+                let mut aliases = machine.aliases().iter().map(String::as_str);
+                !self.policy.exempts(machine.name())
+                    && (one_edit_apart(&machine.name().to_ascii_lowercase(), &name)
+                        || aliases.any(|alias| one_edit_apart(&alias.to_ascii_lowercase(), &name)))
+            };
+            let similar = self.library.iter().position(near);
+            if let Some(similar) = similar.and_then(|index| u16::try_from(index).ok()) {
+                return Denied::Refused(Kind::Misspelled, Some(similar));
+            }
+        }
+        Denied::Unchecked(Unchecked::UnknownProtocol)
+    }
+
+    /// Finds the conversation of a message among those with its identifier: the one in which sender and
+    /// receiver take part. Otherwise, an agent that does not lead one of them can begin another.
+    fn place(&self, id: &str, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<u32> {
+        let ranked = self.table.find_all(id).map(|at| {
+            let rank = self.rank(at, observed);
+            let slot = self.table.slot(at);
+            // Other agents may take part in a conversation that began elsewhere.
+            let joined = rank == 0 && slot.is_some_and(|slot| slot.conversation.joined);
+            let serial = slot.map_or(0, |slot| slot.serial);
+            (
+                rank,
+                joined,
+                self.has_protocol(at, header, observed),
+                serial,
+                at,
+            )
+        });
+        // Of several, the last that began.
+        let best = ranked.max();
+        let local = self
+            .table
+            .find_all(id)
+            .find(|at| self.fits_role(*at, header, observed));
+        if local.is_some() {
+            return local;
+        }
+        let (rank, .., at) = best?;
+        if rank == 2 {
+            return Some(at);
+        }
+        let begins = |machine: &Machine| {
+            step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
+        };
+        let named = header.protocol_name();
+        let machine = named.and_then(|name| self.library.find(name));
+        let stays = match machine {
+            Some(machine) if begins(machine) => !self.begins_another(at, machine, observed),
+            // The monitor may have removed the conversation of the message.
+            _ => self.is_certain(id),
+        };
+        stays.then_some(at)
+    }
+
+    /// 2 if the sender and a receiver take part in the conversation or in one within it, 1 if the
+    /// sender does.
+    fn rank(&self, main: u32, observed: &ObservedMessage<'_>) -> u8 {
+        let any = |takes_part: &dyn Fn(&Conversation) -> bool| {
+            let mut at = main;
+            let mut slot = self.table.slot(main);
+            let first = slot.map_or(NONE, |slot| slot.child);
+            while let Some(here) = slot {
+                if takes_part(&here.conversation) {
+                    return true;
+                }
+                at = if at == main { first } else { here.sibling };
+                slot = self.table.slot(at);
+            }
+            false
+        };
+        let has = |conversation: &Conversation, agent: &str| {
+            conversation.is_local() && self.agent.as_deref() == Some(agent)
+                || conversation.takes_part(&self.names, agent)
+                || conversation.is_designated(&self.names, agent)
+        };
+        let sends = |conversation: &Conversation| {
+            conversation.unnamed.is_some() || has(conversation, observed.sender)
+        };
+        let receives = |conversation: &Conversation| {
+            let mut receivers = observed.receivers.iter().take(MAX_LOOKED_AT);
+            receivers.any(|receiver| has(conversation, receiver))
+        };
+        // With a state for each participant, these exchange messages with the initiator only.
+        let linked = |conversation: &Conversation| {
+            let machine = self.library.machine(conversation.machine);
+            if machine.is_none_or(|machine| machine.scope == Scope::Conversation) {
+                return sends(conversation) && receives(conversation);
+            }
+            let names = &self.names;
+            let leads = |agent: &str| {
+                names.is(conversation.initiator, agent) || conversation.is_designated(names, agent)
+            };
+            let answers = |agent: &str| {
+                conversation.unnamed.is_some() || conversation.party(names, agent).is_some()
+            };
+            let receivers = || observed.receivers.iter().take(MAX_LOOKED_AT);
+            leads(observed.sender) && receivers().any(|receiver| answers(receiver))
+                || answers(observed.sender) && receivers().any(|receiver| leads(receiver))
+        };
+        let embeds = self.table.slot(main).is_some_and(|slot| slot.child != NONE);
+        if any(&linked) || embeds && any(&sends) && any(&receives) {
+            return 2;
+        }
+        u8::from(any(&sends))
+    }
+
+    /// Whether the protocol of a message is that of the conversation or of one within it, or may begin
+    /// within it.
+    fn has_protocol(&self, at: u32, header: &Header<'_>, observed: &ObservedMessage<'_>) -> bool {
+        let Some(name) = header.protocol_name() else {
+            return true;
+        };
+        let mut part = at;
+        while let Some(slot) = self.table.slot(part) {
+            let machine = self.machine_of(&self.library, part);
+            if machine.is_some_and(|machine| machine.is_called(name))
+                || self.may_begin(&self.library, part, name, observed.sender)
+            {
+                return true;
+            }
+            part = if part == at { slot.child } else { slot.sibling };
+        }
+        false
+    }
+
+    /// Whether the first message of a protocol begins another conversation than this one.
+    fn begins_another(&self, at: u32, machine: &Machine, observed: &ObservedMessage<'_>) -> bool {
+        let name = machine.name();
+        let mut part = at;
+        while let Some(slot) = self.table.slot(part) {
+            let conversation = &slot.conversation;
+            let initiates = part == at && self.names.is(conversation.initiator, observed.sender);
+            let leads = !conversation.joined
+                && (initiates || conversation.is_designated(&self.names, observed.sender));
+            if leads || self.may_begin(&self.library, part, name, observed.sender) {
+                return false;
+            }
+            part = if part == at { slot.child } else { slot.sibling };
+        }
+        true
+    }
+
+    /// If a conversation may have begun before the monitor, a violation is none: it shows that the
+    /// first message continued the conversation.
+    fn recheck_beginning(&mut self, at: u32, denied: Denied) -> Denied {
+        let slot = self.table.slot(at);
+        let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
+        let uncertain = rare.is_some_and(|rare| !rare.alternatives.is_empty());
+        match denied {
+            Denied::Fault(..) if uncertain => {
+                self.forget(at);
+                Denied::Unchecked(Unchecked::UnknownHistory)
+            }
+            denied => denied,
+        }
     }
 
     /// Checks a message with another protocol than its conversation has. It belongs to an embedded
@@ -238,7 +571,7 @@ impl Monitor {
         main: u32,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: SystemTime,
+        now: Now,
     ) -> Result<Passed, Denied> {
         let name = header.protocol_name().unwrap_or_default();
         let (mut denied, mut open) = (None, None);
@@ -252,7 +585,7 @@ impl Monitor {
             if called.is_some_and(|machine| machine.is_called(name)) {
                 match self.advance(child, header, observed, now) {
                     Ok(passed) => {
-                        self.touch(main, millis(now));
+                        self.touch(main, now.millis());
                         return Ok(passed);
                     }
                     Err(fault) if self.may_continue_elsewhere(child) => open = Some((child, fault)),
@@ -269,7 +602,7 @@ impl Monitor {
                     let inner = library.index_of(name).filter(|_| !observed.own);
                     if let Some(inner) = inner.filter(|_| children < self.limits.embedded) {
                         let id = header.conversation().unwrap_or_default();
-                        self.join(id, main, inner, observed, now);
+                        let _ = self.join(id, main, inner, (header, observed), now);
                     }
                     Denied::Unchecked(Unchecked::BegunElsewhere)
                 }
@@ -288,7 +621,7 @@ impl Monitor {
         let id = header.conversation().unwrap_or_default();
         match self.open(id, main, machine, header, observed, now) {
             Ok(passed) => {
-                self.touch(main, millis(now));
+                self.touch(main, now.millis());
                 Ok(passed)
             }
             Err(not_opened) => Err(denied.unwrap_or(not_opened)),
@@ -351,53 +684,181 @@ impl Monitor {
         machine: u16,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: SystemTime,
+        now: Now,
     ) -> Result<Passed, Denied> {
         let library = Arc::clone(&self.library);
         let Some(protocol) = library.machine(machine) else {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
         // Checked before eviction, so that an invalid message evicts no conversation.
-        let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
-        if begins.is_none() {
-            // The initiator may have named the monitored agent in a `reply-to`.
-            let named = parent == NONE && self.agent.is_some() && !observed.own;
-            return Err(if named && protocol.is_answer(observed.act) {
-                self.join(id, parent, machine, observed, now);
-                Denied::Unchecked(Unchecked::BegunElsewhere)
-            } else {
-                Denied::NotOpened(machine)
-            });
+        if parent == NONE
+            && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
+        {
+            let machine = (machine, protocol);
+            return self.open_local(id, machine, &projection, (header, observed), now);
         }
-        self.evict(parent);
-        let at = self.table.insert(id, parent, machine, millis(now));
-        let initiator = self.names.acquire(observed.sender);
+        let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
+        let Some(begins) = begins else {
+            return Err(match parent {
+                NONE => self.unopened(id, machine, protocol, header, observed, now),
+                _ => Denied::NotOpened(machine),
+            });
+        };
+        let at = self.insert(id, parent, machine, (header, observed), now)?;
+        let certain = parent != NONE || self.is_certain(id);
         if let Some(slot) = self.table.slot_mut(at) {
-            slot.conversation.initiator = initiator;
+            let conversation = &mut slot.conversation;
+            conversation.initiator = conversation.acquire(&mut self.names, observed.sender);
             if protocol.scope == Scope::Conversation {
                 let party = Party::new(NONE, protocol.initial);
-                slot.conversation.parties.push(party);
+                conversation.parties.push(party);
+            }
+            if !certain {
+                let others = protocol.later_targets(observed.act, begins);
+                if !others.is_empty() {
+                    conversation.rare().alternatives = others;
+                }
             }
         }
         let passed = self.advance(at, header, observed, now);
         passed.map_err(|denied| {
             self.remove(at);
             match denied {
+                Denied::Fault(fault, _) if fault.kind == Kind::TooMany => {
+                    Denied::Refused(Kind::TooMany, None)
+                }
                 Denied::Fault(..) => Denied::NotOpened(machine),
                 other => other,
             }
         })
     }
 
-    /// Removes conversations until there is space for one more. The conversation `keep` is kept.
-    pub(crate) fn evict(&mut self, keep: u32) {
-        while self.table.len() >= self.limits.conversations.max(1) {
+    /// Inserts a conversation that a message begins, and evicts others for it.
+    pub(crate) fn insert(
+        &mut self,
+        id: &str,
+        parent: u32,
+        machine: u16,
+        (header, observed): (&Header<'_>, &ObservedMessage<'_>),
+        now: Now,
+    ) -> Result<u32, Denied> {
+        if parent == NONE {
+            self.evict_alike(id)?;
+        }
+        let peer = match self.table.slot(parent) {
+            Some(main) => self.names.acquire_again(main.peer),
+            None if observed.own => NONE,
+            None => {
+                let peer = header.peer_name().unwrap_or(observed.sender);
+                self.names.acquire(peer)
+            }
+        };
+        let peer_cost = match peer {
+            NONE => 0,
+            peer => Names::cost(self.names.text(peer).len()),
+        };
+        let bytes = size_of::<crate::table::Slot>() + id.len() + peer_cost;
+        self.evict(parent, peer, 1, bytes);
+        let at = self.table.insert(id, parent, peer, machine, now.millis());
+        if let Some(slot) = self.table.slot_mut(at) {
+            slot.conversation.charged_names += peer_cost;
+        }
+        Ok(at)
+    }
+
+    /// Returns the verdict on a message that begins no conversation, if the monitor has none for it.
+    fn unopened(
+        &mut self,
+        id: &str,
+        machine: u16,
+        protocol: &Machine,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+        now: Now,
+    ) -> Denied {
+        if !protocol.may_follow(observed.act) {
+            return Denied::NotOpened(machine);
+        }
+        if self.agent.is_none() || observed.own {
+            if self.is_certain(id) {
+                return Denied::NotOpened(machine);
+            }
+            return Denied::Unchecked(Unchecked::UnknownHistory);
+        }
+        if self.policy.unsolicited && !self.policy.exempts(protocol.name()) {
+            return Denied::Refused(Kind::Unsolicited, None);
+        }
+        // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
+        if protocol.is_answer(observed.act) {
+            if let Err(denied) = self.join(id, NONE, machine, (header, observed), now) {
+                return denied;
+            }
+            return Denied::Unchecked(Unchecked::BegunElsewhere);
+        }
+        // The agent may answer.
+        self.remember_removed(id);
+        Denied::Unchecked(Unchecked::UnknownHistory)
+    }
+
+    /// Removes the least recently active conversation with this identifier, if there are too many of
+    /// them. Those that the monitored agent began stay.
+    fn evict_alike(&mut self, id: &str) -> Result<(), Denied> {
+        let alike: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
+        if alike.len() < MAX_ALIKE {
+            return Ok(());
+        }
+        let slots = alike
+            .iter()
+            .filter_map(|at| Some((*at, self.table.slot(*at)?)));
+        let of_peers = slots.filter(|(_, slot)| slot.peer != NONE || self.agent.is_none());
+        let oldest = of_peers.min_by_key(|(_, slot)| (slot.touched, slot.serial));
+        match oldest.map(|(at, _)| at) {
+            Some(at) => {
+                self.forgotten += 1;
+                self.forget(at);
+                Ok(())
+            }
+            None => Err(Denied::Refused(Kind::TooMany, None)),
+        }
+    }
+
+    /// Charges the peer of a conversation, and evicts others if it has grown beyond a limit.
+    pub(crate) fn charge(&mut self, at: u32) {
+        if self.table.charge(at)
+            && let Some(slot) = self.table.slot(at)
+        {
+            let main = if slot.parent == NONE { at } else { slot.parent };
+            self.evict(main, slot.peer, 0, 0);
+        }
+    }
+
+    /// Removes conversations until there is space for so many more of this peer, with so many bytes.
+    /// The conversation `keep` is kept.
+    fn evict(&mut self, keep: u32, peer: Name, more: usize, bytes: usize) {
+        loop {
+            let full = self.table.len() + more > self.limits.conversations.max(1);
+            let heavy = self.table.bytes() + bytes > self.limits.bytes;
+            let (count, held) = self.table.of_peer(peer);
+            let over = peer != NONE
+                && (held + bytes > self.limits.share_of_bytes()
+                    || count + more > self.limits.share_of_conversations());
+            if !full && !heavy && !over {
+                return;
+            }
             let other = |at: &u32| *at != keep;
-            let ended = self.table.oldest(List::Ended).filter(other);
-            let Some(at) = ended.or_else(|| self.table.oldest(List::Open).filter(other)) else {
+            let own = |list| self.table.oldest_of(peer, list).filter(other);
+            let any = |list| self.table.oldest(list).filter(other);
+            let own = || own(List::Ended).or_else(|| own(List::Open));
+            let any = || any(List::Ended).or_else(|| any(List::Open));
+            let oldest = match over {
+                true => own().or_else(|| any().filter(|_| full || heavy)),
+                false => any(),
+            };
+            let Some(at) = oldest else {
                 return;
             };
-            if ended.is_none() {
+            let slot = self.table.slot(at);
+            if slot.is_some_and(|slot| slot.list() == List::Open) {
                 self.forgotten += 1;
             }
             self.forget(at);
@@ -410,10 +871,11 @@ impl Monitor {
         at: u32,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: SystemTime,
+        now: Now,
     ) -> Result<Passed, Denied> {
-        let now_ms = millis(now);
+        let now_ms = now.millis();
         let fault = |kind| Denied::Fault(Fault::plain(kind), at);
+        let copied = self.copied(header, observed);
         let Some(slot) = self.table.slot_mut(at) else {
             return Err(fault(Kind::NotOpened));
         };
@@ -422,6 +884,21 @@ impl Monitor {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
         expire(machine, &mut slot.conversation, now_ms);
+        let copied = copied.filter(|_| machine.scope == Scope::Conversation);
+        if let Some((fingerprint, receiver)) = copied {
+            let names = &mut self.names;
+            if is_another_copy(
+                &mut slot.conversation,
+                names,
+                observed,
+                fingerprint,
+                receiver,
+            ) {
+                let passed = Passed::in_state_of(&slot.conversation, machine, index);
+                self.charge(at);
+                return Ok(passed);
+            }
+        }
         let conversation = &slot.conversation;
         judge(
             machine,
@@ -434,12 +911,18 @@ impl Monitor {
         let new =
             |made: &&Move| matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
         let grown = conversation.parties.len() + self.moves.iter().filter(new).count();
+        let agents = observed.receivers.len() + header.reply_to_names().len();
         if grown > self.limits.participants
-            || conversation.bound.len() + observed.receivers.len() > self.limits.participants + 1
+            || conversation.bound.len() + agents > self.limits.participants + 1
+            || is_crowded(conversation, &self.names, header)
+            || size_after(conversation, observed, &self.moves, header)
+                > self.limits.share_of_bytes()
         {
             return Err(fault(Kind::TooMany));
         }
-        let due = header.reply_by_time(now).map_or(0, millis);
+        let due = header.reply_by_time(now.wall);
+        let due = due.map_or(0, |due| now.millis_at(due));
+        let roles = self.moves.first().map(|made| made.next_state.roles);
         let mut change = Change {
             machine,
             names: &mut self.names,
@@ -466,28 +949,54 @@ impl Monitor {
         }
         if change.names_designated(&slot.conversation, &self.moves) {
             change.designate(&mut slot.conversation, header);
+        } else {
+            change.delegate(&mut slot.conversation, &self.moves, header);
         }
         let (opened, moved) = (change.opened, change.state);
         let (late, void) = (change.late, change.void);
-        let parties = &slot.conversation.parties;
-        let first = parties.first().map_or(machine.initial, |party| party.state);
-        let complete = slot.conversation.unnamed.is_none()
-            && parties.iter().all(|party| is_final(machine, party.state));
+        if let Some(((fingerprint, receiver), roles)) = copied.zip(roles) {
+            keep_copied(&mut slot.conversation, fingerprint, receiver, roles);
+        }
+        if !opened {
+            still_uncertain(machine, &mut slot.conversation, observed);
+        }
+        let passed = Passed::in_state_of(&slot.conversation, machine, index);
         let passed = Passed {
-            machine: index,
-            state: moved.unwrap_or(first),
+            state: moved.unwrap_or(passed.state),
             opened,
-            complete,
             late,
             void,
-            elsewhere: slot.conversation.joined,
+            ..passed
         };
         let is_main = slot.parent == NONE;
         if is_main {
             self.touch(at, now_ms);
         }
+        self.charge(at);
         self.keep_deadlines_few();
         Ok(passed)
+    }
+
+    /// Returns fingerprints of a message and of its receiver, if this is the copy for one of several
+    /// receivers.
+    fn copied(&self, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<(u64, u64)> {
+        let addressed = header.addressed();
+        let first = addressed.first()?;
+        let receiver = observed.receivers.first()?;
+        if addressed.len() == 1 && first == receiver {
+            return None;
+        }
+        let message = (
+            header.act().name(),
+            observed.sender,
+            addressed,
+            observed.reply_with,
+            observed.in_reply_to,
+        );
+        Some((
+            self.hasher.hash_one(message),
+            self.hasher.hash_one(&**receiver),
+        ))
     }
 
     /// Updates the time and the list of a main conversation.
@@ -515,9 +1024,17 @@ impl Monitor {
         self.table.touch(at, list, now);
     }
 
-    /// Time at which the caller must call [`handle_timeout`](Self::handle_timeout) next.
+    /// Time at which the caller must call [`handle_timeout`](Self::handle_timeout) next, on the wall
+    /// clock of the last call.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<SystemTime> {
+        self.last.wall_at(self.poll_elapsed()?)
+    }
+
+    /// Time at which the caller must call [`handle_timeout`](Self::handle_timeout) next, on the
+    /// monotonic clock: see [`Now::elapsed`].
+    #[must_use]
+    pub fn poll_elapsed(&self) -> Option<Duration> {
         let kept = |list, span: Duration| {
             let slot = self.table.slot(self.table.oldest(list)?)?;
             Some(
@@ -530,13 +1047,14 @@ impl Monitor {
         let idle = kept(List::Open, self.limits.idle);
         let due = self.deadlines.next().map(|due| due.saturating_add(1));
         let next = [ended, idle, due].into_iter().flatten().min()?;
-        UNIX_EPOCH.checked_add(Duration::from_millis(next))
+        Some(Duration::from_millis(next))
     }
 
     /// Handles timeouts: reports overdue messages, and removes conversations that are over or
     /// abandoned.
-    pub fn handle_timeout(&mut self, now: SystemTime) -> Vec<Event> {
-        let now = millis(now);
+    pub fn handle_timeout(&mut self, now: impl Into<Now>) -> Vec<Event> {
+        self.last = now.into();
+        let now = self.last.millis();
         let mut events = Vec::new();
         while let Some(deadline) = self.deadlines.pop_before(now) {
             events.extend(self.overdue(deadline));
@@ -563,7 +1081,13 @@ impl Monitor {
                         conversation_id: slot.conversation.id.clone(),
                     });
                 }
-                self.forget(at);
+                // After an undelivered message, a conversation may continue.
+                let undelivered = |party: &Party| party.state == FAILED;
+                if list == List::Ended && !conversation.parties.iter().any(undelivered) {
+                    self.remove_all(at);
+                } else {
+                    self.forget(at);
+                }
             }
         }
         events
@@ -603,8 +1127,19 @@ impl Monitor {
         complete.then_some(event)
     }
 
-    /// Removes a main conversation with its embedded conversations.
+    /// Removes a main conversation with its embedded conversations before its time. Messages to it may
+    /// still come.
     fn forget(&mut self, at: u32) {
+        if let Some(slot) = self.table.slot(at) {
+            let id = self.hasher.hash_one(slot.conversation.id.as_str());
+            self.removed.add(id);
+        }
+        self.remove_all(at);
+    }
+
+    /// Removes a main conversation with its embedded conversations, without remembering that the
+    /// monitor had it. A further message to it is a violation.
+    fn remove_all(&mut self, at: u32) {
         while let Some(slot) = self.table.slot(at) {
             let child = slot.child;
             if child == NONE {
@@ -621,9 +1156,12 @@ impl Monitor {
             self.names.release(conversation.initiator);
             let peers = conversation.parties.iter().map(|party| party.peer);
             let bound = conversation.bound.iter().map(|bound| bound.agent);
+            let delegates = conversation.delegates().iter().map(|(_, agent)| *agent);
             let named = peers
                 .chain(bound)
-                .chain(conversation.reply_to.iter().copied());
+                .chain(conversation.reply_to.iter().copied())
+                .chain(delegates)
+                .chain([slot.peer]);
             for name in named.filter(|name| *name != NONE) {
                 self.names.release(name);
             }
@@ -647,6 +1185,184 @@ impl Monitor {
         };
         self.deadlines.keep_few(counts);
     }
+}
+
+impl Passed {
+    /// The result of a message that changes nothing.
+    pub(crate) fn in_state_of(conversation: &Conversation, machine: &Machine, index: u16) -> Self {
+        let parties = &conversation.parties;
+        Self {
+            machine: index,
+            state: parties.first().map_or(machine.initial, |party| party.state),
+            opened: false,
+            complete: conversation.unnamed.is_none()
+                && parties.iter().all(|party| is_final(machine, party.state)),
+            late: false,
+            void: false,
+            elsewhere: conversation.joined,
+        }
+    }
+}
+
+/// Number of receivers that are looked at to find the conversation of a message.
+const MAX_LOOKED_AT: usize = 16;
+
+/// Whether the message names more agents in `reply-to` than a conversation keeps.
+fn is_crowded(conversation: &Conversation, names: &Names, header: &Header<'_>) -> bool {
+    let reply_to = header.reply_to_names();
+    if reply_to.is_empty() {
+        return false;
+    }
+    let new = |name: &&Cow<'_, str>| {
+        !conversation.is_designated(names, name)
+            && !conversation
+                .delegates()
+                .iter()
+                .any(|(_, known)| names.is(*known, name))
+    };
+    let kept = conversation.reply_to.len() + conversation.delegates().len();
+    kept + reply_to.iter().filter(new).count() > MAX_DESIGNATED
+}
+
+/// Returns an upper bound of the bytes of a conversation after a message.
+fn size_after(
+    conversation: &Conversation,
+    observed: &ObservedMessage<'_>,
+    moves: &[Move],
+    header: &Header<'_>,
+) -> usize {
+    let name = |name: &str| Names::cost(name.len());
+    let receivers = moves.iter().map(|made| match made.target {
+        MoveTarget::Receiver(number) => {
+            let receiver = observed.receivers.get(number);
+            size_of::<Party>() + receiver.map_or(0, |receiver| name(receiver))
+        }
+        _ => 0,
+    });
+    let reply_to = header.reply_to_names().iter().map(|agent| name(agent));
+    let added = receivers.sum::<usize>() + reply_to.sum::<usize>() + name(observed.sender);
+    size_of::<crate::table::Slot>() + conversation.allocated() + added
+}
+
+/// Whether the message is another copy of the last one to several receivers. Its receiver then has the
+/// role of the receivers.
+fn is_another_copy(
+    conversation: &mut Conversation,
+    names: &mut Names,
+    observed: &ObservedMessage<'_>,
+    fingerprint: u64,
+    receiver: u64,
+) -> bool {
+    let Some(rare) = conversation.rare.as_deref_mut() else {
+        return false;
+    };
+    let mut copied = rare.copied.iter_mut();
+    let Some(copied) = copied.find(|copied| copied.fingerprint == fingerprint) else {
+        return false;
+    };
+    if copied.seen.contains(&receiver) {
+        return false;
+    }
+    copied.seen.push(receiver);
+    let (_, to) = copied.roles;
+    if to.count_ones() == 1
+        && let Some(name) = observed.receivers.first()
+    {
+        let role = u8::try_from(to.trailing_zeros()).unwrap_or(0);
+        let agent = conversation.acquire(names, name);
+        conversation.bound.push(RoleBinding { role, agent });
+    }
+    true
+}
+
+/// Keeps a message of which further copies may follow.
+fn keep_copied(
+    conversation: &mut Conversation,
+    fingerprint: u64,
+    receiver: u64,
+    roles: (u32, u32),
+) {
+    /// Number of messages whose copies may mix.
+    const MAX: usize = 4;
+    let copied = &mut conversation.rare().copied;
+    copied.retain(|copied| copied.fingerprint != fingerprint);
+    if copied.len() == MAX {
+        copied.remove(0);
+    }
+    copied.push(Copied {
+        fingerprint,
+        seen: vec![receiver],
+        roles,
+    });
+}
+
+/// Removes the other states of a conversation that may have begun before the monitor, if the message
+/// does not fit them.
+fn still_uncertain(
+    machine: &Machine,
+    conversation: &mut Conversation,
+    observed: &ObservedMessage<'_>,
+) {
+    let Some(rare) = conversation.rare.as_deref_mut() else {
+        return;
+    };
+    let alternatives = std::mem::take(&mut rare.alternatives);
+    let fits = alternatives.iter().filter_map(|state| {
+        let state = machine.state(*state)?;
+        step(&state.steps, observed.act, u32::MAX, u32::MAX)
+    });
+    rare.alternatives = fits.map(|step| step.target).collect();
+}
+
+/// Takes a message of a sender to a receiver back, if it is the last one between them: a standard
+/// performative by its number, whether it is a cancel, and its `reply-with`.
+fn take_back(
+    machine: &Machine,
+    conversation: &mut Conversation,
+    names: &Names,
+    (sender, receiver): (&str, &str),
+    (act, cancels, reply_with): (u8, bool, u64),
+) -> bool {
+    let leads = names.is(conversation.initiator, sender)
+        || conversation.is_designated(names, sender) && conversation.party(names, sender).is_none();
+    let (at, side) = match machine.scope {
+        Scope::Participant if leads => {
+            // The members of a pattern have one state until they answer.
+            match conversation.party(names, receiver) {
+                Some((at, _)) => (at, Side::Initiator),
+                None => return false,
+            }
+        }
+        Scope::Participant => match conversation.party(names, sender) {
+            Some((at, _)) => (at, Side::Other),
+            None => return false,
+        },
+        Scope::Conversation if conversation.speaks_for_initiator(names, sender) => {
+            (0, Side::Initiator)
+        }
+        Scope::Conversation => (0, Side::Other),
+    };
+    let Some(party) = conversation.parties.get_mut(at) else {
+        return false;
+    };
+    let index = side_index(side);
+    let is_last = match cancels && party.state == CANCELLING {
+        true => party.canceling_side == side && party.cancel == reply_with,
+        false => party.last == side && party.acts[index] == act && party.asked[index] == reply_with,
+    };
+    if is_last {
+        let made = failed(at, party);
+        (party.state, party.resume, party.echo) = (
+            made.next_state.state,
+            made.next_state.resume,
+            made.next_state.echo,
+        );
+        // The other side answers the message before it, and need not be told which.
+        if act != act_number(crate::act::CANCEL) {
+            party.asked[index] = 0;
+        }
+    }
+    is_last
 }
 
 #[cfg(test)]

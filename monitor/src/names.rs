@@ -16,6 +16,9 @@ pub(crate) struct Names {
     hasher: RandomState,
 }
 
+/// Maximum capacity of the buffer of an unused name, in bytes.
+const KEPT: usize = 64;
+
 #[derive(Debug)]
 struct Entry {
     name: String,
@@ -67,6 +70,14 @@ impl Names {
         index
     }
 
+    /// Adds a reference to a name in use, if it is one.
+    pub(crate) fn acquire_again(&mut self, name: Name) -> Name {
+        if let Some(entry) = self.entry(name) {
+            entry.uses += 1;
+        }
+        name
+    }
+
     pub(crate) fn release(&mut self, name: Name) {
         let Some(entry) = self.entries.get_mut(name as usize) else {
             return;
@@ -80,7 +91,7 @@ impl Names {
             found.remove();
         }
         // The buffer of a long name is not reused.
-        if entry.name.capacity() > 256 {
+        if entry.name.capacity() > KEPT {
             entry.name = String::new();
         }
         self.free.push(name);
@@ -100,6 +111,12 @@ impl Names {
     /// Returns the index of the name if it is in use.
     pub(crate) fn known(&self, text: &str) -> Option<Name> {
         self.find(self.hasher.hash_one(text), text)
+    }
+
+    /// Bytes that a reference to a name of this length is charged with.
+    pub(crate) fn cost(len: usize) -> usize {
+        // The buffer and the entry in the index.
+        len.max(24) + size_of::<Entry>() + 2 * size_of::<Name>()
     }
 
     #[cfg(test)]
@@ -140,7 +157,7 @@ mod tests {
 
     #[test]
     fn buffers_of_long_names_are_not_kept() {
-        for (len, kept) in [(200, true), (256, true), (257, false), (1_000, false)] {
+        for (len, kept) in [(40, true), (64, true), (65, false), (1_000, false)] {
             let mut names = Names::new(RandomState::new());
             let name = names.acquire(&"x".repeat(len));
             names.release(name);

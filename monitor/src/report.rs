@@ -1,16 +1,27 @@
 //! Descriptions of violations: the message, the state of the conversation, the expected messages.
 
-use crate::conversation::{CANCELLING, Conversation, FAILED, Party, state_name};
+use crate::conversation::{CANCELLING, Conversation, FAILED, Party, Tail, state_name};
 use crate::judge::Fault;
 use crate::machine::{Machine, Roles, Scope, State};
 use crate::monitor::Denied;
 use crate::names::Names;
 use crate::table::Table;
-use crate::verdict::{Expected, Violation, ViolationKind as Kind};
+use crate::verdict::{Expected, ReplyMismatch, Violation, ViolationKind as Kind};
 use crate::{Header, Library};
 
 /// Maximum number of receivers in a violation.
 const MAX_NAMED: usize = 16;
+/// Maximum length of a text of a message in a violation, in bytes.
+const MAX_SHOWN: usize = 4_096;
+
+/// Shortens a text of a message.
+fn shown(text: &str) -> String {
+    let mut end = text.len().min(MAX_SHOWN);
+    while !text.is_char_boundary(end) {
+        end -= 1;
+    }
+    text.get(..end).unwrap_or_default().to_owned()
+}
 
 pub(crate) fn violation(
     library: &Library,
@@ -21,19 +32,21 @@ pub(crate) fn violation(
 ) -> Violation {
     let mut violation = Violation {
         kind: Kind::NotOpened,
-        protocol: header.protocol_name().unwrap_or_default().to_owned(),
-        conversation_id: header.conversation().unwrap_or_default().to_owned(),
-        performative: header.act().name().to_owned(),
-        sender: header.sender_name().unwrap_or_default().to_owned(),
+        protocol: shown(header.protocol_name().unwrap_or_default()),
+        conversation_id: shown(header.conversation().unwrap_or_default()),
+        performative: shown(header.act().name()),
+        sender: shown(header.sender_name().unwrap_or_default()),
         receivers: header
             .receiver_names()
             .iter()
             .take(MAX_NAMED)
-            .map(|name| name.clone().into_owned())
+            .map(|name| shown(name))
             .collect(),
         participant: None,
         state: None,
         expected: Vec::new(),
+        reply: None,
+        similar: None,
     };
     let (fault, at) = match denied {
         Denied::Fault(fault, at) => (fault, at),
@@ -42,6 +55,12 @@ pub(crate) fn violation(
                 machine.name().clone_into(&mut violation.protocol);
                 violation.expected = expected(machine, machine.initial(), None, names, None);
             }
+            return violation;
+        }
+        Denied::Refused(kind, similar) => {
+            violation.kind = kind;
+            let machine = similar.and_then(|machine| library.machine(machine));
+            violation.similar = machine.map(|machine| machine.name().to_owned());
             return violation;
         }
         // The caller handles this case.
@@ -83,6 +102,27 @@ pub(crate) fn violation(
                 to: "the side that canceled".to_owned(),
             }];
         }
+    }
+    if kind == Kind::WrongReply {
+        let sender = header.sender_name().unwrap_or_default();
+        let mut parties = conversation.parties.iter();
+        let name = participant.as_deref();
+        let party = match (machine.scope, name) {
+            (Scope::Participant, Some(name)) => conversation.party(names, name),
+            _ => None,
+        };
+        let party = party.map(|(_, party)| party).or_else(|| parties.next());
+        let by_initiator = match (machine.scope, party) {
+            (Scope::Participant, Some(party)) => !names.is(party.peer, sender),
+            _ => conversation.speaks_for_initiator(names, sender),
+        };
+        let other = usize::from(by_initiator);
+        violation.reply = party.map(|party| ReplyMismatch {
+            expected: party.asked_text[other].text().to_owned(),
+            received: Tail::of(header.in_reply_to_text().unwrap_or_default())
+                .text()
+                .to_owned(),
+        });
     }
     violation.participant = participant;
     violation

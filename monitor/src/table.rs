@@ -1,4 +1,7 @@
-//! The table of conversations: indexed by identifier, and listed in the order of their last message.
+//! The table of conversations: indexed by identifier, listed in the order of their last message, and
+//! charged to the peers that began them.
+//!
+//! Several conversations may have one identifier, if their agents differ.
 
 use std::hash::{BuildHasher, RandomState};
 
@@ -6,6 +9,7 @@ use hashbrown::HashTable;
 use smallvec::SmallVec;
 
 use crate::conversation::{Conversation, NONE};
+use crate::names::Name;
 
 /// A list of conversations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,8 +31,21 @@ pub(crate) struct Table {
     free: Vec<u32>,
     by_id: HashTable<u32>,
     hasher: RandomState,
+    /// The lists of all conversations.
     ends: [Ends; 2],
+    accounts: HashTable<Account>,
     len: usize,
+    bytes: usize,
+    begun: u64,
+}
+
+/// The conversations of one peer.
+#[derive(Debug)]
+struct Account {
+    peer: Name,
+    len: usize,
+    bytes: usize,
+    ends: [Ends; 2],
 }
 
 #[derive(Debug)]
@@ -36,20 +53,42 @@ pub(crate) struct Slot {
     pub(crate) conversation: Conversation,
     /// Number of conversations that have used the slot.
     pub(crate) generation: u32,
-    /// Time of the last message, in milliseconds since 1970.
+    /// Time of the last message, in milliseconds of the monotonic clock.
     pub(crate) touched: u64,
     /// First conversation embedded in this one.
     pub(crate) child: u32,
     /// Next conversation with the same parent.
     pub(crate) sibling: u32,
     pub(crate) parent: u32,
+    /// The peer to which the conversation belongs, or [`NONE`] for the monitored agent.
+    pub(crate) peer: Name,
+    /// Bytes with which the peer is charged.
+    cost: usize,
+    /// Number of conversations that began before this one.
+    pub(crate) serial: u64,
     used: bool,
     list: List,
-    /// Value of `touched` when the conversation got its position in the list.
+    /// Value of `touched` when the conversation got its position in the lists.
     listed: u64,
+    /// Neighbors in the list of all conversations and in that of the peer.
+    links: [Link; 2],
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Link {
     older: u32,
     newer: u32,
 }
+
+const UNLINKED: Link = Link {
+    older: NONE,
+    newer: NONE,
+};
+
+/// Index of the link in the list of all conversations.
+const ALL: usize = 0;
+/// Index of the link in the list of the peer.
+const PEERS: usize = 1;
 
 #[derive(Debug, Clone, Copy)]
 struct Ends {
@@ -57,19 +96,29 @@ struct Ends {
     newest: u32,
 }
 
+const EMPTY: Ends = Ends {
+    oldest: NONE,
+    newest: NONE,
+};
+
+impl Slot {
+    pub(crate) fn list(&self) -> List {
+        self.list
+    }
+}
+
 impl Table {
     pub(crate) fn new(hasher: RandomState) -> Self {
-        let none = Ends {
-            oldest: NONE,
-            newest: NONE,
-        };
         Self {
             slots: Vec::new(),
             free: Vec::new(),
             by_id: HashTable::new(),
             hasher,
-            ends: [none; 2],
+            ends: [EMPTY; 2],
+            accounts: HashTable::new(),
             len: 0,
+            bytes: 0,
+            begun: 0,
         }
     }
 
@@ -78,13 +127,30 @@ impl Table {
         self.len
     }
 
+    /// Bytes of all conversations.
+    pub(crate) fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Number and bytes of the conversations of a peer.
+    pub(crate) fn of_peer(&self, peer: Name) -> (usize, usize) {
+        let account = self.accounts.find(spread(peer), |one| one.peer == peer);
+        account.map_or((0, 0), |account| (account.len, account.bytes))
+    }
+
+    /// The conversations with this identifier, at most [`MAX_ALIKE`](crate::limits::MAX_ALIKE).
     #[inline]
-    pub(crate) fn find(&self, id: &str) -> Option<u32> {
-        let same = |at: &u32| {
+    pub(crate) fn find_all<'t>(&'t self, id: &'t str) -> impl Iterator<Item = u32> + 't {
+        let hash = self.hasher.hash_one(id);
+        self.by_id.iter_hash(hash).copied().filter(move |at| {
             self.slot(*at)
                 .is_some_and(|slot| slot.conversation.id == id)
-        };
-        self.by_id.find(self.hasher.hash_one(id), same).copied()
+        })
+    }
+
+    #[cfg(test)]
+    pub(crate) fn find(&self, id: &str) -> Option<u32> {
+        self.find_all(id).next()
     }
 
     pub(crate) fn slot(&self, at: u32) -> Option<&Slot> {
@@ -99,17 +165,37 @@ impl Table {
         Some(self.ends[list as usize].oldest).filter(|at| *at != NONE)
     }
 
-    /// Inserts a new conversation, with a parent or [`NONE`].
-    pub(crate) fn insert(&mut self, id: &str, parent: u32, machine: u16, now: u64) -> u32 {
+    /// The least recently active conversation of a peer in a list.
+    pub(crate) fn oldest_of(&self, peer: Name, list: List) -> Option<u32> {
+        let account = self.accounts.find(spread(peer), |one| one.peer == peer);
+        account
+            .map(|account| account.ends[list as usize].oldest)
+            .filter(|at| *at != NONE)
+    }
+
+    /// Inserts a new conversation of this peer, with a parent or [`NONE`]. The caller holds a reference
+    /// to the name of the peer for it.
+    pub(crate) fn insert(
+        &mut self,
+        id: &str,
+        parent: u32,
+        peer: Name,
+        machine: u16,
+        now: u64,
+    ) -> u32 {
         let at = self.free_slot(id);
         if let Some(slot) = self.slots.get_mut(at as usize) {
             slot.used = true;
             slot.generation = slot.generation.wrapping_add(1);
+            slot.serial = self.begun;
             slot.touched = now;
             (slot.child, slot.sibling, slot.parent) = (NONE, NONE, parent);
+            (slot.peer, slot.cost) = (peer, 0);
             slot.conversation.machine = machine;
         }
         self.len += 1;
+        self.begun += 1;
+        self.account(peer).len += 1;
         if parent == NONE {
             let (slots, hasher) = (&self.slots, &self.hasher);
             self.by_id.insert_unique(hasher.hash_one(id), at, |at| {
@@ -126,7 +212,39 @@ impl Table {
                 slot.child = at;
             }
         }
+        self.charge(at);
         at
+    }
+
+    /// Charges the peer of a conversation with its present size. Returns whether it has grown.
+    pub(crate) fn charge(&mut self, at: u32) -> bool {
+        let Some(slot) = self.slot_mut(at) else {
+            return false;
+        };
+        let cost = size_of::<Slot>() + slot.conversation.allocated();
+        if cost == slot.cost {
+            return false;
+        }
+        let before = std::mem::replace(&mut slot.cost, cost);
+        let peer = slot.peer;
+        self.bytes = (self.bytes + cost).saturating_sub(before);
+        let account = self.account(peer);
+        account.bytes = (account.bytes + cost).saturating_sub(before);
+        cost > before
+    }
+
+    fn account(&mut self, peer: Name) -> &mut Account {
+        let entry =
+            self.accounts
+                .entry(spread(peer), |one| one.peer == peer, |one| spread(one.peer));
+        entry
+            .or_insert(Account {
+                peer,
+                len: 0,
+                bytes: 0,
+                ends: [EMPTY; 2],
+            })
+            .into_mut()
     }
 
     fn free_slot(&mut self, id: &str) -> u32 {
@@ -147,17 +265,21 @@ impl Table {
                 joined: false,
                 reply_to: Vec::new(),
                 unnamed: None,
+                rare: None,
+                charged_names: 0,
             },
             generation: 0,
             touched: 0,
             child: NONE,
             sibling: NONE,
             parent: NONE,
+            peer: NONE,
+            cost: 0,
+            serial: 0,
             used: false,
             list: List::Open,
             listed: 0,
-            older: NONE,
-            newer: NONE,
+            links: [UNLINKED; 2],
         });
         u32::try_from(self.slots.len() - 1).unwrap_or(NONE)
     }
@@ -180,7 +302,7 @@ impl Table {
         let Some(slot) = self.slot(at) else {
             return;
         };
-        let parent = slot.parent;
+        let (parent, peer, cost) = (slot.parent, slot.peer, slot.cost);
         if parent == NONE {
             let hash = self.hasher.hash_one(slot.conversation.id.as_str());
             if let Ok(found) = self.by_id.find_entry(hash, |other| *other == at) {
@@ -194,7 +316,7 @@ impl Table {
             slot.used = false;
             let conversation = &mut slot.conversation;
             // Large buffers are not kept for reuse.
-            if conversation.id.capacity() > 256 {
+            if conversation.id.capacity() > KEPT {
                 conversation.id = String::new();
             }
             conversation.parties = SmallVec::new();
@@ -202,9 +324,22 @@ impl Table {
             conversation.joined = false;
             conversation.reply_to = Vec::new();
             conversation.unnamed = None;
+            conversation.rare = None;
+            conversation.charged_names = 0;
         }
         self.free.push(at);
         self.len -= 1;
+        self.bytes = self.bytes.saturating_sub(cost);
+        let account = self.account(peer);
+        account.len = account.len.saturating_sub(1);
+        account.bytes = account.bytes.saturating_sub(cost);
+        if account.len == 0
+            && let Ok(found) = self
+                .accounts
+                .find_entry(spread(peer), |one| one.peer == peer)
+        {
+            found.remove();
+        }
     }
 
     fn leave_parent(&mut self, at: u32, parent: u32) {
@@ -230,34 +365,61 @@ impl Table {
     }
 
     fn append(&mut self, at: u32, list: List) {
-        let newest = self.ends[list as usize].newest;
-        if let Some(slot) = self.slot_mut(at) {
-            (slot.list, slot.older, slot.newer) = (list, newest, NONE);
-            slot.listed = slot.touched;
+        let Some(slot) = self.slot_mut(at) else {
+            return;
+        };
+        slot.list = list;
+        slot.listed = slot.touched;
+        let peer = slot.peer;
+        for kind in [ALL, PEERS] {
+            let newest = self.ends_of(kind, peer, list).newest;
+            if let Some(slot) = self.slot_mut(at) {
+                slot.links[kind] = Link {
+                    older: newest,
+                    newer: NONE,
+                };
+            }
+            match self.slot_mut(newest) {
+                Some(slot) => slot.links[kind].newer = at,
+                None => self.ends_of(kind, peer, list).oldest = at,
+            }
+            self.ends_of(kind, peer, list).newest = at;
         }
-        match self.slot_mut(newest) {
-            Some(slot) => slot.newer = at,
-            None => self.ends[list as usize].oldest = at,
-        }
-        self.ends[list as usize].newest = at;
     }
 
     fn unlink(&mut self, at: u32) {
-        let Some(&Slot {
-            list, older, newer, ..
-        }) = self.slot(at)
-        else {
+        let Some(slot) = self.slot(at) else {
             return;
         };
-        match self.slot_mut(older) {
-            Some(slot) => slot.newer = newer,
-            None => self.ends[list as usize].oldest = newer,
-        }
-        match self.slot_mut(newer) {
-            Some(slot) => slot.older = older,
-            None => self.ends[list as usize].newest = older,
+        let (peer, list, links) = (slot.peer, slot.list, slot.links);
+        for kind in [ALL, PEERS] {
+            let Link { older, newer } = links[kind];
+            match self.slot_mut(older) {
+                Some(slot) => slot.links[kind].newer = newer,
+                None => self.ends_of(kind, peer, list).oldest = newer,
+            }
+            match self.slot_mut(newer) {
+                Some(slot) => slot.links[kind].older = older,
+                None => self.ends_of(kind, peer, list).newest = older,
+            }
         }
     }
+
+    fn ends_of(&mut self, kind: usize, peer: Name, list: List) -> &mut Ends {
+        let ends = match kind {
+            ALL => &mut self.ends,
+            _ => &mut self.account(peer).ends,
+        };
+        &mut ends[list as usize]
+    }
+}
+
+/// Maximum capacity of the buffer for the identifier of a free slot, in bytes.
+const KEPT: usize = 128;
+
+/// A hash of a name. Names are small numbers that this table gives out, so it needs no key.
+pub(crate) fn spread(name: Name) -> u64 {
+    u64::from(name).wrapping_mul(0x9e37_79b9_7f4a_7c15)
 }
 
 #[cfg(test)]
@@ -269,7 +431,7 @@ mod tests {
         let mut at = table.oldest(list);
         while let Some(slot) = at.and_then(|at| table.slot(at)) {
             names.push(slot.conversation.id.clone());
-            at = Some(slot.newer);
+            at = Some(slot.links[ALL].newer);
         }
         names
     }
@@ -277,7 +439,7 @@ mod tests {
     #[test]
     fn conversations_are_listed_by_age_and_slots_are_reused() {
         let mut table = Table::new(RandomState::new());
-        let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, NONE, 0, 1));
+        let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, NONE, 7, 0, 1));
         assert_eq!(order(&table, List::Open), ["a", "b", "c"]);
         table.touch(a, List::Open, 2_000);
         assert_eq!(order(&table, List::Open), ["b", "c", "a"]);
@@ -295,16 +457,43 @@ mod tests {
         assert_eq!(order(&table, List::Open), ["b", "c"]);
         table.remove(b);
         assert_eq!((table.find("b"), table.find("c")), (None, Some(c)));
-        assert_eq!(table.insert("d", NONE, 0, 6_000), b);
+        assert_eq!(table.insert("d", NONE, 7, 0, 6_000), b);
         assert_eq!(order(&table, List::Open), ["c", "d"]);
         assert_eq!(table.len(), 3);
     }
 
     #[test]
+    fn each_peer_has_a_list_and_is_charged() {
+        let mut table = Table::new(RandomState::new());
+        let a = table.insert("a", NONE, 1, 0, 1);
+        let b = table.insert("b", NONE, 2, 0, 2);
+        let c = table.insert("a", NONE, 1, 0, 3);
+        let child = table.insert("a", c, 1, 0, 3);
+        assert_eq!(table.find_all("a").count(), 2);
+        assert_eq!(table.oldest_of(1, List::Open), Some(a));
+        assert_eq!(table.oldest_of(2, List::Open), Some(b));
+        assert_eq!(table.oldest_of(3, List::Open), None);
+        table.touch(a, List::Ended, 5_000);
+        assert_eq!(table.oldest_of(1, List::Open), Some(c));
+        assert_eq!(table.oldest_of(1, List::Ended), Some(a));
+        let (count, bytes) = table.of_peer(1);
+        assert_eq!(count, 3);
+        assert_eq!(bytes + table.of_peer(2).1, table.bytes());
+        table.slot_mut(a).unwrap().conversation.charged_names = 500;
+        table.charge(a);
+        assert_eq!(table.of_peer(1), (3, bytes + 500));
+        for at in [child, c, a, b] {
+            table.remove(at);
+        }
+        assert_eq!((table.bytes(), table.len()), (0, 0));
+        assert_eq!(table.accounts.len(), 0);
+    }
+
+    #[test]
     fn buffers_of_long_ids_are_not_kept() {
-        for (len, kept) in [(200, true), (256, true), (257, false), (1_000, false)] {
+        for (len, kept) in [(100, true), (128, true), (129, false), (1_000, false)] {
             let mut table = Table::new(RandomState::new());
-            let at = table.insert(&"x".repeat(len), NONE, 0, 1);
+            let at = table.insert(&"x".repeat(len), NONE, 7, 0, 1);
             table.remove(at);
             let left = table.slots[at as usize].conversation.id.capacity();
             assert_eq!(left >= len, kept, "{len}: {left}");
@@ -314,8 +503,8 @@ mod tests {
     #[test]
     fn embedded_conversations_are_linked_to_their_parent() {
         let mut table = Table::new(RandomState::new());
-        let main = table.insert("main", NONE, 0, 1);
-        let children = [0; 3].map(|_| table.insert("main", main, 1, 1));
+        let main = table.insert("main", NONE, 7, 0, 1);
+        let children = [0; 3].map(|_| table.insert("main", main, 7, 1, 1));
         let chain = |table: &Table| {
             let mut found = Vec::new();
             let mut at = table.slot(main).unwrap().child;

@@ -85,6 +85,21 @@ pub struct Violation {
     pub state: Option<String>,
     /// Messages that the state allows.
     pub expected: Vec<Expected>,
+    /// The compared texts, if the kind is [`WrongReply`](ViolationKind::WrongReply).
+    pub reply: Option<ReplyMismatch>,
+    /// The known protocol with a similar name, if the kind is
+    /// [`Misspelled`](ViolationKind::Misspelled).
+    pub similar: Option<String>,
+}
+
+/// An `in-reply-to` that does not match.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct ReplyMismatch {
+    /// The `reply-with` of the message to be answered. Of a long text, only the last 32 bytes.
+    pub expected: String,
+    /// The `in-reply-to` of the message. Of a long text, only the last 32 bytes.
+    pub received: String,
 }
 
 /// The kind of a violation.
@@ -115,6 +130,19 @@ pub enum ViolationKind {
     /// The conversation has too many participants or embedded conversations: see
     /// [`Limits`](crate::Limits).
     TooMany,
+    /// The message exceeds the limits of the monitor, so that it cannot be checked: its
+    /// conversation-id or a name is too long, or it names too many agents. An observer has
+    /// [`Unchecked::TooLarge`] instead.
+    TooLarge,
+    /// The message has a known protocol and no conversation-id.
+    NoConversation,
+    /// The name of the protocol is unknown and similar to a known one.
+    Misspelled,
+    /// The message continues a conversation that the monitor does not know.
+    Unsolicited,
+    /// A rule of the protocol about several participants does not allow the message: for example,
+    /// another participant has already been accepted.
+    Guard,
 }
 
 /// A message that a state allows.
@@ -153,6 +181,14 @@ pub enum Unchecked {
     /// answers to an agent that a `reply-to` names.
     #[error("the conversation, or the protocol within it, began between other agents")]
     BegunElsewhere,
+    /// The message may continue a conversation that the monitor does not know: it began before the
+    /// monitor, the monitor has removed it, or a `reply-to` that the monitor has not seen names the
+    /// agent.
+    #[error("the monitor does not know the beginning of the conversation")]
+    UnknownHistory,
+    /// The message is a not-understood that answers a violation.
+    #[error("the message answers a message that violates its protocol")]
+    AnswersViolation,
     /// The conversation identifier or a name is too long, or the message has too many receivers.
     #[error(
         "the message exceeds the limits of the monitor: its conversation-id or a name is too \
@@ -177,7 +213,21 @@ impl ViolationKind {
             Self::WrongReply => "wrong-reply",
             Self::WrongProtocol => "wrong-protocol",
             Self::TooMany => "too-many",
+            Self::TooLarge => "too-large",
+            Self::NoConversation => "no-conversation",
+            Self::Misspelled => "misspelled",
+            Self::Unsolicited => "unsolicited",
+            Self::Guard => "guard",
         }
+    }
+
+    /// Whether a [`Policy`](crate::Policy) causes the violation, and not the state of a conversation.
+    #[must_use]
+    pub fn depends_on_policy(self) -> bool {
+        matches!(
+            self,
+            Self::NoConversation | Self::Misspelled | Self::Unsolicited
+        )
     }
 }
 
@@ -216,7 +266,25 @@ impl fmt::Display for Violation {
             ViolationKind::TooMany => {
                 "the conversation has more participants or parts than the monitor allows"
             }
+            ViolationKind::TooLarge => {
+                "the message exceeds the limits of the monitor: its conversation-id or a name is \
+                 too long, or it names too many agents"
+            }
+            ViolationKind::NoConversation => "the message has a protocol and no conversation-id",
+            ViolationKind::Misspelled => "the protocol is unknown",
+            ViolationKind::Unsolicited => {
+                "the conversation is unknown, and the message only continues one"
+            }
+            ViolationKind::Guard => {
+                "the states of the other participants do not allow this message"
+            }
         })?;
+        if let Some(similar) = &self.similar {
+            write!(f, "; a known protocol is {}", escape(similar))?;
+        }
+        if let Some(ReplyMismatch { expected, received }) = &self.reply {
+            write!(f, "; expected {expected:?}, received {received:?}")?;
+        }
         match (&self.state, &self.participant) {
             (Some(state), Some(participant)) => {
                 let participant = escape(participant);

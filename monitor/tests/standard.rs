@@ -264,6 +264,8 @@ struct Walk<'t> {
     monitor: Monitor,
     now: SystemTime,
     state: &'static str,
+    /// The state before.
+    before: &'static str,
     last: char,
 }
 
@@ -274,6 +276,7 @@ impl<'t> Walk<'t> {
             monitor: Monitor::observer(Arc::clone(library)),
             now: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
             state: "0",
+            before: "-",
             last: '-',
         }
     }
@@ -291,6 +294,8 @@ impl<'t> Walk<'t> {
         let before = self.state;
         if side == '!' {
             self.now += Duration::from_secs(10);
+            // A timeout does not cross messages.
+            self.before = "-";
             self.state = to;
             return;
         }
@@ -312,6 +317,7 @@ impl<'t> Walk<'t> {
             }
             other => panic!("{name}: {before} {side}{act}: {other:?}"),
         }
+        self.before = before;
         self.state = to;
         self.last = side;
     }
@@ -351,7 +357,12 @@ impl<'t> Walk<'t> {
             "not-understood" => !ended || side != self.last,
             // Allowed for the initiator before it has received the end.
             "cancel" => self.table.cancel && side == '>' && (!over || self.last == '<'),
-            _ => false,
+            _ => {
+                // A message that crossed the last one of the other side.
+                let mut rows = self.table.rows.iter();
+                let allows = |row: &Row| (row.0, row.1, row.2) == (self.before, side, act);
+                side != self.last && rows.any(allows)
+            }
         }
     }
 }
@@ -475,7 +486,7 @@ fn several_participants_have_independent_states() {
     for table in &TABLES {
         let paths = timeless_paths(table);
         let mut walked = 0;
-        for (number, first) in paths.iter().enumerate() {
+        'paths: for (number, first) in paths.iter().enumerate() {
             // The first message goes to all three. Each then takes another path.
             let [second, third] = [1, 3].map(|other| &paths[(number + other) % paths.len()]);
             if first[0] != second[0] || first[0] != third[0] {
@@ -496,7 +507,7 @@ fn several_participants_have_independent_states() {
                 }
             };
             say(&mut walk, "ann", &["ben", "cid", "dan"], first[0].2);
-            let mut ends = [false; 3];
+            let (mut ends, mut leads) = ([false; 3], [false; 3]);
             for at in 1..first.len().max(second.len()).max(third.len()) {
                 for (index, path) in [first, second, third].into_iter().enumerate() {
                     let Some((_, side, act, to)) = path.get(at) else {
@@ -508,6 +519,11 @@ fn several_participants_have_independent_states() {
                     } else {
                         (peer, "ann")
                     };
+                    // Only one bidder leads.
+                    leads[index] = *to == "leads";
+                    if leads.iter().filter(|leads| **leads).count() > 1 {
+                        continue 'paths;
+                    }
                     let (ended, complete) = say(&mut walk, from, &[receiver], act);
                     ends[index] = to.starts_with('F');
                     assert_eq!((ended, complete), (ends[index], ends == [true; 3]));

@@ -24,7 +24,7 @@ static ACTS: LazyLock<Vec<&'static str>> = LazyLock::new(|| {
 const AGENTS: [&str; 6] = ["ann", "ben", "cid", "dan", "host-mts", "arm_.*"];
 
 /// Files with all features of the format of fipa_acl and with the attributes of the namespace.
-const OWN: [(&str, &str); 3] = [
+const OWN: [(&str, &str); 4] = [
     (
         "plain",
         r#"<scxml initial="1">
@@ -69,6 +69,18 @@ const OWN: [(&str, &str); 3] = [
         </state>
         <state id="4"><transition performative="inform" from="b" to="a" target="2"/>
             <transition performative="confirm" from="a" to="b" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#,
+    ),
+    (
+        "guarded",
+        r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2">
+            <transition performative="agree" from="b" to="a" target="3" f:at-most="2"/>
+            <transition performative="refuse" from="b" to="a" target="5"/>
+        </state>
+        <state id="3"><transition performative="confirm" from="a" to="b" target="4" f:when="all"/></state>
+        <state id="4"><transition performative="inform" from="a" to="b" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#,
     ),
 ];

@@ -25,7 +25,9 @@ const MAX_MTS_NAME: usize = 255;
 const MAX_DEADLINE: Duration = MAX_REMAINING;
 /// Upper bound of `mts.queue`, in letters.
 const MAX_QUEUE: usize = 65_536;
-/// Bounds of `mts.queue_bytes`.
+/// Bounds of `monitor.conversations`.
+const MONITORED: RangeInclusive<usize> = 8..=10_000_000;
+/// Bounds of `mts.queue_bytes` and of `monitor.bytes`.
 const QUEUE_BYTES: RangeInclusive<u64> = 64 << 10..=1 << 40;
 /// Maximum number of lines of each of `[routes]`, `access.allow` and `access.deny`.
 const MAX_ROUTES: usize = 256;
@@ -112,6 +114,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.heartbeat(config.monitor.heartbeat);
     found.protocols(&config.monitor.protocols);
     found.platform(&config.platform);
+    found.monitor(&config.monitor);
     found.0
 }
 
@@ -309,6 +312,27 @@ impl Findings {
                 format_args!("cannot be {} bytes", mts.queue_bytes),
                 "use 64KiB to 1TiB",
             );
+        }
+    }
+
+    fn monitor(&mut self, monitor: &super::Monitor) {
+        if !MONITORED.contains(&monitor.conversations) {
+            self.add(
+                &["monitor", "conversations"],
+                format_args!("cannot be {}", monitor.conversations),
+                "use 8 to 10000000 conversations",
+            );
+        }
+        if !QUEUE_BYTES.contains(&monitor.bytes) {
+            self.add(
+                &["monitor", "bytes"],
+                format_args!("cannot be {} bytes", monitor.bytes),
+                "use 64KiB to 1TiB",
+            );
+        }
+        if monitor.idle.is_zero() {
+            let what = format_args!("cannot be 0");
+            self.add(&["monitor", "idle"], what, "use a duration such as 24h");
         }
     }
 

@@ -278,6 +278,27 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.monitor.protocols),
     },
     Key {
+        path: &["monitor", "idle"],
+        shape: Shape::Text,
+        expected: r#"a duration such as "24h""#,
+        write: |config, value| duration(value).map(|idle| config.monitor.idle = idle),
+        read: |config| duration_text(config.monitor.idle),
+    },
+    Key {
+        path: &["monitor", "conversations"],
+        shape: Shape::Plain,
+        expected: "a number of conversations such as 100000",
+        write: |config, value| number(value).map(|most| config.monitor.conversations = most),
+        read: |config| Value::Number(config.monitor.conversations),
+    },
+    Key {
+        path: &["monitor", "bytes"],
+        shape: Shape::Text,
+        expected: r#"a size such as "64MiB""#,
+        write: |config, value| size(value).map(|bytes| config.monitor.bytes = bytes),
+        read: |config| size_text(config.monitor.bytes),
+    },
+    Key {
         path: &["platform", "ams"],
         shape: Shape::Text,
         expected: PLATFORM_AGENT,

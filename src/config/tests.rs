@@ -353,6 +353,9 @@ check = "off"                        # default
 answer = false                       # default
 heartbeat = "5s"                     # default
 protocols = []                       # default
+idle = "1day"                        # default
+conversations = 100000               # default
+bytes = "64MiB"                      # default
 
 [platform]
 ams = true                           # default
@@ -442,6 +445,8 @@ prop_compose! {
             .collect();
         config.monitor.check = check;
         config.monitor.answer = answer;
+        config.monitor.idle = Duration::from_nanos(deadline);
+        config.monitor.bytes = queue_bytes;
         config
     }
 }

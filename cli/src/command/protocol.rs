@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use comfy_table::{Table, presets};
+use fipa::monitor::projection::Projection;
 use fipa::monitor::scxml::MAX_FILE;
 use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
 use fipa_acl::escape;
@@ -76,13 +77,19 @@ JSON:
     ///
     /// Reports every error with its line: unknown and unreachable states, ambiguous transitions, roles
     /// that no agent can take. The exit code is 0 if there is no error.
+    ///
+    /// A protocol with three or more roles is projected onto each role, so that each agent checks what it
+    /// sees. If this is not possible, the protocol is only watched, and the reasons are printed: a role
+    /// that cannot know when to speak, several roles that decide at once, a deadlock, a message that no
+    /// role expects, a state that is not reached.
     #[command(after_help = "\
 Examples:
   fipa protocol check my.scxml
   fipa protocol check protocols/*.scxml --json
 
 JSON:
-  [ { \"file\", \"name\": text or null, \"mistakes\": [ { \"line\", \"what\" } ] } ]")]
+  [ { \"file\", \"name\": text or null, \"mistakes\": [ { \"line\", \"what\" } ],
+      \"defects\": [ text ] } ]")]
     Check {
         /// SCXML files; - for standard input
         #[arg(required = true)]
@@ -240,12 +247,17 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         let mut failures = Vec::new();
         for file in files {
             match read(file) {
-                Ok(machine) => output::text(&format!(
-                    "{}: {}, states: {}, no errors\n",
-                    input::name(file),
-                    escape(machine.name()),
-                    machine.states().len()
-                ))?,
+                Ok(machine) => {
+                    output::text(&format!(
+                        "{}: {}, states: {}, no errors\n",
+                        input::name(file),
+                        escape(machine.name()),
+                        machine.states().len()
+                    ))?;
+                    for defect in defects(&machine) {
+                        output::text(&format!("  only watched: {defect}\n"))?;
+                    }
+                }
                 Err(failure) => failures.push(failure),
             }
         }
@@ -266,13 +278,23 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
             }
         };
         let name_of = read.as_ref().ok().map(Machine::name);
-        results.push(json!({ "file": name, "name": name_of, "mistakes": mistakes }));
+        let defects = read.as_ref().map(defects).unwrap_or_default();
+        results.push(json!({
+            "file": name, "name": name_of, "mistakes": mistakes, "defects": defects
+        }));
     }
     output::json(&results)?;
     if invalid {
         return Err(Failure::already_reported());
     }
     Ok(())
+}
+
+/// The reasons that agents cannot check what they see of the protocol.
+fn defects(machine: &Machine) -> Vec<String> {
+    let defects = Projection::defects(machine).into_iter();
+    let shown = defects.map(|defect| escape(&defect.to_string()).to_string());
+    shown.collect()
 }
 
 fn scope(machine: &Machine) -> &'static str {

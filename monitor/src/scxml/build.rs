@@ -1,14 +1,17 @@
 //! Builds a machine from a document: resolves all names, makes all checks, collects all mistakes.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::document::{self, Document};
 use super::{Ambiguity, Mistake, Problem};
 use crate::act::{Acts, is_word, whole};
 use crate::machine::{
-    After, Cancel, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
+    After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
+use crate::policy::one_edit_apart;
+use crate::projection::Projection;
 
 /// Maximum number of transitions of a state, including those behind optional transitions.
 const MAX_STEPS: usize = 100;
@@ -78,12 +81,19 @@ impl<'d> Builder<'d> {
             initiator: 0,
             initial: initial?,
             states,
+            projection: None,
         };
         self.bound_roles(&machine);
         self.skip_optional(&mut machine);
         self.reachable(&machine);
         self.unambiguous(&machine);
         machine.initiator = self.beginner(&machine)?;
+        if machine.scope == Scope::Conversation
+            && machine.roles.len() > 2
+            && self.mistakes.is_empty()
+        {
+            machine.projection = Projection::new(&machine).ok().map(Arc::new);
+        }
         Some(machine)
     }
 
@@ -176,13 +186,35 @@ impl<'d> Builder<'d> {
         let acts = acts.and_then(|text| self.acts(read.line, text));
         let from = from.and_then(|text| self.roles(read.line, "from", text));
         let to = to.and_then(|text| self.roles(read.line, "to", text));
+        let guard = self.guard(read);
         Some(Transition {
             acts: acts?,
             from: from?,
             to: to?,
             target: target?,
             optional,
+            guard,
         })
+    }
+
+    fn guard(&mut self, read: &'d document::Transition) -> Guard {
+        let mut guard = Guard::default();
+        if let Some(text) = &read.at_most {
+            match text.parse::<u16>() {
+                Ok(most @ 1..) => guard.at_most = most,
+                _ => self.value(read.line, "at-most", text, "a number from 1 to 65535"),
+            }
+        }
+        match read.when.as_deref() {
+            None => {}
+            Some("all") => guard.when_all = true,
+            Some(other) => self.value(read.line, "when", other, "all"),
+        }
+        let per_participant = self.document.scope.as_deref() == Some("participant");
+        if guard != Guard::default() && !per_participant {
+            self.wrong(read.line, Problem::GuardOfScope);
+        }
+        guard
     }
 
     fn timeout(&mut self, read: &'d document::Transition, after: &str) -> Option<Timeout> {
@@ -542,24 +574,4 @@ fn duration(text: &str) -> Option<Duration> {
     };
     let ms = number.parse::<u64>().ok()?.checked_mul(factor)?;
     (1..=DAY).contains(&ms).then_some(Duration::from_millis(ms))
-}
-
-/// Whether the texts differ in one inserted, omitted or changed character.
-fn one_edit_apart(one: &str, other: &str) -> bool {
-    let (short, long): (Vec<char>, Vec<char>) = if one.len() <= other.len() {
-        (one.chars().collect(), other.chars().collect())
-    } else {
-        (other.chars().collect(), one.chars().collect())
-    };
-    let same = short.iter().zip(&long).take_while(|(a, b)| a == b).count();
-    // All names of one or two characters would be near.
-    if short.len() < 3 {
-        return false;
-    }
-    let (short_rest, long_rest) = (short.get(same + 1..), long.get(same + 1..));
-    match long.len().checked_sub(short.len()) {
-        Some(0) => short_rest == long_rest,
-        Some(1) => short.get(same..) == long_rest,
-        _ => false,
-    }
 }

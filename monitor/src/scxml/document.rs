@@ -51,6 +51,8 @@ pub(super) struct Transition {
     pub(super) target: String,
     pub(super) optional: Option<String>,
     pub(super) after: Option<String>,
+    pub(super) at_most: Option<String>,
+    pub(super) when: Option<String>,
 }
 
 #[derive(Debug, Default)]
@@ -221,6 +223,7 @@ impl<'a> Reader<'a> {
             ..Transition::default()
         };
         let mut target = None;
+        const KNOWN: &str = "optional, after, at-most, when";
         for (ours, key, value) in self.attributes(element)? {
             let value = Some(value);
             match (ours, key.as_ref()) {
@@ -230,7 +233,9 @@ impl<'a> Reader<'a> {
                 (false, "target") => target = value,
                 (true, "optional") => transition.optional = value,
                 (true, "after") => transition.after = value,
-                (true, other) => return Err(self.unknown("transition", other, "optional, after")),
+                (true, "at-most") => transition.at_most = value,
+                (true, "when") => transition.when = value,
+                (true, other) => return Err(self.unknown("transition", other, KNOWN)),
                 (false, _) => {}
             }
         }

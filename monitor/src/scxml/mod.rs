@@ -27,6 +27,8 @@
 //! | `scxml` | `cancel` | agents that may cancel: `initiator` (default in a file with this namespace), `anyone` (default in a file without it), `nobody` |
 //! | `transition` | `optional` | `yes`: the transition may be skipped |
 //! | `transition` | `after` | makes the transition a timeout, without a performative and roles: it is taken when no message has come by the `reply-by` of the last one (`reply-by`), or within a span (`500ms`, `30s`, `10min`, `1h`) |
+//! | `transition` | `at-most` | maximum number of participants in the target state at the same time, for `scope="participant"` |
+//! | `transition` | `when` | `all`: each participant must be in a state with the same transition or in its target, for `scope="participant"`; a participant whose conversation was canceled or failed does not count |
 //!
 //! [`crate::Monitor`] runs the machines.
 
@@ -215,6 +217,9 @@ pub enum Problem {
     /// A protocol with a state for each participant does not have two roles.
     #[error("scope=\"participant\" needs two roles, but there are {0}: {1}")]
     RolesOfScope(usize, String),
+    /// A transition has a guard, but there is one state for all participants.
+    #[error("at-most and when need scope=\"participant\"")]
+    GuardOfScope,
     /// Several roles can send the first message.
     #[error("the first message has several senders: {0}; only one role may begin")]
     Beginners(String),

@@ -184,12 +184,19 @@ fn valid_deadlines_are_kept_among_many_stale_ones() {
 
 #[test]
 fn the_number_of_agents_in_reply_to_is_bounded() {
+    let names = |from: usize, to| (from..=to).map(|number| format!("d{number}"));
     let mut stage = Stage::observer();
-    let names = (1..=65).map(|number| format!("d{number}"));
-    stage.right(request("request ann>ben").reply_to(names));
-    let too_many = stage.wrong(request("agree ben>d65"));
-    assert_eq!(too_many.kind, Kind::WrongReceiver);
+    let too_large = request("request ann>ben").reply_to(names(1, 65));
+    assert_eq!(
+        stage.check(&too_large),
+        Verdict::Unchecked(Unchecked::TooLarge)
+    );
+    stage.right(request("request ann>ben").reply_to(names(1, 64)));
     stage.right(request("agree ben>d64"));
+    // Several messages cannot name more either.
+    let more = stage.wrong(request("inform ben>d64").reply_to(["one more"]));
+    assert_eq!(more.kind, Kind::TooMany);
+    stage.right(request("inform ben>d64").reply_to(["d1"]));
 }
 
 #[test]
@@ -287,10 +294,12 @@ fn the_initiator_may_begin_embedded_protocols() {
         <state id="done" final="yes"/></scxml>"#,
     );
     stage.right(own("subscribe ann>ben"));
-    let other = stage.wrong(request("request ben>cid"));
-    assert_eq!(other.kind, Kind::WrongProtocol);
     assert_eq!(stage.right(request("request ann>cid")), "requested");
     assert_eq!(stage.right(request("inform cid>ann")), "done");
+    // The other role cannot: this is another conversation with the same identifier.
+    let separate = request("request ben>dan");
+    assert_eq!(stage.right(separate), "requested");
+    assert_eq!(stage.monitor.len(), 3);
 }
 
 #[test]
@@ -370,7 +379,7 @@ fn the_end_of_an_embedded_conversation_does_not_end_the_outer_one() {
     stage.right(broker("agree bro>ann"));
     stage.right(request("request bro>ben"));
     stage.right(request("inform ben>bro"));
-    // A conversation is removed one minute after its end, or one hour after its last message.
+    // A conversation is removed one minute after its end, or a day after its last message.
     assert_eq!(stage.pass(120), []);
     stage.right(broker("inform bro>ann"));
 }

@@ -1,9 +1,9 @@
 //! A reference implementation of the rules, written for correctness and not for speed. It shares only
 //! the transitions of the files with the monitor. It keeps all messages and decides from them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet, VecDeque};
 
-use fipa_monitor::{Library, Machine, Scope};
+use fipa_monitor::{Cancel, Library, Machine, Scope};
 
 mod talk;
 
@@ -40,7 +40,12 @@ pub(crate) type Overview<'l> = (&'l Machine, Vec<&'static str>, Vec<(&'static st
 pub(crate) struct Reference<'l> {
     library: &'l Library,
     agent: Option<&'static str>,
-    talks: HashMap<String, Conversation<'l>>,
+    /// Conversations by their identifiers, in the order of their beginnings.
+    talks: HashMap<String, Vec<Conversation<'l>>>,
+    /// Identifiers of conversations that the monitor does not know any more.
+    removed: HashSet<String>,
+    /// The last refused messages: identifier, sender, receiver.
+    refused: VecDeque<(String, &'static str, &'static str)>,
 }
 
 struct Conversation<'l> {
@@ -56,6 +61,12 @@ struct Conversation<'l> {
     designated: Vec<&'static str>,
     /// Whether it began between other agents, which answer the monitored agent.
     joined: bool,
+    /// Participants and the agents that continue in their places.
+    delegates: Vec<(&'static str, &'static str)>,
+    /// Other states to which the first message may have led.
+    alternatives: Vec<String>,
+    /// Time of the last accepted message.
+    touched: u64,
     /// Embedded conversations, the latest first.
     inner: Vec<Self>,
 }
@@ -66,6 +77,8 @@ impl<'l> Reference<'l> {
             library,
             agent,
             talks: HashMap::new(),
+            removed: HashSet::new(),
+            refused: VecDeque::new(),
         }
     }
 
@@ -75,7 +88,7 @@ impl<'l> Reference<'l> {
 
     /// Returns the states of a conversation, to choose a message that fits.
     pub(crate) fn states(&self, id: &str) -> Option<Overview<'l>> {
-        let conversation = self.talks.get(id)?;
+        let conversation = self.talks.get(id)?.last()?;
         let talks = conversation.talks.iter();
         let states = talks.map(|(peer, talk)| (*peer, talk.name()));
         let designated = conversation.designated.iter().copied();
@@ -84,39 +97,204 @@ impl<'l> Reference<'l> {
     }
 
     pub(crate) fn check(&mut self, words: &Words, now: u64) -> ReferenceVerdict {
-        if let Some(conversation) = self.talks.get_mut(&words.id) {
-            let library = self.library;
-            return conversation
-                .check_any(library, words, now)
-                .unwrap_or_else(ReferenceVerdict::Violation);
+        let mut own = words.clone();
+        own.to = Vec::new();
+        for name in &words.to {
+            if !own.to.contains(name) {
+                own.to.push(name);
+            }
         }
-        let named = words
-            .protocol
-            .as_ref()
-            .and_then(|name| self.library.find(name));
-        let Some(machine) = named else {
+        // The agent is a member of the group that the message names.
+        if let Some(agent) = self.agent
+            && words.from != agent
+            && !own.to.contains(&agent)
+        {
+            own.to = vec![agent];
+        }
+        let verdict = self.check_own(&own, now);
+        if !matches!(verdict, ReferenceVerdict::Violation(_)) {
+            return verdict;
+        }
+        for name in &words.to {
+            if words.act != "not-understood" {
+                let key = (words.id.clone(), words.from, *name);
+                self.refused.push_back(key);
+                if self.refused.len() > 1_024 {
+                    self.refused.pop_front();
+                }
+            }
+        }
+        if words.act == "not-understood" {
+            let answered = |(id, from, to): &(String, &str, &str)| {
+                *id == words.id && *to == words.from && words.to.contains(from)
+            };
+            if let Some(at) = self.refused.iter().position(answered) {
+                self.refused.remove(at);
+                return ReferenceVerdict::Unchecked;
+            }
+        }
+        verdict
+    }
+
+    fn check_own(&mut self, words: &Words, now: u64) -> ReferenceVerdict {
+        let library = self.library;
+        let alike = self.talks.entry(words.id.clone()).or_default();
+        let ranked = alike.iter().enumerate();
+        let best = ranked
+            .map(|(at, conversation)| {
+                let rank = conversation.rank(words);
+                let joined = rank == 0 && conversation.joined;
+                (rank, joined, conversation.has_protocol(library, words), at)
+            })
+            .max();
+        let at = match best {
+            Some((2, .., at)) => Some(at),
+            Some((.., at)) if !words.begins_in(library) => {
+                Some(at).filter(|_| !self.removed.contains(&words.id))
+            }
+            Some((.., at)) => Some(at).filter(|at| !alike[*at].is_another(library, words)),
+            None => None,
+        };
+        if let Some(at) = at {
+            let conversation = &mut alike[at];
+            let verdict = match conversation.check_any(library, words, now) {
+                // It may have begun before the monitor.
+                Err((_, true)) if !conversation.alternatives.is_empty() => {
+                    alike.remove(at);
+                    self.removed.insert(words.id.clone());
+                    return ReferenceVerdict::Unchecked;
+                }
+                Err((wrong, _)) => ReferenceVerdict::Violation(wrong),
+                Ok(verdict) => verdict,
+            };
+            return verdict;
+        }
+        let named = words.protocol.as_ref();
+        let Some(machine) = named.and_then(|name| library.find(name)) else {
             return ReferenceVerdict::Unchecked;
         };
-        let mut conversation = Conversation::new(machine, words.from, self.agent);
-        match conversation.check(words, now) {
-            Ok(verdict) => {
-                self.talks.insert(words.id.clone(), conversation);
-                verdict
+        if begins(machine, words.act) {
+            let mut conversation = Conversation::new(machine, words.from, self.agent);
+            if self.removed.contains(&words.id) {
+                conversation.alternatives = later_targets(machine, words.act);
             }
-            Err(_) => match self.agent {
-                Some(agent)
-                    if agent != words.from
-                        && is_answer(machine, words.act)
-                        && !begins(machine, words.act) =>
-                {
-                    let joined = Conversation::joined(machine, agent, words);
-                    self.talks.insert(words.id.clone(), joined);
-                    ReferenceVerdict::Unchecked
+            evict_alike(alike, &mut self.removed, words, self.agent);
+            return match conversation.check(words, now) {
+                Ok(verdict) => {
+                    alike.push(conversation);
+                    verdict
                 }
-                _ => ReferenceVerdict::Violation("not-opened"),
-            },
+                Err(_) => ReferenceVerdict::Violation("not-opened"),
+            };
+        }
+        if !may_follow(machine, words.act) {
+            return ReferenceVerdict::Violation("not-opened");
+        }
+        match self.agent {
+            Some(agent) if agent != words.from => {
+                if is_answer(machine, words.act) {
+                    evict_alike(alike, &mut self.removed, words, self.agent);
+                    let joined = Conversation::joined(machine, agent, words, now);
+                    alike.push(joined);
+                } else {
+                    self.removed.insert(words.id.clone());
+                }
+                ReferenceVerdict::Unchecked
+            }
+            _ if self.removed.contains(&words.id) => ReferenceVerdict::Unchecked,
+            _ => ReferenceVerdict::Violation("not-opened"),
         }
     }
+}
+
+impl Words {
+    /// Whether the message can begin its protocol.
+    fn begins_in(&self, library: &Library) -> bool {
+        let named = self.protocol.as_ref();
+        let machine = named.and_then(|name| library.find(name));
+        machine.is_some_and(|machine| begins(machine, self.act))
+    }
+}
+
+/// Keeps at most eight conversations with one identifier.
+fn evict_alike(
+    alike: &mut Vec<Conversation<'_>>,
+    removed: &mut HashSet<String>,
+    words: &Words,
+    agent: Option<&str>,
+) {
+    if alike.len() < 8 {
+        return;
+    }
+    let mut of_peers = alike.iter().enumerate().filter(|(_, one)| {
+        // Those that the monitored agent began stay.
+        agent.is_none() || one.joined || Some(one.initiator) != agent
+    });
+    let first = of_peers.next().expect("an agent has fewer identifiers");
+    let oldest = of_peers.fold(first, |oldest, other| {
+        if other.1.touched < oldest.1.touched {
+            other
+        } else {
+            oldest
+        }
+    });
+    let at = oldest.0;
+    removed.insert(words.id.clone());
+    alike.remove(at);
+}
+
+/// Whether the performative may come after the first message.
+fn may_follow(machine: &Machine, act: &str) -> bool {
+    let initial = machine.initial().id();
+    let all = || {
+        let states = machine.states().iter();
+        states.flat_map(|state| state.transitions())
+    };
+    let returns = all().any(|step| machine.target(step) == initial);
+    let later = machine.states().iter().any(|state| {
+        (returns || state.id() != initial)
+            && (options(machine, state.id())
+                .iter()
+                .any(|step| matches(step.performative(), act))
+                || embedded(machine, state.id())
+                    .iter()
+                    .any(|sub| sub.proxied_to().is_some()))
+    });
+    later
+        || ["not-understood", "failure", "inform"].contains(&act)
+        || act == "cancel" && machine.cancel() != Cancel::Nobody
+}
+
+/// The subprotocols of a state and those behind optional transitions.
+fn embedded<'m>(machine: &'m Machine, id: &str) -> Vec<&'m fipa_monitor::Subprotocol> {
+    let here = state(machine, id);
+    let mut all: Vec<_> = here.subprotocols().iter().collect();
+    for step in here.transitions().iter().filter(|step| step.is_optional()) {
+        all.extend(embedded(machine, machine.target(step)));
+    }
+    all
+}
+
+/// The states to which a message like the first one leads later.
+fn later_targets(machine: &Machine, act: &str) -> Vec<String> {
+    let first = options(machine, machine.initial().id());
+    let first = first.iter().find(|step| matches(step.performative(), act));
+    let first = first.expect("it begins the protocol");
+    let overlap = |one: &str, other: &str| {
+        let mut roles = machine.roles().iter();
+        one == ".*" || other == ".*" || roles.any(|role| matches(one, role) && matches(other, role))
+    };
+    let states = machine.states().iter();
+    let later = states.filter(|state| state.id() != machine.initial().id());
+    let steps = later.flat_map(|state| state.transitions());
+    let mut targets: Vec<String> = steps
+        .filter(|step| matches(step.performative(), act) && overlap(step.from(), first.from()))
+        .map(|step| machine.target(step).to_owned())
+        .filter(|target| target != machine.target(first))
+        .collect();
+    targets.sort();
+    targets.dedup();
+    targets
 }
 
 fn begins(machine: &Machine, act: &str) -> bool {
@@ -148,21 +326,86 @@ impl<'l> Conversation<'l> {
             roles: Vec::new(),
             designated: Vec::new(),
             joined: false,
+            delegates: Vec::new(),
+            alternatives: Vec::new(),
+            touched: 0,
             inner: Vec::new(),
         }
     }
 
-    fn joined(machine: &'l Machine, agent: &'static str, words: &Words) -> Self {
+    fn joined(machine: &'l Machine, agent: &'static str, words: &Words, now: u64) -> Self {
         let mut conversation = Self::new(machine, agent, Some(agent));
         conversation.joined = true;
-        conversation.learn(words);
+        conversation.learn(words, now);
         conversation
     }
 
-    fn learn(&mut self, words: &Words) {
-        let talk = Talk::joined(self.machine, words);
+    /// 2 if the sender and a receiver take part, 1 if the sender does.
+    fn rank(&self, words: &Words) -> u8 {
+        let all = || std::iter::once(self).chain(&self.inner);
+        let has = |one: &Self, name: &str| one.takes_part(name) || one.designated.contains(&name);
+        if !all().any(|one| one.multicast.is_some() || has(one, words.from)) {
+            return 0;
+        }
+        let receives = |one: &Self| words.to.iter().any(|name| has(one, name));
+        let linked = |one: &Self| {
+            let multicast = one.multicast.is_some();
+            if one.machine.scope() == Scope::Conversation {
+                return (multicast || has(one, words.from)) && receives(one);
+            }
+            let leads = |name: &str| one.initiator == name || one.designated.contains(&name);
+            let answers = |name: &str| multicast || one.place(name).is_some();
+            leads(words.from) && words.to.iter().any(|name| answers(name))
+                || answers(words.from) && words.to.iter().any(|name| leads(name))
+        };
+        let across = !self.inner.is_empty() && all().any(receives);
+        1 + u8::from(all().any(linked) || across)
+    }
+
+    fn has_protocol(&self, library: &'l Library, words: &Words) -> bool {
+        let Some(name) = &words.protocol else {
+            return true;
+        };
+        let mut all = std::iter::once(self).chain(&self.inner);
+        all.any(|one| one.machine.is_called(name) || one.may_begin(library, name, words.from))
+    }
+
+    /// Whether the message begins another conversation.
+    fn is_another(&self, library: &'l Library, words: &Words) -> bool {
+        let Some(name) = &words.protocol else {
+            return false;
+        };
+        let Some(machine) = library.find(name) else {
+            return false;
+        };
+        let leads = |one: &Self, main: bool| {
+            !one.joined
+                && (main && one.initiator == words.from || one.designated.contains(&words.from))
+        };
+        let held_back = leads(self, true)
+            || self.inner.iter().any(|inner| leads(inner, false))
+            || std::iter::once(self)
+                .chain(&self.inner)
+                .any(|one| one.may_begin(library, name, words.from));
+        begins(machine, words.act) && !held_back
+    }
+
+    fn place(&self, name: &str) -> Option<usize> {
+        place(&self.talks, name).or_else(|| {
+            let mut delegates = self.delegates.iter();
+            let (peer, _) = delegates.find(|(_, delegate)| *delegate == name)?;
+            place(&self.talks, peer)
+        })
+    }
+
+    fn learn(&mut self, words: &Words, now: u64) {
+        self.touched = now;
+        let talk = Talk::joined(self.machine, words, self.joined);
         let peer = match self.machine.scope() {
-            Scope::Participant => words.from,
+            Scope::Participant => match self.place(words.from) {
+                Some(at) => self.talks[at].0,
+                None => words.from,
+            },
             _ => "",
         };
         match self.talks.iter_mut().find(|(known, _)| *known == peer) {
@@ -181,6 +424,7 @@ impl<'l> Conversation<'l> {
         &mut self,
         words: &Words,
         wrong: &'static str,
+        now: u64,
     ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let asked = self.may_continue_elsewhere() && self.takes_part(words.from);
@@ -203,10 +447,13 @@ impl<'l> Conversation<'l> {
                             && others.any(|role| matches(step.to(), role))
                     }))
         } else if is_answer(machine, words.act) {
-            self.learn(words);
+            self.learn(words, now);
             true
         } else {
-            self.joined && begins(machine, words.act)
+            let cancels = machine.cancel() != Cancel::Nobody;
+            self.joined
+                && (begins(machine, words.act)
+                    || cancels && ["inform", "failure"].contains(&words.act))
         };
         if excused {
             Ok(ReferenceVerdict::Unchecked)
@@ -221,14 +468,29 @@ impl<'l> Conversation<'l> {
         library: &'l Library,
         words: &Words,
         now: u64,
-    ) -> Result<ReferenceVerdict, &'static str> {
+    ) -> Result<ReferenceVerdict, (&'static str, bool)> {
         let name = match &words.protocol {
-            Some(name) if !self.machine.is_called(name) => name,
+            Some(name) if !self.machine.is_called(name) => name.clone(),
             _ => {
                 let verdict = self.check(words, now);
-                return verdict.or_else(|wrong| self.elsewhere(words, wrong));
+                let verdict = verdict.or_else(|wrong| self.elsewhere(words, wrong, now));
+                return verdict.map_err(|wrong| (wrong, true));
             }
         };
+        let verdict = self.check_inner(library, &name, words, now);
+        if matches!(&verdict, Ok(ReferenceVerdict::Accepted(..))) {
+            self.touched = now;
+        }
+        verdict.map_err(|wrong| (wrong, false))
+    }
+
+    fn check_inner(
+        &mut self,
+        library: &'l Library,
+        name: &str,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let may_begin = self.may_begin(library, name, words.from)
             || self
                 .inner
@@ -249,7 +511,9 @@ impl<'l> Conversation<'l> {
                 return Err(wrong);
             }
             if let Some((at, wrong)) = open {
-                return self.inner[at].elsewhere(words, wrong);
+                let verdict = self.inner[at].elsewhere(words, wrong, now);
+                self.touched = self.touched.max(self.inner[at].touched);
+                return verdict;
             }
             if let Some(agent) = self.agent
                 && !self.takes_part(words.from)
@@ -258,7 +522,8 @@ impl<'l> Conversation<'l> {
                 let machine = library.find(name).filter(|_| words.from != agent);
                 let machine = machine.filter(|machine| is_answer(machine, words.act));
                 if let Some(machine) = machine.filter(|_| self.inner.len() < 64) {
-                    let joined = Conversation::joined(machine, agent, words);
+                    let joined = Conversation::joined(machine, agent, words, now);
+                    self.touched = now;
                     self.inner.insert(0, joined);
                 }
                 return Ok(ReferenceVerdict::Unchecked);
@@ -317,7 +582,7 @@ impl<'l> Conversation<'l> {
 
     fn takes_part(&self, agent: &str) -> bool {
         agent == self.initiator
-            || self.talks.iter().any(|(peer, _)| *peer == agent)
+            || self.place(agent).is_some()
             || self.roles.iter().any(|(_, bound)| *bound == agent)
     }
 
@@ -358,10 +623,24 @@ impl Conversation<'_> {
         for (_, talk) in &mut self.talks {
             talk.expire(self.machine, now);
         }
-        match self.machine.scope() {
+        let verdict = match self.machine.scope() {
             Scope::Participant => self.check_per_participant(words, now),
             _ => self.check_per_conversation(words, now),
+        }?;
+        self.touched = now;
+        if let ReferenceVerdict::Accepted(_, [false, ..]) = &verdict {
+            let machine = self.machine;
+            let before = std::mem::take(&mut self.alternatives);
+            let fitting = before.iter().filter_map(|id| {
+                let all = options(machine, id);
+                let step = all
+                    .iter()
+                    .find(|step| matches(step.performative(), words.act))?;
+                Some(machine.target(step).to_owned())
+            });
+            self.alternatives = fitting.collect();
         }
+        Ok(verdict)
     }
 
     fn view<'w>(&self, words: &'w Words, by_initiator: bool) -> View<'w> {
@@ -396,7 +675,7 @@ impl Conversation<'_> {
         let designated = self.designated.contains(&words.from);
         if words.from == self.initiator {
             self.check_initiator(words, now)
-        } else if self.multicast.is_some() || place(&self.talks, words.from).is_some() {
+        } else if self.multicast.is_some() || self.place(words.from).is_some() {
             match self.check_participant(words, now) {
                 // The other of the two parts of the sender may fit.
                 Err(wrong) if designated => {
@@ -421,7 +700,7 @@ impl Conversation<'_> {
         now: u64,
     ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
-        let known = place(&self.talks, words.from);
+        let known = self.place(words.from);
         let talk = match (known, &self.multicast) {
             (Some(at), _) => self.talks[at].1.clone(),
             (None, Some(talk)) => talk.clone(),
@@ -432,11 +711,15 @@ impl Conversation<'_> {
             return Err("wrong-receiver");
         }
         let step = judge(machine, &talk, &self.view(words, false))?;
+        if let Some(at) = known {
+            self.guards(&[(self.talks[at].0, &step)], words, false)?;
+        }
         let at = known.unwrap_or_else(|| {
             self.talks.push((words.from, talk));
             self.talks.len() - 1
         });
         let (opened, late) = self.talks[at].1.go(machine, words, false, step, now);
+        self.delegate(words, self.talks[at].0);
         Ok(self.verdict(Some(at), opened || known.is_none(), late))
     }
 
@@ -459,7 +742,9 @@ impl Conversation<'_> {
             if witness.is_some_and(|agent| agent != *name && !name.contains('*')) {
                 continue;
             }
-            let talk = match place(&self.talks, name) {
+            let place = self.place(name);
+            let peer = place.map_or(*name, |at| self.talks[at].0);
+            let talk = match place {
                 Some(at) => self.talks[at].1.clone(),
                 None if name.contains('*') && self.multicast.is_some() => {
                     self.multicast.clone().expect("there is one")
@@ -475,12 +760,14 @@ impl Conversation<'_> {
             {
                 (side, step) = (false, Ok(other));
             }
-            if !steps.iter().any(|(known, ..)| known == name) {
-                steps.push((*name, side, step?));
+            if !steps.iter().any(|(known, ..)| *known == peer) {
+                steps.push((peer, side, step?));
             } else {
                 step?;
             }
         }
+        let led: Vec<(&str, &Step)> = steps.iter().map(|(name, _, step)| (*name, step)).collect();
+        self.guards(&led, words, steps.first().is_none_or(|(_, side, _)| *side))?;
         let (mut opened, mut late, mut first) = (false, false, None);
         // A continuing agent may only have sent to itself, as a participant.
         let speaks = words.from == self.initiator || steps.iter().any(|(_, side, _)| *side);
@@ -505,8 +792,58 @@ impl Conversation<'_> {
         }
         if speaks {
             self.designate(words);
+        } else {
+            self.delegate(words, words.from);
         }
         Ok(self.verdict_in(first, opened, late))
+    }
+
+    /// Adds the agents that a participant names in `reply-to`.
+    fn delegate(&mut self, words: &Words, peer: &'static str) {
+        for name in &words.reply_to {
+            if *name != self.initiator && self.place(name).is_none() {
+                self.delegates.push((peer, name));
+            }
+        }
+    }
+
+    /// Checks the rules about all participants.
+    fn guards(
+        &self,
+        steps: &[(&str, &Step)],
+        words: &Words,
+        by_initiator: bool,
+    ) -> Result<(), &'static str> {
+        let guarded = steps.iter().find(|(_, step)| step.guard != (None, false));
+        let Some((_, Step { spot, guard, .. })) = guarded else {
+            return Ok(());
+        };
+        if self.joined || !self.designated.is_empty() {
+            return Ok(());
+        }
+        let moved = |peer: &str| steps.iter().any(|(name, _)| *name == peer);
+        let others = || self.talks.iter().filter(|(peer, _)| !moved(peer));
+        let there = others().filter(|(_, talk)| talk.spot == *spot).count();
+        let reach = steps.iter().filter(|(_, step)| step.spot == *spot).count();
+        if guard
+            .0
+            .is_some_and(|most| there + reach > usize::from(most))
+        {
+            return Err("guard");
+        }
+        let view = self.view(words, by_initiator);
+        let ready = |talk: &Talk| match &talk.spot {
+            Spot::At(id) => {
+                let all = options(self.machine, id);
+                let step = all.iter().find(|step| view.fits(step));
+                talk.spot == *spot || step.is_some_and(|step| step.needs_all())
+            }
+            _ => true,
+        };
+        if guard.1 && !others().all(|(_, talk)| ready(talk)) {
+            return Err("guard");
+        }
+        Ok(())
     }
 
     fn designate(&mut self, words: &Words) {
@@ -521,9 +858,7 @@ impl Conversation<'_> {
     /// violation.
     fn reported_from_outside(&mut self, words: &Words) -> Result<ReferenceVerdict, &'static str> {
         let takes_part = |name: &str| {
-            name == self.initiator
-                || self.designated.contains(&name)
-                || place(&self.talks, name).is_some()
+            name == self.initiator || self.designated.contains(&name) || self.place(name).is_some()
         };
         if words.act != "failure" || !words.to.iter().all(|name| takes_part(name)) {
             return Err("stranger");
@@ -632,6 +967,20 @@ impl Conversation<'_> {
         let (opened, late) = self.talks[0].1.go(machine, words, by_initiator, step, now);
         if by_initiator {
             self.designate(words);
+        } else {
+            let held: Vec<String> = self
+                .roles
+                .iter()
+                .filter(|(_, agent)| *agent == words.from)
+                .map(|(role, _)| role.clone())
+                .collect();
+            for name in &words.reply_to {
+                for role in &held {
+                    if !self.roles.contains(&(role.clone(), *name)) {
+                        self.roles.push((role.clone(), *name));
+                    }
+                }
+            }
         }
         Ok(self.verdict(Some(0), opened, late))
     }

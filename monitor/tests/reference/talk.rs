@@ -10,11 +10,11 @@ use super::Words;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Spot {
     At(String),
-    NotUnderstood,
+    /// The state before.
+    NotUnderstood(String),
     Cancelling(String),
-    Cancelled {
-        one_more: bool,
-    },
+    /// The state behind a message that may have crossed the cancel: its answer may still come.
+    Cancelled(Option<String>),
     Undelivered(Box<Spot>),
     /// The monitored agent does not know the state.
     Elsewhere,
@@ -26,6 +26,8 @@ pub(super) struct Talk {
     pub(super) previous: Spot,
     pub(super) said: Vec<SentMessage>,
     pub(super) due: Option<u64>,
+    /// Whether a failure that may have crossed a cancel was taken for the answer to it.
+    pub(super) echo: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -37,14 +39,23 @@ pub(super) struct SentMessage {
     pub(super) cancels: bool,
     /// Sent before the cancel of the other side was received.
     pub(super) crossed: bool,
+    /// The answer to a cancel.
+    pub(super) answers_cancel: bool,
 }
 
 pub(super) struct Step {
     pub(super) spot: Spot,
     pub(super) roles: Option<(String, String)>,
     pub(super) crossed: bool,
-    /// Answers the message before the last one.
+    /// Answers a message before the last one.
     pub(super) void: bool,
+    /// The transition has a rule about all participants.
+    pub(super) guard: (Option<u16>, bool),
+    /// The state that allows the message, after an undelivered one.
+    pub(super) before: Option<Spot>,
+    pub(super) echo: bool,
+    /// Answers a cancel, and is no step of the protocol itself.
+    pub(super) answers_cancel: bool,
 }
 
 pub(super) fn to(spot: Spot) -> Step {
@@ -53,6 +64,10 @@ pub(super) fn to(spot: Spot) -> Step {
         roles: None,
         crossed: false,
         void: false,
+        guard: (None, false),
+        before: None,
+        echo: false,
+        answers_cancel: false,
     }
 }
 
@@ -107,6 +122,7 @@ impl Talk {
             spot,
             said: Vec::new(),
             due: None,
+            echo: false,
         }
     }
 
@@ -118,13 +134,16 @@ impl Talk {
 
     pub(super) fn last_of(&self, initiator: bool) -> Option<&SentMessage> {
         let mut said = self.said.iter().rev();
-        said.find(|said| said.by_initiator == initiator && !said.cancels)
+        said.find(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel)
     }
 
-    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&SentMessage> {
+    /// Whether one of the six questions before the last message has this `reply-with`.
+    pub(super) fn asked_earlier(&self, initiator: bool, text: &str) -> bool {
         let said = self.said.iter().rev();
-        let mut own = said.filter(|said| said.by_initiator == initiator && !said.cancels);
-        own.nth(1)
+        let own = said
+            .filter(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel);
+        let mut asked = own.skip(1).filter_map(|said| said.reply_with.as_deref());
+        asked.by_ref().take(6).any(|asked| asked == text)
     }
 
     pub(super) fn cancel(&self) -> Option<&SentMessage> {
@@ -138,7 +157,7 @@ impl Talk {
     }
 
     /// Creates the state of an agent that joined with an answer: known if only one state can follow.
-    pub(super) fn joined(machine: &Machine, words: &Words) -> Self {
+    pub(super) fn joined(machine: &Machine, words: &Words, elsewhere: bool) -> Self {
         let mut in_time = vec![machine.initial().id()];
         for at in 0.. {
             let Some(id) = in_time.get(at) else { break };
@@ -156,6 +175,12 @@ impl Talk {
         targets.sort_unstable();
         targets.dedup();
         let spot = match targets[..] {
+            _ if elsewhere
+                && machine.cancel() != Cancel::Nobody
+                && ["inform", "failure"].contains(&words.act) =>
+            {
+                Spot::Elsewhere
+            }
             [only] if machine.scope() == Scope::Participant => Spot::At(only.to_owned()),
             _ => Spot::Elsewhere,
         };
@@ -168,8 +193,10 @@ impl Talk {
                 reply_with: words.reply_with.clone(),
                 cancels: false,
                 crossed: false,
+                answers_cancel: false,
             }],
             due: None,
+            echo: false,
         }
     }
 
@@ -184,9 +211,9 @@ impl Talk {
     pub(super) fn name(&self) -> String {
         match &self.spot {
             Spot::At(id) => id.clone(),
-            Spot::NotUnderstood => "not-understood".into(),
+            Spot::NotUnderstood(_) => "not-understood".into(),
             Spot::Cancelling(_) => "cancelling".into(),
-            Spot::Cancelled { .. } => "cancelled".into(),
+            Spot::Cancelled(_) => "cancelled".into(),
             Spot::Undelivered(_) => "undelivered".into(),
             Spot::Elsewhere => "elsewhere".into(),
         }
@@ -248,29 +275,103 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
     let answers_cancel = ["inform", "failure", "not-understood"].contains(&act);
     let repeated = talk.is_repeated(view.words, view.by_initiator);
     match &talk.spot {
-        Spot::At(id) => judge_at(machine, talk, id, view),
+        Spot::At(id) => {
+            if talk.echo
+                && answers_cancel
+                && let Some(cancel) = talk.cancel()
+                && cancel.by_initiator != view.by_initiator
+                && cancel.reply_with.is_some()
+                && cancel.reply_with == view.words.in_reply_to
+            {
+                let next = to(match act {
+                    "inform" => Spot::Cancelled(None),
+                    "failure" => Spot::At(id.clone()),
+                    _ => Spot::NotUnderstood(id.clone()),
+                });
+                return Ok(Step {
+                    answers_cancel: true,
+                    ..next
+                });
+            }
+            judge_at(machine, talk, id, view)
+        }
         Spot::Undelivered(before) => {
             let at = |spot: &Spot| match spot {
                 Spot::At(id) => judge_at(machine, talk, id, view),
                 // Only the protocol's own states.
                 _ => Err("unexpected"),
             };
-            at(before).or_else(|wrong| at(&talk.previous).map_err(|_| wrong))
+            let in_spot = |spot: &Spot| {
+                let step = at(spot)?;
+                Ok(Step {
+                    before: Some(spot.clone()),
+                    ..step
+                })
+            };
+            let over = matches!(&**before, Spot::At(id) if is_over(machine, id));
+            let (first, second) = match act == "cancel" && over {
+                true => (&talk.previous, &**before),
+                false => (&**before, &talk.previous),
+            };
+            in_spot(first).or_else(|wrong| in_spot(second).map_err(|_| wrong))
         }
         Spot::Elsewhere => Err("unexpected"),
-        Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
-        Spot::Cancelled { one_more } => {
-            let canceling_side = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
-            if *one_more && view.by_initiator != canceling_side && answers_cancel {
-                return Ok(to(Spot::Cancelled { one_more: false }));
+        Spot::NotUnderstood(back) => {
+            let last = talk.said.last().expect("a not-understood was sent");
+            if !view.own
+                && last.by_initiator != view.by_initiator
+                && let Ok(step) = judge_at(machine, talk, back, view)
+            {
+                let back = match step.spot {
+                    Spot::At(id) => id,
+                    _ => back.clone(),
+                };
+                return Ok(Step {
+                    void: true,
+                    ..to(Spot::NotUnderstood(back))
+                });
             }
             Err(if repeated { "repeated" } else { "ended" })
+        }
+        Spot::Cancelled(back) => {
+            let wrong = Err(if repeated { "repeated" } else { "ended" });
+            let cancel = talk.cancel().expect("a cancel was sent");
+            let Some(back) = back else { return wrong };
+            if view.by_initiator == cancel.by_initiator {
+                return wrong;
+            }
+            let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
+            let answers = answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to);
+            let on_its_way = judge_at(machine, talk, back, view);
+            if act == "failure" && answers {
+                return Ok(Step {
+                    echo: !both && on_its_way.is_ok(),
+                    answers_cancel: true,
+                    ..to(Spot::At(back.clone()))
+                });
+            }
+            if let Ok(step) = on_its_way
+                && !(both && answers)
+            {
+                return Ok(to(match step.spot {
+                    Spot::At(id) => Spot::Cancelled(Some(id)),
+                    Spot::NotUnderstood(back) => Spot::NotUnderstood(back),
+                    _ => Spot::Cancelled(Some(back.clone())),
+                }));
+            }
+            match answers {
+                true => Ok(Step {
+                    answers_cancel: true,
+                    ..to(Spot::Cancelled(None))
+                }),
+                false => wrong,
+            }
         }
         Spot::Cancelling(back) => {
             let cancel = talk.cancel().expect("a cancel was sent");
             if machine.scope() == Scope::Participant && view.by_initiator == cancel.by_initiator {
                 return match act {
-                    "not-understood" => Ok(to(Spot::NotUnderstood)),
+                    "not-understood" => Ok(to(Spot::NotUnderstood(back.clone()))),
                     _ if repeated => Err("repeated"),
                     _ => Err("unexpected"),
                 };
@@ -278,13 +379,22 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
             let on_its_way = judge_at(machine, talk, back, view);
             if answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to) {
-                return Ok(to(match act {
-                    "inform" => Spot::Cancelled {
-                        one_more: !both && on_its_way.is_ok(),
-                    },
+                let echo = act == "failure" && !both && on_its_way.is_ok();
+                let next = to(match act {
+                    "inform" => Spot::Cancelled(match on_its_way {
+                        Ok(Step {
+                            spot: Spot::At(id), ..
+                        }) if !both => Some(id),
+                        _ => None,
+                    }),
                     "failure" => Spot::At(back.clone()),
-                    _ => Spot::NotUnderstood,
-                }));
+                    _ => Spot::NotUnderstood(back.clone()),
+                });
+                return Ok(Step {
+                    echo,
+                    answers_cancel: true,
+                    ..next
+                });
             }
             on_its_way.map(|step| match step.spot {
                 Spot::At(id) | Spot::Cancelling(id) => Step {
@@ -292,6 +402,10 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     crossed: true,
                     roles: step.roles,
                     void: step.void,
+                    guard: (None, false),
+                    before: None,
+                    echo: false,
+                    answers_cancel: false,
                 },
                 // During a cancel, a failure counts as a crossing message too.
                 Spot::Undelivered(_) => Step {
@@ -320,9 +434,8 @@ pub(super) fn judge_at(
         if let (true, Some(asked), Some(answer)) = (view.compares, asked, &words.in_reply_to)
             && asked != answer
         {
-            let earlier = talk.earlier_of(!view.by_initiator);
-            return match earlier.and_then(|said| said.reply_with.as_ref()) {
-                Some(earlier) if earlier == answer && !view.own => Ok(Step {
+            return match talk.asked_earlier(!view.by_initiator, answer) {
+                true if !view.own => Ok(Step {
                     void: true,
                     ..to(Spot::At(id.to_owned()))
                 }),
@@ -331,6 +444,7 @@ pub(super) fn judge_at(
         }
         return Ok(Step {
             roles: Some((taken.from().to_owned(), taken.to().to_owned())),
+            guard: (taken.at_most(), taken.needs_all()),
             ..to(Spot::At(machine.target(taken).to_owned()))
         });
     }
@@ -355,7 +469,7 @@ pub(super) fn judge_at(
         };
         match words.act {
             "not-understood" if !here.is_final() || received_last => {
-                return Ok(to(Spot::NotUnderstood));
+                return Ok(to(Spot::NotUnderstood(id.to_owned())));
             }
             "cancel" if may_cancel && (!over || (received_last && !view.own)) => {
                 return Ok(to(Spot::Cancelling(id.to_owned())));
@@ -366,6 +480,12 @@ pub(super) fn judge_at(
             }
             _ => {}
         }
+    }
+    if has_crossed(machine, talk, id, view) {
+        return Ok(Step {
+            void: true,
+            ..to(Spot::At(id.to_owned()))
+        });
     }
     Err(if talk.is_repeated(words, view.by_initiator) {
         "repeated"
@@ -381,6 +501,34 @@ pub(super) fn judge_at(
     } else {
         "unexpected"
     })
+}
+
+/// Whether the message was sent before its sender had received the last ones.
+fn has_crossed(machine: &Machine, talk: &Talk, now: &str, view: &View<'_>) -> bool {
+    if view.own || !view.compares {
+        return false;
+    }
+    let fits = |id: &str| options(machine, id).iter().any(|step| view.fits(step));
+    let other = !view.by_initiator;
+    match &view.words.in_reply_to {
+        None => {
+            let sends = |step: &&Transition| {
+                step.from() == ".*" || view.to.iter().any(|role| matches(step.from(), role))
+            };
+            let led = |id: &str| {
+                let mut steps = options(machine, id).into_iter().filter(sends);
+                steps.any(|step| machine.target(step) == now)
+            };
+            talk.last_by_initiator() == other
+                && matches!(&talk.previous, Spot::At(id) if fits(id) && led(id))
+        }
+        Some(answer) => {
+            let asked = talk.last_of(other);
+            asked.is_none_or(|asked| asked.reply_with.as_ref() != Some(answer))
+                && talk.asked_earlier(other, answer)
+                && machine.states().iter().any(|state| fits(state.id()))
+        }
+    }
 }
 
 pub(super) fn comes_later(
@@ -421,6 +569,7 @@ impl Talk {
         now: u64,
     ) -> (bool, bool) {
         let opened = !self.said.iter().any(|said| !said.cancels);
+        self.echo = step.echo;
         if let Spot::Undelivered(_) = &step.spot {
             self.spot = step.spot;
             let late =
@@ -435,15 +584,14 @@ impl Talk {
         }
         let cancels =
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
-        if !matches!(self.spot, Spot::Undelivered(_)) {
-            self.previous = self.spot.clone();
-        }
+        self.previous = step.before.clone().unwrap_or_else(|| self.spot.clone());
         self.said.push(SentMessage {
             by_initiator,
             act: words.act,
             reply_with: words.reply_with.clone(),
             cancels,
             crossed: step.crossed,
+            answers_cancel: step.answers_cancel,
         });
         self.spot = step.spot;
         self.due = words.reply_by;

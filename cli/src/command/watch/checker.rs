@@ -99,7 +99,7 @@ impl Checker {
             return CheckResult::Excluded("not delivered");
         }
         // A letter has exactly one receiver, a message can have several.
-        let header = Header::from(message).receivers([&*passage.receiver]);
+        let header = Header::from(message).copy_for(&*passage.receiver);
         match self.monitor.check(&header, passage.at) {
             Verdict::Accepted(accepted) => CheckResult::Accepted {
                 protocol: accepted.protocol.to_owned(),

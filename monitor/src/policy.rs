@@ -1,0 +1,109 @@
+//! Settings of a monitor beside its limits: the messages that it refuses without a conversation, and
+//! the extent of its knowledge.
+
+use std::collections::BTreeSet;
+
+/// The messages that a monitor refuses although no conversation shows them to be wrong.
+///
+/// A refused message is a [`Violation`](crate::Violation) whose kind
+/// [depends on the policy](crate::ViolationKind::depends_on_policy). A caller should only warn if the
+/// message comes from a peer that predates these rules.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Policy {
+    /// Whether a message with a known protocol needs a `conversation-id` (FIPA00061).
+    pub conversation_id: bool,
+    /// Whether a protocol name that differs from a known one by one typing error is refused.
+    pub spelling: bool,
+    /// Whether a received message that continues an unknown conversation is refused. Without it, such a
+    /// message is [unchecked](crate::Unchecked::UnknownHistory).
+    pub unsolicited: bool,
+    /// Names of protocols to which this policy does not apply. Case is ignored.
+    pub exempt: BTreeSet<String>,
+}
+
+impl Policy {
+    /// Creates a policy that refuses all of these messages.
+    #[must_use]
+    pub fn strict() -> Self {
+        Self {
+            conversation_id: true,
+            spelling: true,
+            unsolicited: true,
+            exempt: BTreeSet::new(),
+        }
+    }
+
+    pub(crate) fn exempts(&self, protocol: &str) -> bool {
+        let mut exempt = self.exempt.iter();
+        exempt.any(|name| name.eq_ignore_ascii_case(protocol))
+    }
+}
+
+/// The extent of the knowledge of a monitor about conversations that it does not have.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum History {
+    /// The monitor gets all messages since the first of the agent, or of all agents. A conversation
+    /// that the monitor does not have, and has not removed before its end, did not begin.
+    #[default]
+    Complete,
+    /// Conversations may have begun before the monitor: the agent has restarted or moved, or the
+    /// observer began late.
+    Unknown,
+}
+
+/// Whether the texts differ in one inserted, omitted or changed character, or in two neighbors that
+/// changed places. Short names are never near.
+pub(crate) fn one_edit_apart(one: &str, other: &str) -> bool {
+    let (short, long): (Vec<char>, Vec<char>) = if one.len() <= other.len() {
+        (one.chars().collect(), other.chars().collect())
+    } else {
+        (other.chars().collect(), one.chars().collect())
+    };
+    let same = short.iter().zip(&long).take_while(|(a, b)| a == b).count();
+    // All names of one or two characters would be near.
+    if short.len() < 3 {
+        return false;
+    }
+    let (short_rest, long_rest) = (short.get(same + 1..), long.get(same + 1..));
+    match long.len().checked_sub(short.len()) {
+        Some(0) => {
+            let swapped = short.get(same) == long.get(same + 1)
+                && short.get(same + 1) == long.get(same)
+                && short.get(same + 2..) == long.get(same + 2..);
+            short_rest == long_rest || swapped
+        }
+        Some(1) => short.get(same..) == long_rest,
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_typing_error_makes_names_near() {
+        for near in [
+            "fipa-reqest",
+            "fipa-requestt",
+            "fipa-reqeust",
+            "fipa-requesd",
+        ] {
+            assert!(one_edit_apart("fipa-request", near), "{near}");
+            assert!(one_edit_apart(near, "fipa-request"), "{near}");
+        }
+        for far in ["fipa-query", "fipa-rqeeust", "fipa-request-when", ""] {
+            assert!(!one_edit_apart("fipa-request", far), "{far}");
+        }
+        assert!(!one_edit_apart("ab", "ac"));
+    }
+
+    #[test]
+    fn exempt_protocols_are_found_in_any_case() {
+        let mut policy = Policy::strict();
+        policy.exempt.insert("fipa-query".into());
+        assert!(policy.exempts("FIPA-Query") && !policy.exempts("fipa-request"));
+    }
+}

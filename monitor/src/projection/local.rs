@@ -1,0 +1,298 @@
+//! The projection onto one role, and a conversation that runs it.
+
+use super::{Label, Performed};
+use crate::act::Act;
+use crate::machine::Machine;
+
+/// A protocol as one role sees it.
+#[derive(Debug, Clone)]
+pub struct Local {
+    pub(crate) role: u8,
+    pub(super) name: String,
+    pub(super) roles: Vec<String>,
+    pub(crate) states: Vec<LocalState>,
+}
+
+/// A state of a [`Local`]: the states of the protocol that the role cannot tell apart.
+#[derive(Debug, Clone)]
+pub struct LocalState {
+    names: Vec<String>,
+    pub(super) is_final: bool,
+    globals: Vec<u16>,
+    pub(super) steps: Vec<LocalStep>,
+}
+
+/// A message that the role sends or receives.
+#[derive(Debug, Clone)]
+pub struct LocalStep {
+    pub(super) label: Label,
+    pub(super) target: u16,
+}
+
+impl Local {
+    /// Name of the role.
+    #[must_use]
+    pub fn role(&self) -> &str {
+        &self.name
+    }
+
+    /// The states. The first is the initial one.
+    #[must_use]
+    pub fn states(&self) -> &[LocalState] {
+        &self.states
+    }
+
+    /// The role that sends the message of a step.
+    #[must_use]
+    pub fn from(&self, step: &LocalStep) -> &str {
+        self.name_of(step.label.from)
+    }
+
+    /// The role that receives the message of a step.
+    #[must_use]
+    pub fn to(&self, step: &LocalStep) -> &str {
+        self.name_of(step.label.to)
+    }
+
+    fn name_of(&self, role: u8) -> &str {
+        let role = self.roles.get(usize::from(role));
+        role.map_or("", String::as_str)
+    }
+
+    pub(super) fn state(&self, at: u16) -> Option<&LocalState> {
+        self.states.get(usize::from(at))
+    }
+}
+
+impl LocalState {
+    pub(super) fn of(machine: &Machine, states: impl Iterator<Item = u16> + Clone) -> Self {
+        let all = || {
+            states
+                .clone()
+                .filter_map(|at| Some((at, machine.state(at)?)))
+        };
+        Self {
+            names: all().map(|(_, state)| state.id.clone()).collect(),
+            is_final: all().any(|(_, state)| state.is_final),
+            globals: states.clone().collect(),
+            steps: Vec::new(),
+        }
+    }
+
+    /// The states of the protocol that the role cannot tell apart.
+    #[must_use]
+    pub fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// Whether the protocol may have ended.
+    #[must_use]
+    pub fn is_final(&self) -> bool {
+        self.is_final
+    }
+
+    /// The messages that the role may send or receive.
+    #[must_use]
+    pub fn steps(&self) -> &[LocalStep] {
+        &self.steps
+    }
+
+    /// A state of the protocol that stands for these. The monitor removes a conversation whose state
+    /// is over, so this is such a state only if the role has nothing more to do.
+    pub(crate) fn global_in(&self, machine: &Machine) -> u16 {
+        let over = |at: &u16| machine.state(*at).is_some_and(|state| state.is_over());
+        let mut all = self.globals.iter().copied();
+        let wanted = all.clone().find(|at| over(at) == self.is_over());
+        wanted.or_else(|| all.next()).unwrap_or(machine.initial)
+    }
+
+    /// Whether the role has nothing more to send or receive.
+    pub(crate) fn is_over(&self) -> bool {
+        self.steps.is_empty()
+    }
+}
+
+impl LocalStep {
+    /// The performative.
+    #[must_use]
+    pub fn performative(&self) -> &str {
+        self.label.act.name()
+    }
+
+    /// Index of the state after the message.
+    #[must_use]
+    pub fn target(&self) -> usize {
+        usize::from(self.target)
+    }
+}
+
+/// A message of the monitored agent, with the roles that its sender and all its receivers may have.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Observed<'a> {
+    pub(crate) act: Act<'a>,
+    /// Whether the agent sends it.
+    pub(crate) own: bool,
+    /// Roles that the other side may have.
+    pub(crate) peers: u32,
+}
+
+/// A message that does not fit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum NotLocal {
+    /// The state does not allow it.
+    Unexpected,
+    /// The agent has nothing more to send or receive.
+    Ended,
+}
+
+/// The conversation of an agent as its role sees it. The agent may have several roles until a message
+/// tells them apart.
+#[derive(Debug, Clone)]
+pub(crate) struct LocalRun {
+    pub(crate) parts: Vec<Part>,
+}
+
+/// A possible role of the agent, and its state.
+#[derive(Debug, Clone)]
+pub(crate) struct Part {
+    pub(crate) role: u8,
+    pub(crate) state: u16,
+    /// Messages that came before their turn, because messages of other senders are under way.
+    early: Vec<(u8, Performed)>,
+}
+
+/// Maximum number of early messages.
+const MAX_EARLY: usize = 16;
+/// Maximum number of states that are searched for the turn of an early message.
+const MAX_SEARCHED: usize = 256;
+
+impl LocalRun {
+    /// A conversation that has not begun, in which the agent may have any of these roles.
+    pub(crate) fn new(locals: &[Local], roles: u32) -> Self {
+        let parts = locals.iter().filter(|local| roles & (1 << local.role) != 0);
+        let part = |local: &Local| Part {
+            role: local.role,
+            state: 0,
+            early: Vec::new(),
+        };
+        Self {
+            parts: parts.map(part).collect(),
+        }
+    }
+
+    /// Takes a message. Returns the role of the agent and that of the other side, if they are certain.
+    pub(crate) fn take(
+        &mut self,
+        locals: &[Local],
+        message: Observed<'_>,
+    ) -> Result<(Option<u8>, Option<u8>), NotLocal> {
+        let local = |part: &Part| locals.iter().find(|local| local.role == part.role);
+        let mut taken: Vec<(Part, u8)> = Vec::new();
+        for part in &self.parts {
+            let Some(local) = local(part) else { continue };
+            taken.extend(part.after(local, message));
+        }
+        // An early message waits only if it fits no role now.
+        if taken.is_empty() && !message.own {
+            for part in &self.parts {
+                let Some(local) = local(part) else { continue };
+                taken.extend(part.keeping(local, message));
+            }
+        }
+        if taken.is_empty() {
+            let over = |part: &Part| {
+                let state = local(part).and_then(|local| local.state(part.state));
+                state.is_none_or(LocalState::is_over)
+            };
+            return Err(match self.parts.iter().all(over) {
+                true => NotLocal::Ended,
+                false => NotLocal::Unexpected,
+            });
+        }
+        let same = |one: &dyn Fn(&(Part, u8)) -> u8| {
+            let first = taken.first().map(one);
+            first.filter(|first| taken.iter().all(|part| one(part) == *first))
+        };
+        let roles = (same(&|(part, _)| part.role), same(&|(_, peer)| *peer));
+        self.parts = taken.into_iter().map(|(part, _)| part).collect();
+        Ok(roles)
+    }
+
+    /// The state of the first possible role.
+    pub(crate) fn state<'l>(&self, locals: &'l [Local]) -> Option<&'l LocalState> {
+        let part = self.parts.first()?;
+        let local = locals.iter().find(|local| local.role == part.role)?;
+        local.state(part.state)
+    }
+}
+
+impl Part {
+    /// The part after a message whose turn it is, and the role of the other side.
+    fn after(&self, local: &Local, message: Observed<'_>) -> Option<(Self, u8)> {
+        let state = local.state(self.state)?;
+        let step = state.steps.iter().find(|step| {
+            let peer = match message.own {
+                true => step.label.to,
+                false => step.label.from,
+            };
+            (step.label.from == self.role) == message.own
+                && message.peers & (1 << peer) != 0
+                && step.label.act.is(message.act)
+        })?;
+        let mut part = self.clone();
+        part.state = step.target;
+        part.take_early(local);
+        let peer = match message.own {
+            true => step.label.to,
+            false => step.label.from,
+        };
+        Some((part, peer))
+    }
+
+    /// Takes the early messages whose turn it is.
+    fn take_early(&mut self, local: &Local) {
+        while let Some((at, target)) = self.next_early(local) {
+            self.early.remove(at);
+            self.state = target;
+        }
+    }
+
+    fn next_early(&self, local: &Local) -> Option<(usize, u16)> {
+        let state = local.state(self.state)?;
+        let mut early = self.early.iter().enumerate();
+        early.find_map(|(at, (from, act))| {
+            // Messages of one sender arrive in their order.
+            let first = !self.early.iter().take(at).any(|(other, _)| other == from);
+            let mut steps = state.steps.iter().filter(|_| first);
+            let step = steps.find(|step| step.label.from == *from && step.label.act == *act)?;
+            Some((at, step.target))
+        })
+    }
+
+    /// The part with a message whose turn comes after messages of other roles.
+    fn keeping(&self, local: &Local, message: Observed<'_>) -> Option<(Self, u8)> {
+        if self.early.len() == MAX_EARLY {
+            return None;
+        }
+        let mut reached = vec![self.state];
+        let mut next = 0;
+        while let Some(state) = reached.get(next).and_then(|at| local.state(*at)) {
+            next += 1;
+            for step in &state.steps {
+                let Label { from, act, .. } = &step.label;
+                let fits = message.peers & (1 << from) != 0 && act.is(message.act);
+                if next > 1 && *from != self.role && fits {
+                    let mut part = self.clone();
+                    part.early.push((*from, act.clone()));
+                    return Some((part, *from));
+                }
+                // Only messages of other senders can be under way.
+                let others = *from != self.role && message.peers != 1 << from;
+                if others && !reached.contains(&step.target) && reached.len() < MAX_SEARCHED {
+                    reached.push(step.target);
+                }
+            }
+        }
+        None
+    }
+}

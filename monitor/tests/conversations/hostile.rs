@@ -1,0 +1,215 @@
+//! Messages of hostile peers: they take a bounded part of the memory, and cannot evade the checks.
+
+use super::*;
+
+fn enforced(policy: Policy) -> Stage {
+    Stage::new(Monitor::agent(library(), "ben").with_policy(policy))
+}
+
+#[test]
+fn a_peer_evicts_only_its_own_conversations() {
+    let mut limits = Limits::default();
+    limits.conversations = 800;
+    let monitor = Monitor::agent(library(), "ben").with_limits(limits);
+    let mut stage = Stage::new(monitor);
+    stage.right(request("request ann>ben").conversation_id("ann 1"));
+    for number in 0..5_000 {
+        let id = format!("flood {number}");
+        stage.right(request("request mallory>ben").conversation_id(id));
+    }
+    assert_eq!(stage.monitor.len(), 101, "an eighth");
+    assert_eq!(stage.monitor.forgotten(), 4_900);
+    assert_eq!(
+        stage.right(request("agree ben>ann").conversation_id("ann 1")),
+        "agreed"
+    );
+    // The peer may claim many names: its connection tells them apart.
+    for number in 0..5_000 {
+        let id = format!("flood {number}");
+        let header = request("request mallory>ben").sender(format!("m{number}"));
+        stage.right(header.conversation_id(id).peer("host of mallory"));
+    }
+    assert_eq!(
+        stage.right(request("inform ben>ann").conversation_id("ann 1")),
+        "done"
+    );
+}
+
+#[test]
+fn the_bytes_of_a_peer_are_bounded() {
+    let mut limits = Limits::default();
+    limits.bytes = 8 << 20;
+    let monitor = Monitor::agent(library(), "ben").with_limits(limits);
+    let mut stage = Stage::new(monitor);
+    stage.right(request("request ann>ben").conversation_id("ann 1"));
+    let long = |number: usize| format!("{number}{}", "x".repeat(4_000));
+    for number in 0..200 {
+        let header = request("request mallory>ben").conversation_id(format!("{number}"));
+        stage.right(header.reply_to((0..64).map(long)));
+        assert!(stage.monitor.bytes() < (1 << 20) + 4_096);
+    }
+    let header = request("agree ben>ann").conversation_id("ann 1");
+    assert_eq!(stage.right(header), "agreed");
+    // A conversation that grows is charged too.
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    for number in 0..400 {
+        let header = say("cfp ann>ben").receivers([long(number)]);
+        let id = format!("{}", number % 20);
+        stage.check(&header.conversation_id(id));
+        assert!(stage.monitor.bytes() < 1 << 20);
+    }
+    // A single conversation that is larger than the part of a peer is refused.
+    let header = say("cfp ann>ben").receivers((0..300).map(long));
+    assert_eq!(stage.wrong(header.conversation_id("x")).kind, Kind::TooMany);
+    stage.pass(100_000);
+    assert_eq!(stage.monitor.bytes(), 0);
+}
+
+#[test]
+fn what_is_too_large_to_check_is_refused_for_an_agent() {
+    let mut stage = enforced(Policy::default());
+    let many = (0..2_000).map(|number| number.to_string());
+    for header in [
+        request("agree ann>ben").conversation_id("c".repeat(5_000)),
+        request("agree ann>ben").reply_to(many.clone()),
+        request("agree ann>ben").receivers(many.clone()),
+        request("agree ann>ben").sender("x".repeat(5_000)),
+        request("agree ann>ben").peer("x".repeat(5_000)),
+        request("request ben>platoon").group("platoon", many),
+    ] {
+        assert_eq!(stage.wrong(header).kind, Kind::TooLarge);
+    }
+    let refused = stage.wrong(request("agree ann>ben").sender("x".repeat(50_000)));
+    assert!(refused.to_string().len() < 10_000, "it is shortened");
+}
+
+#[test]
+fn a_policy_refuses_messages_without_a_conversation() {
+    let no_id = || {
+        Header::new(act("request"))
+            .sender("ann")
+            .receivers(["ben"])
+            .protocol("fipa-request")
+    };
+    let reqest = || say_in("fipa-reqest", "request ann>ben");
+    let unsolicited = || say_in("fipa-contract-net", "accept-proposal ann>ben");
+    let answer = || request("inform ann>ben").conversation_id("d");
+    let mut lax = enforced(Policy::default());
+    for (header, why) in [
+        (no_id(), Unchecked::NoConversation),
+        (reqest(), Unchecked::UnknownProtocol),
+        (unsolicited(), Unchecked::UnknownHistory),
+        (answer(), Unchecked::BegunElsewhere),
+    ] {
+        assert_eq!(lax.check(&header), Verdict::Unchecked(why));
+    }
+    let mut strict = enforced(Policy::strict());
+    for (header, kind, reason) in [
+        (no_id(), Kind::NoConversation, "no conversation-id"),
+        (
+            reqest(),
+            Kind::Misspelled,
+            "a known protocol is fipa-request",
+        ),
+        (unsolicited(), Kind::Unsolicited, "only continues one"),
+        (answer(), Kind::Unsolicited, "only continues one"),
+    ] {
+        let refused = strict.wrong(header);
+        assert_eq!(refused.kind, kind);
+        assert!(refused.kind.depends_on_policy());
+        assert!(refused.to_string().contains(reason), "{refused}");
+    }
+    assert!(strict.monitor.is_empty());
+    // What the policy does not name passes.
+    let other = say_in("dance", "cfp ann>ben");
+    let unknown = Verdict::Unchecked(Unchecked::UnknownProtocol);
+    assert_eq!(strict.check(&other), unknown);
+    strict.right(request("request ann>ben"));
+    let mut policy = Policy::strict();
+    policy.exempt.insert("FIPA-Request".into());
+    policy.exempt.insert("fipa-contract-net".into());
+    let mut exempt = enforced(policy);
+    for header in [no_id(), reqest(), unsolicited(), answer()] {
+        assert!(exempt.check(&header).violation().is_none());
+    }
+    assert!(!Kind::NotOpened.depends_on_policy());
+}
+
+#[test]
+fn an_impossible_message_is_a_violation_whatever_came_before() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ben").with_history(History::Unknown));
+    for header in [
+        request("subscribe ann>ben"),
+        request("propose ben>ann"),
+        say_in("fipa-auction-english", "cancel ann>ben"),
+    ] {
+        assert_eq!(stage.wrong(header).kind, Kind::NotOpened);
+    }
+}
+
+#[test]
+fn a_guessed_identifier_does_not_block_its_owner() {
+    // Mallory knows the next identifier of ben.
+    for words in ["inform mallory>ben", "request mallory>ben"] {
+        for protocol in ["fipa-request", "fipa-auction-english", "fipa-brokering"] {
+            let monitors = [
+                Monitor::agent(library(), "ben"),
+                Monitor::agent(library(), "ann"),
+                Monitor::observer(library()),
+            ];
+            for (number, monitor) in monitors.into_iter().enumerate() {
+                let mut stage = Stage::new(monitor);
+                // The monitor of ann does not get the message.
+                if number != 1 {
+                    stage.check(&say_in(protocol, words));
+                }
+                stage.right(request("request ben>ann"));
+                stage.right(request("agree ann>ben"));
+                stage.right(request("inform ann>ben"));
+            }
+        }
+    }
+    // Many names cannot block it either.
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    for number in 0..100 {
+        let guessed = request("request mallory>ben").sender(format!("m{number}"));
+        stage.right(guessed);
+    }
+    assert_eq!(stage.monitor.len(), 8);
+    stage.right(request("request ben>ann"));
+    for number in 0..100 {
+        let guessed = request("request mallory>ben").sender(format!("n{number}"));
+        stage.right(guessed);
+    }
+    stage.right(request("inform ann>ben"));
+    assert_eq!(stage.monitor.len(), 8);
+}
+
+#[test]
+fn conversations_with_one_identifier_are_independent() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("request cid>dan"));
+    stage.right(say("cfp eve>ben"));
+    assert_eq!(stage.monitor.len(), 3);
+    stage.right(request("agree ben>ann"));
+    stage.right(request("refuse dan>cid"));
+    stage.right(say("propose ben>eve"));
+    assert_eq!(stage.wrong(request("agree ben>ann")).kind, Kind::Unexpected);
+    assert_eq!(stage.right(request("inform ben>ann")), "done");
+}
+
+#[test]
+fn a_message_to_many_agents_is_judged_in_linear_steps() {
+    // The number of comparisons of names is that of the names, whatever their order.
+    let names = |prefix: &'static str| (0..500).map(move |number| format!("{prefix}{number}"));
+    let mut stage = Stage::observer();
+    let twice = names("agent ").chain(names("agent "));
+    stage.right(say("cfp ann>ben").receivers(twice));
+    stage.right(say("cfp ann>ben").receivers(names("other ")));
+    for name in names("other ").chain(names("agent ")) {
+        stage.right(say("propose ben>ann").sender(name));
+    }
+    let all = names("other ").chain(names("agent "));
+    stage.right(say("reject-proposal ann>ben").receivers(all));
+}

@@ -1,0 +1,349 @@
+//! Legal conversations: coalitions, long conversations, restarts, undelivered and crossing messages, and
+//! delegates. No message is refused.
+
+use super::*;
+
+fn subscribe(words: &'static str) -> Header<'static> {
+    say_in("fipa-subscribe", words)
+}
+
+const UNKNOWN: Verdict<'static> = Verdict::Unchecked(Unchecked::UnknownHistory);
+
+#[test]
+fn a_coalition_is_resolved_as_of_the_sending() {
+    // The initiator.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(say("cfp ann>platoon").group("platoon", ["ann", "ben", "cid"]));
+    stage.right(say("propose ben>ann"));
+    stage.right(say("propose cid>ann"));
+    stage.right(say("accept-proposal ann>ben"));
+    stage.right(say("reject-proposal ann>cid"));
+    assert_eq!(stage.right(say("inform ben>ann")), "done");
+    // An agent that was not asked.
+    assert_eq!(stage.wrong(say("propose dan>ann")).kind, Kind::Stranger);
+    // A member. Its letter names the coalition.
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(say("cfp ann>platoon"));
+    assert_eq!(stage.right(say("propose ben>ann")), "proposed");
+    assert_eq!(stage.right(say("accept-proposal ann>platoon")), "accepted");
+    assert_eq!(stage.right(say("inform ben>ann")), "done");
+    // A coalition with a leader has one receiver.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(request("request ann>platoon").group("platoon", ["cid"]));
+    assert_eq!(stage.right(request("inform cid>ann")), "done");
+    // A pattern that is resolved.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(say("cfp ann>arm_.*").group("arm_.*", ["arm_1", "arm_2"]));
+    stage.right(say("refuse arm_1>ann"));
+    stage.right(say("refuse arm_2>ann"));
+    assert_eq!(stage.wrong(say("refuse arm_3>ann")).kind, Kind::Stranger);
+    // A group without another member.
+    let alone = say("cfp ann>platoon").group("platoon", ["ann"]);
+    let alone = alone.conversation_id("alone");
+    let alone_unchecked = Verdict::Unchecked(Unchecked::NoReceiver);
+    assert_eq!(stage.check(&alone), alone_unchecked);
+}
+
+#[test]
+fn the_result_of_a_long_action_is_accepted() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("agree ben>ann"));
+    assert_eq!(stage.pass(90 * 60), []);
+    assert_eq!(stage.right(request("inform ben>ann")), "done");
+}
+
+#[test]
+fn the_age_of_a_conversation_does_not_depend_on_the_wall_clock() {
+    let mut monitor = Monitor::observer(library());
+    let wall = SystemTime::UNIX_EPOCH + START;
+    let day = Duration::from_secs(24 * 60 * 60);
+    let at = |wall, secs| Now::new(wall, Duration::from_secs(secs));
+    let begin = request("request ann>ben");
+    assert!(monitor.check(&begin, at(wall, 100)).is_accepted());
+    // The wall clock is set 30 days ahead.
+    assert_eq!(monitor.handle_timeout(at(wall + 30 * day, 101)), []);
+    let agree = request("agree ben>ann");
+    assert!(
+        monitor
+            .check(&agree, at(wall + 30 * day, 102))
+            .is_accepted()
+    );
+    assert_eq!(
+        monitor.poll_elapsed(),
+        Some(day + Duration::from_millis(102_001))
+    );
+    let due = monitor.poll_timeout();
+    assert_eq!(due, Some(wall + 31 * day + Duration::from_millis(1)));
+    assert_eq!(monitor.handle_timeout(at(wall, 86_600)).len(), 1);
+    // A `reply-by` is a time of the wall clock.
+    let due = Time::from_system_time(wall + Duration::from_secs(5)).unwrap();
+    let call = say("cfp ann>ben").reply_by(due);
+    assert!(monitor.check(&call, at(wall, 86_600)).is_accepted());
+    assert_eq!(monitor.handle_timeout(at(wall, 86_604)), []);
+    assert_eq!(monitor.handle_timeout(at(wall, 86_606)).len(), 1);
+}
+
+#[test]
+fn unknown_history_is_unchecked() {
+    for name in ["ann", "ben"] {
+        let monitor = Monitor::agent(library(), name).with_history(History::Unknown);
+        let mut stage = Stage::new(monitor);
+        for words in ["agree ben>ann", "cancel ann>ben", "inform ben>ann"] {
+            let header = request(words);
+            assert!(
+                stage.check(&header).violation().is_none(),
+                "{name}: {words}"
+            );
+        }
+        let contract = [
+            "propose ben>ann",
+            "accept-proposal ann>ben",
+            "inform ben>ann",
+        ];
+        for words in contract {
+            let header = say(words).conversation_id("d");
+            assert!(
+                stage.check(&header).violation().is_none(),
+                "{name}: {words}"
+            );
+        }
+        // A conversation that certainly begins is checked.
+        stage.right(request("request ann>ben").conversation_id("e"));
+        let wrong = stage.wrong(request("inform ann>ben").conversation_id("e"));
+        assert_eq!(wrong.kind, Kind::WrongSender);
+    }
+    let mut stage = Stage::new(Monitor::observer(library()).with_history(History::Unknown));
+    assert_eq!(stage.check(&request("agree ben>ann")), UNKNOWN);
+    // Without this setting, an agent that sends first knows that the conversation did not begin.
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    assert_eq!(stage.wrong(request("agree ben>ann")).kind, Kind::NotOpened);
+}
+
+#[test]
+fn a_first_message_may_be_a_later_one_of_an_unknown_conversation() {
+    let auction = |words| say_in("fipa-auction-english", words);
+    let stage = || {
+        let monitor = Monitor::agent(library(), "ben").with_history(History::Unknown);
+        Stage::new(monitor)
+    };
+    // The end of an auction that began before the restart, not its announcement.
+    let mut ended = stage();
+    ended.right(auction("inform auc>ben"));
+    assert_eq!(ended.check(&auction("request auc>ben")), UNKNOWN);
+    assert!(ended.monitor.is_empty());
+    // A call shows that it was the announcement.
+    let mut begun = stage();
+    begun.right(auction("inform auc>ben"));
+    begun.right(auction("cfp auc>ben"));
+    let wrong = begun.wrong(auction("request auc>ben"));
+    assert_eq!(wrong.kind, Kind::OutOfOrder);
+}
+
+#[test]
+fn an_evicted_conversation_is_unchecked() {
+    let mut limits = Limits::default();
+    limits.conversations = 4;
+    let monitor = Monitor::agent(library(), "ben").with_limits(limits);
+    let mut stage = Stage::new(monitor);
+    for number in 0..8 {
+        stage.right(request("request ben>ann").conversation_id(format!("{number}")));
+    }
+    let late = |id: &'static str| request("agree ann>ben").conversation_id(id);
+    assert!(stage.check(&late("0")).violation().is_none());
+    assert!(stage.check(&late("7")).is_accepted());
+    // Its own message to an evicted conversation.
+    let own = request("cancel ben>ann").conversation_id("1");
+    assert_eq!(stage.check(&own), UNKNOWN);
+}
+
+#[test]
+fn an_undelivered_message_can_be_sent_again() {
+    let ask = || request("request ann>ben").reply_with("q");
+    for name in [None, Some("ann")] {
+        let mut stage = Stage::new(match name {
+            None => Monitor::observer(library()),
+            Some(name) => Monitor::agent(library(), name),
+        });
+        stage.right(ask());
+        assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+        let now = stage.now;
+        stage.monitor.undelivered(&ask(), "ben", now);
+        assert_eq!(stage.right(ask()), "requested");
+        // The first copy arrived after all, and was answered.
+        stage.monitor.undelivered(&ask(), "ben", now);
+        assert_eq!(stage.right(request("agree ben>ann")), "agreed");
+        // The answer proves the delivery, so a later report changes nothing.
+        stage.monitor.undelivered(&ask(), "ben", now);
+        assert_eq!(stage.wrong(ask()).kind, Kind::Unexpected);
+        // So it is with an answer, with a cancel, and with one of several receivers.
+        stage
+            .monitor
+            .undelivered(&request("agree ben>ann"), "ann", now);
+        assert_eq!(stage.right(request("agree ben>ann")), "agreed");
+        let cancel = || request("cancel ann>ben").reply_with("x");
+        stage.right(cancel());
+        assert_eq!(stage.wrong(cancel()).kind, Kind::Unexpected);
+        stage.monitor.undelivered(&cancel(), "ben", now);
+        assert_eq!(stage.right(cancel()), "cancelling");
+        stage.right(say("cfp ann>ben,cid").conversation_id("d"));
+        let call = || say("cfp ann>ben,cid").conversation_id("d");
+        stage.monitor.undelivered(&call(), "cid", now);
+        let again = |to: &'static str| call().receivers([to]);
+        assert_eq!(stage.wrong(again("ben")).kind, Kind::Unexpected);
+        assert_eq!(stage.right(again("cid")), "called");
+    }
+    // Other messages, and other conversations.
+    let mut stage = Stage::observer();
+    stage.right(ask());
+    let now = stage.now;
+    for other in [
+        request("request ann>ben").reply_with("other"),
+        request("agree ann>ben").reply_with("q"),
+        ask().conversation_id("d"),
+        ask().protocol("fipa-query"),
+    ] {
+        stage.monitor.undelivered(&other, "ben", now);
+        assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+    }
+    stage.monitor.undelivered(&ask(), "cid", now);
+    assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+}
+
+#[test]
+fn messages_go_to_the_delegate_of_a_participant() {
+    for name in [None, Some("ann")] {
+        let mut stage = Stage::new(match name {
+            None => Monitor::observer(library()),
+            Some(name) => Monitor::agent(library(), name),
+        });
+        stage.right(say("cfp ann>ben,cid"));
+        stage.right(say("propose ben>ann").reply_to(["dan"]).reply_with("b"));
+        stage.right(say("propose cid>ann"));
+        // FIPA00061: later messages go to the agent in reply-to.
+        let accept = || say("accept-proposal ann>dan").in_reply_to("b");
+        assert_eq!(stage.right(accept()), "accepted");
+        assert_eq!(stage.wrong(accept()).kind, Kind::Unexpected);
+        assert_eq!(stage.right(say("inform dan>ann")), "done");
+        assert_eq!(stage.wrong(say("inform ben>ann")).kind, Kind::Ended);
+        assert_eq!(stage.right(say("accept-proposal ann>cid")), "accepted");
+    }
+    // The delegate does not know the beginning.
+    let mut stage = Stage::new(Monitor::agent(library(), "dan"));
+    assert_eq!(stage.check(&say("accept-proposal ann>dan")), UNKNOWN);
+    assert_eq!(stage.check(&say("inform dan>ann")), UNKNOWN);
+    // With one state for all.
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="accept-proposal" from="a" to="b" target="4"/></state>
+        <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    let own = |words| say_in("own", words);
+    stage.right(own("cfp ann>ben"));
+    stage.right(own("propose ben>ann").reply_to(["dan"]));
+    stage.right(own("accept-proposal ann>dan"));
+    assert_eq!(stage.right(own("inform dan>ann")), "5");
+}
+
+#[test]
+fn not_understood_answers_nonsense() {
+    for agent in [None, Some("ben")] {
+        let mut stage = Stage::new(match agent {
+            None => Monitor::observer(library()),
+            Some(name) => Monitor::agent(library(), name),
+        });
+        stage.right(request("request ann>ben"));
+        stage.right(request("refuse ben>ann"));
+        let violation = stage.wrong(request("confirm ann>ben"));
+        assert_eq!(violation.kind, Kind::Ended);
+        let answered = Verdict::Unchecked(Unchecked::AnswersViolation);
+        let answer = request("not-understood ben>ann");
+        assert_eq!(stage.check(&answer), answered);
+        // A violation has one answer.
+        assert_eq!(stage.wrong(answer).kind, Kind::Ended);
+        // Nonsense of a stranger.
+        stage.wrong(request("confirm zoe>ben"));
+        let other = stage.check(&request("not-understood ben>zoe"));
+        assert_eq!(other, answered);
+    }
+}
+
+#[test]
+fn a_bid_may_answer_an_earlier_call() {
+    let auction = |words| say_in("fipa-auction-dutch", words);
+    let bid = |text: &str| auction("propose ben>auc").in_reply_to(text.to_owned());
+    let mut stage = Stage::observer();
+    stage.right(auction("inform auc>ben"));
+    for number in 1..=9 {
+        stage.right(auction("cfp auc>ben").reply_with(format!("call {number}")));
+    }
+    // A bounded number of calls is remembered.
+    for (text, late) in [("call 7", true), ("call 3", true), ("call 9", false)] {
+        let Verdict::Accepted(accepted) = stage.monitor.check(&bid(text), stage.now) else {
+            panic!("{text}");
+        };
+        assert_eq!((accepted.late, accepted.void), (late, late), "{text}");
+    }
+}
+
+#[test]
+fn a_wrong_reply_names_the_expected_and_the_received_value() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_with("q1"));
+    let wrong = stage.wrong(request("agree ben>ann").in_reply_to("q0"));
+    let reply = wrong.reply.as_ref().unwrap();
+    assert_eq!((&*reply.expected, &*reply.received), ("q1", "q0"));
+    let text = wrong.to_string();
+    assert!(text.contains(r#"expected "q1", received "q0""#), "{text}");
+}
+
+#[test]
+fn several_informs_may_cross_a_cancel() {
+    for end in ["inform", "failure"] {
+        let mut stage = Stage::observer();
+        stage.right(subscribe("subscribe ann>ben"));
+        stage.right(subscribe("inform ben>ann"));
+        stage.right(subscribe("cancel ann>ben"));
+        // fipa_services does not write `in-reply-to`.
+        for _ in 0..5 {
+            assert_eq!(stage.right(subscribe("inform ben>ann")), "cancelled");
+        }
+        match end {
+            // The cancel failed, so the subscription continues and can be canceled again.
+            "failure" => {
+                assert_eq!(stage.right(subscribe("failure ben>ann")), "active");
+                stage.right(subscribe("inform ben>ann"));
+                stage.right(subscribe("cancel ann>ben"));
+            }
+            _ => assert_eq!(stage.wrong(subscribe("agree ben>ann")).kind, Kind::Ended),
+        }
+    }
+}
+
+#[test]
+fn the_copies_of_a_multicast_are_one_message() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="query-if" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="2"/></state>
+        </scxml>"#;
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    let own = |words| say_in("own", words);
+    let copy = |to: &'static str| own("query-if ann>ben,cid,dan").copy_for(to);
+    stage.right(copy("ben"));
+    stage.right(copy("cid"));
+    // An answer comes before the last copy.
+    stage.right(own("inform ben>ann"));
+    stage.right(copy("dan"));
+    stage.right(own("inform dan>ann"));
+    stage.right(own("inform cid>ann"));
+    // A second message to one of them is another message.
+    assert_eq!(stage.wrong(copy("cid")).kind, Kind::Unexpected);
+    let alone = own("query-if ann>eve").copy_for("eve");
+    assert_eq!(stage.wrong(alone).kind, Kind::WrongReceiver);
+}

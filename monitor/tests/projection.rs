@@ -1,0 +1,357 @@
+//! Protocols with three or more roles: their projections, the defects of others, and the monitors of
+//! their agents.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fastrand::Rng;
+use fipa_monitor::projection::{Defect, Local, Projection};
+use fipa_monitor::{
+    Header, History, Library, Machine, Monitor, Scope, Unchecked, Verdict, ViolationKind as Kind,
+};
+
+/// Docking of a drone at a station, which a mediator arranges.
+const DOCKING: &str = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol">
+    <state id="1"><transition performative="request" from="drone" to="mediator" target="2"/></state>
+    <state id="2">
+        <transition performative="query-if" from="mediator" to="station" target="3"/>
+        <transition performative="refuse" from="mediator" to="drone" target="done"/>
+    </state>
+    <state id="3">
+        <transition performative="confirm" from="station" to="mediator" target="4"/>
+        <transition performative="disconfirm" from="station" to="mediator" target="5"/>
+    </state>
+    <state id="4"><transition performative="agree" from="mediator" to="drone" target="6"/></state>
+    <state id="5"><transition performative="refuse" from="mediator" to="drone" target="done"/></state>
+    <state id="6"><transition performative="inform" from="drone" to="station" target="7"/></state>
+    <state id="7"><transition performative="inform" from="station" to="mediator" target="8"/></state>
+    <state id="8"><transition performative="inform" from="mediator" to="drone" target="done"/></state>
+    <state id="done" final="yes"/></scxml>"#;
+
+fn machine(text: &str) -> Machine {
+    Machine::read("own", text).unwrap()
+}
+
+/// The states and messages of a projection: `state: act from>to`.
+fn shown(local: &Local) -> Vec<String> {
+    let states = local.states().iter();
+    let shown = states.flat_map(|state| {
+        state.steps().iter().map(|step| {
+            format!(
+                "{}: {} {}>{} {}",
+                state.names().join("|"),
+                step.performative(),
+                local.from(step),
+                local.to(step),
+                local.states()[step.target()].names().join("|")
+            )
+        })
+    });
+    shown.collect()
+}
+
+#[test]
+fn a_projection_hides_the_messages_of_other_roles() {
+    let docking = machine(DOCKING);
+    let projection = docking.projection().unwrap();
+    let roles: Vec<&str> = projection.locals().iter().map(Local::role).collect();
+    assert_eq!(roles, ["drone", "mediator", "station"]);
+    assert_eq!(
+        shown(&projection.locals()[2]),
+        [
+            "1|2|done: query-if mediator>station 3",
+            "3: confirm station>mediator 4|6",
+            "3: disconfirm station>mediator 5|done",
+            "4|6: inform drone>station 7",
+            "7: inform station>mediator 8|done",
+        ]
+    );
+    // Only the message of the drone to the station is hidden from the mediator.
+    let mediator = projection.locals()[1].states().len();
+    assert_eq!(mediator, docking.states().len() - 1);
+    assert_eq!(Projection::defects(&docking), []);
+    // The state of a station that was not asked may be the last one.
+    assert!(projection.locals()[2].states()[0].is_final());
+    assert!(!projection.locals()[0].states()[0].is_final());
+}
+
+#[test]
+fn all_standard_protocols_are_inside_the_class() {
+    for machine in Library::standard().iter() {
+        assert_eq!(Projection::defects(machine), [], "{}", machine.name());
+        assert!(machine.scope() == Scope::Participant || machine.projection().is_some());
+    }
+}
+
+fn defects(states: &str) -> Vec<Defect> {
+    let machine = machine(&format!(r#"<scxml initial="1">{states}</scxml>"#));
+    let defects = Projection::defects(&machine);
+    assert_eq!(machine.projection().is_none(), !defects.is_empty());
+    defects
+}
+
+#[test]
+fn a_role_that_is_not_told_cannot_know_when_to_speak() {
+    let found = defects(
+        r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="c" to="a" target="3"/></state>
+        <state id="3"><transition performative="confirm" from="a" to="c" target="4"/></state>
+        <state id="4" final="yes"/>"#,
+    );
+    let not_told = Defect::NotTold {
+        role: "c".into(),
+        performative: "inform".into(),
+        state: "2".into(),
+        other: "1".into(),
+    };
+    assert!(found.contains(&not_told), "{found:?}");
+    let text = not_told.to_string();
+    assert!(
+        text.starts_with("c cannot know when to send inform"),
+        "{text}"
+    );
+}
+
+#[test]
+fn two_roles_must_not_decide_the_same_choice() {
+    let found = defects(
+        r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="b" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="b" target="4"/>
+            <transition performative="refuse" from="b" to="c" target="4"/></state>
+        <state id="4" final="yes"/>"#,
+    );
+    let mixed = Defect::MixedChoice {
+        state: "3".into(),
+        one: "c".into(),
+        other: "b".into(),
+    };
+    assert!(found.contains(&mixed), "{found:?}");
+    // Both messages wait for a receiver that has gone on.
+    let crossed = |defect: &Defect| matches!(defect, Defect::Unexpected { .. });
+    assert!(found.iter().any(crossed), "{found:?}");
+    // Independent messages are no choice.
+    let none = defects(
+        r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="3"/>
+            <transition performative="request" from="a" to="c" target="4"/></state>
+        <state id="3"><transition performative="request" from="a" to="c" target="5"/></state>
+        <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/>"#,
+    );
+    assert_eq!(none, []);
+}
+
+#[test]
+fn a_choice_that_a_waiting_role_is_not_told_is_a_deadlock() {
+    let found = defects(
+        r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/>
+            <transition performative="propose" from="a" to="b" target="3"/></state>
+        <state id="2"><transition performative="request" from="b" to="c" target="4"/></state>
+        <state id="3"><transition performative="request" from="b" to="c" target="5"/></state>
+        <state id="4"><transition performative="agree" from="c" to="b" target="6"/></state>
+        <state id="5"><transition performative="refuse" from="c" to="b" target="6"/></state>
+        <state id="6" final="yes"/>"#,
+    );
+    // The station is told the same in both cases, and may answer with the wrong one.
+    assert!(
+        found
+            .iter()
+            .any(|defect| matches!(defect, Defect::NotTold { role, .. } if role == "c")),
+        "{found:?}"
+    );
+    let unexpected = |defect: &Defect| matches!(defect, Defect::Unexpected { from, to, .. } if from == "c" && to == "b");
+    assert!(found.iter().any(unexpected), "{found:?}");
+    let text = r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from=".*" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
+        <state id="4" final="yes"/>"#;
+    let found = defects(text);
+    assert!(
+        matches!(&found[..], [Defect::Pattern { what: "from", .. }]),
+        "{found:?}"
+    );
+}
+
+struct Stage {
+    monitor: Monitor,
+    now: SystemTime,
+}
+
+fn stage(agent: &str) -> Stage {
+    let mut library = Library::standard();
+    library.add(machine(DOCKING)).unwrap();
+    Stage {
+        monitor: Monitor::agent(Arc::new(library), agent),
+        now: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
+    }
+}
+
+impl Stage {
+    fn check(&mut self, words: &'static str) -> Verdict<'_> {
+        let (act, agents) = words.split_once(' ').unwrap();
+        let (from, to) = agents.split_once('>').unwrap();
+        let header = Header::new(act.parse().unwrap())
+            .sender(from)
+            .receivers([to])
+            .protocol("own")
+            .conversation_id("c");
+        self.monitor.check(&header, self.now)
+    }
+
+    fn right(&mut self, all: &[&'static str]) {
+        for words in all {
+            let verdict = self.check(words);
+            assert!(verdict.is_accepted(), "{words}: {verdict:?}");
+        }
+    }
+
+    fn wrong(&mut self, words: &'static str) -> Kind {
+        let verdict = self.check(words);
+        verdict
+            .violation()
+            .unwrap_or_else(|| panic!("{words}: {verdict:?}"))
+            .kind
+    }
+}
+
+#[test]
+fn each_agent_checks_what_it_sees() {
+    // The station was not told the first message.
+    let mut station = stage("sta");
+    station.right(&["query-if med>sta"]);
+    assert_eq!(station.wrong("inform sta>med"), Kind::Unexpected);
+    assert_eq!(station.wrong("agree med>sta"), Kind::Unexpected);
+    station.right(&["confirm sta>med"]);
+    // It does not know the drone yet, but the mediator is not the drone.
+    assert_eq!(station.wrong("inform med>sta"), Kind::Unexpected);
+    station.right(&["inform dro>sta"]);
+    assert_eq!(station.wrong("inform sta>dro"), Kind::Unexpected);
+    station.right(&["inform sta>med"]);
+    assert_eq!(station.wrong("inform sta>med"), Kind::Ended);
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
+    drone.right(&["agree med>dro", "inform dro>sta", "inform med>dro"]);
+    let mut mediator = stage("med");
+    mediator.right(&["request dro>med", "query-if med>sta", "disconfirm sta>med"]);
+    assert_eq!(mediator.wrong("agree med>dro"), Kind::Unexpected);
+    mediator.right(&["refuse med>dro"]);
+    assert_eq!(mediator.monitor.len(), 1);
+    mediator.now += Duration::from_secs(100);
+    mediator.monitor.handle_timeout(mediator.now);
+    assert!(mediator.monitor.is_empty(), "it is over");
+}
+
+#[test]
+fn a_message_may_overtake_one_of_another_sender() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
+        <state id="4"><transition performative="agree" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    library.add(machine(text)).unwrap();
+    let mut stage = stage("ben");
+    stage.monitor = Monitor::agent(Arc::new(library), "ben");
+    // The inform of cid overtakes the request of ann.
+    stage.right(&["inform cid>ben"]);
+    assert_eq!(stage.wrong("agree ben>ann"), Kind::Unexpected);
+    stage.right(&["request ann>ben"]);
+    stage.right(&["agree ben>ann"]);
+    assert_eq!(stage.wrong("inform cid>ben"), Kind::Ended);
+}
+
+#[test]
+fn the_rules_of_all_protocols_and_unknown_history_apply() {
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "not-understood med>dro"]);
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Ended);
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    assert_eq!(drone.check("cancel dro>med"), elsewhere);
+    // The agent may have restarted.
+    let mut drone = stage("dro");
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::NotOpened);
+    assert_eq!(drone.wrong("subscribe med>dro"), Kind::NotOpened);
+    assert_eq!(drone.check("confirm med>dro"), unknown);
+    let mut drone = stage("dro");
+    drone.monitor = drone.monitor.with_history(History::Unknown);
+    assert_eq!(drone.check("inform dro>sta"), unknown);
+}
+
+/// Random runs of the roles with slow routes: no monitor refuses a message.
+#[test]
+fn no_message_of_a_projected_protocol_is_refused() {
+    let number = |name: &str| {
+        std::env::var(name)
+            .ok()
+            .map(|text| text.parse::<u64>().unwrap())
+    };
+    let runs = number("FIPA_WALK_SEEDS").unwrap_or(2_000);
+    let docking = machine(DOCKING);
+    let locals = docking.projection().unwrap().locals();
+    let mut library = Library::standard();
+    library.add(docking.clone()).unwrap();
+    let library = Arc::new(library);
+    let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+    let names = ["dro", "med", "sta"];
+    let (mut said, mut ended) = (0, 0);
+    for seed in 0..runs {
+        let mut rng = Rng::with_seed(seed);
+        let mut monitors = names.map(|name| Monitor::agent(Arc::clone(&library), name));
+        let mut states = [0; 3];
+        let mut queues: Vec<VecDeque<String>> = vec![VecDeque::new(); 9];
+        let mut idle = 0;
+        while idle < 60 {
+            idle += 1;
+            let role = rng.usize(..3);
+            let state = &locals[role].states()[states[role]];
+            let Some(step) = rng.choice(state.steps()) else {
+                continue;
+            };
+            let index = |name: &str| {
+                locals
+                    .iter()
+                    .position(|local| local.role() == name)
+                    .unwrap()
+            };
+            let (from, to) = (index(locals[role].from(step)), index(locals[role].to(step)));
+            let queue = &mut queues[from * 3 + to];
+            if from != role && queue.front().map(String::as_str) != Some(step.performative()) {
+                continue;
+            }
+            match from == role {
+                true => queue.push_back(step.performative().to_owned()),
+                false => drop(queue.pop_front()),
+            }
+            states[role] = step.target();
+            idle = 0;
+            said += 1;
+            let header = Header::new(step.performative().parse().unwrap())
+                .sender(names[from])
+                .receivers([names[to]])
+                .protocol("own")
+                .conversation_id("c");
+            let verdict = monitors[role].check(&header, now);
+            assert!(
+                verdict.is_accepted(),
+                "seed {seed}: {header:?}: {verdict:?}"
+            );
+        }
+        ended += usize::from(
+            locals
+                .iter()
+                .zip(states)
+                .all(|(local, at)| local.states()[at].is_final()),
+        );
+    }
+    assert_eq!(ended as u64, runs);
+    assert!(said > runs * 4);
+}
