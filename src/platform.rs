@@ -243,7 +243,7 @@ impl<'a> Df<'a> {
     pub async fn subscribe(
         &self,
         template: &AgentDescription,
-    ) -> Result<Notifications<'a>, PlatformError> {
+    ) -> Result<Notifications, PlatformError> {
         let client = &self.0;
         let content = subscription(&client.server, template)?;
         let message = client.message(Performative::Subscribe, "fipa-sl2", content);
@@ -267,9 +267,9 @@ impl<'a> Df<'a> {
 /// to [`Agent::receive`].
 #[derive(Debug)]
 #[must_use = "next() returns the notifications"]
-pub struct Notifications<'a>(Subscription<'a>);
+pub struct Notifications(Subscription);
 
-impl Notifications<'_> {
+impl Notifications {
     /// Waits for the next notification, without a time limit, and returns the descriptions that have
     /// changed. A description with a name only is that of an agent that has deregistered.
     ///

@@ -21,8 +21,8 @@ pub struct Df<'a> {
 /// A subscription to a directory facilitator; see [`crate::platform::Notifications`].
 #[derive(Debug)]
 #[must_use = "next() returns the notifications"]
-pub struct Notifications<'a> {
-    notifications: platform::Notifications<'a>,
+pub struct Notifications {
+    notifications: platform::Notifications,
     runtime: &'a Runtime,
 }
 
@@ -117,10 +117,7 @@ impl<'a> Df<'a> {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn subscribe(
-        &self,
-        template: &AgentDescription,
-    ) -> Result<Notifications<'a>, PlatformError> {
+    pub fn subscribe(&self, template: &AgentDescription) -> Result<Notifications, PlatformError> {
         let runtime = self.runtime;
         let notifications = runtime.block_on(self.df.subscribe(template))?;
         Ok(Notifications {
@@ -138,7 +135,7 @@ impl Ams<'_> {
     }
 }
 
-impl Notifications<'_> {
+impl Notifications {
     /// See [`crate::platform::Notifications::next`].
     ///
     /// # Errors

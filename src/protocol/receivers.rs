@@ -20,7 +20,7 @@ pub(super) struct Expanded {
 /// Replaces patterns and coalitions by the agents that they stand for now, and removes repeated names.
 /// An unknown name stays, and the message to it fails.
 pub(super) fn expand(core: &AgentCore, receivers: &[AgentId]) -> Expanded {
-    let directory = core.endpoint.domain.directory();
+    let directory = &*core.endpoint.domain.inner.service.host;
     expand_in(directory, &core.endpoint.name, receivers)
 }
 

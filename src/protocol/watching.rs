@@ -141,7 +141,7 @@ impl PartnerWatch {
     }
 
     fn directory(&self) -> &dyn Directory {
-        self.core.endpoint.domain.directory()
+        &*self.core.endpoint.domain.inner.service.host
     }
 
     fn handle_change(&mut self, change: &Change) {
