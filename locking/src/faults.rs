@@ -18,8 +18,6 @@ pub(crate) enum Fault {
     DropDeferred,
     /// The owner gives the same number twice.
     ReuseFence,
-    /// An answer extends a lease that has ended.
-    ReviveExpired,
     /// A restarted owner counts from the epoch of its life before.
     KeepEpoch,
     /// The owner agrees while a grant is live.

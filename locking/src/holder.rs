@@ -178,11 +178,6 @@ impl Holder {
                 self.until = self.until.max(until);
                 self.lease = lease;
             }
-            Phase::Lost if fault!(self.fault, ReviveExpired) => {
-                self.phase = Phase::Held;
-                self.until = until;
-                out.push(HolderStep::Held);
-            }
             Phase::Unfenced | Phase::Lost => {}
         }
     }

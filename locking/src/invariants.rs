@@ -117,8 +117,8 @@ impl History {
                 self.confirmed.remove(&request);
                 let latest = self.released.get(from);
                 let is_late = |latest: &Conversation| message.conversation.is_not_after(latest);
-                let of_live = |live: &Live| (&live.holder, &live.conversation) == (from, &request.1);
-                let counts = matches!(act, Act::Release) || self.live.as_ref().is_some_and(of_live);
+                // A token is a report in the conversation of its sender's own request.
+                let counts = matches!(act, Act::Release) || message.conversation.is_of(from);
                 if counts && !latest.is_some_and(is_late) {
                     self.released.insert(request.0, request.1);
                 }

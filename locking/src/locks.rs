@@ -622,6 +622,13 @@ impl<A: Algorithm> Locks<A> {
         act: &Act,
         out: &mut Actions,
     ) {
+        // An earlier registration of this agent is no other owner.
+        if from.name() == self.me.name() {
+            return;
+        }
+        if *act == Act::Owned && self.resources.len() < MAX_FOREIGN {
+            self.entry(resource);
+        }
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
@@ -785,9 +792,11 @@ impl<A: Algorithm> Locks<A> {
             algorithm.handle(context, from, conversation, act, steps);
         });
         if let Act::Token(_) = act {
-            // The token's return is the report of the agent that had it.
             self.at_owner(resource, out, |core, steps| {
-                core.release(now, from, conversation, steps);
+                if conversation.is_of(from) {
+                    // The token's return is the report of the agent that had it.
+                    core.release(now, from, conversation, steps);
+                }
                 if legacy_holder {
                     core.left_without_report(now, steps);
                 }
@@ -1460,6 +1469,7 @@ impl<A: Algorithm> Locks<A> {
             owner: entry.owner.as_ref(),
             gate: entry.gate,
             lease: self.options.lease,
+            retry: self.options.retry,
             fault: self.options.fault,
         };
         call(&mut entry.algorithm, &context, steps);

@@ -150,6 +150,12 @@ impl Conversation {
         }
     }
 
+    /// Whether the identifier has the form that `peer` gives the conversations that it begins.
+    #[must_use]
+    pub fn is_of(&self, peer: &Peer) -> bool {
+        *self.prefix == *peer.name && self.number.is_some()
+    }
+
     /// Whether this conversation began at the same time as `other` or before it, by the numbers of
     /// the agent that began both. Conversations with different prefixes have no order.
     #[must_use]

@@ -120,6 +120,8 @@ pub struct Context<'a> {
     pub gate: Gate,
     /// Lease of a grant.
     pub lease: Millis,
+    /// Time after which a request without an answer is repeated.
+    pub retry: Millis,
     pub(crate) fault: Fault,
 }
 

@@ -37,6 +37,9 @@ pub struct SuzukiKasami {
     /// served the one before.
     pending: bool,
     own: Option<OwnRequest>,
+    /// Conversation of the request that this agent is leaving, during that call: the token's return is
+    /// its report.
+    leaving: Option<Conversation>,
     token: Option<Token>,
     /// Newest generation.
     generation: u64,
@@ -139,7 +142,7 @@ impl SuzukiKasami {
         let owner = context.owner.filter(|owner| **owner != self.me);
         if let (true, Some(owner)) = (self.extended, owner) {
             let to = owner.clone();
-            let conversation = self.own.as_ref().map(|own| own.conversation.clone());
+            let conversation = self.leaving.clone();
             self.send_token(context, to, conversation, out);
             return;
         }
@@ -149,34 +152,76 @@ impl SuzukiKasami {
                 token.queue.push_back(name.clone());
             }
         }
+        let me = self.me.shared_name();
+        let waits = self.own.is_some();
+        token.queue.retain(|name| name != me || waits);
+        if waits && !token.queue.contains(me) {
+            token.queue.push_back(me.clone());
+        }
         // An agent that has no request here was lost, or has sent a request that has not arrived.
-        let next = token.queue.iter().position(|name| {
-            self.requests.get(name).is_some_and(|request| {
-                let may = context.gate.lets_pass(context.dialect(&request.peer));
-                may && context.members.contains_key(&request.peer)
-            })
-        });
-        if let Some(name) = next.and_then(|next| token.queue.remove(next))
-            && let Some(request) = self.requests.get(&name)
-        {
+        let known = |name: &Arc<str>| {
+            let request = self.requests.get(name);
+            request.filter(|request| context.members.contains_key(&request.peer))
+        };
+        let next = match context.gate {
+            // The first agent waits for the end of the live grant, and so do those behind it.
+            Gate::Closed => {
+                let first = token
+                    .queue
+                    .iter()
+                    .position(|name| name == me || known(name).is_some());
+                first.filter(|first| token.queue.get(*first) == Some(me))
+            }
+            gate => token.queue.iter().position(|name| {
+                let may = |peer| gate.lets_pass(context.dialect(peer));
+                name == me || known(name).is_some_and(|request| may(&request.peer))
+            }),
+        };
+        let Some(name) = next.and_then(|next| token.queue.remove(next)) else {
+            return;
+        };
+        if name == *me {
+            token.last.insert(name, self.number);
+            self.enter(out);
+        } else if let Some(request) = self.requests.get(&name) {
             let to = request.peer.clone();
             self.send_token(context, to, None, out);
         }
     }
 
-    /// Serves a request that is repeated although the token was sent for it and replaced since: the
-    /// token was lost. If the repetition was late, the agent returns the token.
-    fn serve_again(&mut self, from: &Peer, number: u64) {
+    /// Handles a repeated request at the owner: a token that was sent for it was lost. If the repetition
+    /// was late, the agent discards the older token and returns the newer one.
+    fn serve_again(
+        &mut self,
+        context: &Context<'_>,
+        from: &Peer,
+        number: u64,
+        out: &mut Vec<Step>,
+    ) {
         let name = from.shared_name();
         let latest = self.requests.get(name);
         if !latest.is_some_and(|latest| latest.number == number && latest.peer == *from) {
             return;
         }
-        let away = self.away.as_mut().filter(|away| away.to != *from);
-        let away = away.map(|away| &mut away.token);
-        for token in self.token.as_mut().into_iter().chain(away) {
-            if let Some(last) = token.last.get_mut(name) {
-                *last = number.saturating_sub(1).min(*last);
+        match &mut self.away {
+            Some(away) if away.to == *from => {
+                // A request that crossed the token does not show a loss.
+                let sent = away.until.saturating_sub(context.lease);
+                let crossed = context.now < sent.saturating_add(context.retry);
+                if !crossed && context.gate.lets_pass(context.dialect(from)) {
+                    self.generation = self.generation.saturating_add(1);
+                    self.token = Some(away.token.clone());
+                    self.send_token(context, from.clone(), None, out);
+                }
+            }
+            away => {
+                let away = away.as_mut().map(|away| &mut away.token);
+                for token in self.token.as_mut().into_iter().chain(away) {
+                    if let Some(last) = token.last.get_mut(name) {
+                        *last = number.saturating_sub(1).min(*last);
+                    }
+                }
+                self.pass(context, out);
             }
         }
     }
@@ -237,7 +282,6 @@ impl SuzukiKasami {
     fn renew(&mut self, context: &Context<'_>, token: Token, out: &mut Vec<Step>) {
         self.generation = self.generation.saturating_add(1);
         self.token = Some(token);
-        self.enter(out);
         self.pass(context, out);
     }
 
@@ -276,10 +320,16 @@ impl SuzukiKasami {
         token
             .last
             .insert(self.me.shared_name().clone(), self.number);
-        let own = self.me.shared_name();
-        token.queue.retain(|name| name != own);
+        let returned = self.extended && self.is_owner(context);
+        if !returned {
+            let me = self.me.shared_name();
+            token.queue.retain(|name| name != me);
+        }
         self.token = Some(token);
-        self.enter(out);
+        if !returned {
+            self.enter(out);
+        }
+        // The owner waits for its turn, since the token returns to it after each.
         self.pass(context, out);
     }
 }
@@ -298,6 +348,7 @@ impl Algorithm for SuzukiKasami {
             number: 0,
             pending: false,
             own: None,
+            leaving: None,
             token: owns.then(Token::default),
             generation: 0,
             archive: None,
@@ -324,10 +375,10 @@ impl Algorithm for SuzukiKasami {
     }
 
     fn leave(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
-        if let Some(own) = &mut self.own {
-            own.entered = false;
+        if let Some(own) = self.own.take() {
+            self.leaving = Some(own.conversation);
             self.pass(context, out);
-            self.own = None;
+            self.leaving = None;
         }
     }
 
@@ -343,21 +394,8 @@ impl Algorithm for SuzukiKasami {
             Act::RequestToken { number } => {
                 if self.record(from, *number, conversation) {
                     self.pass(context, out);
-                } else if let Some(away) = &self.away
-                    && away.to == *from
-                    && away.number == *number
-                    && context.gate.lets_pass(context.dialect(from))
-                {
-                    // The agent asks again: the token was lost. If it was not, the agent discards
-                    // the older one.
-                    let token = away.token.clone();
-                    let to = from.clone();
-                    self.generation = self.generation.saturating_add(1);
-                    self.token = Some(token);
-                    self.send_token(context, to, None, out);
                 } else if self.extended && self.is_owner(context) {
-                    self.serve_again(from, *number);
-                    self.pass(context, out);
+                    self.serve_again(context, from, *number, out);
                 }
             }
             Act::Token(token) => self.take(context, from, token, out),

@@ -16,7 +16,7 @@ pub(super) struct Graph {
     done: Vec<bool>,
     /// Source and target of each step.
     edges: Vec<(u32, u32)>,
-    /// The first state that breaks an invariant.
+    /// A state that breaks an invariant, over the shortest path to one.
     pub(super) broken: Option<u32>,
 }
 
@@ -25,7 +25,7 @@ fn fingerprint(state: &State) -> u64 {
 }
 
 impl Graph {
-    /// Explores every reachable state, breadth first.
+    /// Explores every reachable state, breadth first, up to one that breaks an invariant.
     ///
     /// # Panics
     ///
@@ -49,7 +49,8 @@ impl Graph {
             let id = graph.done.len() as u32;
             graph.done.push(System::is_done(&state));
             if state.broken().is_some() {
-                graph.broken.get_or_insert(id);
+                graph.broken = Some(id);
+                break;
             }
             system.actions(&state, &mut steps);
             for (number, step) in (0_u16..).zip(steps.drain(..)) {

@@ -112,7 +112,7 @@ impl System {
     fn options(&self) -> Options {
         Options {
             lease: self.lease,
-            probe_interval: if self.probes { 2 } else { 60 },
+            probe_interval: if self.probes { 1 } else { 60 },
             probe_timeout: 2,
             retry: 2,
             discovery: 4,
@@ -299,7 +299,9 @@ impl System {
     }
 
     fn observe(state: &mut State) {
-        for agent in &state.agents {
+        let (held, not): (Vec<_>, Vec<_>) =
+            state.agents.iter().partition(|agent| agent.fence().is_some());
+        for agent in not.into_iter().chain(held) {
             let fence = agent.fence();
             state.history.holds(&agent.me, fence.as_ref());
             if let (Some(fence), Some(owner)) = (fence, &state.agents[0].locks) {

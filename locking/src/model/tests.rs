@@ -60,10 +60,124 @@ fn holds(system: &System) -> usize {
     explore(system, SMALL).unwrap_or_else(|(_, text)| panic!("{text}"))
 }
 
+const NONE: Faults = Faults {
+    losses: 0,
+    duplicates: 0,
+    crashes: 0,
+    pauses: 0,
+    restarts: 0,
+    withdrawals: 0,
+};
+
 #[test]
 fn two_requesters_and_delayed_messages() {
     for kind in Kind::ALL {
-        holds(&system(kind, &[0, 1, 1], Time::Free(1), Faults::default()));
+        holds(&system(kind, &[0, 1, 1], Time::Free(1), NONE));
+    }
+}
+
+#[test]
+fn the_owner_and_a_requester() {
+    for kind in Kind::ALL {
+        holds(&system(kind, &[1, 1], Time::Prompt, NONE));
+    }
+}
+
+const EXTENDED: [Kind; 2] = [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended];
+
+#[test]
+fn a_message_is_lost_and_the_owner_restarts() {
+    for kind in EXTENDED {
+        let faults = Faults {
+            losses: 1,
+            restarts: 1,
+            ..NONE
+        };
+        holds(&system(kind, &[0, 1], Time::Prompt, faults));
+    }
+}
+
+#[test]
+fn a_requester_crashes_and_returns() {
+    for kind in EXTENDED {
+        let faults = Faults {
+            losses: 1,
+            crashes: 1,
+            ..NONE
+        };
+        holds(&system(kind, &[0, 1], Time::Prompt, faults));
+    }
+}
+
+#[test]
+fn a_request_is_withdrawn() {
+    for kind in Kind::ALL {
+        let faults = Faults {
+            withdrawals: 1,
+            ..NONE
+        };
+        holds(&system(kind, &[0, 2], Time::Prompt, faults));
+    }
+}
+
+#[test]
+fn a_holder_pauses() {
+    for kind in EXTENDED {
+        let faults = Faults { pauses: 1, ..NONE };
+        let probed = System {
+            probes: true,
+            ..system(kind, &[0, 1], Time::Prompt, faults)
+        };
+        holds(&probed);
+    }
+}
+
+/// The checker of `stateright` explores the same states and finds no counterexample either.
+#[test]
+fn stateright_agrees() {
+    let model = system(Kind::SuzukiKasamiExtended, &[1, 1], Time::Free(2), NONE);
+    let checker = model.clone().checker().threads(2).spawn_bfs().join();
+    checker.assert_properties();
+    assert_eq!(checker.unique_state_count(), holds(&model));
+}
+
+/// Each mistake breaks an invariant, in a configuration in which the core without it breaks none.
+#[test]
+fn mistakes_are_found() {
+    let basic = Kind::RicartAgrawala;
+    let token = Kind::SuzukiKasamiExtended;
+    let prompt = |kind, claims: &[u8], faults| system(kind, claims, Time::Prompt, faults);
+    let free = |ticks, lease, faults| System {
+        lease,
+        ..system(token, &[1, 1], Time::Free(ticks), faults)
+    };
+    let duplicates = Faults {
+        duplicates: 1,
+        ..NONE
+    };
+    let restarts = Faults {
+        restarts: 1,
+        ..NONE
+    };
+    let probed = System {
+        probes: true,
+        ..free(3, 3, NONE)
+    };
+    for (fault, model, broken) in [
+        (Fault::RenewByProbe, probed, 4),
+        (Fault::CountFromArrival, free(2, 2, NONE), 4),
+        (Fault::GrantAfterRestart, free(1, 4, restarts), 4),
+        (Fault::KeepEpoch, prompt(basic, &[1, 1], restarts), 1),
+        (Fault::ReleaseByName, prompt(basic, &[0, 2], duplicates), 6),
+        (Fault::DropDeferred, prompt(basic, &[0, 1, 1], NONE), 10),
+        (Fault::ReuseFence, prompt(basic, &[0, 2], NONE), 1),
+        (Fault::IgnoreGate, prompt(basic, &[0, 1, 1], NONE), 9),
+        (Fault::GrantWithdrawn, prompt(basic, &[0, 1], duplicates), 7),
+    ] {
+        holds(&model);
+        let mutant = System { fault, ..model };
+        let found = explore(&mutant, SMALL).err().map(|(number, _)| number);
+        assert_eq!(found, Some(broken), "{fault:?}");
     }
 }
 
