@@ -139,7 +139,15 @@ mod tests {
         let fence = Fence::new(&owner, 7, 42);
         assert_eq!(fence.to_string(), "7.42@crane@bay");
         assert_eq!("7.42@crane@bay".parse(), Ok(fence));
-        for wrong in ["", "7.42", "7@crane", "+7.1@crane", "7.1@", "a.1@b", "1.99999999999999999999@a"] {
+        for wrong in [
+            "",
+            "7.42",
+            "7@crane",
+            "+7.1@crane",
+            "7.1@",
+            "a.1@b",
+            "1.99999999999999999999@a",
+        ] {
             assert!(wrong.parse::<Fence>().is_err(), "{wrong}");
         }
     }

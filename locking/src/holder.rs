@@ -42,7 +42,10 @@ enum Phase {
 
 /// Result of a call of a holder.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[allow(clippy::exhaustive_enums, reason = "the caller has to perform each step")]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "the caller has to perform each step"
+)]
 pub enum HolderStep {
     /// Send this to the owner.
     Send(Act),
@@ -148,8 +151,8 @@ impl Holder {
         out: &mut Vec<HolderStep>,
     ) {
         self.handle_timeout(now, out);
-        let of_this_request =
-            (self.first..=now).contains(&asked) && self.fence.as_ref().is_none_or(|own| own == fence);
+        let of_this_request = (self.first..=now).contains(&asked)
+            && self.fence.as_ref().is_none_or(|own| own == fence);
         if !of_this_request {
             return;
         }
@@ -205,7 +208,7 @@ impl Holder {
     #[cfg(test)]
     pub(crate) fn probed(&mut self, now: Millis) {
         if fault!(self.fault, RenewByProbe) && self.is_held(now) {
-            self.until = now + self.lease * SHARE / 100;
+            self.until = now + self.lease;
         }
     }
 

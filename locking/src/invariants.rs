@@ -17,8 +17,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::{
-    Act, Action, Algorithm, ClaimId, Content, Conversation, Ending, Event, Fence, LockMessage, Locks,
-    Millis, Peer, Resource,
+    Act, Action, Algorithm, ClaimId, Content, Conversation, Ending, Event, Fence, LockMessage,
+    Locks, Millis, Peer, Resource,
 };
 
 /// A broken invariant.
@@ -202,7 +202,10 @@ impl History {
             return;
         };
         let lets_enter = matches!(act, Act::Agree { .. } | Act::Token(_));
-        if *resource == self.resource && lets_enter && self.live.as_ref().is_some_and(|live| live.fence.is_some()) {
+        if *resource == self.resource
+            && lets_enter
+            && self.live.as_ref().is_some_and(|live| live.fence.is_some())
+        {
             self.break_invariant(9, format!("{act:?} to {to} while {:?} is live", self.live));
         }
     }

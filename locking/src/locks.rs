@@ -8,8 +8,8 @@ use crate::holder::{Holder, HolderStep};
 use crate::owner::{Ending, Grant, Owner, OwnerStep};
 use crate::probes::{ProbeStep, Probes};
 use crate::{
-    Act, Algorithm, Content, Conversation, Dialect, Fence, Gate, Kind, LockMessage, Millis, Options,
-    OwnerState, Peer, Refusal, Resource,
+    Act, Algorithm, Content, Conversation, Dialect, Fence, Gate, Kind, LockMessage, Millis,
+    Options, OwnerState, Peer, Refusal, Resource,
 };
 
 /// Maximum number of members. Messages of further agents are ignored.
@@ -25,7 +25,10 @@ pub struct ClaimId(u64);
 
 /// Result of a call of the core.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[allow(clippy::exhaustive_enums, reason = "the caller has to perform each action")]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "the caller has to perform each action"
+)]
 pub enum Action {
     /// Send a message.
     Send {
@@ -385,13 +388,7 @@ impl<A: Algorithm> Locks<A> {
     ///
     /// [`Event::Owning`] follows after [`Options::claim`], or [`Event::OwningRefused`] if another agent
     /// owns the resource. Nothing happens if this agent owns it already.
-    pub fn own(
-        &mut self,
-        now: Millis,
-        resource: &Resource,
-        state: &OwnerState,
-        out: &mut Actions,
-    ) {
+    pub fn own(&mut self, now: Millis, resource: &Resource, state: &OwnerState, out: &mut Actions) {
         let (me, options) = (self.me.clone(), self.options);
         let entry = self.entry(resource);
         if entry.owned.is_some() {
@@ -564,13 +561,7 @@ impl<A: Algorithm> Locks<A> {
         timer.into_iter().chain(self.probes.poll_timeout()).min()
     }
 
-    fn dispatch(
-        &mut self,
-        now: Millis,
-        from: &Peer,
-        message: &LockMessage,
-        out: &mut Actions,
-    ) {
+    fn dispatch(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
         let conversation = &message.conversation;
         match &message.content {
             Content::Probe => {
@@ -837,9 +828,10 @@ impl<A: Algorithm> Locks<A> {
             let Some(entry) = self.resources.get(&resource) else {
                 continue;
             };
-            let discovering = entry.current.as_ref().is_some_and(|current| {
-                matches!(current.phase, Phase::Discovering { .. })
-            });
+            let discovering = entry
+                .current
+                .as_ref()
+                .is_some_and(|current| matches!(current.phase, Phase::Discovering { .. }));
             let act = match &entry.owned {
                 Some(owned) if owned.claim_until.is_some() => Some(Act::Query { claim: true }),
                 Some(_) => Some(Act::Owned),
@@ -888,7 +880,9 @@ impl<A: Algorithm> Locks<A> {
         out: &mut Actions,
     ) {
         self.touched.insert(resource.clone());
-        self.at_owner(resource, out, |core, steps| core.lost(now, peer, gone, steps));
+        self.at_owner(resource, out, |core, steps| {
+            core.lost(now, peer, gone, steps)
+        });
         self.update_gate(now, resource, out);
         self.owner_lost(now, resource, peer, gone, out);
         self.at_algorithm(now, resource, out, |algorithm, context, steps| {
@@ -994,7 +988,11 @@ impl<A: Algorithm> Locks<A> {
                 continue;
             };
             entry.waiting.retain(|waiting| *waiting != id);
-            if entry.current.as_ref().is_some_and(|current| current.claim == id) {
+            if entry
+                .current
+                .as_ref()
+                .is_some_and(|current| current.claim == id)
+            {
                 self.end_current(now, resource, out);
             }
             self.touched.insert(resource.clone());
@@ -1336,7 +1334,10 @@ impl<A: Algorithm> Locks<A> {
             Phase::Requesting { next, .. } => self.kind.is_extended().then_some(*next),
             Phase::Entered { holder, .. } => holder.poll_timeout(),
         });
-        let claims = entry.waiting.iter().chain(current.map(|current| &current.claim));
+        let claims = entry
+            .waiting
+            .iter()
+            .chain(current.map(|current| &current.claim));
         let deadlines = claims.filter_map(|claim| {
             let claim = self.claims.get(claim)?;
             claim.deadline.filter(|_| claim.wanted() == Some(resource))

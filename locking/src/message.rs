@@ -19,7 +19,10 @@ pub struct LockMessage {
 
 /// Implementation of an agent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-#[allow(clippy::exhaustive_enums, reason = "an agent requests grants, or it does not")]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "an agent requests grants, or it does not"
+)]
 pub enum Dialect {
     /// This library: the agent requests a grant with a fence.
     Own,

@@ -197,7 +197,16 @@ mod tests {
 
     #[test]
     fn conversations_keep_their_text() {
-        for text in ["agent2_0", "a_b_17", "a_017", "a_", "_", "", "x", "a_99999999999999999999"] {
+        for text in [
+            "agent2_0",
+            "a_b_17",
+            "a_017",
+            "a_",
+            "_",
+            "",
+            "x",
+            "a_99999999999999999999",
+        ] {
             assert_eq!(Conversation::parse(text).to_string(), text);
         }
         let first = Conversation::parse("agent2_9");

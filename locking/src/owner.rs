@@ -79,7 +79,10 @@ pub enum Ending {
 
 /// Result of a call of an owner.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[allow(clippy::exhaustive_enums, reason = "the caller has to perform each step")]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "the caller has to perform each step"
+)]
 pub enum OwnerStep {
     /// Send a message.
     Send {
@@ -260,10 +263,9 @@ impl Owner {
         self.handle_timeout(now, out);
         self.proved(from, conversation);
         let by_name = fault!(self.fault, ReleaseByName);
-        let of_live = self
-            .live
-            .as_ref()
-            .is_some_and(|live| live.holder == *from && (by_name || live.conversation == *conversation));
+        let of_live = self.live.as_ref().is_some_and(|live| {
+            live.holder == *from && (by_name || live.conversation == *conversation)
+        });
         if of_live {
             self.end(Ending::Released, out);
         } else if !self.is_closed(from, conversation) {
@@ -303,13 +305,7 @@ impl Owner {
     }
 
     /// Handles the loss of an agent. `gone` is a proof that its registration or its process has ended.
-    pub(crate) fn lost(
-        &mut self,
-        now: Millis,
-        peer: &Peer,
-        gone: bool,
-        out: &mut Vec<OwnerStep>,
-    ) {
+    pub(crate) fn lost(&mut self, now: Millis, peer: &Peer, gone: bool, out: &mut Vec<OwnerStep>) {
         self.queue.retain(|waiter| waiter.peer != *peer);
         if gone {
             if self.live.as_ref().is_some_and(|live| live.holder == *peer) {
@@ -447,7 +443,11 @@ impl Owner {
     pub(crate) fn rebase(&mut self, by: Millis) {
         let expires = self.live.as_mut().and_then(|live| live.expires.as_mut());
         let asked = self.queue.iter_mut().flat_map(|waiter| &mut waiter.asked);
-        for time in expires.into_iter().chain(&mut self.silent_until).chain(asked) {
+        for time in expires
+            .into_iter()
+            .chain(&mut self.silent_until)
+            .chain(asked)
+        {
             *time = time.saturating_sub(by);
         }
     }

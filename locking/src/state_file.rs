@@ -68,7 +68,13 @@ impl OwnerState {
 
 impl fmt::Display for OwnerState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "{}\nepoch {}\nlease {}", Self::HEAD, self.epoch, self.lease)
+        writeln!(
+            f,
+            "{}\nepoch {}\nlease {}",
+            Self::HEAD,
+            self.epoch,
+            self.lease
+        )
     }
 }
 
@@ -77,7 +83,9 @@ impl fmt::Display for OwnerState {
 #[non_exhaustive]
 pub enum OwnerStateError {
     /// The file is not a state file of this version, or it is incomplete.
-    #[error("line {0} of the owner's state file is not valid; restore the file, since fences have to rise")]
+    #[error(
+        "line {0} of the owner's state file is not valid; restore the file, since fences have to rise"
+    )]
     Line(usize),
 }
 

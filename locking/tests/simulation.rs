@@ -82,7 +82,9 @@ fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
                 claims: 10,
             };
             let mut world = World::new(setup, seed);
-            world.run().unwrap_or_else(|error| panic!("{kind}, seed {seed}: {error}"));
+            world
+                .run()
+                .unwrap_or_else(|error| panic!("{kind}, seed {seed}: {error}"));
             highest = highest.max(world.overtaken);
         }
         assert!(highest <= bound, "{kind}: overtaken {highest} times");
@@ -108,7 +110,11 @@ fn the_number_of_messages_is_the_minimum() {
             let n = agents as u64;
             match kind {
                 Kind::RicartAgrawala | Kind::RicartAgrawalaExtended => {
-                    assert_eq!((first, again), (2 * (n - 1) + 3, 2 * (n - 1) + 3), "{kind}, {n}");
+                    assert_eq!(
+                        (first, again),
+                        (2 * (n - 1) + 3, 2 * (n - 1) + 3),
+                        "{kind}, {n}"
+                    );
                 }
                 // The token stays with its last holder.
                 Kind::SuzukiKasami => assert_eq!((first, again), (n + 3, 3), "{kind}, {n}"),

@@ -15,7 +15,10 @@ use crate::{Act, Conversation, Dialect, Millis, Peer};
 
 /// The algorithms. All agents of a group use the same one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-#[allow(clippy::exhaustive_enums, reason = "the protocols of distributed_locking")]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "the protocols of distributed_locking"
+)]
 pub enum Kind {
     /// Ricart-Agrawala for members and messages that are never lost.
     RicartAgrawala,
@@ -135,7 +138,10 @@ impl Context<'_> {
 
 /// Result of a call of an algorithm.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[allow(clippy::exhaustive_enums, reason = "the caller has to perform each step")]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "the caller has to perform each step"
+)]
 pub enum Step {
     /// Send a message.
     Send {

@@ -141,6 +141,11 @@ impl Algorithm for RicartAgrawala {
         match *act {
             Act::Request { clock } => {
                 self.clock = self.clock.max(clock.min(MAX_CLOCK));
+                let known = self.deferred.get(from);
+                if known.is_some_and(|known| known.clock > clock) {
+                    // A late copy of a request before the one that waits.
+                    return;
+                }
                 let closed = !context.gate.lets_pass(context.dialect(from))
                     && !fault!(context.fault, IgnoreGate);
                 if closed && fault!(context.fault, DropDeferred) {

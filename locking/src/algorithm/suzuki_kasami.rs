@@ -37,8 +37,8 @@ pub struct SuzukiKasami {
     /// served the one before.
     pending: bool,
     own: Option<OwnRequest>,
-    /// Conversation of the request that this agent is leaving, during that call: the token's return is
-    /// its report.
+    /// Conversation of the request that this agent leaves or has withdrawn, during that call: the token's
+    /// return is its report.
     leaving: Option<Conversation>,
     token: Option<Token>,
     /// Newest generation.
@@ -285,7 +285,14 @@ impl SuzukiKasami {
         self.pass(context, out);
     }
 
-    fn take(&mut self, context: &Context<'_>, from: &Peer, token: &Token, out: &mut Vec<Step>) {
+    fn take(
+        &mut self,
+        context: &Context<'_>,
+        from: &Peer,
+        conversation: &Conversation,
+        token: &Token,
+        out: &mut Vec<Step>,
+    ) {
         if token.archive.is_some() {
             self.archive = token.archive;
         }
@@ -330,7 +337,9 @@ impl SuzukiKasami {
             self.enter(out);
         }
         // The owner waits for its turn, since the token returns to it after each.
+        self.leaving = (!returned).then(|| conversation.clone());
         self.pass(context, out);
+        self.leaving = None;
     }
 }
 
@@ -398,7 +407,7 @@ impl Algorithm for SuzukiKasami {
                     self.serve_again(context, from, *number, out);
                 }
             }
-            Act::Token(token) => self.take(context, from, token, out),
+            Act::Token(token) => self.take(context, from, conversation, token, out),
             _ => {}
         }
     }

@@ -34,8 +34,8 @@ use std::sync::Arc;
 use fipa_acl::{AgentId, BuildError, Message, Performative};
 
 use crate::{
-    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, Millis, NameError,
-    Refusal, Resource, Token,
+    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, Millis,
+    NameError, Refusal, Resource, Token,
 };
 
 /// Ontology of the messages of this library.
@@ -213,7 +213,9 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
         Some(ONTOLOGY) => Dialect::Own,
         _ => Dialect::Legacy,
     };
-    let content = message.content().map_or(&[][..], |content| content.as_ref());
+    let content = message
+        .content()
+        .map_or(&[][..], |content| content.as_ref());
     if content.len() > MAX_CONTENT {
         return Err(DecodeError::TooLong(content.len()));
     }

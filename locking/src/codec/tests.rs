@@ -43,16 +43,44 @@ fn recorded_messages_of_distributed_locking() {
     for (kind, performative, protocol, conversation, language, content) in [
         (basic, QueryIf, "dlm_discover", "agent2_0", "", "rsc"),
         (basic, Inform, "dlm_discover", "agent2_0", "", "rsc"),
-        (basic, RequestAct, "ricart_agrawala", "agent2_1", "", "1\nrsc"),
+        (
+            basic,
+            RequestAct,
+            "ricart_agrawala",
+            "agent2_1",
+            "",
+            "1\nrsc",
+        ),
         (basic, Agree, "ricart_agrawala", "agent2_1", "", "3\nrsc"),
         (basic, Confirm, "ricart_agrawala", "agent2_1", "", "rsc"),
         (basic, Disconfirm, "ricart_agrawala", "agent2_1", "", "rsc"),
         (basic, RequestAct, "dlm_probe", "agent1_3", "", ""),
         (basic, Confirm, "dlm_probe", "agent1_3", "", ""),
         (token, RequestAct, "suzuki_kasami", "agent2_1", "", "rsc\n1"),
-        (token, Propagate, "suzuki_kasami", "agent2_1", BOOST_TOKEN, archive_1),
-        (token, Propagate, "suzuki_kasami", "agent1_3", BOOST_TOKEN, archive_2),
-        (token, Propagate, "suzuki_kasami", "agent3_1", BOOST_TOKEN, archive_3),
+        (
+            token,
+            Propagate,
+            "suzuki_kasami",
+            "agent2_1",
+            BOOST_TOKEN,
+            archive_1,
+        ),
+        (
+            token,
+            Propagate,
+            "suzuki_kasami",
+            "agent1_3",
+            BOOST_TOKEN,
+            archive_2,
+        ),
+        (
+            token,
+            Propagate,
+            "suzuki_kasami",
+            "agent3_1",
+            BOOST_TOKEN,
+            archive_3,
+        ),
     ] {
         let message = recorded(performative, protocol, conversation, language, content);
         let read = decode(&message, kind).unwrap();
@@ -60,7 +88,13 @@ fn recorded_messages_of_distributed_locking() {
         let written = encode(&read, kind, &id("agent2"), &id("agent1")).unwrap();
         assert_eq!(written, message);
     }
-    let message = recorded(Propagate, "suzuki_kasami", "agent1_3", BOOST_TOKEN, archive_2);
+    let message = recorded(
+        Propagate,
+        "suzuki_kasami",
+        "agent1_3",
+        BOOST_TOKEN,
+        archive_2,
+    );
     let Content::Lock {
         act: Act::Token(token),
         ..
@@ -69,9 +103,10 @@ fn recorded_messages_of_distributed_locking() {
         panic!("a token");
     };
     assert_eq!(token.last.values().copied().collect::<Vec<_>>(), [1, 1, 1]);
-    assert_eq!(token.last.keys().map(|name| &**name).collect::<Vec<_>>(), [
-        "agent1", "agent2", "agent3"
-    ]);
+    assert_eq!(
+        token.last.keys().map(|name| &**name).collect::<Vec<_>>(),
+        ["agent1", "agent2", "agent3"]
+    );
     assert_eq!(token.queue, [Arc::from("agent3")]);
     assert_eq!(token.generation, None);
 }
@@ -90,7 +125,10 @@ fn archives_of_all_versions() {
         assert_eq!(read.archive, Some(version));
         assert_eq!(read.queue, token.queue);
     }
-    assert!(boost::read(&old.replace(' ', "\n")).is_ok(), "newlines separate too");
+    assert!(
+        boost::read(&old.replace(' ', "\n")).is_ok(),
+        "newlines separate too"
+    );
 }
 
 #[test]
@@ -111,11 +149,20 @@ fn bad_messages_are_errors() {
         assert_eq!(error(&message, basic), DecodeError::Number("the clock"));
     }
     let long = request(protocol, &format!("1\n{}", "x".repeat(10_000)));
-    assert_eq!(error(&long, basic), DecodeError::Name(NameError::TooLong(10_000)));
+    assert_eq!(
+        error(&long, basic),
+        DecodeError::Name(NameError::TooLong(10_000))
+    );
     let cfp = recorded(Performative::Cfp, protocol, "a_1", "", "rsc");
     assert_eq!(error(&cfp, basic), DecodeError::Performative("cfp".into()));
     let token = |content: &str| {
-        recorded(Performative::Propagate, "suzuki_kasami", "a_1", BOOST_TOKEN, content)
+        recorded(
+            Performative::Propagate,
+            "suzuki_kasami",
+            "a_1",
+            BOOST_TOKEN,
+            content,
+        )
     };
     for content in [
         "",
@@ -127,7 +174,10 @@ fn bad_messages_are_errors() {
         "22 serialization::archive 18 3 rsc 0 1 0 0 0 0 0 0 0 0",
     ] {
         let error = error(&token(content), Kind::SuzukiKasami);
-        assert!(matches!(error, DecodeError::Token { .. }), "{content}: {error}");
+        assert!(
+            matches!(error, DecodeError::Token { .. }),
+            "{content}: {error}"
+        );
     }
 }
 
@@ -159,8 +209,12 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
         any::<bool>().prop_map(move |claim| (ra, Act::Query { claim })),
         Just((ra, Act::Owned)),
         Just((sk, Act::Contested)),
-        number.clone().prop_map(move |clock| (ra, Act::Request { clock })),
-        number.clone().prop_map(move |clock| (ra, Act::Agree { clock })),
+        number
+            .clone()
+            .prop_map(move |clock| (ra, Act::Request { clock })),
+        number
+            .clone()
+            .prop_map(move |clock| (ra, Act::Agree { clock })),
         number.prop_map(move |number| (sk, Act::RequestToken { number })),
         token.prop_map(move |token| (sk, Act::Token(token))),
         (kind.clone(), any::<u64>())

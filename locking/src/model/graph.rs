@@ -116,7 +116,9 @@ impl Graph {
             system.actions(&state, &mut steps);
             let step = steps.swap_remove(usize::from(number));
             path.push(step.clone());
-            state = system.next_state(&state, step).expect("a step of the graph");
+            state = system
+                .next_state(&state, step)
+                .expect("a step of the graph");
         }
         (path, state)
     }

@@ -40,6 +40,7 @@ pub(super) struct System {
     pub(super) claims: Vec<u8>,
     pub(super) time: Time,
     pub(super) faults: Faults,
+    /// Whether the owner probes. Otherwise no agent does.
     pub(super) probes: bool,
     pub(super) lease: Millis,
     pub(super) fault: Fault,
@@ -109,10 +110,10 @@ fn name(agent: u8) -> &'static str {
 }
 
 impl System {
-    fn options(&self) -> Options {
+    fn options(&self, agent: u8) -> Options {
         Options {
             lease: self.lease,
-            probe_interval: if self.probes { 1 } else { 60 },
+            probe_interval: if self.probes && agent == 0 { 1 } else { 60 },
             probe_timeout: 2,
             retry: 2,
             discovery: 4,
@@ -124,7 +125,7 @@ impl System {
 
     fn agent(&self, agent: u8, registration: u64) -> Agent {
         let me = Peer::new(name(agent), registration).unwrap();
-        let mut options = self.options();
+        let mut options = self.options(agent);
         options.first_conversation = registration * 32;
         Agent {
             locks: Some(Locks::new(me.clone(), self.kind, options)),
@@ -166,7 +167,10 @@ impl System {
         let locks = state.locks(0);
         locks.rebase(1);
         locks.handle_timeout(NOW, out);
-        assert!(out.iter().any(|action| matches!(action, Action::Event(Event::Owning { .. }))));
+        assert!(
+            out.iter()
+                .any(|action| matches!(action, Action::Event(Event::Owning { .. })))
+        );
         state
     }
 
@@ -179,7 +183,11 @@ impl System {
         for action in actions {
             match action {
                 Action::Send { to, message } => {
-                    if state.agents.iter().any(|agent| agent.me == to && agent.locks.is_some()) {
+                    if state
+                        .agents
+                        .iter()
+                        .any(|agent| agent.me == to && agent.locks.is_some())
+                    {
                         state.network.insert((to, from.clone(), message));
                     }
                 }
@@ -287,7 +295,10 @@ impl System {
             .filter(|other| other.locks.is_some())
             .map(|other| other.me.clone())
             .collect();
-        let owner = state.agents[0].locks.is_some().then(|| state.agents[0].me.clone());
+        let owner = state.agents[0]
+            .locks
+            .is_some()
+            .then(|| state.agents[0].me.clone());
         self.call(state, agent, |locks, out| {
             for peer in &peers {
                 locks.join(NOW, peer, Dialect::Own, out);
@@ -299,8 +310,10 @@ impl System {
     }
 
     fn observe(state: &mut State) {
-        let (held, not): (Vec<_>, Vec<_>) =
-            state.agents.iter().partition(|agent| agent.fence().is_some());
+        let (held, not): (Vec<_>, Vec<_>) = state
+            .agents
+            .iter()
+            .partition(|agent| agent.fence().is_some());
         for agent in not.into_iter().chain(held) {
             let fence = agent.fence();
             state.history.holds(&agent.me, fence.as_ref());
@@ -325,11 +338,16 @@ impl System {
 
 impl State {
     fn locks(&mut self, agent: u8) -> &mut Locks<AnyAlgorithm> {
-        self.agents[usize::from(agent)].locks.as_mut().expect("not crashed")
+        self.agents[usize::from(agent)]
+            .locks
+            .as_mut()
+            .expect("not crashed")
     }
 
     fn is_paused(&self, peer: &Peer) -> bool {
-        self.agents.iter().any(|agent| agent.me == *peer && agent.paused)
+        self.agents
+            .iter()
+            .any(|agent| agent.me == *peer && agent.paused)
     }
 
     pub(super) fn broken(&self) -> Option<&crate::invariants::Violation> {
@@ -488,7 +506,9 @@ impl Model for System {
                 let file: OwnerState = state.file.to_string().parse().ok()?;
                 state.file = file.next_life(self.lease);
                 let file = state.file;
-                self.call(state, 0, |locks, out| locks.own(NOW, &resource(), &file, out));
+                self.call(state, 0, |locks, out| {
+                    locks.own(NOW, &resource(), &file, out)
+                });
             }
         }
         Self::observe(state);
@@ -496,8 +516,9 @@ impl Model for System {
     }
 
     fn properties(&self) -> Vec<Property<Self>> {
-        vec![Property::always("the invariants hold", |_, state: &State| {
-            state.broken().is_none()
-        })]
+        vec![Property::always(
+            "the invariants hold",
+            |_, state: &State| state.broken().is_none(),
+        )]
     }
 }

@@ -40,7 +40,11 @@ fn describe(system: &System, problem: &str, path: &[Step], state: &State) -> Str
 fn explore(system: &System, limit: usize) -> Result<usize, (u8, String)> {
     let begin = Instant::now();
     let graph = Graph::explore(system, limit);
-    println!("{} states, {:.1?}: {system:?}", graph.states(), begin.elapsed());
+    println!(
+        "{} states, {:.1?}: {system:?}",
+        graph.states(),
+        begin.elapsed()
+    );
     if let Some(id) = graph.broken {
         let (path, state) = graph.path(system, id);
         let violation = state.broken().expect("a broken state");
@@ -167,7 +171,11 @@ fn mistakes_are_found() {
         (Fault::RenewByProbe, probed, 4),
         (Fault::CountFromArrival, free(2, 2, NONE), 4),
         (Fault::GrantAfterRestart, free(1, 4, restarts), 4),
-        (Fault::KeepEpoch, prompt(basic, &[1, 1], restarts), 1),
+        (
+            Fault::KeepEpoch,
+            prompt(Kind::RicartAgrawalaExtended, &[0, 2], restarts),
+            1,
+        ),
         (Fault::ReleaseByName, prompt(basic, &[0, 2], duplicates), 6),
         (Fault::DropDeferred, prompt(basic, &[0, 1, 1], NONE), 10),
         (Fault::ReuseFence, prompt(basic, &[0, 2], NONE), 1),
@@ -199,7 +207,9 @@ fn chosen() {
         match key {
             "claims" => {
                 let claims = value.split('.');
-                model.claims = claims.map(|claims| claims.parse().expect("a number")).collect();
+                model.claims = claims
+                    .map(|claims| claims.parse().expect("a number"))
+                    .collect();
             }
             "ticks" => model.time = Time::Free(number()),
             "lease" => model.lease = number().into(),
@@ -217,7 +227,11 @@ fn chosen() {
     if stateright {
         let begin = Instant::now();
         let checker = model.clone().checker().threads(2).spawn_bfs().join();
-        println!("{} states, {:.1?}: {model:?}", checker.unique_state_count(), begin.elapsed());
+        println!(
+            "{} states, {:.1?}: {model:?}",
+            checker.unique_state_count(),
+            begin.elapsed()
+        );
         checker.assert_properties();
     } else {
         explore(&model, usize::MAX).unwrap_or_else(|(_, text)| panic!("{text}"));

@@ -159,7 +159,8 @@ impl World {
 
     fn at(&mut self, after: Millis, occurrence: Occurrence) {
         self.sequence += 1;
-        self.events.insert((self.now + after, self.sequence), occurrence);
+        self.events
+            .insert((self.now + after, self.sequence), occurrence);
     }
 
     fn log(&mut self, text: impl FnOnce() -> String) {
@@ -202,7 +203,9 @@ impl World {
             let file = file.next_life(LEASE);
             self.files[agent] = file;
             let resource = self.resources[agent].clone();
-            self.call(agent, |locks, now, out| locks.own(now, &resource, &file, out));
+            self.call(agent, |locks, now, out| {
+                locks.own(now, &resource, &file, out)
+            });
         }
     }
 
@@ -235,7 +238,10 @@ impl World {
     fn send(&mut self, agent: usize, to: Peer, message: LockMessage) {
         self.messages += 1;
         let from = self.agents[agent].me.clone();
-        let receiver = self.agents.iter().position(|agent| agent.me.name() == to.name());
+        let receiver = self
+            .agents
+            .iter()
+            .position(|agent| agent.me.name() == to.name());
         if receiver.is_some_and(|to| self.cut.contains(&(agent, to))) {
             return;
         }
@@ -276,7 +282,11 @@ impl World {
                 }
             }
             Event::Failed { claim, .. } | Event::Lost { claim, .. } => {
-                if self.agents[agent].claim.as_ref().is_some_and(|active| active.id == claim) {
+                if self.agents[agent]
+                    .claim
+                    .as_ref()
+                    .is_some_and(|active| active.id == claim)
+                {
                     self.agents[agent].claim = None;
                     self.claim_later(agent);
                 }
@@ -311,7 +321,9 @@ impl World {
         };
         let mut out = Vec::new();
         let id = locks.lock_all(now, &resources, within, &mut out);
-        let unreached = (0..self.setup.agents).filter(|other| *other != agent).collect();
+        let unreached = (0..self.setup.agents)
+            .filter(|other| *other != agent)
+            .collect();
         of.claim = Some(ActiveClaim {
             id,
             resources,
@@ -324,7 +336,11 @@ impl World {
 
     fn release(&mut self, agent: usize, claim: ClaimId) {
         let of = &mut self.agents[agent];
-        if of.claim.as_ref().is_some_and(|active| active.id == claim && active.acquired) {
+        if of
+            .claim
+            .as_ref()
+            .is_some_and(|active| active.id == claim && active.acquired)
+        {
             of.claim = None;
             self.call(agent, |locks, now, out| locks.release(now, claim, out));
             self.claim_later(agent);
@@ -347,7 +363,9 @@ impl World {
         }
         self.log(|| format!("agent{agent} from {from:?}: {message:?}"));
         self.reached(agent, &from, &message);
-        self.call(agent, |locks, now, out| locks.handle(now, &from, &message, out));
+        self.call(agent, |locks, now, out| {
+            locks.handle(now, &from, &message, out)
+        });
     }
 
     /// Records that a request has reached an agent.
@@ -408,10 +426,13 @@ impl World {
         for other in (0..self.setup.agents).filter(|other| *other != agent) {
             let after = self.rng.u64(1..1_500);
             let ended = ended.clone();
-            self.at(after, Occurrence::Notice {
-                agent: other,
-                ended,
-            });
+            self.at(
+                after,
+                Occurrence::Notice {
+                    agent: other,
+                    ended,
+                },
+            );
         }
         let back = self.rng.u64(1..1_500);
         self.at(back, Occurrence::Return(agent));
@@ -467,13 +488,17 @@ impl World {
 
     /// True time of the next timeout of an agent.
     fn next_timeout(&self) -> Option<(Millis, usize)> {
-        let due = self.agents.iter().enumerate().filter_map(|(number, agent)| {
-            let due = agent.locks.as_ref()?.poll_timeout()?;
-            let due = due.saturating_sub(agent.offset);
-            // The first true time at which the agent's clock has the value.
-            let due = (due * 1000).div_ceil(agent.rate);
-            Some((due.max(agent.paused_until).max(self.now), number))
-        });
+        let due = self
+            .agents
+            .iter()
+            .enumerate()
+            .filter_map(|(number, agent)| {
+                let due = agent.locks.as_ref()?.poll_timeout()?;
+                let due = due.saturating_sub(agent.offset);
+                // The first true time at which the agent's clock has the value.
+                let due = (due * 1000).div_ceil(agent.rate);
+                Some((due.max(agent.paused_until).max(self.now), number))
+            });
         due.min()
     }
 
@@ -517,7 +542,11 @@ impl World {
             .map(|agent| format!("{:?}: {:#?}", agent.me, agent.locks))
             .collect();
         self.print_log();
-        Err(format!("open claims at {} ms: {}", self.now, open.join("\n")))
+        Err(format!(
+            "open claims at {} ms: {}",
+            self.now,
+            open.join("\n")
+        ))
     }
 
     fn print_log(&self) {
@@ -536,7 +565,9 @@ impl World {
                 continue;
             };
             for (owner, resource) in self.resources.iter().enumerate() {
-                let fence = claim.as_ref().and_then(|claim| locks.fence(now, claim.id, resource));
+                let fence = claim
+                    .as_ref()
+                    .and_then(|claim| locks.fence(now, claim.id, resource));
                 if ended_only && fence.is_some() {
                     continue;
                 }
