@@ -2,9 +2,8 @@
 
 /// A mistake of the core.
 #[cfg(test)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum Fault {
-    #[default]
     None,
     /// The holder counts its lease from the owner's last probe.
     RenewByProbe,
@@ -26,9 +25,19 @@ pub(crate) enum Fault {
     GrantWithdrawn,
 }
 
+#[cfg(test)]
+impl Fault {
+    pub(crate) const NO: Self = Self::None;
+}
+
 #[cfg(not(test))]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Fault;
+
+#[cfg(not(test))]
+impl Fault {
+    pub(crate) const NO: Self = Self;
+}
 
 /// Whether the core makes this mistake: never outside of tests.
 macro_rules! fault {

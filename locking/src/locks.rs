@@ -588,16 +588,16 @@ impl<A: Algorithm> Locks<A> {
                         self.discover(now, from, resource, conversation, act, out);
                     }
                     Act::Confirm { .. } | Act::Renew { .. } | Act::Release => {
-                        self.to_owner(now, from, resource, conversation, act, out);
+                        self.for_owner(now, from, resource, conversation, act, out);
                     }
                     Act::Granted { .. } | Act::Refused { .. } => {
-                        self.to_holder(now, from, resource, conversation, act, out);
+                        self.for_holder(now, from, resource, conversation, act, out);
                     }
                     Act::Request { .. }
                     | Act::Agree { .. }
                     | Act::RequestToken { .. }
                     | Act::Token(_) => {
-                        self.to_algorithm(now, from, resource, conversation, act, out);
+                        self.for_algorithm(now, from, resource, conversation, act, out);
                     }
                 }
             }
@@ -640,9 +640,15 @@ impl<A: Algorithm> Locks<A> {
         };
         match (act, established) {
             (Act::Query { claim }, true) => {
+                // The answer belongs to the conversation of the question. The other members did not ask.
+                let announcement = self.side_conversation("discover", now);
                 let members: Vec<_> = self.members.keys().cloned().collect();
                 for member in members {
-                    self.send(member, resource, conversation.clone(), Act::Owned, out);
+                    let conversation = match member == *from {
+                        true => conversation.clone(),
+                        false => announcement.clone(),
+                    };
+                    self.send(member, resource, conversation, Act::Owned, out);
                 }
                 if *claim {
                     let to = from.clone();
@@ -674,7 +680,7 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    fn to_owner(
+    fn for_owner(
         &mut self,
         now: Millis,
         from: &Peer,
@@ -710,7 +716,7 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    fn to_holder(
+    fn for_holder(
         &mut self,
         now: Millis,
         from: &Peer,
@@ -750,7 +756,7 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    fn to_algorithm(
+    fn for_algorithm(
         &mut self,
         now: Millis,
         from: &Peer,

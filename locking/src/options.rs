@@ -35,7 +35,7 @@ impl Default for Options {
             discovery: 2_000,
             claim: 1_000,
             first_conversation: 0,
-            fault: Fault::default(),
+            fault: Fault::NO,
         }
     }
 }

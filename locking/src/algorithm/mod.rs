@@ -217,6 +217,7 @@ pub trait Algorithm: Clone + Eq + Hash + fmt::Debug {
     /// Estimate of the number of agents that enter before this one.
     fn ahead(&self) -> usize;
 
+    /// Moves all times back.
     #[cfg(test)]
     fn rebase(&mut self, by: Millis);
 }
@@ -224,6 +225,10 @@ pub trait Algorithm: Clone + Eq + Hash + fmt::Debug {
 /// An algorithm that is chosen at run time.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 #[allow(clippy::exhaustive_enums, reason = "one variant per algorithm")]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one value per resource, all of one variant"
+)]
 pub enum AnyAlgorithm {
     /// Ricart-Agrawala.
     RicartAgrawala(RicartAgrawala),

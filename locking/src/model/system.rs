@@ -362,14 +362,16 @@ impl Agent {
 }
 
 fn rebased(mut message: LockMessage) -> LockMessage {
-    if let Content::Lock { act, .. } = &mut message.content {
-        match act {
+    if let Content::Lock {
+        act:
             Act::Confirm { asked: Some(asked) }
             | Act::Renew { asked, .. }
             | Act::Granted { asked, .. }
-            | Act::Refused { asked, .. } => *asked = asked.saturating_sub(1),
-            _ => {}
-        }
+            | Act::Refused { asked, .. },
+        ..
+    } = &mut message.content
+    {
+        *asked = asked.saturating_sub(1);
     }
     message
 }

@@ -1,5 +1,3 @@
-#![expect(clippy::print_stdout, reason = "a long run prints its progress")]
-
 use std::time::Instant;
 
 use stateright::{Checker, Model};

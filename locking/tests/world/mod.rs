@@ -281,18 +281,19 @@ impl World {
                     self.at(hold, Occurrence::Release(agent, claim));
                 }
             }
-            Event::Failed { claim, .. } | Event::Lost { claim, .. } => {
-                if self.agents[agent]
-                    .claim
-                    .as_ref()
-                    .is_some_and(|active| active.id == claim)
-                {
-                    self.agents[agent].claim = None;
-                    self.claim_later(agent);
-                }
+            Event::Failed { claim, .. } | Event::Lost { claim, .. }
+                if self.is_open(agent, claim) =>
+            {
+                self.agents[agent].claim = None;
+                self.claim_later(agent);
             }
             _ => {}
         }
+    }
+
+    fn is_open(&self, agent: usize, claim: ClaimId) -> bool {
+        let open = self.agents[agent].claim.as_ref();
+        open.is_some_and(|active| active.id == claim)
     }
 
     fn claim_later(&mut self, agent: usize) {
