@@ -1,0 +1,239 @@
+//! Ricart-Agrawala: an agent enters when each member has agreed.
+//!
+//! A member defers its answer while it has entered, and while its own request is earlier. Requests
+//! are ordered by their Lamport clock, then by agent.
+//!
+//! After a request has reached all members, each other agent enters at most once before it: the clock
+//! of its next request is higher.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{Algorithm, Context, Kind, Step};
+use crate::faults::fault;
+use crate::{Act, Conversation, Gate, Millis, Peer};
+
+/// Maximum clock: `distributed_locking` reads a 32-bit integer. Clocks that have reached it are equal,
+/// and the order is that of the agents.
+const MAX_CLOCK: u64 = i32::MAX as u64;
+
+/// State of one agent for one resource.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct RicartAgrawala {
+    me: Peer,
+    extended: bool,
+    /// Highest clock that was sent or received.
+    clock: u64,
+    own: Option<OwnRequest>,
+    deferred: BTreeMap<Peer, Deferred>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct OwnRequest {
+    conversation: Conversation,
+    clock: u64,
+    /// Members that have not agreed. The request has entered when there are none.
+    awaited: BTreeSet<Peer>,
+    entered: bool,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Deferred {
+    conversation: Conversation,
+    clock: u64,
+}
+
+impl RicartAgrawala {
+    /// Whether the request of this agent precedes that of `peer`.
+    fn precedes(&self, peer: &Peer, clock: u64) -> bool {
+        self.own
+            .as_ref()
+            .is_some_and(|own| own.entered || (own.clock, &self.me) < (clock, peer))
+    }
+
+    /// Answers the deferred requests that nothing holds back any more.
+    fn answer_deferred(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
+        let deferred = std::mem::take(&mut self.deferred);
+        for (peer, request) in deferred {
+            if self.precedes(&peer, request.clock)
+                || !context.gate.lets_pass(context.dialect(&peer))
+            {
+                self.deferred.insert(peer, request);
+            } else {
+                out.push(self.agree(peer, request.conversation));
+            }
+        }
+    }
+
+    fn agree(&self, to: Peer, conversation: Conversation) -> Step {
+        let clock = self.clock;
+        Step::Send {
+            to,
+            conversation,
+            act: Act::Agree { clock },
+        }
+    }
+
+    fn ask(own: &OwnRequest, to: &Peer) -> Step {
+        Step::Send {
+            to: to.clone(),
+            conversation: own.conversation.clone(),
+            act: Act::Request { clock: own.clock },
+        }
+    }
+
+    fn no_longer_awaited(&mut self, peer: &Peer, out: &mut Vec<Step>) {
+        if let Some(own) = &mut self.own
+            && own.awaited.remove(peer)
+            && own.awaited.is_empty()
+            && !own.entered
+        {
+            own.entered = true;
+            out.push(Step::Entered);
+        }
+    }
+}
+
+impl Algorithm for RicartAgrawala {
+    fn new(kind: Kind, me: Peer, _: bool) -> Self {
+        Self {
+            me,
+            extended: kind.is_extended(),
+            clock: 0,
+            own: None,
+            deferred: BTreeMap::new(),
+        }
+    }
+
+    fn request(&mut self, context: &Context<'_>, conversation: &Conversation, out: &mut Vec<Step>) {
+        self.clock = (self.clock + 1).min(MAX_CLOCK);
+        let mut own = OwnRequest {
+            conversation: conversation.clone(),
+            clock: self.clock,
+            awaited: BTreeSet::new(),
+            entered: false,
+        };
+        for (peer, member) in context.members {
+            out.push(Self::ask(&own, peer));
+            if !member.suspected || context.owner == Some(peer) {
+                own.awaited.insert(peer.clone());
+            }
+        }
+        own.entered = own.awaited.is_empty();
+        if own.entered {
+            out.push(Step::Entered);
+        }
+        self.own = Some(own);
+    }
+
+    fn leave(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
+        self.own = None;
+        self.answer_deferred(context, out);
+    }
+
+    fn handle(
+        &mut self,
+        context: &Context<'_>,
+        from: &Peer,
+        conversation: &Conversation,
+        act: &Act,
+        out: &mut Vec<Step>,
+    ) {
+        match *act {
+            Act::Request { clock } => {
+                self.clock = self.clock.max(clock.min(MAX_CLOCK));
+                let known = self.deferred.get(from);
+                if known.is_some_and(|known| known.clock > clock) {
+                    // A late copy of a request before the one that waits.
+                    return;
+                }
+                let closed = !context.gate.lets_pass(context.dialect(from))
+                    && !fault!(context.fault, IgnoreGate);
+                if closed && fault!(context.fault, DropDeferred) {
+                    return;
+                }
+                if closed || self.precedes(from, clock) {
+                    let conversation = conversation.clone();
+                    let deferred = Deferred {
+                        conversation,
+                        clock,
+                    };
+                    self.deferred.insert(from.clone(), deferred);
+                } else {
+                    self.deferred.remove(from);
+                    out.push(self.agree(from.clone(), conversation.clone()));
+                }
+            }
+            Act::Agree { clock } => {
+                self.clock = self.clock.max(clock.min(MAX_CLOCK));
+                let own = self.own.as_ref();
+                if own.is_some_and(|own| own.conversation == *conversation) {
+                    self.no_longer_awaited(from, out);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn gate_changed(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
+        if context.gate != Gate::Closed {
+            self.answer_deferred(context, out);
+        }
+    }
+
+    fn grant_ended(&mut self, _: &Peer) {}
+
+    fn own(&mut self, _: &Context<'_>, _: &mut Vec<Step>) {}
+
+    fn owner_changed(&mut self) {}
+
+    fn joined(&mut self, _: &Context<'_>, peer: &Peer, out: &mut Vec<Step>) {
+        if let Some(own) = &mut self.own
+            && self.extended
+            && !own.entered
+            && own.awaited.insert(peer.clone())
+        {
+            out.push(Self::ask(own, peer));
+        }
+    }
+
+    fn lost(&mut self, _: &Context<'_>, peer: &Peer, gone: bool, out: &mut Vec<Step>) {
+        if gone {
+            self.deferred.remove(peer);
+        }
+        if self.extended || gone {
+            self.no_longer_awaited(peer, out);
+        }
+    }
+
+    fn repeat(&mut self, _: &Context<'_>, out: &mut Vec<Step>) {
+        if let Some(own) = &self.own
+            && self.extended
+        {
+            out.extend(own.awaited.iter().map(|peer| Self::ask(own, peer)));
+        }
+    }
+
+    fn handle_timeout(&mut self, _: &Context<'_>, _: &mut Vec<Step>) {}
+
+    fn poll_timeout(&self) -> Option<Millis> {
+        None
+    }
+
+    fn has_entered(&self) -> bool {
+        self.own.as_ref().is_some_and(|own| own.entered)
+    }
+
+    fn awaited(&self) -> BTreeSet<Peer> {
+        match &self.own {
+            Some(own) if self.extended => own.awaited.clone(),
+            _ => BTreeSet::new(),
+        }
+    }
+
+    fn ahead(&self) -> usize {
+        self.own.as_ref().map_or(0, |own| own.awaited.len())
+    }
+
+    #[cfg(test)]
+    fn rebase(&mut self, _: Millis) {}
+}

@@ -1,0 +1,55 @@
+//! Deliberate mistakes, for the tests that show that the model finds them. Other builds have none.
+
+/// A mistake of the core.
+#[cfg(test)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) enum Fault {
+    None,
+    /// The holder counts its lease from the owner's last probe.
+    RenewByProbe,
+    /// The holder counts its lease from the arrival of the answer.
+    CountFromArrival,
+    /// A restarted owner grants at once.
+    GrantAfterRestart,
+    /// The owner applies a release to the sender's grant, whatever its conversation.
+    ReleaseByName,
+    /// The owner drops requests that arrive while a grant is live.
+    DropDeferred,
+    /// The owner gives the same number twice.
+    ReuseFence,
+    /// A restarted owner counts from the epoch of its life before.
+    KeepEpoch,
+    /// The owner agrees while a grant is live.
+    IgnoreGate,
+    /// A request that was withdrawn is granted by a late report.
+    GrantWithdrawn,
+}
+
+#[cfg(test)]
+impl Fault {
+    pub(crate) const NO: Self = Self::None;
+}
+
+#[cfg(not(test))]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Fault;
+
+#[cfg(not(test))]
+impl Fault {
+    pub(crate) const NO: Self = Self;
+}
+
+/// Whether the core makes this mistake: never outside of tests.
+macro_rules! fault {
+    ($fault:expr, $name:ident) => {{
+        #[cfg(test)]
+        let is = $fault == crate::faults::Fault::$name;
+        #[cfg(not(test))]
+        let is = {
+            let crate::faults::Fault = $fault;
+            false
+        };
+        is
+    }};
+}
+pub(crate) use fault;

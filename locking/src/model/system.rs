@@ -1,0 +1,526 @@
+//! States, steps and faults of the model.
+
+use std::collections::BTreeSet;
+
+use stateright::{Model, Property};
+
+use crate::faults::Fault;
+use crate::invariants::History;
+use crate::{
+    Act, Action, AnyAlgorithm, ClaimId, Content, Dialect, Event, Fence, Kind, LockMessage, Locks,
+    Millis, Options, OwnerState, Peer, Resource,
+};
+
+/// The time of each state. It exceeds every span, so that no time before it is cut off at 0.
+const NOW: Millis = 64;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Time {
+    /// Messages are delayed for any time. Number of ticks.
+    Free(u8),
+    /// Messages arrive before time passes.
+    Prompt,
+}
+
+/// Number of faults of each kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub(super) struct Faults {
+    pub(super) losses: u8,
+    pub(super) duplicates: u8,
+    pub(super) crashes: u8,
+    pub(super) pauses: u8,
+    pub(super) restarts: u8,
+    pub(super) withdrawals: u8,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct System {
+    pub(super) kind: Kind,
+    /// Number of claims of each agent. Agent 0 is the owner.
+    pub(super) claims: Vec<u8>,
+    pub(super) time: Time,
+    pub(super) faults: Faults,
+    /// Whether the owner probes. Otherwise no agent does.
+    pub(super) probes: bool,
+    pub(super) lease: Millis,
+    pub(super) fault: Fault,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct State {
+    agents: Vec<Agent>,
+    network: BTreeSet<(Peer, Peer, LockMessage)>,
+    history: History,
+    /// State file of the owner.
+    file: OwnerState,
+    ticks: u8,
+    left: Faults,
+    /// Registrations that have ended, and the agents that have no proof of it.
+    unnoticed: BTreeSet<(Peer, u8)>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Agent {
+    me: Peer,
+    /// A crashed agent has none.
+    locks: Option<Locks<AnyAlgorithm>>,
+    paused: bool,
+    claim: Option<ClaimId>,
+    acquired: bool,
+    left: u8,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) enum Step {
+    Lock(u8),
+    Release(u8),
+    Withdraw(u8),
+    Deliver(Peer, Peer, LockMessage),
+    Tick,
+    Notice(Peer, u8),
+    Resume(u8),
+    Lose(Peer, Peer, LockMessage),
+    Duplicate(Peer, Peer, LockMessage),
+    Crash(u8),
+    Return(u8),
+    Pause(u8),
+    Restart,
+}
+
+impl Step {
+    pub(super) fn is_fault(&self) -> bool {
+        matches!(
+            self,
+            Self::Lose(..)
+                | Self::Duplicate(..)
+                | Self::Crash(_)
+                | Self::Pause(_)
+                | Self::Restart
+                | Self::Withdraw(_)
+        )
+    }
+}
+
+pub(super) fn resource() -> Resource {
+    Resource::new("bay").unwrap()
+}
+
+fn name(agent: u8) -> &'static str {
+    ["a", "b", "c", "d"][usize::from(agent)]
+}
+
+impl System {
+    fn options(&self, agent: u8) -> Options {
+        Options {
+            lease: self.lease,
+            probe_interval: if self.probes && agent == 0 { 1 } else { 60 },
+            probe_timeout: 2,
+            retry: 2,
+            discovery: 4,
+            claim: 1,
+            first_conversation: 0,
+            fault: self.fault,
+        }
+    }
+
+    fn agent(&self, agent: u8, registration: u64) -> Agent {
+        let me = Peer::new(name(agent), registration).unwrap();
+        let mut options = self.options(agent);
+        options.first_conversation = registration * 32;
+        Agent {
+            locks: Some(Locks::new(me.clone(), self.kind, options)),
+            me,
+            paused: false,
+            claim: None,
+            acquired: false,
+            left: self.claims[usize::from(agent)],
+        }
+    }
+
+    fn initial(&self) -> State {
+        let count = self.claims.len() as u8;
+        let agents: Vec<_> = (0..count).map(|agent| self.agent(agent, 1)).collect();
+        let file = OwnerState::first().next_life(self.lease);
+        let mut state = State {
+            history: History::new(resource(), agents[0].me.clone()),
+            agents,
+            network: BTreeSet::new(),
+            file,
+            ticks: 0,
+            left: self.faults,
+            unnoticed: BTreeSet::new(),
+        };
+        let peers: Vec<_> = state.agents.iter().map(|agent| agent.me.clone()).collect();
+        for agent in 0..count {
+            let mut out = Vec::new();
+            let locks = state.locks(agent);
+            for peer in &peers {
+                locks.join(NOW, peer, Dialect::Own, &mut out);
+            }
+            if agent == 0 {
+                locks.own(NOW, &resource(), &file, &mut out);
+            } else {
+                locks.owner_known(NOW, &resource(), &peers[0], Dialect::Own, &mut out);
+            }
+        }
+        let out = &mut Vec::new();
+        let locks = state.locks(0);
+        locks.rebase(1);
+        locks.handle_timeout(NOW, out);
+        assert!(
+            out.iter()
+                .any(|action| matches!(action, Action::Event(Event::Owning { .. })))
+        );
+        state
+    }
+
+    /// Performs the actions of an agent.
+    fn perform(&self, state: &mut State, agent: u8, actions: Vec<Action>) {
+        if agent == 0 {
+            state.history.owner_acts(&actions);
+        }
+        let from = state.agents[usize::from(agent)].me.clone();
+        for action in actions {
+            match action {
+                Action::Send { to, message } => {
+                    if state
+                        .agents
+                        .iter()
+                        .any(|agent| agent.me == to && agent.locks.is_some())
+                    {
+                        state.network.insert((to, from.clone(), message));
+                    }
+                }
+                Action::Event(event) => {
+                    let agent = &mut state.agents[usize::from(agent)];
+                    match event {
+                        Event::Acquired { claim } if agent.claim == Some(claim) => {
+                            agent.acquired = true;
+                        }
+                        Event::Failed { claim, .. } | Event::Lost { claim, .. }
+                            if agent.claim == Some(claim) =>
+                        {
+                            agent.claim = None;
+                            agent.acquired = false;
+                        }
+                        // The event of the call that makes the claim precedes its return.
+                        Event::Acquired { .. } => agent.acquired = true,
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
+
+    fn call(
+        &self,
+        state: &mut State,
+        agent: u8,
+        call: impl FnOnce(&mut Locks<AnyAlgorithm>, &mut Vec<Action>),
+    ) {
+        let mut actions = Vec::new();
+        let Some(locks) = &mut state.agents[usize::from(agent)].locks else {
+            return;
+        };
+        call(locks, &mut actions);
+        self.perform(state, agent, actions);
+    }
+
+    fn deliver(&self, state: &mut State, to: &Peer, from: &Peer, message: &LockMessage) {
+        let agent = state.agents.iter().position(|agent| agent.me == *to);
+        let Some(agent) = agent else {
+            return;
+        };
+        if agent == 0 {
+            state.history.owner_receives(from, message);
+        }
+        self.call(state, agent as u8, |locks, out| {
+            locks.handle(NOW, from, message, out);
+        });
+    }
+
+    fn tick(&self, state: &mut State) {
+        for agent in &mut state.agents {
+            if let Some(locks) = &mut agent.locks {
+                locks.rebase(1);
+            }
+        }
+        state.network = std::mem::take(&mut state.network)
+            .into_iter()
+            .map(|(to, from, message)| (to, from, rebased(message)))
+            .collect();
+        for agent in 0..state.agents.len() as u8 {
+            self.time_out(state, agent);
+        }
+    }
+
+    fn time_out(&self, state: &mut State, agent: u8) {
+        let of = &state.agents[usize::from(agent)];
+        let due = of.locks.as_ref().and_then(Locks::poll_timeout);
+        if !of.paused && due.is_some_and(|due| due <= NOW) {
+            self.call(state, agent, |locks, out| locks.handle_timeout(NOW, out));
+        }
+    }
+
+    /// Ends a registration.
+    fn end(&self, state: &mut State, agent: u8) {
+        let count = state.agents.len() as u8;
+        let ended = &mut state.agents[usize::from(agent)];
+        ended.locks = None;
+        ended.claim = None;
+        ended.acquired = false;
+        ended.paused = false;
+        let peer = ended.me.clone();
+        state.history.holds(&peer, None);
+        state.network.retain(|(to, _, _)| *to != peer);
+        for other in (0..count).filter(|other| *other != agent) {
+            if state.agents[usize::from(other)].locks.is_some() {
+                state.unnoticed.insert((peer.clone(), other));
+            }
+        }
+        state.unnoticed.retain(|(_, other)| *other != agent);
+    }
+
+    /// Registers an agent again.
+    fn again(&self, state: &mut State, agent: u8) {
+        let registration = state.agents[usize::from(agent)].me.registration() + 1;
+        let left = state.agents[usize::from(agent)].left;
+        state.agents[usize::from(agent)] = Agent {
+            left,
+            ..self.agent(agent, registration)
+        };
+        let peers: Vec<_> = state
+            .agents
+            .iter()
+            .filter(|other| other.locks.is_some())
+            .map(|other| other.me.clone())
+            .collect();
+        let owner = state.agents[0]
+            .locks
+            .is_some()
+            .then(|| state.agents[0].me.clone());
+        self.call(state, agent, |locks, out| {
+            for peer in &peers {
+                locks.join(NOW, peer, Dialect::Own, out);
+            }
+            if let Some(owner) = owner.filter(|_| agent != 0) {
+                locks.owner_known(NOW, &resource(), &owner, Dialect::Own, out);
+            }
+        });
+    }
+
+    fn observe(state: &mut State) {
+        let (held, not): (Vec<_>, Vec<_>) = state
+            .agents
+            .iter()
+            .partition(|agent| agent.fence().is_some());
+        for agent in not.into_iter().chain(held) {
+            let fence = agent.fence();
+            state.history.holds(&agent.me, fence.as_ref());
+            if let (Some(fence), Some(owner)) = (fence, &state.agents[0].locks) {
+                let accepted = owner.admit(NOW, &resource(), &fence);
+                state.history.admitted(&fence, accepted);
+            }
+        }
+    }
+
+    pub(super) fn initial_state(&self) -> State {
+        self.initial()
+    }
+
+    pub(super) fn is_done(state: &State) -> bool {
+        state
+            .agents
+            .iter()
+            .all(|agent| agent.locks.is_none() || (agent.claim.is_none() && agent.left == 0))
+    }
+}
+
+impl State {
+    fn locks(&mut self, agent: u8) -> &mut Locks<AnyAlgorithm> {
+        self.agents[usize::from(agent)]
+            .locks
+            .as_mut()
+            .expect("not crashed")
+    }
+
+    fn is_paused(&self, peer: &Peer) -> bool {
+        self.agents
+            .iter()
+            .any(|agent| agent.me == *peer && agent.paused)
+    }
+
+    pub(super) fn broken(&self) -> Option<&crate::invariants::Violation> {
+        self.history.violation()
+    }
+}
+
+impl Agent {
+    fn fence(&self) -> Option<Fence> {
+        self.locks.as_ref()?.fence(NOW, self.claim?, &resource())
+    }
+}
+
+fn rebased(mut message: LockMessage) -> LockMessage {
+    if let Content::Lock {
+        act:
+            Act::Confirm { asked: Some(asked) }
+            | Act::Renew { asked, .. }
+            | Act::Granted { asked, .. }
+            | Act::Refused { asked, .. },
+        ..
+    } = &mut message.content
+    {
+        *asked = asked.saturating_sub(1);
+    }
+    message
+}
+
+impl Model for System {
+    type State = State;
+    type Action = Step;
+
+    fn init_states(&self) -> Vec<State> {
+        vec![self.initial()]
+    }
+
+    fn actions(&self, state: &State, actions: &mut Vec<Step>) {
+        // A broken state is the end of a counterexample.
+        if state.broken().is_some() {
+            return;
+        }
+        let left = state.left;
+        for (to, from, message) in &state.network {
+            let (to, from, message) = (to.clone(), from.clone(), message.clone());
+            if left.losses > 0 {
+                actions.push(Step::Lose(to.clone(), from.clone(), message.clone()));
+            }
+            if state.is_paused(&to) {
+                continue;
+            }
+            if left.duplicates > 0 {
+                actions.push(Step::Duplicate(to.clone(), from.clone(), message.clone()));
+            }
+            actions.push(Step::Deliver(to, from, message));
+        }
+        for (number, agent) in (0..).zip(&state.agents) {
+            if agent.locks.is_none() {
+                actions.push(Step::Return(number));
+                continue;
+            }
+            if agent.paused {
+                actions.push(Step::Resume(number));
+                continue;
+            }
+            match (agent.claim, agent.acquired) {
+                (None, _) if agent.left > 0 => actions.push(Step::Lock(number)),
+                (Some(_), true) => actions.push(Step::Release(number)),
+                (Some(_), false) if left.withdrawals > 0 => actions.push(Step::Withdraw(number)),
+                _ => {}
+            }
+            if number > 0 && left.crashes > 0 {
+                actions.push(Step::Crash(number));
+            }
+            if left.pauses > 0 && agent.acquired {
+                actions.push(Step::Pause(number));
+            }
+        }
+        if left.restarts > 0 {
+            actions.push(Step::Restart);
+        }
+        for (peer, agent) in &state.unnoticed {
+            actions.push(Step::Notice(peer.clone(), *agent));
+        }
+        let may_pass = match self.time {
+            Time::Free(ticks) => state.ticks < ticks,
+            Time::Prompt => state.network.iter().all(|(to, ..)| state.is_paused(to)),
+        };
+        if may_pass {
+            actions.push(Step::Tick);
+        }
+    }
+
+    fn next_state(&self, before: &State, step: Step) -> Option<State> {
+        let mut next = before.clone();
+        let state = &mut next;
+        match step {
+            Step::Lock(number) => {
+                let agent = &mut state.agents[usize::from(number)];
+                agent.left -= 1;
+                let mut actions = Vec::new();
+                let locks = agent.locks.as_mut()?;
+                agent.claim = Some(locks.lock(NOW, &resource(), None, &mut actions));
+                self.perform(state, number, actions);
+            }
+            Step::Release(number) | Step::Withdraw(number) => {
+                if matches!(step, Step::Withdraw(_)) {
+                    state.left.withdrawals -= 1;
+                }
+                let agent = &mut state.agents[usize::from(number)];
+                agent.acquired = false;
+                let claim = agent.claim.take()?;
+                self.call(state, number, |locks, out| locks.release(NOW, claim, out));
+            }
+            Step::Deliver(to, from, message) => {
+                let key = (to, from, message);
+                state.network.remove(&key);
+                self.deliver(state, &key.0, &key.1, &key.2);
+            }
+            Step::Duplicate(to, from, message) => {
+                state.left.duplicates -= 1;
+                self.deliver(state, &to, &from, &message);
+            }
+            Step::Lose(to, from, message) => {
+                state.left.losses -= 1;
+                state.network.remove(&(to, from, message));
+            }
+            Step::Tick => {
+                if let Time::Free(_) = self.time {
+                    state.ticks += 1;
+                }
+                self.tick(state);
+            }
+            Step::Notice(peer, number) => {
+                state.unnoticed.remove(&(peer.clone(), number));
+                if number == 0 {
+                    state.history.departed(&peer);
+                }
+                self.call(state, number, |locks, out| locks.depart(NOW, &peer, out));
+            }
+            Step::Pause(number) => {
+                state.left.pauses -= 1;
+                state.agents[usize::from(number)].paused = true;
+            }
+            Step::Resume(number) => {
+                state.agents[usize::from(number)].paused = false;
+                self.time_out(state, number);
+            }
+            Step::Crash(number) => {
+                state.left.crashes -= 1;
+                self.end(state, number);
+            }
+            Step::Return(number) => self.again(state, number),
+            Step::Restart => {
+                state.left.restarts -= 1;
+                self.end(state, 0);
+                self.again(state, 0);
+                state.history.owner_restarted(state.agents[0].me.clone());
+                let file: OwnerState = state.file.to_string().parse().ok()?;
+                state.file = file.next_life(self.lease);
+                let file = state.file;
+                self.call(state, 0, |locks, out| {
+                    locks.own(NOW, &resource(), &file, out)
+                });
+            }
+        }
+        Self::observe(state);
+        Some(next)
+    }
+
+    fn properties(&self) -> Vec<Property<Self>> {
+        vec![Property::always(
+            "the invariants hold",
+            |_, state: &State| state.broken().is_none(),
+        )]
+    }
+}

@@ -1,0 +1,237 @@
+use std::time::Instant;
+
+use stateright::{Checker, Model};
+
+use super::graph::Graph;
+use super::system::{Faults, State, Step, System, Time};
+use crate::Kind;
+use crate::faults::Fault;
+
+/// More states than any configuration that runs by default.
+const SMALL: usize = 300_000;
+
+fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
+    System {
+        kind,
+        claims: claims.to_vec(),
+        time,
+        faults,
+        probes: false,
+        lease: 4,
+        fault: Fault::None,
+    }
+}
+
+fn describe(system: &System, problem: &str, path: &[Step], state: &State) -> String {
+    let mut text = format!("{system:?}\n{problem}\n");
+    for step in path {
+        text += &format!("  {step:?}\n");
+    }
+    text + &format!("{state:#?}")
+}
+
+/// Explores a configuration.
+///
+/// # Errors
+///
+/// Returns the number of the broken invariant (10: a claim that cannot end), and a counterexample.
+fn explore(system: &System, limit: usize) -> Result<usize, (u8, String)> {
+    let begin = Instant::now();
+    let graph = Graph::explore(system, limit);
+    println!(
+        "{} states, {:.1?}: {system:?}",
+        graph.states(),
+        begin.elapsed()
+    );
+    if let Some(id) = graph.broken {
+        let (path, state) = graph.path(system, id);
+        let violation = state.broken().expect("a broken state");
+        let text = describe(system, &violation.to_string(), &path, &state);
+        return Err((violation.number, text));
+    }
+    if system.time == Time::Prompt
+        && let Some(id) = graph.stuck()
+    {
+        let (path, state) = graph.path(system, id);
+        return Err((10, describe(system, "a claim cannot end", &path, &state)));
+    }
+    Ok(graph.states())
+}
+
+fn holds(system: &System) -> usize {
+    explore(system, SMALL).unwrap_or_else(|(_, text)| panic!("{text}"))
+}
+
+const NONE: Faults = Faults {
+    losses: 0,
+    duplicates: 0,
+    crashes: 0,
+    pauses: 0,
+    restarts: 0,
+    withdrawals: 0,
+};
+
+#[test]
+fn two_requesters_and_delayed_messages() {
+    for kind in Kind::ALL {
+        holds(&system(kind, &[0, 1, 1], Time::Free(1), NONE));
+    }
+}
+
+#[test]
+fn the_owner_and_a_requester() {
+    for kind in Kind::ALL {
+        holds(&system(kind, &[1, 1], Time::Prompt, NONE));
+    }
+}
+
+const EXTENDED: [Kind; 2] = [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended];
+
+#[test]
+fn a_message_is_lost_and_the_owner_restarts() {
+    for kind in EXTENDED {
+        let faults = Faults {
+            losses: 1,
+            restarts: 1,
+            ..NONE
+        };
+        holds(&system(kind, &[0, 1], Time::Prompt, faults));
+    }
+}
+
+#[test]
+fn a_requester_crashes_and_returns() {
+    for kind in EXTENDED {
+        let faults = Faults {
+            losses: 1,
+            crashes: 1,
+            ..NONE
+        };
+        holds(&system(kind, &[0, 1], Time::Prompt, faults));
+    }
+}
+
+#[test]
+fn a_request_is_withdrawn() {
+    for kind in Kind::ALL {
+        let faults = Faults {
+            withdrawals: 1,
+            ..NONE
+        };
+        holds(&system(kind, &[0, 2], Time::Prompt, faults));
+    }
+}
+
+#[test]
+fn a_holder_pauses() {
+    for kind in EXTENDED {
+        let faults = Faults { pauses: 1, ..NONE };
+        let probed = System {
+            probes: true,
+            ..system(kind, &[0, 1], Time::Prompt, faults)
+        };
+        holds(&probed);
+    }
+}
+
+/// The checker of `stateright` explores the same states and finds no counterexample either.
+#[test]
+fn stateright_agrees() {
+    let model = system(Kind::SuzukiKasamiExtended, &[1, 1], Time::Free(2), NONE);
+    let checker = model.clone().checker().threads(2).spawn_bfs().join();
+    checker.assert_properties();
+    assert_eq!(checker.unique_state_count(), holds(&model));
+}
+
+/// Each mistake breaks an invariant, in a configuration in which the core without it breaks none.
+#[test]
+fn mistakes_are_found() {
+    let basic = Kind::RicartAgrawala;
+    let token = Kind::SuzukiKasamiExtended;
+    let prompt = |kind, claims: &[u8], faults| system(kind, claims, Time::Prompt, faults);
+    let free = |ticks, lease, faults| System {
+        lease,
+        ..system(token, &[1, 1], Time::Free(ticks), faults)
+    };
+    let duplicates = Faults {
+        duplicates: 1,
+        ..NONE
+    };
+    let restarts = Faults {
+        restarts: 1,
+        ..NONE
+    };
+    let probed = System {
+        probes: true,
+        ..free(3, 3, NONE)
+    };
+    for (fault, model, broken) in [
+        (Fault::RenewByProbe, probed, 4),
+        (Fault::CountFromArrival, free(2, 2, NONE), 4),
+        (Fault::GrantAfterRestart, free(1, 4, restarts), 4),
+        (
+            Fault::KeepEpoch,
+            prompt(Kind::RicartAgrawalaExtended, &[0, 2], restarts),
+            1,
+        ),
+        (Fault::ReleaseByName, prompt(basic, &[0, 2], duplicates), 6),
+        (Fault::DropDeferred, prompt(basic, &[0, 1, 1], NONE), 10),
+        (Fault::ReuseFence, prompt(basic, &[0, 2], NONE), 1),
+        (Fault::IgnoreGate, prompt(basic, &[0, 1, 1], NONE), 9),
+        (Fault::GrantWithdrawn, prompt(basic, &[0, 1], duplicates), 7),
+    ] {
+        holds(&model);
+        let mutant = System { fault, ..model };
+        let found = explore(&mutant, SMALL).err().map(|(number, _)| number);
+        assert_eq!(found, Some(broken), "{fault:?}");
+    }
+}
+
+/// Explores the configuration in `FIPA_LOCKS_MODEL`, for example
+/// `ricart_agrawala_extended,claims=0.1.1,ticks=4,losses=1`.
+#[test]
+fn chosen() {
+    let text = std::env::var("FIPA_LOCKS_MODEL")
+        .unwrap_or_else(|_| "ricart_agrawala_extended,claims=0.1".into());
+    let mut words = text.split(',');
+    let name = words.next().unwrap_or_default();
+    let kind = Kind::ALL.into_iter().find(|kind| kind.protocol() == name);
+    let kind = kind.expect("FIPA_LOCKS_MODEL begins with a protocol");
+    let mut model = system(kind, &[0, 1], Time::Prompt, Faults::default());
+    let mut stateright = false;
+    for word in words {
+        let (key, value) = word.split_once('=').unwrap_or((word, "1"));
+        let number = || value.parse::<u8>().expect("a number");
+        match key {
+            "claims" => {
+                let claims = value.split('.');
+                model.claims = claims
+                    .map(|claims| claims.parse().expect("a number"))
+                    .collect();
+            }
+            "ticks" => model.time = Time::Free(number()),
+            "lease" => model.lease = number().into(),
+            "probes" => model.probes = true,
+            "losses" => model.faults.losses = number(),
+            "duplicates" => model.faults.duplicates = number(),
+            "crashes" => model.faults.crashes = number(),
+            "pauses" => model.faults.pauses = number(),
+            "restarts" => model.faults.restarts = number(),
+            "withdrawals" => model.faults.withdrawals = number(),
+            "stateright" => stateright = true,
+            _ => panic!("FIPA_LOCKS_MODEL: unknown word {word}"),
+        }
+    }
+    if stateright {
+        let begin = Instant::now();
+        let checker = model.clone().checker().threads(2).spawn_bfs().join();
+        println!(
+            "{} states, {:.1?}: {model:?}",
+            checker.unique_state_count(),
+            begin.elapsed()
+        );
+        checker.assert_properties();
+    } else {
+        explore(&model, usize::MAX).unwrap_or_else(|(_, text)| panic!("{text}"));
+    }
+}

@@ -1,0 +1,454 @@
+//! The core of an owner, for one resource: one live grant at a time.
+//!
+//! * The owner counts a lease from its answer. Only a request of the holder extends it.
+//! * A release names its conversation. Late and repeated ones change nothing.
+//! * A report that arrives before the release of the grant before it waits. Agents of
+//!   `distributed_locking` let the next agent enter before they report that they have left.
+//! * A grant to a legacy agent has neither fence nor end. It ends with the agent's report, with the
+//!   proof that the agent has ended, or by [`Owner::force`].
+//! * After a start, the owner grants nothing while a grant of an earlier life may be live.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use crate::faults::{Fault, fault};
+use crate::{Act, Conversation, Dialect, Fence, Gate, Millis, Peer, Refusal};
+
+/// The owner's state for one resource.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Owner {
+    me: Peer,
+    epoch: u64,
+    /// Number of the last grant.
+    number: u64,
+    lease: Millis,
+    /// Time before which a grant of an earlier life may be live.
+    silent_until: Option<Millis>,
+    live: Option<Grant>,
+    /// Holder whose grant expired, until it reports or ends.
+    unproved: Option<(Peer, Conversation)>,
+    /// At most one report per registration.
+    queue: VecDeque<Waiter>,
+    /// Latest conversation of each agent that has ended.
+    closed: BTreeMap<Peer, Conversation>,
+    fault: Fault,
+}
+
+/// A live grant.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Grant {
+    /// The holder.
+    pub holder: Peer,
+    /// The conversation of its request.
+    pub conversation: Conversation,
+    /// The fence. A legacy agent has none.
+    pub fence: Option<Fence>,
+    /// End of the lease. The grant of a legacy agent has none.
+    pub expires: Option<Millis>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Waiter {
+    peer: Peer,
+    conversation: Conversation,
+    /// Time that the grant repeats. Legacy agents have none.
+    asked: Option<Millis>,
+}
+
+impl Waiter {
+    fn dialect(&self) -> Dialect {
+        match self.asked {
+            Some(_) => Dialect::Own,
+            None => Dialect::Legacy,
+        }
+    }
+}
+
+/// End of a grant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum Ending {
+    /// The holder released it, or withdrew its request.
+    Released,
+    /// Its lease ended.
+    Expired,
+    /// The holder's registration or process ended.
+    Gone,
+    /// The owner ended it.
+    Forced,
+}
+
+/// Result of a call of an owner.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[allow(
+    clippy::exhaustive_enums,
+    reason = "the caller has to perform each step"
+)]
+pub enum OwnerStep {
+    /// Send a message.
+    Send {
+        /// The receiver.
+        to: Peer,
+        /// The conversation.
+        conversation: Conversation,
+        /// The act.
+        act: Act,
+    },
+    /// A grant begins.
+    Began(Grant),
+    /// A grant ends.
+    Ended {
+        /// The grant.
+        grant: Grant,
+        /// The reason.
+        how: Ending,
+    },
+}
+
+impl Owner {
+    /// Creates the state of a life that is silent for the given time.
+    pub(crate) fn new(
+        me: Peer,
+        epoch: u64,
+        lease: Millis,
+        now: Millis,
+        silence: Millis,
+        fault: Fault,
+    ) -> Self {
+        let mut silence = silence;
+        if fault!(fault, GrantAfterRestart) {
+            silence = 0;
+        }
+        let mut epoch = epoch;
+        if fault!(fault, KeepEpoch) {
+            epoch = 1;
+        }
+        Self {
+            me,
+            epoch,
+            number: 0,
+            lease,
+            silent_until: (silence > 0).then(|| now.saturating_add(silence)),
+            live: None,
+            unproved: None,
+            queue: VecDeque::new(),
+            closed: BTreeMap::new(),
+            fault,
+        }
+    }
+
+    /// The live grant.
+    #[must_use]
+    pub fn live(&self, now: Millis) -> Option<&Grant> {
+        self.live
+            .as_ref()
+            .filter(|grant| grant.expires.is_none_or(|expires| now < expires))
+    }
+
+    /// Agents whose reports wait, the next one first.
+    pub fn waiters(&self) -> impl Iterator<Item = &Peer> {
+        self.queue.iter().map(|waiter| &waiter.peer)
+    }
+
+    /// Whether a command with this fence is carried out: only with the fence of the live grant.
+    #[must_use]
+    pub fn admit(&self, now: Millis, fence: &Fence) -> bool {
+        self.live(now)
+            .is_some_and(|grant| grant.fence.as_ref() == Some(fence))
+    }
+
+    /// Agents that the owner lets pass in the algorithm.
+    #[must_use]
+    pub fn gate(&self) -> Gate {
+        if self.live.is_some() || self.silent_until.is_some() {
+            Gate::Closed
+        } else if self.unproved.is_some() {
+            Gate::Own
+        } else {
+            Gate::Open
+        }
+    }
+
+    /// Time of the next timeout.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Millis> {
+        let expires = self.live.as_ref().and_then(|grant| grant.expires);
+        expires.into_iter().chain(self.silent_until).min()
+    }
+
+    /// Handles a report that an agent has entered. `asked` is absent in those of legacy agents.
+    pub(crate) fn confirm(
+        &mut self,
+        now: Millis,
+        from: &Peer,
+        conversation: &Conversation,
+        asked: Option<Millis>,
+        out: &mut Vec<OwnerStep>,
+    ) {
+        self.handle_timeout(now, out);
+        if let Some(live) = &mut self.live
+            && live.holder == *from
+            && live.conversation == *conversation
+        {
+            // The answer was lost, or the report was repeated.
+            if let (Some(asked), Some(fence)) = (asked, live.fence.clone()) {
+                live.expires = Some(now.saturating_add(self.lease));
+                out.push(Self::granted(from, conversation, fence, self.lease, asked));
+            }
+            return;
+        }
+        if self.is_closed(from, conversation) {
+            if let Some(asked) = asked {
+                out.push(Self::refused(from, conversation, Refusal::Closed, asked));
+            }
+            return;
+        }
+        if let Some(live) = &self.live
+            && live.holder == *from
+        {
+            if conversation.is_not_after(&live.conversation) {
+                return;
+            }
+            // A newer request of the holder: it has left. Its report was lost or is late.
+            self.end(Ending::Released, out);
+        }
+        self.proved(from, conversation);
+        let known = self.queue.iter_mut().find(|waiter| waiter.peer == *from);
+        match known {
+            Some(waiter) if waiter.conversation == *conversation => {
+                waiter.asked = waiter.asked.max(asked);
+            }
+            Some(waiter) if conversation.is_not_after(&waiter.conversation) => return,
+            Some(waiter) => {
+                waiter.conversation = conversation.clone();
+                waiter.asked = asked;
+            }
+            None => self.queue.push_back(Waiter {
+                peer: from.clone(),
+                conversation: conversation.clone(),
+                asked,
+            }),
+        }
+        self.grant_next(now, out);
+    }
+
+    /// Handles a request to extend a grant.
+    pub(crate) fn renew(
+        &mut self,
+        now: Millis,
+        from: &Peer,
+        conversation: &Conversation,
+        fence: &Fence,
+        asked: Millis,
+        out: &mut Vec<OwnerStep>,
+    ) {
+        self.handle_timeout(now, out);
+        match &mut self.live {
+            Some(live) if live.holder == *from && live.fence.as_ref() == Some(fence) => {
+                live.expires = Some(now.saturating_add(self.lease));
+                let fence = fence.clone();
+                out.push(Self::granted(from, conversation, fence, self.lease, asked));
+            }
+            _ => out.push(Self::refused(from, conversation, Refusal::NotLive, asked)),
+        }
+    }
+
+    /// Handles a report that an agent has left, or has withdrawn its request.
+    pub(crate) fn release(
+        &mut self,
+        now: Millis,
+        from: &Peer,
+        conversation: &Conversation,
+        out: &mut Vec<OwnerStep>,
+    ) {
+        self.handle_timeout(now, out);
+        self.proved(from, conversation);
+        let by_name = fault!(self.fault, ReleaseByName);
+        let of_live = self.live.as_ref().is_some_and(|live| {
+            live.holder == *from && (by_name || live.conversation == *conversation)
+        });
+        if of_live {
+            self.end(Ending::Released, out);
+        } else if !self.is_closed(from, conversation) {
+            self.queue
+                .retain(|waiter| waiter.peer != *from || waiter.conversation != *conversation);
+            self.close(from, conversation);
+        }
+        self.grant_next(now, out);
+    }
+
+    /// Records that a legacy agent has entered, for an algorithm in which it does not report that.
+    pub(crate) fn entered_without_report(
+        &mut self,
+        peer: &Peer,
+        conversation: &Conversation,
+        out: &mut Vec<OwnerStep>,
+    ) {
+        if self.live.is_none() {
+            let grant = Grant {
+                holder: peer.clone(),
+                conversation: conversation.clone(),
+                fence: None,
+                expires: None,
+            };
+            self.live = Some(grant.clone());
+            out.push(OwnerStep::Began(grant));
+        }
+    }
+
+    /// Records that a legacy agent, if one holds the grant, has left: the token is elsewhere.
+    pub(crate) fn left_without_report(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
+        let legacy = self.live.as_ref().is_some_and(|live| live.fence.is_none());
+        if legacy {
+            self.end(Ending::Released, out);
+            self.grant_next(now, out);
+        }
+    }
+
+    /// Handles the loss of an agent. `gone` is a proof that its registration or its process has ended.
+    pub(crate) fn lost(&mut self, now: Millis, peer: &Peer, gone: bool, out: &mut Vec<OwnerStep>) {
+        self.queue.retain(|waiter| waiter.peer != *peer);
+        if gone {
+            if self.live.as_ref().is_some_and(|live| live.holder == *peer) {
+                self.end(Ending::Gone, out);
+            }
+            if self.unproved.as_ref().is_some_and(|(of, _)| of == peer) {
+                self.unproved = None;
+            }
+            self.closed.remove(peer);
+        }
+        self.grant_next(now, out);
+    }
+
+    /// Ends the grant, and no longer waits for the proof that an expired holder has left.
+    pub(crate) fn force(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
+        if self.live.is_some() {
+            self.end(Ending::Forced, out);
+        }
+        self.unproved = None;
+        self.grant_next(now, out);
+    }
+
+    /// Ends the lease and the silence that are over.
+    pub(crate) fn handle_timeout(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
+        let over = |until: Option<Millis>| until.is_some_and(|until| until <= now);
+        if over(self.silent_until) {
+            self.silent_until = None;
+        }
+        if over(self.live.as_ref().and_then(|live| live.expires)) {
+            if let Some(live) = &self.live {
+                self.unproved = Some((live.holder.clone(), live.conversation.clone()));
+            }
+            self.end(Ending::Expired, out);
+        }
+        self.grant_next(now, out);
+    }
+
+    fn is_closed(&self, peer: &Peer, conversation: &Conversation) -> bool {
+        let closed = self.closed.get(peer);
+        !fault!(self.fault, GrantWithdrawn)
+            && closed.is_some_and(|closed| conversation.is_not_after(closed))
+    }
+
+    fn close(&mut self, peer: &Peer, conversation: &Conversation) {
+        let closed = self.closed.get(peer);
+        if !closed.is_some_and(|closed| conversation.is_not_after(closed)) {
+            self.closed.insert(peer.clone(), conversation.clone());
+        }
+    }
+
+    /// The agent shows that it has left the conversation whose grant expired.
+    fn proved(&mut self, from: &Peer, conversation: &Conversation) {
+        let unproved = self.unproved.as_ref();
+        if unproved.is_some_and(|(peer, of)| peer == from && of.is_not_after(conversation)) {
+            self.unproved = None;
+        }
+    }
+
+    fn end(&mut self, how: Ending, out: &mut Vec<OwnerStep>) {
+        if let Some(grant) = self.live.take() {
+            self.close(&grant.holder, &grant.conversation);
+            out.push(OwnerStep::Ended { grant, how });
+        }
+    }
+
+    fn grant_next(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
+        if self.live.is_some() || self.silent_until.is_some() {
+            return;
+        }
+        let gate = self.gate();
+        let next = self
+            .queue
+            .iter()
+            .position(|waiter| gate.lets_pass(waiter.dialect()));
+        let Some(waiter) = next.and_then(|next| self.queue.remove(next)) else {
+            return;
+        };
+        let mut grant = Grant {
+            holder: waiter.peer.clone(),
+            conversation: waiter.conversation.clone(),
+            fence: None,
+            expires: None,
+        };
+        if let Some(asked) = waiter.asked {
+            if !fault!(self.fault, ReuseFence) || self.number == 0 {
+                self.number += 1;
+            }
+            let fence = Fence::new(&self.me, self.epoch, self.number);
+            grant.fence = Some(fence.clone());
+            grant.expires = Some(now.saturating_add(self.lease));
+            out.push(Self::granted(
+                &waiter.peer,
+                &waiter.conversation,
+                fence,
+                self.lease,
+                asked,
+            ));
+        }
+        self.live = Some(grant.clone());
+        out.push(OwnerStep::Began(grant));
+    }
+
+    fn granted(
+        to: &Peer,
+        conversation: &Conversation,
+        fence: Fence,
+        lease: Millis,
+        asked: Millis,
+    ) -> OwnerStep {
+        OwnerStep::Send {
+            to: to.clone(),
+            conversation: conversation.clone(),
+            act: Act::Granted {
+                fence,
+                lease,
+                asked,
+            },
+        }
+    }
+
+    fn refused(
+        to: &Peer,
+        conversation: &Conversation,
+        reason: Refusal,
+        asked: Millis,
+    ) -> OwnerStep {
+        OwnerStep::Send {
+            to: to.clone(),
+            conversation: conversation.clone(),
+            act: Act::Refused { reason, asked },
+        }
+    }
+
+    #[cfg(test)]
+    pub(crate) fn rebase(&mut self, by: Millis) {
+        let expires = self.live.as_mut().and_then(|live| live.expires.as_mut());
+        let asked = self.queue.iter_mut().flat_map(|waiter| &mut waiter.asked);
+        for time in expires
+            .into_iter()
+            .chain(&mut self.silent_until)
+            .chain(asked)
+        {
+            *time = time.saturating_sub(by);
+        }
+    }
+}

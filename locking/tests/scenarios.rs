@@ -1,0 +1,601 @@
+//! Single situations: legacy agents, withdrawal, discovery, two owners, silence after a restart, probes.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use fipa_locking::{
+    Act, Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Ending, Event, Failure,
+    Fence, Kind, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource, Token,
+};
+
+fn bay() -> Resource {
+    Resource::new("bay").unwrap()
+}
+
+fn peer(name: &str) -> Peer {
+    Peer::new(name, 1).unwrap()
+}
+
+/// One agent, its time, and the actions that it has made since the last look.
+struct Agent {
+    locks: Locks<AnyAlgorithm>,
+    now: Millis,
+    out: Vec<Action>,
+}
+
+impl Agent {
+    fn new(name: &str, kind: Kind) -> Self {
+        Self {
+            locks: Locks::new(peer(name), kind, Options::default()),
+            now: 0,
+            out: Vec::new(),
+        }
+    }
+
+    /// An established owner of the bay, with these members.
+    fn owner(name: &str, kind: Kind, members: &[(&str, Dialect)]) -> Self {
+        let mut owner = Self::new(name, kind);
+        for (member, dialect) in members {
+            owner.locks.join(0, &peer(member), *dialect, &mut owner.out);
+        }
+        let state = OwnerState::first().next_life(Options::default().lease);
+        owner.locks.own(0, &bay(), &state, &mut owner.out);
+        owner.pass(1_000);
+        owner.out.clear();
+        owner
+    }
+
+    /// Passes time, with each timeout at its time.
+    fn pass(&mut self, span: Millis) {
+        let end = self.now + span;
+        while let Some(due) = self.locks.poll_timeout().filter(|due| *due <= end) {
+            self.now = due.max(self.now);
+            self.locks.handle_timeout(self.now, &mut self.out);
+        }
+        self.now = end;
+    }
+
+    fn receive(&mut self, from: &str, dialect: Dialect, conversation: &str, act: Act) {
+        let message = LockMessage {
+            conversation: Conversation::parse(conversation),
+            dialect,
+            content: Content::Lock {
+                resource: bay(),
+                act,
+            },
+        };
+        self.locks
+            .handle(self.now, &peer(from), &message, &mut self.out);
+    }
+
+    fn lock(&mut self, within: Option<Millis>) -> ClaimId {
+        self.locks.lock(self.now, &bay(), within, &mut self.out)
+    }
+
+    /// Acts that were sent since the last call, as receiver, conversation and act.
+    fn sent(&mut self) -> Vec<(String, String, Act)> {
+        let sent = self.out.iter().filter_map(|action| match action {
+            Action::Send { to, message } => match &message.content {
+                Content::Lock { act, .. } => {
+                    let conversation = message.conversation.to_string();
+                    Some((to.name().to_owned(), conversation, act.clone()))
+                }
+                Content::Probe | Content::Alive => None,
+            },
+            Action::Event(_) => None,
+        });
+        let sent = sent.collect();
+        self.out.retain(|action| matches!(action, Action::Event(_)));
+        sent
+    }
+
+    fn events(&mut self) -> Vec<Event> {
+        let events = self.out.iter().filter_map(|action| match action {
+            Action::Event(event) => Some(event.clone()),
+            Action::Send { .. } => None,
+        });
+        let events = events.collect();
+        self.out
+            .retain(|action| matches!(action, Action::Send { .. }));
+        events
+    }
+}
+
+fn to(receiver: &str, conversation: &str, act: Act) -> (String, String, Act) {
+    (receiver.to_owned(), conversation.to_owned(), act)
+}
+
+const LEGACY: Dialect = Dialect::Legacy;
+const OWN: Dialect = Dialect::Own;
+
+fn confirm(asked: Millis) -> Act {
+    Act::Confirm { asked: Some(asked) }
+}
+
+fn fence_in(sent: &[(String, String, Act)]) -> Fence {
+    let fence = sent.iter().find_map(|(.., act)| match act {
+        Act::Granted { fence, .. } => Some(fence.clone()),
+        _ => None,
+    });
+    fence.unwrap_or_else(|| panic!("no grant in {sent:?}"))
+}
+
+/// The recorded order of `distributed_locking`: the deferred agree precedes the report to the owner.
+#[test]
+fn an_early_confirm_waits_for_the_report_of_a_legacy_agent() {
+    let members = [("agent2", LEGACY), ("agent3", OWN)];
+    let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+    owner.receive("agent2", LEGACY, "agent2_1", Act::Request { clock: 1 });
+    let agree = Act::Agree { clock: 1 };
+    assert_eq!(owner.sent(), [to("agent2", "agent2_1", agree)]);
+    owner.receive("agent2", LEGACY, "agent2_1", Act::Confirm { asked: None });
+    assert_eq!(owner.sent(), []);
+    // Agent 2 has let agent 3 enter, and the owner agreed to it before.
+    owner.receive("agent3", OWN, "agent3_2", confirm(7));
+    assert_eq!(owner.sent(), []);
+    owner.receive("agent2", LEGACY, "agent2_1", Act::Release);
+    let sent = owner.sent();
+    let fence = fence_in(&sent);
+    assert!(owner.locks.admit(owner.now, &bay(), &fence));
+    // A late or repeated report of agent 2 changes nothing.
+    owner.receive("agent2", LEGACY, "agent2_1", Act::Release);
+    assert!(owner.locks.admit(owner.now, &bay(), &fence));
+}
+
+#[test]
+fn the_owner_defers_its_agree_while_a_grant_is_live() {
+    let members = [("agent2", OWN), ("agent3", LEGACY)];
+    let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+    owner.receive("agent2", OWN, "agent2_1", confirm(1));
+    owner.sent();
+    owner.receive("agent3", LEGACY, "agent3_1", Act::Request { clock: 9 });
+    assert_eq!(owner.sent(), []);
+    owner.receive("agent2", OWN, "agent2_1", Act::Release);
+    let agree = Act::Agree { clock: 9 };
+    assert_eq!(owner.sent(), [to("agent3", "agent3_1", agree)]);
+}
+
+/// A legacy agent has no fence, so the resource cannot refuse an expired holder that still uses it.
+#[test]
+fn an_expired_holder_keeps_legacy_agents_out_until_it_is_proved_gone() {
+    let members = [("agent2", OWN), ("agent3", LEGACY), ("agent4", OWN)];
+    for proof in ["release", "departure", "force"] {
+        let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+        owner.receive("agent2", OWN, "agent2_1", confirm(1));
+        let fence = fence_in(&owner.sent());
+        owner.pass(15_000);
+        assert!(!owner.locks.admit(owner.now, &bay(), &fence));
+        owner.receive("agent3", LEGACY, "agent3_1", Act::Request { clock: 9 });
+        assert_eq!(owner.sent(), []);
+        owner.receive("agent4", OWN, "agent4_1", Act::Request { clock: 10 });
+        assert_eq!(
+            owner.sent(),
+            [to("agent4", "agent4_1", Act::Agree { clock: 10 })]
+        );
+        match proof {
+            "release" => owner.receive("agent2", OWN, "agent2_1", Act::Release),
+            "departure" => owner
+                .locks
+                .depart(owner.now, &peer("agent2"), &mut owner.out),
+            _ => owner.locks.force(owner.now, &bay(), &mut owner.out),
+        }
+        let agree = Act::Agree { clock: 10 };
+        assert_eq!(owner.sent(), [to("agent3", "agent3_1", agree)], "{proof}");
+    }
+}
+
+#[test]
+fn a_silent_legacy_holder_is_replaced_only_by_force() {
+    let members = [("agent2", LEGACY), ("agent3", OWN)];
+    let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+    owner.receive("agent2", LEGACY, "agent2_1", Act::Confirm { asked: None });
+    owner.receive("agent3", OWN, "agent3_1", confirm(1));
+    owner.events();
+    owner.pass(8_000);
+    let silent = Event::Silent {
+        resource: bay(),
+        holder: peer("agent2"),
+    };
+    assert!(owner.events().contains(&silent));
+    owner.receive("agent3", OWN, "agent3_1", confirm(9_000));
+    assert_eq!(owner.sent(), []);
+    owner.locks.force(owner.now, &bay(), &mut owner.out);
+    assert_eq!(fence_in(&owner.sent()).to_string(), "1.1@agent1");
+}
+
+/// In Suzuki-Kasami legacy agents send no reports: the token is the report.
+#[test]
+fn a_legacy_agent_holds_the_resource_while_it_has_the_token() {
+    let members = [("agent2", LEGACY), ("agent3", OWN)];
+    let mut owner = Agent::owner("agent1", Kind::SuzukiKasamiExtended, &members);
+    owner.receive(
+        "agent2",
+        LEGACY,
+        "agent2_1",
+        Act::RequestToken { number: 1 },
+    );
+    let sent = owner.sent();
+    let [(_, conversation, Act::Token(token))] = &sent[..] else {
+        panic!("{sent:?}");
+    };
+    assert_eq!(
+        (conversation.as_str(), token.archive),
+        ("agent2_1", Some(18))
+    );
+    // The token does not come back by itself, whatever time passes.
+    owner.receive("agent3", OWN, "agent3_1", Act::RequestToken { number: 1 });
+    owner.pass(4_000);
+    assert_eq!(owner.sent(), []);
+    let returned = Token {
+        last: [("agent2".into(), 1)].into(),
+        archive: Some(17),
+        ..Token::default()
+    };
+    owner.receive("agent2", LEGACY, "agent1_0", Act::Token(returned));
+    let sent = owner.sent();
+    let [(receiver, conversation, Act::Token(token))] = &sent[..] else {
+        panic!("{sent:?}");
+    };
+    assert_eq!(
+        (receiver.as_str(), conversation.as_str()),
+        ("agent3", "agent3_1")
+    );
+    assert_eq!(token.archive, Some(17), "the version that the peers write");
+}
+
+#[test]
+fn a_lock_at_a_legacy_owner_has_no_fence() {
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    agent.locks.join(0, &peer("agent1"), LEGACY, &mut agent.out);
+    let claim = agent.lock(None);
+    assert!(matches!(
+        &agent.sent()[..],
+        [(_, _, Act::Query { claim: false })]
+    ));
+    agent.receive("agent1", LEGACY, "agent2_discover_0", Act::Owned);
+    let request = Act::Request { clock: 1 };
+    assert_eq!(agent.sent(), [to("agent1", "agent2_0", request)]);
+    agent.receive("agent1", LEGACY, "agent2_0", Act::Agree { clock: 3 });
+    let report = Act::Confirm { asked: None };
+    assert_eq!(agent.sent(), [to("agent1", "agent2_0", report)]);
+    assert_eq!(agent.events(), [Event::Acquired { claim }]);
+    assert_eq!(agent.locks.fence(0, claim, &bay()), None);
+    assert_eq!(agent.locks.remaining(0, claim), None);
+    agent.locks.release(0, claim, &mut agent.out);
+    assert_eq!(agent.sent(), [to("agent1", "agent2_0", Act::Release)]);
+}
+
+#[test]
+fn without_an_owner_a_claim_fails() {
+    let mut agent = Agent::new("agent2", Kind::default());
+    agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
+    let claim = agent.lock(None);
+    agent.pass(2_000);
+    let queries = agent.sent();
+    assert_eq!(queries.len(), 2, "{queries:?}");
+    let failure = Failure::NoOwner;
+    let resource = bay();
+    assert_eq!(
+        agent.events(),
+        [Event::Failed {
+            claim,
+            resource,
+            failure
+        }]
+    );
+}
+
+#[test]
+fn a_withdrawn_request_is_answered_and_its_grant_released() {
+    let mut agent = Agent::new("agent2", Kind::default());
+    for name in ["agent1", "agent3"] {
+        agent.locks.join(0, &peer(name), OWN, &mut agent.out);
+    }
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    let claim = agent.lock(Some(300));
+    agent.receive("agent3", OWN, "agent3_0", Act::Request { clock: 5 });
+    agent.sent();
+    // The time ends while two members have not agreed.
+    agent.pass(300);
+    let failure = Failure::TimedOut { ahead: 2 };
+    let resource = bay();
+    assert_eq!(
+        agent.events(),
+        [Event::Failed {
+            claim,
+            resource,
+            failure
+        }]
+    );
+    assert_eq!(
+        agent.sent(),
+        [to("agent3", "agent3_0", Act::Agree { clock: 5 })]
+    );
+    // Late agreements of the withdrawn request do not count for the next one.
+    agent.lock(None);
+    agent.sent();
+    for name in ["agent1", "agent3"] {
+        agent.receive(name, OWN, "agent2_0", Act::Agree { clock: 6 });
+    }
+    assert_eq!(agent.sent(), []);
+    // A grant that crosses the withdrawal is released at once.
+    let granted = Act::Granted {
+        fence: "1.1@agent1".parse().unwrap(),
+        lease: 15_000,
+        asked: 200,
+    };
+    agent.receive("agent1", OWN, "agent2_0", granted);
+    assert_eq!(agent.sent(), [to("agent1", "agent2_0", Act::Release)]);
+}
+
+#[test]
+fn try_lock_withdraws_after_one_round() {
+    let mut agent = Agent::new("agent2", Kind::default());
+    agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    let first = agent.locks.try_lock(0, &bay(), &mut agent.out);
+    let second = agent.locks.try_lock(0, &bay(), &mut agent.out);
+    let failed = |claim, ahead| Event::Failed {
+        claim,
+        resource: bay(),
+        failure: Failure::TimedOut { ahead },
+    };
+    assert_eq!(agent.events(), [failed(second, 2)]);
+    agent.pass(1_000);
+    assert_eq!(agent.events(), [failed(first, 1)]);
+}
+
+#[test]
+fn a_lost_owner_makes_the_resource_unreachable() {
+    for proved in [true, false] {
+        let mut agent = Agent::new("agent2", Kind::default());
+        agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
+        agent
+            .locks
+            .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+        let claim = agent.lock(None);
+        if proved {
+            agent.locks.depart(0, &peer("agent1"), &mut agent.out);
+        } else {
+            agent.pass(8_000);
+        }
+        let failure = Failure::Unreachable {
+            owner: peer("agent1"),
+        };
+        let resource = bay();
+        assert_eq!(
+            agent.events(),
+            [Event::Failed {
+                claim,
+                resource,
+                failure
+            }]
+        );
+    }
+}
+
+#[test]
+fn a_second_owner_is_refused_and_both_are_told() {
+    let mut first = Agent::owner("agent1", Kind::default(), &[("agent2", OWN)]);
+    let mut second = Agent::new("agent2", Kind::default());
+    second.locks.join(0, &peer("agent1"), OWN, &mut second.out);
+    let state = OwnerState::first().next_life(1_000);
+    second.locks.own(0, &bay(), &state, &mut second.out);
+    let claim = Act::Query { claim: true };
+    assert_eq!(
+        second.sent(),
+        [to("agent1", "agent2_discover_0", claim.clone())]
+    );
+    first.receive("agent2", OWN, "agent2_discover_0", claim);
+    let contested = Event::Contested {
+        resource: bay(),
+        by: peer("agent2"),
+    };
+    assert_eq!(first.events(), [contested]);
+    for (_, conversation, act) in first.sent() {
+        second.receive("agent1", OWN, &conversation, act);
+    }
+    let refused = Event::OwningRefused {
+        resource: bay(),
+        by: peer("agent1"),
+    };
+    assert_eq!(second.events(), [refused]);
+    assert!(second.locks.owner(&bay()).is_none());
+    assert!(first.locks.owner(&bay()).is_some());
+}
+
+#[test]
+fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
+    let before = OwnerState::first().next_life(15_000);
+    let stored: OwnerState = before.to_string().parse().unwrap();
+    let mut owner = Agent::new("agent1", Kind::default());
+    owner.locks.join(0, &peer("agent2"), OWN, &mut owner.out);
+    owner
+        .locks
+        .own(0, &bay(), &stored.next_life(15_000), &mut owner.out);
+    owner.receive("agent2", OWN, "agent2_0", confirm(1));
+    // An earlier fence is refused at once.
+    let earlier = "1.7@agent1".parse().unwrap();
+    assert!(!owner.locks.admit(0, &bay(), &earlier));
+    owner.pass(14_999);
+    owner.receive("agent2", OWN, "agent2_0", confirm(2));
+    let of_lock = |(_, _, act): &(String, String, Act)| matches!(act, Act::Granted { .. });
+    assert!(!owner.sent().iter().any(of_lock));
+    // The waiter is probed, and answers.
+    owner.pass(1);
+    assert_eq!(fence_in(&owner.sent()).to_string(), "2.1@agent1");
+}
+
+#[test]
+fn several_resources_are_held_all_or_none() {
+    let names = ["c", "a", "b"].map(|name| Resource::new(name).unwrap());
+    let mut owner = Agent::new("agent1", Kind::default());
+    owner.locks.join(0, &peer("agent2"), OWN, &mut owner.out);
+    for name in &names {
+        let state = OwnerState::first().next_life(15_000);
+        owner.locks.own(0, name, &state, &mut owner.out);
+    }
+    owner.pass(1_000);
+    owner.out.clear();
+    let message = |resource: &Resource, conversation: &str, act| LockMessage {
+        conversation: Conversation::parse(conversation),
+        dialect: OWN,
+        content: Content::Lock {
+            resource: resource.clone(),
+            act,
+        },
+    };
+    // Agent 2 holds "b".
+    let report = message(&names[2], "agent2_0", confirm(1));
+    owner
+        .locks
+        .handle(owner.now, &peer("agent2"), &report, &mut owner.out);
+    let claim = owner
+        .locks
+        .lock_all(owner.now, &names, Some(5_000), &mut owner.out);
+    let asked: Vec<_> = owner
+        .out
+        .iter()
+        .filter_map(|action| match action {
+            Action::Send { message, .. } => match &message.content {
+                Content::Lock {
+                    resource,
+                    act: Act::Request { .. },
+                } => Some((message.conversation.to_string(), resource.clone())),
+                _ => None,
+            },
+            Action::Event(_) => None,
+        })
+        .collect();
+    assert_eq!(
+        asked,
+        [("agent1_0".to_owned(), names[1].clone())],
+        "the first by name"
+    );
+    let agree = message(&names[1], "agent1_0", Act::Agree { clock: 1 });
+    owner
+        .locks
+        .handle(owner.now, &peer("agent2"), &agree, &mut owner.out);
+    assert!(owner.locks.fence(owner.now, claim, &names[1]).is_some());
+    assert!(!owner.locks.is_held(owner.now, claim));
+    owner.pass(5_000);
+    assert!(owner.locks.fence(owner.now, claim, &names[1]).is_none());
+    let failed = owner.events().into_iter().find_map(|event| match event {
+        Event::Failed { resource, .. } => Some(resource),
+        _ => None,
+    });
+    assert_eq!(failed, Some(names[2].clone()));
+    assert!(
+        owner
+            .locks
+            .owner(&names[1])
+            .unwrap()
+            .live(owner.now)
+            .is_none()
+    );
+}
+
+#[test]
+fn a_dead_holder_is_replaced_at_once_and_its_late_command_refused() {
+    let members = [("agent2", OWN), ("agent3", OWN)];
+    let mut owner = Agent::owner("agent1", Kind::default(), &members);
+    owner.receive("agent2", OWN, "agent2_0", confirm(1));
+    let first = fence_in(&owner.sent());
+    owner.receive("agent3", OWN, "agent3_0", confirm(1));
+    assert_eq!(owner.sent(), []);
+    owner.events();
+    owner
+        .locks
+        .depart(owner.now, &peer("agent2"), &mut owner.out);
+    let second = fence_in(&owner.sent());
+    let gone = |event: &Event| {
+        matches!(
+            event,
+            Event::Ended {
+                how: Ending::Gone,
+                ..
+            }
+        )
+    };
+    assert!(owner.events().iter().any(gone));
+    assert!(!owner.locks.admit(owner.now, &bay(), &first));
+    assert!(owner.locks.admit(owner.now, &bay(), &second));
+    // Its late request is not granted.
+    owner.receive("agent2", OWN, "agent2_1", confirm(2));
+    owner.receive("agent3", OWN, "agent3_0", Act::Release);
+    assert_eq!(owner.sent(), []);
+}
+
+#[test]
+fn requests_of_one_peer_take_a_bounded_amount_of_memory() {
+    for kind in Kind::ALL {
+        let mut owner = Agent::owner("agent1", kind, &[("agent2", OWN)]);
+        owner.receive("agent2", OWN, "agent2_0", confirm(1));
+        for number in 1..=2_000_u64 {
+            let conversation = format!("agent3_{number}");
+            let clock = number;
+            owner.receive("agent3", OWN, &conversation, Act::Request { clock });
+            owner.receive("agent3", OWN, &conversation, Act::RequestToken { number });
+            owner.receive("agent3", OWN, &conversation, confirm(number));
+            owner.out.clear();
+        }
+        let status = owner.locks.status(owner.now).next().unwrap();
+        assert_eq!(status.waiters, [peer("agent3")], "{kind}");
+        let text = format!("{:?}", owner.locks);
+        assert!(text.len() < 20_000, "{kind}: {} bytes", text.len());
+    }
+}
+
+#[test]
+fn an_agent_that_owns_nothing_refuses_reports() {
+    let mut agent = Agent::new("agent1", Kind::default());
+    agent.receive("agent2", OWN, "agent2_0", confirm(3));
+    let refused = Act::Refused {
+        reason: Refusal::NotOwner,
+        asked: 3,
+    };
+    assert_eq!(agent.sent(), [to("agent2", "agent2_0", refused)]);
+    // Any agent agrees to requests for resources that it does not use.
+    agent.receive("agent2", OWN, "agent2_1", Act::Request { clock: 4 });
+    assert_eq!(
+        agent.sent(),
+        [to("agent2", "agent2_1", Act::Agree { clock: 4 })]
+    );
+}
+
+/// A report can wait longer than the lease. The holder uses the grant only after it is confirmed.
+#[test]
+fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
+    let mut agent = Agent::new("agent2", Kind::default());
+    agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    let claim = agent.lock(None);
+    agent.receive("agent1", OWN, "agent2_0", Act::Agree { clock: 1 });
+    agent.now = 14_250;
+    agent.sent();
+    let fence: Fence = "1.1@agent1".parse().unwrap();
+    let granted = |asked| Act::Granted {
+        fence: "1.1@agent1".parse().unwrap(),
+        lease: 15_000,
+        asked,
+    };
+    agent.receive("agent1", OWN, "agent2_0", granted(0));
+    assert!(!agent.locks.is_held(agent.now, claim));
+    let asked = agent.now;
+    let renew = Act::Renew {
+        fence: fence.clone(),
+        asked,
+    };
+    assert!(agent.sent().contains(&to("agent1", "agent2_0", renew)));
+    agent.receive("agent1", OWN, "agent2_0", granted(asked));
+    assert_eq!(agent.locks.fence(agent.now, claim, &bay()), Some(fence));
+    assert_eq!(agent.locks.remaining(agent.now, claim), Some(14_250));
+    // An answer to a request that this agent did not make, or makes later, does not count.
+    agent.receive("agent1", OWN, "agent2_0", granted(asked + 10_000));
+    assert_eq!(agent.locks.remaining(agent.now, claim), Some(14_250));
+}

@@ -1,0 +1,130 @@
+//! Seeded simulations of up to eight agents: lost, delayed and repeated messages, clocks that differ by
+//! up to 2 %, agents that crash, return and pause, and owners that restart.
+//!
+//! The invariants are checked after each event. After the last fault, every claim has to end.
+//! `FIPA_LOCKS_SEEDS` sets the number of seeds, `FIPA_LOCKS_SEED` repeats one.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+#![expect(clippy::print_stderr, reason = "the log of a seed that is repeated")]
+
+mod world;
+
+use fipa_locking::Kind;
+use world::{Setup, World};
+
+fn seeds(default: u64) -> std::ops::Range<u64> {
+    let number = |name: &str| {
+        let text = std::env::var(name).ok();
+        text.map(|text| text.parse::<u64>().expect("a number"))
+    };
+    match number("FIPA_LOCKS_SEED") {
+        Some(seed) => seed..seed + 1,
+        None => 0..number("FIPA_LOCKS_SEEDS").unwrap_or(default),
+    }
+}
+
+fn simulate(kind: Kind, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
+    let mut acquired = 0;
+    for seed in seeds {
+        let setup = Setup {
+            kind,
+            agents: 2 + (seed % 7) as usize,
+            resources: 1 + (seed % 2) as usize,
+            faults,
+            claims: 6,
+        };
+        let mut world = World::new(setup, seed);
+        if let Err(error) = world.run() {
+            panic!("{kind}, seed {seed}: {error}");
+        }
+        acquired += world.acquired;
+    }
+    acquired
+}
+
+#[test]
+fn faults_break_no_invariant_of_ricart_agrawala_and_every_claim_ends() {
+    assert!(simulate(Kind::RicartAgrawalaExtended, true, seeds(60)) > 0);
+}
+
+#[test]
+fn faults_break_no_invariant_of_suzuki_kasami_and_every_claim_ends() {
+    assert!(simulate(Kind::SuzukiKasamiExtended, true, seeds(60)) > 0);
+}
+
+/// Basic algorithms need reliable members and messages. Then each claim is acquired.
+#[test]
+fn without_faults_every_claim_is_acquired() {
+    for kind in Kind::ALL {
+        let seeds = seeds(20);
+        let mut expected = 0;
+        for seed in seeds.clone() {
+            expected += 6 * (2 + seed % 7);
+        }
+        assert_eq!(simulate(kind, false, seeds), expected, "{kind}");
+    }
+}
+
+/// After a request has reached all members, each other agent enters at most once before it
+/// (Ricart-Agrawala). With a token, the agent that has entered or is about to receive the token can enter
+/// once more.
+#[test]
+fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
+    for kind in Kind::ALL {
+        let bound = if kind.has_token() { 2 } else { 1 };
+        let mut highest = 0;
+        for seed in seeds(40) {
+            let setup = Setup {
+                kind,
+                agents: 3 + (seed % 6) as usize,
+                resources: 1,
+                faults: false,
+                claims: 10,
+            };
+            let mut world = World::new(setup, seed);
+            world
+                .run()
+                .unwrap_or_else(|error| panic!("{kind}, seed {seed}: {error}"));
+            highest = highest.max(world.overtaken);
+        }
+        assert!(highest <= bound, "{kind}: overtaken {highest} times");
+        assert!(highest > 0, "{kind}: the agents do not compete");
+    }
+}
+
+/// Messages per uncontended acquire and release, for a requester that is not the owner.
+#[test]
+fn the_number_of_messages_is_the_minimum() {
+    for agents in [2_usize, 3, 5, 8] {
+        for kind in Kind::ALL {
+            let setup = Setup {
+                kind,
+                agents,
+                resources: 1,
+                faults: false,
+                claims: 0,
+            };
+            let mut world = World::new(setup, 1);
+            let first = world.messages_of_one_acquisition(1);
+            let again = world.messages_of_one_acquisition(1);
+            let n = agents as u64;
+            match kind {
+                Kind::RicartAgrawala | Kind::RicartAgrawalaExtended => {
+                    assert_eq!(
+                        (first, again),
+                        (2 * (n - 1) + 3, 2 * (n - 1) + 3),
+                        "{kind}, {n}"
+                    );
+                }
+                // The token stays with its last holder.
+                Kind::SuzukiKasami => assert_eq!((first, again), (n + 3, 3), "{kind}, {n}"),
+                // The token's return is the report to the owner.
+                Kind::SuzukiKasamiExtended => {
+                    assert_eq!((first, again), (n + 3, n + 3), "{kind}, {n}");
+                    // Agent 0 is the owner and has the token.
+                    assert_eq!(world.messages_of_one_acquisition(0), 0, "{kind}, {n}");
+                }
+            }
+        }
+    }
+}
