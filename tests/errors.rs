@@ -12,9 +12,8 @@ use fipa::routes::AskError;
 use fipa::{
     CoalitionError, DeregisterError, DomainDirError, EncodeError, EntryError, ErrorChain,
     HostError, Kind, ListenError, MembersError, Message, NameError, OpenError, Payload, PostError,
-    ReceiveError, RegisterError, SendError, blocking,
+    RegisterError, SendError, blocking,
 };
-use fipa_acl::Letter;
 
 const CAUSE: &str = "the disk is on fire";
 
@@ -27,8 +26,6 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
     let path = || "/dir".into();
     let name = NameError::Empty.to_string();
     let encode = EncodeError::EnvelopeTooLong(70_000);
-    let decode = Message::decode(&Payload::from(bytes::Bytes::from_static(b"?"))).unwrap_err();
-    let malformed = decode.to_string();
     let directory = || HostError::Io {
         what: "open",
         path: path(),
@@ -119,13 +116,6 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
                 encode.clone(),
             )))),
             format!("cannot send the request to the gateway: cannot encode the letter: {encode}"),
-        ),
-        (
-            Box::new(ReceiveError::Malformed {
-                source: decode,
-                letter: Box::new(Letter::new(bytes::Bytes::new(), bytes::Bytes::new())),
-            }),
-            format!("received a letter with a message that cannot be decoded: {malformed}"),
         ),
         (
             Box::new(blocking::OpenError::Thread(cause())),

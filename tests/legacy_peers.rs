@@ -426,7 +426,7 @@ fn request_of_jade(sender: &str, act: &str) -> Vec<u8> {
 async fn an_agent_of_jade_uses_the_directory_facilitator() {
     let df = "platform.df=df@jadetest";
     let host = Host::with("rusty@rustap", "jade", &[df]).await;
-    let rover = host.domain.register("rover").unwrap();
+    let rover = host.domain.register("rover").await.unwrap();
     let ask = async |letter: Vec<u8>| {
         send_as_peer(&letter, &host.address()).await;
         read(&host.read_by_peer().await)

@@ -75,7 +75,7 @@ fn names<'a>(ids: impl IntoIterator<Item = &'a Option<AgentId>>) -> Vec<String> 
 }
 
 /// Waits for the next notification.
-async fn next(notifications: &mut fipa::platform::Notifications<'_>) -> Vec<AgentDescription> {
+async fn next(notifications: &mut fipa::platform::Notifications) -> Vec<AgentDescription> {
     let next = tokio::time::timeout(PATIENCE, notifications.next()).await;
     next.unwrap().unwrap()
 }
@@ -84,8 +84,8 @@ async fn next(notifications: &mut fipa::platform::Notifications<'_>) -> Vec<Agen
 async fn services_are_registered_found_and_watched() {
     let config = config(&[]);
     let (gateway, domain) = host(&config).await;
-    let rover = domain.register("rover").unwrap();
-    let crane = domain.register("crane").unwrap();
+    let rover = domain.register("rover").await.unwrap();
+    let crane = domain.register("crane").await.unwrap();
     let df = rover.df().unwrap();
     assert_eq!(df.id().name(), format!("df@{}", gateway.name()));
     let mut notifications = df.subscribe(&lifting()).await.unwrap();
@@ -132,7 +132,7 @@ async fn services_are_registered_found_and_watched() {
 async fn the_agents_and_the_platform_are_listed() {
     let config = config(&[]);
     let (gateway, domain) = host(&config).await;
-    let rover = domain.register("rover").unwrap();
+    let rover = domain.register("rover").await.unwrap();
     let ams = rover.ams().unwrap();
     let all = ams.search(&AmsDescription::default()).await.unwrap();
     let own = gateway.name();
@@ -172,8 +172,8 @@ async fn the_agents_and_the_platform_are_listed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_of_another_host_registers_itself_for_a_time() {
     let [(near, at_home), (far, abroad)] = two_hosts(&[]).await;
-    let rover = at_home.register("rover").unwrap();
-    let crane = abroad.register("crane").unwrap();
+    let rover = at_home.register("rover").await.unwrap();
+    let crane = abroad.register("crane").await.unwrap();
     let [df, ams] = ["df", "ams"].map(|it| AgentId::new(format!("{it}@{}", near.name())).unwrap());
     knows(&abroad, df.name()).await;
     knows(&abroad, ams.name()).await;
@@ -236,14 +236,14 @@ async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
         }
     }
     // Each agent uses the directory facilitator of its own host.
-    let rover = abroad.register("rover").unwrap();
+    let rover = abroad.register("rover").await.unwrap();
     let df = rover.df().unwrap();
     let own = df
         .register_service(ServiceDescription::new("a", "lifting"))
         .await;
     assert_eq!(own.unwrap().lease_time, None);
     assert_eq!(df.search(&lifting()).await.unwrap().len(), 1);
-    let other = at_home.register("other").unwrap();
+    let other = at_home.register("other").await.unwrap();
     let other = other.df().unwrap().search(&lifting()).await.unwrap();
     assert!(other.is_empty());
     for domain in [at_home, abroad] {
@@ -256,7 +256,7 @@ async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_configuration_names_the_agents_and_turns_them_off() {
     let (gateway, domain) = host(&config(&["platform.ams=false", "platform.df=pages"])).await;
-    let rover = domain.register("rover").unwrap();
+    let rover = domain.register("rover").await.unwrap();
     assert_eq!(rover.df().unwrap().id().name(), "pages");
     assert!(
         rover

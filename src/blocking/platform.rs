@@ -21,7 +21,7 @@ pub struct Df<'a> {
 /// A subscription to a directory facilitator; see [`crate::platform::Notifications`].
 #[derive(Debug)]
 #[must_use = "next() returns the notifications"]
-pub struct Notifications {
+pub struct Notifications<'a> {
     notifications: platform::Notifications,
     runtime: &'a Runtime,
 }
@@ -117,7 +117,10 @@ impl<'a> Df<'a> {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn subscribe(&self, template: &AgentDescription) -> Result<Notifications, PlatformError> {
+    pub fn subscribe(
+        &self,
+        template: &AgentDescription,
+    ) -> Result<Notifications<'a>, PlatformError> {
         let runtime = self.runtime;
         let notifications = runtime.block_on(self.df.subscribe(template))?;
         Ok(Notifications {
@@ -135,7 +138,7 @@ impl Ams<'_> {
     }
 }
 
-impl Notifications {
+impl Notifications<'_> {
     /// See [`crate::platform::Notifications::next`].
     ///
     /// # Errors

@@ -64,7 +64,7 @@ fn gone<T: std::fmt::Debug>(result: &Result<T, DialogueError>, name: &str) {
 async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     let host = host(&[]);
     let domain = Domain::open(&config(&host)).await.unwrap();
-    let rover = Arc::new(domain.register("rover").unwrap());
+    let rover = Arc::new(domain.register("rover").await.unwrap());
     let mut arm = Process::start("arm", &host);
     let ask = |act| to(&rover, act, "arm");
 
@@ -185,7 +185,7 @@ fn a_killed_partner_ends_a_blocking_call() {
 async fn a_participant_learns_that_its_initiator_was_killed() {
     let host = host(&[]);
     let domain = Domain::open(&config(&host)).await.unwrap();
-    let rover = domain.register("rover").unwrap();
+    let rover = domain.register("rover").await.unwrap();
     let mut starter = Process::start("starter", &host);
     let first = rover.receive().await.unwrap().message;
     let mut task = rover.take_part(&first).unwrap();
@@ -201,9 +201,9 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
     let (here, there) = (config(&host), config(&host));
     let here = Domain::open(&here).await.unwrap();
     let there = Domain::open(&there).await.unwrap();
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     for registers_again in [false, true] {
-        let arm = there.register("arm").unwrap();
+        let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let mut request = rover.request(request, PATIENCE).await.unwrap();
         let first = arm.receive().await.unwrap().message;
@@ -212,7 +212,10 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
         assert!(request.agreed().await.unwrap());
         // The agent is deregistered before its task is dropped.
         drop(arm);
-        let again = registers_again.then(|| there.register("arm").unwrap());
+        let again = match registers_again {
+            true => Some(there.register("arm").await.unwrap()),
+            false => None,
+        };
         gone(&request.result().await, "arm");
         drop((again, task));
     }
@@ -223,9 +226,9 @@ async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
     let host = host(&[]);
     let here = Domain::open(&config(&host)).await.unwrap();
     let there = Domain::open(&config(&host)).await.unwrap();
-    let rover = here.register("rover").unwrap();
+    let rover = here.register("rover").await.unwrap();
     for _ in 0..20 {
-        let arm = there.register("arm").unwrap();
+        let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let request = rover.request(request, PATIENCE).await.unwrap();
         let first = arm.receive().await.unwrap().message;
@@ -275,7 +278,7 @@ impl TwoHosts {
 async fn a_killed_partner_on_another_host_ends_the_call() {
     let hosts = TwoHosts::start(&[]).await;
     let mut arm = hosts.agent("arm").await;
-    let rover = hosts.domain.register("rover").unwrap();
+    let rover = hosts.domain.register("rover").await.unwrap();
     let request = to(&rover, Performative::Request, "arm");
     let mut request = rover.request(request, PATIENCE).await.unwrap();
     assert!(request.agreed().await.unwrap());
@@ -302,7 +305,7 @@ async fn a_killed_partner_on_another_host_ends_the_call() {
 async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     let hosts = TwoHosts::start(&["monitor.heartbeat=1s"]).await;
     let mut arm = hosts.agent("arm").await;
-    let rover = Arc::new(hosts.domain.register("rover").unwrap());
+    let rover = Arc::new(hosts.domain.register("rover").await.unwrap());
     let request = to(&rover, Performative::Request, "arm");
     let mut request = rover.request(request, PATIENCE).await.unwrap();
     assert!(request.agreed().await.unwrap());

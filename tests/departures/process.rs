@@ -75,7 +75,7 @@ pub(crate) fn run() {
 
 async fn agent(config: &Config, name: &str, finish: &Arc<Semaphore>) {
     let domain = Domain::open(config).await.unwrap();
-    let agent = Arc::new(domain.register(name).unwrap());
+    let agent = Arc::new(domain.register(name).await.unwrap());
     say("ready");
     if name == "starter" {
         tokio::spawn(start(Arc::clone(&agent)));

@@ -31,8 +31,12 @@ async fn bid(arm: &Agent) {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_contract_net_reaches_the_members_of_patterns_and_coalitions_once() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
-    let rover = here.register("rover").unwrap();
-    let arms = ["arm_1", "arm_2", "leg"].map(|name| there.register(name).unwrap());
+    let rover = here.register("rover").await.unwrap();
+    let arms = [
+        there.register("arm_1").await.unwrap(),
+        there.register("arm_2").await.unwrap(),
+        there.register("leg").await.unwrap(),
+    ];
     let members = ["rover", "arm_1", "leg", "lost"];
     let options = RegisterOptions::default;
     let _platoon = here.form("platoon", members, None, options()).unwrap();
@@ -89,8 +93,11 @@ async fn join_all(mut futures: Vec<Pin<Box<impl Future<Output = ()>>>>) {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_auction_reaches_the_members_of_a_coalition() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
-    let rover = here.register("rover").unwrap();
-    let arms = ["arm_1", "arm_2"].map(|name| there.register(name).unwrap());
+    let rover = here.register("rover").await.unwrap();
+    let arms = [
+        there.register("arm_1").await.unwrap(),
+        there.register("arm_2").await.unwrap(),
+    ];
     let options = RegisterOptions::default();
     let _platoon = here
         .form("platoon", ["arm_1", "arm_2"], None, options)
@@ -118,8 +125,11 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_request_needs_receivers_that_stand_for_one_agent() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
-    let rover = here.register("rover").unwrap();
-    let arms = ["arm_1", "arm_2"].map(|name| there.register(name).unwrap());
+    let rover = here.register("rover").await.unwrap();
+    let arms = [
+        there.register("arm_1").await.unwrap(),
+        there.register("arm_2").await.unwrap(),
+    ];
     let both = ["arm_1", "arm_2"];
     let options = RegisterOptions::default;
     let _platoon = here.form("platoon", both, None, options()).unwrap();
@@ -317,10 +327,14 @@ async fn until(what: &str, holds: impl Fn() -> bool) {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
-    let battery = there.register("battery").unwrap();
+    let battery = there.register("battery").await.unwrap();
     let charge = battery.publisher("charge").unwrap();
-    let names = ["rover", "leaver", "quitter", "other"];
-    let [rover, leaver, quitter, other] = names.map(|name| here.register(name).unwrap());
+    let [rover, leaver, quitter, other] = [
+        here.register("rover").await.unwrap(),
+        here.register("leaver").await.unwrap(),
+        here.register("quitter").await.unwrap(),
+        here.register("other").await.unwrap(),
+    ];
     let subscribe = async |agent: &Agent, topic: &str| {
         let subscribe = to(agent, Performative::Subscribe, &battery, topic);
         agent.subscribe(subscribe, PATIENCE).await
@@ -371,7 +385,7 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     let (rover, arm) = pair(&[]).await;
-    let mallory = arm.domain().register("mallory").unwrap();
+    let mallory = arm.domain().register("mallory").await.unwrap();
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
     let first = next_message(&arm).await.unwrap().message;

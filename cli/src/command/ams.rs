@@ -65,7 +65,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let (ams, platform, agents) = membership::run(async {
         let domain = membership::join(&config).await?;
         let asked = async {
-            let agent = asking(&domain, "ams", &config)?;
+            let agent = asking(&domain, "ams", &config).await?;
             let ams = match arguments.ams {
                 Some(ams) => agent.ams_of(ams),
                 None => agent.ams().map_err(|error| failed(&error, &config))?,

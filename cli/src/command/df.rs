@@ -212,13 +212,13 @@ pub(super) fn failed(error: &PlatformError, config: &Config) -> Failure {
 }
 
 /// Registers an agent with a random name, which asks the agents of a platform.
-pub(super) fn asking(
+pub(super) async fn asking(
     domain: &fipa::Domain,
     command: &str,
     config: &Config,
 ) -> Result<Agent, Failure> {
     let name = format!("fipa-{command}-{}", Incarnation::random());
-    membership::register(domain, &name, RegisterOptions::default(), config)
+    membership::register(domain, &name, RegisterOptions::default(), config).await
 }
 
 async fn register(
@@ -230,7 +230,8 @@ async fn register(
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
     let done = async {
-        let agent = membership::register(&domain, name.name(), RegisterOptions::default(), config)?;
+        let agent =
+            membership::register(&domain, name.name(), RegisterOptions::default(), config).await?;
         let df = server.of(&agent, config)?;
         let service_type = service.service_type.clone().unwrap_or_default();
         let registered = df.register_service(service).await;
@@ -292,7 +293,7 @@ fn search(
     let (df, found) = membership::run(async {
         let domain = membership::join(config).await?;
         let found = async {
-            let agent = asking(&domain, "df", config)?;
+            let agent = asking(&domain, "df", config).await?;
             let df = server.of(&agent, config)?;
             let found = df.search(&template.description()).await;
             let found = found.map_err(|error| failed(&error, config))?;
@@ -392,7 +393,7 @@ async fn watch(
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
     let done = async {
-        let agent = asking(&domain, "df", config)?;
+        let agent = asking(&domain, "df", config).await?;
         let df = server.of(&agent, config)?;
         let notifications = df.subscribe(&template.description()).await;
         let mut notifications = notifications.map_err(|error| failed(&error, config))?;

@@ -1,7 +1,7 @@
 //! `fipa echo`: an agent that answers.
 
 use clap::Args;
-use fipa::{Agent, AgentId, Config, Incoming, Message, Performative, RegisterOptions};
+use fipa::{Agent, AgentId, Config, ErrorChain, Incoming, Message, Performative, RegisterOptions};
 use fipa_acl::escape;
 
 use crate::membership::{self, Stop};

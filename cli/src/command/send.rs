@@ -8,8 +8,8 @@ use std::time::{Duration, SystemTime};
 use clap::Args;
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
-    Agent, AgentId, Config, Deliveries, DeliveryFailure, Incarnation, Incoming, Message,
-    Performative, RegisterOptions, Time,
+    Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
+    Message, Performative, RegisterOptions, Time,
 };
 use fipa_acl::escape;
 use fipa_acl::json::message_to_json;
