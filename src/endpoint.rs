@@ -154,7 +154,7 @@ impl Endpoint {
             Ok(message) => message,
             Err(error) => {
                 tracing::warn!(
-                    agent = %self.name, %error,
+                    agent = %self.name, error = %ErrorChain(&error),
                     "ignored a received letter: its message cannot be decoded"
                 );
                 self.mts()

@@ -1,8 +1,6 @@
 //! Each error of the public interface has a message without the messages of its causes, and reports
 //! the causes as sources. [`ErrorChain`] prints all of them once.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
-
 use std::error::Error;
 use std::io;
 use std::sync::Arc;
@@ -11,8 +9,8 @@ use fipa::config::ConfigError;
 use fipa::routes::AskError;
 use fipa::{
     CoalitionError, DeregisterError, DomainDirError, EncodeError, EntryError, ErrorChain,
-    HostError, Kind, ListenError, MembersError, Message, NameError, OpenError, Payload, PostError,
-    RegisterError, SendError, blocking,
+    HostError, Kind, ListenError, MembersError, NameError, OpenError, PostError, RegisterError,
+    SendError, blocking,
 };
 
 const CAUSE: &str = "the disk is on fire";

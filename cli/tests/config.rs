@@ -112,6 +112,9 @@ listen = [\"127.0.0.1:0\"]             # default
 [transport.http]
 listen = [\"127.0.0.1:7778\"]          # default
 
+[transport.udt]
+listen = [\"127.0.0.1:0\"]             # default
+
 [discovery]
 mdns = true                          # default
 interfaces = []                      # default

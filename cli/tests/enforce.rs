@@ -25,8 +25,19 @@ fn illegal(to: &str) -> Vec<&str> {
 fn an_illegal_message_does_not_end_an_echo_agent() {
     let host = Host::new();
     let mut echo = host.start(&[&ENFORCE[..], &["echo", "arm_1"]].concat());
+    let in_conversation = |act: &str| {
+        let message = format!(
+            "send --from rover --to arm_1 --in-reply-to x --performative {act} --protocol fipa-request \
+             --conversation-id c"
+        );
+        let words: Vec<&str> = message.split_whitespace().collect();
+        host.run(&words).done()
+    };
+    in_conversation("request");
+    let line = echo.line();
+    assert!(line.contains("request"), "{line}");
     for _ in 0..3 {
-        let sent = host.run(&illegal("arm_1")).done();
+        let sent = in_conversation("accept-proposal");
         assert!(sent.contains("delivered"), "{sent}");
     }
     // The agent still answers, and has printed no illegal message.

@@ -35,7 +35,7 @@ fn protocols_are_listed_and_shown() {
         assert!(list.contains(name), "{list}");
     }
     let json = host.run(&["protocol", "list", "--json"]).done_json();
-    assert_eq!(json.as_array().unwrap().len(), 19);
+    assert_eq!(json.as_array().unwrap().len(), 13);
     let shown = host.run(&["protocol", "show", "contractNet"]).done();
     for line in [
         "fipa-contract-net: Calling for proposals and accepting some",

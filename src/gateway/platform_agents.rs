@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, escape};
 use fipa_content::Dialect;
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Sending, letter_for};
@@ -147,7 +147,7 @@ impl PlatformAgents {
     fn send(&self, from: Incarnation, answer: &Answer) -> Option<Sending> {
         let letter = letter_for(&answer.message, SystemTime::now());
         let letter = letter
-            .inspect_err(|error| tracing::warn!(%error, "cannot encode a letter of the gateway"))
+            .inspect_err(|error| tracing::warn!(error = %ErrorChain(error), "cannot encode a letter of the gateway"))
             .ok()?;
         let mut submission = Submission {
             sender: from,
@@ -286,7 +286,7 @@ impl Task {
         let message = match Message::decode(received.letter.payload()) {
             Ok(message) => message,
             Err(error) => {
-                tracing::info!(%error, agent = %self.name, "cannot decode a letter to an agent of the gateway");
+                tracing::info!(error = %ErrorChain(&error), agent = %self.name, "cannot decode a letter to an agent of the gateway");
                 let mts = &self.means.service.mts;
                 return mts.handle_undecodable(&self.name, received, error.to_string());
             }
@@ -364,7 +364,7 @@ impl Task {
     fn relocate(&mut self) {
         let means = &self.means;
         if let Err(error) = entry(means, self.kind, &self.name, self.incarnation) {
-            tracing::warn!(%error, agent = %self.name, "cannot update an agent of the gateway");
+            tracing::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot update an agent of the gateway");
         }
         if let Core::Ams(ams) = &mut self.core {
             ams.describe(means.description());
@@ -400,7 +400,7 @@ impl Task {
         }
         self.send_answers();
         if let Err(error) = service.host.deregister(&self.name, self.incarnation) {
-            tracing::warn!(%error, agent = %self.name, "cannot deregister an agent of the gateway");
+            tracing::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot deregister an agent of the gateway");
         }
         drop(service.mts.deregister(self.incarnation));
         self.name = id.name().into();
@@ -432,7 +432,7 @@ fn enter(
         let id = match AgentId::new(&*name) {
             Ok(id) => id,
             Err(error) => {
-                tracing::warn!(%error, "cannot register an agent of the gateway");
+                tracing::warn!(error = %ErrorChain(&error), "cannot register an agent of the gateway");
                 return None;
             }
         };
@@ -452,7 +452,7 @@ fn enter(
         }
     }
     if let Some(error) = last {
-        tracing::warn!(%error, "cannot register the {} of the gateway", kind.description());
+        tracing::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
     }
     None
 }

@@ -11,7 +11,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{AgentId, Message, Performative};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative};
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Role, Source};
 use fipa_transport::Incarnation;
@@ -180,11 +180,15 @@ impl GatewayAgent {
                     tracing::info!("ignored a question about agents: not from a gateway");
                 }
                 Ok(asked) => self.handle_local_question(message, received.sender, asked),
-                Err(error) => tracing::info!(%error, "ignored a question about agents"),
+                Err(error) => {
+                    tracing::info!(error = %ErrorChain(&error), "ignored a question about agents")
+                }
             },
             Performative::Inform if is_gateway => match presence::read_answer(content) {
                 Ok(answer) => self.pass_on(received.sender, Some(&answer)),
-                Err(error) => tracing::info!(%error, "ignored an answer about agents"),
+                Err(error) => {
+                    tracing::info!(error = %ErrorChain(&error), "ignored an answer about agents")
+                }
             },
             // The version of the other gateway has no such questions.
             Performative::NotUnderstood if is_gateway => self.pass_on(received.sender, None),
@@ -279,8 +283,12 @@ impl GatewayAgent {
             });
             match question.map(|question| question.build()) {
                 Ok(Ok(question)) => self.send(&question, &entry),
-                Ok(Err(error)) => tracing::warn!(%error, "cannot ask another gateway"),
-                Err(error) => tracing::warn!(%error, "cannot ask another gateway"),
+                Ok(Err(error)) => {
+                    tracing::warn!(error = %ErrorChain(&error), "cannot ask another gateway")
+                }
+                Err(error) => {
+                    tracing::warn!(error = %ErrorChain(&error), "cannot ask another gateway")
+                }
             }
         }
     }

@@ -4,8 +4,12 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time, escape};
-use fipa_monitor::{Header, Library, Monitor, Unchecked, Verdict, Violation, ViolationKind};
+use fipa_acl::{
+    AgentId, BuildError, ErrorChain, Message, MessageBuilder, Performative, Time, escape,
+};
+use fipa_monitor::{
+    Header, Library, Monitor, Policy, Unchecked, Verdict, Violation, ViolationKind,
+};
 use fipa_mts::{Sending, letter_for};
 use fipa_transport::{FailureReason, Incarnation, Outcome};
 
@@ -212,7 +216,8 @@ impl Dialogue {
             Ok(meaning) if meaning.opened => {}
             Ok(_) => return Err(DialogueError::NotOpening(Box::new(first.clone()))),
             Err(CheckFailure::Violation(violation))
-                if violation.kind == ViolationKind::NotOpened =>
+                if violation.kind == ViolationKind::NotOpened
+                    || violation.kind.depends_on_policy() =>
             {
                 return Err(DialogueError::NotOpening(Box::new(first.clone())));
             }
@@ -546,8 +551,11 @@ enum Silence {
 impl Speaker {
     fn new(core: &Arc<AgentCore>, protocol: &str, id: String) -> Self {
         let library = Arc::clone(core.endpoint.domain.inner.rules.library());
+        // The conversation begins here, so that no message continues an earlier one.
+        let mut policy = Policy::default();
+        policy.unsolicited = true;
         Self {
-            monitor: Monitor::agent(library, &core.endpoint.name),
+            monitor: Monitor::agent(library, &core.endpoint.name).with_policy(policy),
             core: Arc::clone(core),
             protocol: protocol.to_owned(),
             id,
@@ -619,7 +627,7 @@ impl Speaker {
                 Err(DialogueError::WouldViolate(_)) => {}
                 Err(error) => {
                     let id = escape(&self.id);
-                    return tracing::debug!(%error, conversation = %id, "cannot end a conversation");
+                    return tracing::debug!(error = %ErrorChain(&error), conversation = %id, "cannot end a conversation");
                 }
             }
         }

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fipa_acl::{Message, Performative, escape};
+use fipa_acl::{ErrorChain, Message, Performative, escape};
 use fipa_transport::FailureReason;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -161,7 +161,7 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
                 false => serve(&core, &first, &subscribers).await,
             };
             if let Err(error) = served {
-                tracing::info!(subscriber = %escape(&name), %error, "a subscription has ended");
+                tracing::info!(subscriber = %escape(&name), error = %ErrorChain(&error), "a subscription has ended");
             }
         });
     }

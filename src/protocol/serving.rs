@@ -4,7 +4,7 @@ use std::fmt::Display;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use fipa_acl::{Message, escape};
+use fipa_acl::{ErrorChain, Message, escape};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::task::{JoinError, JoinHandle};
@@ -156,7 +156,7 @@ where
         let task = match Task::join(queue.agent(), &first, Some(Arc::clone(&home))) {
             Ok(task) => task,
             Err(error) => {
-                tracing::warn!(%error, "cannot take part in a conversation");
+                tracing::warn!(error = %ErrorChain(&error), "cannot take part in a conversation");
                 continue;
             }
         };

@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Directory, Entry, Reach, Role, Watch};
@@ -195,7 +195,9 @@ impl PartnerWatch {
                 },
                 gateway,
             )),
-            Err(error) => tracing::warn!(%error, "cannot ask the gateway about other agents"),
+            Err(error) => {
+                tracing::warn!(%error, "cannot ask the gateway about other agents")
+            }
         }
     }
 
@@ -245,7 +247,9 @@ impl PartnerWatch {
         match message.performative() {
             Performative::Inform => match presence::read_answer(content.unwrap_or_default()) {
                 Ok(answer) => self.partners.handle_answer(Instant::now(), &answer),
-                Err(error) => tracing::info!(%error, "ignored an answer of the gateway"),
+                Err(error) => {
+                    tracing::info!(error = %ErrorChain(&error), "ignored an answer of the gateway")
+                }
             },
             // A gateway that does not support the question, or an undelivered question.
             act => tracing::debug!(performative = %act, "no answer about other agents"),

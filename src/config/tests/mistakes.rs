@@ -2,6 +2,8 @@
 
 use std::fs;
 
+use fipa_acl::ErrorChain;
+
 use super::{config, error};
 use crate::config::{Config, ConfigError, Interface, Sources};
 
@@ -399,6 +401,11 @@ fn mistakes_in_set_arguments_name_the_argument() {
     assert!(error("domain = 5\n", &["domain=a"]).starts_with("fipa.toml:1: `domain` is invalid"));
 }
 
+/// The message of an error with those of its causes.
+fn chain(error: &ConfigError) -> String {
+    ErrorChain(error).to_string()
+}
+
 #[test]
 fn a_named_file_must_be_there() {
     let directory = tempfile::tempdir().unwrap();
@@ -409,7 +416,7 @@ fn a_named_file_must_be_there() {
     };
     let missing = "none.toml (named by --config): No such file or directory (os error 2)";
     assert_eq!(
-        Config::load(&sources).unwrap_err().to_string(),
+        chain(&Config::load(&sources).unwrap_err()),
         format!("cannot read the configuration {missing}")
     );
     let sources = Sources {
@@ -417,7 +424,7 @@ fn a_named_file_must_be_there() {
         ..Sources::default()
     };
     assert_eq!(
-        Config::load(&sources).unwrap_err().to_string(),
+        chain(&Config::load(&sources).unwrap_err()),
         format!(
             "cannot read the configuration {} (named by $FIPA_CONFIG): Is a directory (os error 21)",
             directory.path().display()
@@ -434,7 +441,7 @@ fn a_found_file_must_be_readable_text() {
     };
     let refused = |bytes: &[u8]| {
         fs::write(directory.path().join("fipa.toml"), bytes).unwrap();
-        Config::load(&sources).unwrap_err().to_string()
+        chain(&Config::load(&sources).unwrap_err())
     };
     assert_eq!(
         refused(b"domain = \"a\"\n# \xff\n"),

@@ -212,10 +212,19 @@ pub fn the_first_parcels_arrive_in_order(fixture: &dyn Fixture) {
             a.transport.drive();
             b.transport.drive();
         }
-        for attempt in &taken {
-            assert_eq!(concluded(&[&a, &b], &a, *attempt), accepted());
-        }
+        // The way may lack room for a parcel that waited for it.
+        taken.retain(|attempt| match concluded(&[&a, &b], &a, *attempt) {
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
+                false
+            }
+            end => {
+                assert_eq!(end, accepted());
+                true
+            }
+        });
         let arrived: Vec<u64> = (0..b.arrivals()).map(|it| b.arrived(it).sequence).collect();
+        assert!(!arrived.is_empty());
         assert_eq!(arrived, taken);
     }
 }
