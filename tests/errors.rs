@@ -29,6 +29,7 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
         path: path(),
         source: cause(),
     };
+    #[cfg_attr(not(feature = "secure"), expect(unused_mut))]
     let mut all: Vec<(Box<dyn Error>, String)> = vec![
         (
             Box::new(OpenError::Listen {

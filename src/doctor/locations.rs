@@ -18,11 +18,11 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         (Kind::Udt, &transport.udt.listen),
     ];
     let used = |kind| config.mts.transports.contains(&kind);
-    let built = |kind| match kind {
-        Kind::Quic => cfg!(feature = "quic"),
-        Kind::Http => cfg!(feature = "http"),
-        Kind::Udt => cfg!(feature = "udt"),
-        _ => true,
+    let built = |kind| {
+        let lacks_quic = kind == Kind::Quic && !cfg!(feature = "quic");
+        let lacks_http = kind == Kind::Http && !cfg!(feature = "http");
+        let lacks_udt = kind == Kind::Udt && !cfg!(feature = "udt");
+        !lacks_quic && !lacks_http && !lacks_udt
     };
     let mut found = Vec::new();
     for (kind, listen) in listens {
