@@ -288,7 +288,9 @@ impl<O: Eq> Index<O> {
                 true => before.unwrap_or(first_unproved),
                 false => {
                     let mut unproved = claims.iter().skip(first_unproved);
-                    let index = unproved.position(|(_, other)| entry.precedes(other));
+                    let index = unproved.position(|(_, other)| {
+                        entry.precedes(other) || is_same_registration(&entry, other)
+                    });
                     index.map_or(claims.len(), |index| first_unproved + index)
                 }
             };
@@ -317,5 +319,42 @@ impl<O: Eq> Index<O> {
             self.incarnations
                 .insert(after.incarnation, Arc::clone(after));
         }
+    }
+}
+
+/// Whether one gateway announces one registration by both entries, for example because it changed
+/// the label of its record. The later entry has the current locations.
+fn is_same_registration(a: &Entry, b: &Entry) -> bool {
+    let of = |entry: &Entry| (entry.incarnation, entry.mts.incarnation);
+    of(a) == of(b) && a.incarnation.is_known() && a.mts.incarnation.is_known()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Mts, Registration, Source};
+
+    fn entry(incarnation: u64, gateway: u64, address: &str) -> Arc<Entry> {
+        let at = format!("tcp://{address}:7788#00000000000000aa");
+        let incarnation = Incarnation::from_u64(incarnation);
+        let mut arm = Registration::new("arm", incarnation, vec![at.parse().unwrap()]);
+        arm.registered = std::time::UNIX_EPOCH;
+        let gateway = Mts::new("theirs", Incarnation::from_u64(gateway));
+        Arc::new(arm.into_entry(&gateway, Source::Mdns).unwrap())
+    }
+
+    #[test]
+    fn the_latest_record_of_a_registration_has_its_locations() {
+        let table = Table::new();
+        let (first, second) = (entry(1, 7, "10.99.0.51"), entry(1, 7, "10.99.0.52"));
+        table.put("label", Arc::clone(&first));
+        // The gateway announces the agent by another label before the goodbye of the first.
+        table.put("other label", Arc::clone(&second));
+        assert_eq!(table.known("arm").unwrap().locations, second.locations);
+        // An entry of another gateway for the registration does not take it over.
+        table.put("of another", entry(1, 8, "10.99.0.99"));
+        assert_eq!(table.known("arm").unwrap().locations, second.locations);
+        table.update([("other label", "arm".into(), None)]);
+        assert_eq!(table.known("arm").unwrap().locations, first.locations);
     }
 }

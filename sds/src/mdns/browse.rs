@@ -392,6 +392,13 @@ impl Browser {
         }
     }
 
+    /// Reports the record with this label when it arrives next, even if it is the stored one.
+    pub(super) fn report_again(&mut self, label: &str) {
+        if let Some(known) = self.records.get_mut(label) {
+            known.digest = Digest::default();
+        }
+    }
+
     /// Records that the gateway's beacon matches its stored records, so that all of them are valid.
     pub(super) fn confirm(&mut self, now: Instant, gateway: Incarnation) {
         // The next scan of the records applies it.

@@ -79,7 +79,11 @@ impl Listener {
                 self.repair(shared, silent);
             }
         }
-        self.send(shared.moved());
+        for (label, packet) in shared.relocated(now) {
+            self.sockets.send_to_other_hosts(&packet);
+            // The library may still announce the previous locations.
+            self.browser.report_again(&label);
+        }
         let (ended, doubtful) = {
             let mut stored = shared.peer_records.lock();
             (stored.take_ended(), stored.due(now))
@@ -92,9 +96,11 @@ impl Listener {
             shared.put(&fullname, None);
         }
         let later = shared.peer_records.lock().poll_timeout(now);
+        let relocated = shared.own.lock().relocations.poll_timeout();
         let due = [
             Some(self.browser.poll_timeout()),
             later,
+            relocated,
             self.fast_poll_until,
         ];
         let due = due.into_iter().flatten().min();

@@ -21,6 +21,7 @@ mod packet;
 mod peer_records;
 mod probe;
 mod record;
+mod relocations;
 mod restart;
 mod sockets;
 mod task;
@@ -40,6 +41,7 @@ use self::coalition_sync::{CoalitionSync, Updates};
 use self::pace::Pace;
 use self::peer_records::PeerRecords;
 pub use self::probe::{Multicast, probe};
+use self::relocations::Relocations;
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Role, Source, Subscriber,
@@ -344,13 +346,9 @@ struct OwnAgents {
     /// The announcements at the time the library was stopped, until the next one starts. Later changes
     /// are not announced meanwhile, so a beacon with them would cause unanswered queries.
     while_stopped: Option<beacon::BeaconContent>,
-    /// Names of records in which only the locations changed. They are announced at once, because
-    /// the library needs about two seconds.
-    moved: Vec<Arc<str>>,
+    /// Records in which only the locations changed.
+    relocations: Relocations,
 }
-
-/// Maximum number of records that are announced at once; the library announces the others.
-const MAX_MOVED: usize = 256;
 
 impl OwnAgents {
     fn announced(&self) -> beacon::BeaconContent {
@@ -462,12 +460,13 @@ impl Shared {
                 told: Some((when, _)),
                 ..
             }) => {
-                let settling = match moves(before, entry) {
+                let relocated = moves(before, entry);
+                let settling = match relocated {
                     true => MOVING,
                     false => SETTLING,
                 };
-                if settling == MOVING && own.moved.len() < MAX_MOVED {
-                    own.moved.push(Arc::clone(&entry.name));
+                if relocated {
+                    own.relocations.add(now, &entry.name);
                     self.postponed.notify_one();
                 }
                 Some(*when + settling).filter(|settled| *settled > now)
@@ -507,15 +506,17 @@ impl Shared {
         Ok(())
     }
 
-    /// Builds packets for the records in which only the locations changed.
-    fn moved(&self) -> Vec<Vec<u8>> {
+    /// Builds the due packets for records in which only the locations changed, each with the label of
+    /// its record.
+    fn relocated(&self, now: Instant) -> Vec<(String, Vec<u8>)> {
         let mut own = self.own.lock();
-        let moved = std::mem::take(&mut own.moved);
-        let packets = moved.iter().filter_map(|name| {
+        let due = own.relocations.take_due(now);
+        let packets = due.iter().filter_map(|name| {
             let announced = own.agents.get(name)?;
             let label = record::label(name, announced.attempt);
             let properties = record::encode(&announced.entry);
-            packet::announcement(&label, &announced.host_name(), &properties)
+            let packet = packet::announcement(&label, &announced.host_name(), &properties)?;
+            Some((label.into(), packet))
         });
         packets.collect()
     }

@@ -17,6 +17,8 @@ const PAUSE: Duration = Duration::from_millis(100);
 /// Time after the start of a doubt in which the removal of a queried record also casts doubt on the
 /// rest of its gateway.
 const DOUBT: Duration = Duration::from_secs(6);
+/// Minimum time between two doubts of a gateway whose records change.
+const AGAIN: Duration = Duration::from_secs(1);
 
 /// Records of other hosts by gateway, and the queue of those to verify.
 #[derive(Debug, Default)]
@@ -64,7 +66,8 @@ impl PeerRecords {
                     rest.filter(|it| !waiting.contains(it)).cloned().collect();
                 self.queue.extend(rest);
             }
-            if known.records.is_empty() {
+            let replaced = entry.is_some_and(|entry| entry.mts.incarnation == gateway);
+            if known.records.is_empty() && !replaced {
                 self.gateways.remove(&gateway);
             }
         }
@@ -95,14 +98,21 @@ impl PeerRecords {
 
     /// Doubts the gateway: queues up to `BATCH` of its records for verification first. If it has
     /// more, one of these stands for the rest. Returns false when there are no records, or a doubt
-    /// has already started.
+    /// has already started and no record changed since.
     pub(super) fn doubt(&mut self, now: Instant, gateway: Incarnation) -> bool {
         let Some(known) = self.gateways.get_mut(&gateway) else {
             return false;
         };
         let already = known.doubted.as_ref();
-        if already.is_some_and(|(since, _)| now < *since + DOUBT) {
-            return false;
+        if let Some((since, _)) = already {
+            // Records that changed are a reason to ask again: the gateway may have moved again.
+            let pause = match known.stored.changed > *since {
+                true => AGAIN,
+                false => DOUBT,
+            };
+            if now < *since + pause {
+                return false;
+            }
         }
         let asked: Vec<Arc<str>> = known.records.iter().take(BATCH).cloned().collect();
         let Some(first) = asked.first() else {
@@ -263,5 +273,20 @@ mod tests {
         now += DOUBT;
         put(&mut holdings, now, doubted[0].parse().unwrap(), 7, false);
         assert_eq!(holdings.poll_timeout(now), None);
+    }
+
+    #[test]
+    fn a_gateway_whose_records_change_is_doubted_again_after_a_second() {
+        let mut holdings = PeerRecords::default();
+        let (start, gateway) = (Instant::now(), Incarnation::from_u64(7));
+        put(&mut holdings, start, 1, 7, true);
+        assert!(holdings.doubt(start, gateway));
+        assert!(!holdings.doubt(start + AGAIN, gateway), "nothing changed");
+        // The gateway moves, and answers for its record.
+        let moved = start + Duration::from_millis(300);
+        put(&mut holdings, moved, 1, 7, true);
+        assert!(!holdings.doubt(start + AGAIN / 2, gateway), "too early");
+        assert!(holdings.doubt(start + AGAIN, gateway));
+        assert!(!holdings.doubt(start + 2 * AGAIN, gateway), "unchanged");
     }
 }

@@ -87,6 +87,28 @@ impl Sockets {
         }
     }
 
+    /// Sends the packet on all interfaces, but not to this host: while the mDNS library probes for a
+    /// record, it would take a changed record for that of another host, and rename its own.
+    pub(super) fn send_to_other_hosts(&self, packet: &[u8]) {
+        self.set_loopback(false);
+        self.send(packet);
+        self.set_loopback(true);
+    }
+
+    /// Sets whether this host receives what it sends.
+    fn set_loopback(&self, on: bool) {
+        for (socket, group) in &self.open {
+            let of_socket = SockRef::from(socket);
+            let set = match group {
+                SocketAddr::V4(_) => of_socket.set_multicast_loop_v4(on),
+                SocketAddr::V6(_) => of_socket.set_multicast_loop_v6(on),
+            };
+            if let Err(error) = set {
+                tracing::debug!(%error, %group, "cannot set the loopback of multicast packets");
+            }
+        }
+    }
+
     /// Waits for the next packet, and returns it with its source address and port. This method is
     /// cancel-safe.
     pub(super) async fn receive(&mut self) -> (&[u8], SocketAddr) {

@@ -7,6 +7,7 @@ use fipa_acl::ErrorChain;
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
+use super::beacon::Digest;
 use super::browse::{ParsedPacket, label_of};
 use super::listener::Listener;
 use super::record::{self, Properties};
@@ -167,7 +168,7 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Optio
         }
     };
     if entry.mts.incarnation == shared.config.mts.incarnation {
-        own_found(shared, fullname, &entry);
+        own_found(shared, fullname, &entry, Digest::of(properties));
     } else {
         shared.put(fullname, Some(Arc::clone(&entry)));
         contested(shared, &entry);
@@ -176,10 +177,16 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Optio
 }
 
 /// Handles one of this gateway's own records. A different label means that the library renamed it
-/// and the notification was lost.
-fn own_found(shared: &Shared, fullname: &str, entry: &Entry) {
+/// and the notification was lost. A different content of a record whose locations changed is
+/// outdated.
+fn own_found(shared: &Shared, fullname: &str, entry: &Entry, digest: Digest) {
     let original = {
-        let own = shared.own.lock();
+        let mut own = shared.own.lock();
+        let current = own.agents.get(&entry.name).map(|one| one.digest);
+        if current.is_some_and(|current| current != digest) {
+            // The task sends it before it waits again.
+            own.relocations.handle_outdated(Instant::now(), &entry.name);
+        }
         let announced = own.agents.get(&entry.name);
         let announced = announced.filter(|one| one.entry.incarnation == entry.incarnation);
         // Other differences come from caches that still have abandoned labels.
@@ -263,7 +270,7 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::super::SERVICE_TYPE;
-    use super::super::beacon::{BeaconContent, Digest};
+    use super::super::beacon::BeaconContent;
     use super::super::packet::tests::{Part, answer};
     use super::super::restart::tests::directory;
     use super::*;
