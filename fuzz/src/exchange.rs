@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_sds::{Directory, Entry, Exchange, Mts, Present, Reach, Role, Source};
-use fipa_transport::{Incarnation, Location, Mandate};
+use fipa_transport::{Incarnation, Location};
 
 use crate::input::Input;
 
@@ -55,11 +55,9 @@ pub fn play(bytes: &[u8]) {
     here.handle_own(now, [&arm]);
     there.handle_own(now, [&rover, &lander]);
     let gateways = |with: &[Incarnation]| -> Vec<Present> {
-        let all = with.iter().map(|one| Present {
-            mts: Mts::new("mts", *one),
-            locations: vec![location(*one)],
-            mandate: Mandate::Unproved,
-        });
+        let all = with
+            .iter()
+            .map(|one| Present::unproved(Mts::new("mts", *one), vec![location(*one)]));
         all.collect()
     };
     let mut present = vec![HONEST, LIARS[0], LIARS[1], LIARS[2]];

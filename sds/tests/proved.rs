@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use fipa_sds::{
     Change, ContactDirectory, Directory, Exchange, MergedDirectory, Mts, Present, StaticDirectory,
 };
-use fipa_transport::{Incarnation, Location, Mandate};
+use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
 /// Offset between the number of a gateway and that of its agent.
 const fn agent_of(gateway: u64) -> Incarnation {
@@ -26,11 +26,19 @@ fn certified(agents: &[&str]) -> Mandate {
     Mandate::Certified(agents.iter().map(|agent| (*agent).to_owned()).collect())
 }
 
+/// The certificate of the gateway with this number.
+fn certificate(gateway: u64) -> Principal {
+    let mut fingerprint = [0; 32];
+    fingerprint[..8].copy_from_slice(&gateway.to_be_bytes());
+    Principal::Certificate(fingerprint)
+}
+
 fn present(gateway: u64, mandate: Mandate) -> Present {
     Present {
         mts: Mts::new(format!("mts-{gateway}"), Incarnation::from_u64(gateway)),
         locations: vec![location(gateway)],
         mandate,
+        principal: certificate(gateway),
     }
 }
 
@@ -150,6 +158,25 @@ fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
     bench.connect();
     bench.exchange.handle_timeout(bench.now + Exchange::MEMORY);
     assert_eq!(bench.holder("rover"), Some(1));
+}
+
+#[test]
+fn a_gateway_that_restarts_at_another_address_takes_its_agents_back() {
+    // Gateway 2 is gateway 1 after a restart; gateway 3 has another name.
+    let restarted = |gateway: u64, name: &str| Present {
+        mts: Mts::new(name, Incarnation::from_u64(gateway)),
+        principal: certificate(1),
+        ..present(gateway, certified(&[]))
+    };
+    for (name, holder) in [("mts-1", 2), ("mts-3", 1)] {
+        let mut bench = Bench::new(vec![restarted(1, "mts-1"), restarted(2, name)]);
+        bench.tell(1, &["rover"], 5);
+        bench.tell(2, &["rover"], 5);
+        assert_eq!(bench.holder("rover"), Some(1), "both are connected");
+        bench.neighbours.remove(0);
+        bench.connect();
+        assert_eq!(bench.holder("rover"), Some(holder), "{name}");
+    }
 }
 
 #[test]

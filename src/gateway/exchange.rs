@@ -152,6 +152,7 @@ impl Exchanging {
                 mts: entry.mts.clone(),
                 locations: with_others(&entry.locations, others),
                 mandate: neighbour.mandate.clone(),
+                principal: neighbour.principal,
             }
         };
         let present: Vec<Present> = neighbours.iter().map(located).collect();

@@ -63,7 +63,7 @@ pub struct Neighbour {
     /// Number of open connections with the gateway.
     pub connections: usize,
     /// The identity that the links prove. A connection that proves another one is ignored.
-    principal: Principal,
+    pub(super) principal: Principal,
     /// The agents for which the gateway may act, as far as its links prove it.
     pub(super) mandate: Mandate,
     /// The name in `discovery.static`, if the gateway is listed there.

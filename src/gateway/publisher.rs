@@ -268,7 +268,7 @@ impl PublishTask {
 #[cfg(test)]
 mod tests {
     use fipa_sds::{Exchange, HostConfig, Mts, Present};
-    use fipa_transport::Mandate;
+    use fipa_transport::{Mandate, Principal};
 
     use super::*;
 
@@ -291,6 +291,7 @@ mod tests {
             mts: Mts::new("crex-mts", gateway),
             locations: vec!["tcp://192.0.2.1:7788#0000000000000007".parse().unwrap()],
             mandate,
+            principal: Principal::Certificate([7; 32]),
         };
         exchange.handle_neighbours(Instant::now(), &[present]);
         let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,

@@ -25,7 +25,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{ErrorChain, escape};
-use fipa_transport::{Incarnation, Location, Mandate};
+use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
 pub use directory::ExchangeDirectory;
 use wire::{Changes, ExchangeMessage, Full};
@@ -61,6 +61,8 @@ pub struct Present {
     /// The agents for which its links prove that it may speak. Entries of other agents are
     /// rejected.
     pub mandate: Mandate,
+    /// The identity that its links prove.
+    pub principal: Principal,
 }
 
 impl Present {
@@ -71,6 +73,7 @@ impl Present {
             mts,
             locations,
             mandate: Mandate::Unproved,
+            principal: Principal::Unproved,
         }
     }
 }
@@ -99,6 +102,7 @@ struct Neighbor {
     mts: Mts,
     locations: Vec<Location>,
     mandate: Mandate,
+    principal: Principal,
     /// Time of the disconnect.
     gone: Option<Instant>,
     state: SyncState,
@@ -231,9 +235,11 @@ impl Exchange {
             mts,
             locations,
             mandate,
+            principal,
         } in present
         {
             if let Some(known) = self.neighbors.get_mut(&mts.incarnation) {
+                known.principal = *principal;
                 if known.mandate != *mandate {
                     known.mandate = mandate.clone();
                     self.directory.prove(mts.incarnation, mandate);
@@ -252,6 +258,7 @@ impl Exchange {
             let due = now + self.jitter();
             let mut neighbor = Neighbor::new(mts.clone(), locations.clone(), due);
             neighbor.mandate = mandate.clone();
+            neighbor.principal = *principal;
             self.directory.prove(mts.incarnation, mandate);
             if self.early.remove(&mts.incarnation) {
                 neighbor.request_all(now);
@@ -293,13 +300,15 @@ impl Exchange {
     }
 
     /// Ends disconnected gateways that another incarnation has replaced: a gateway that was killed
-    /// and restarted listens at the same address. Its agents are those that the new incarnation
+    /// and restarted listens at the same address, or has the same certificate and name. Its agents are those that the new incarnation
     /// sends, and letters in the custody of the old one are lost. Entries of a gateway that is
     /// connected and answers stay: two gateways behind one address translator have the same
     /// location.
     fn end_replaced(&mut self) {
         let gone = self.neighbors.iter().filter(|(_, old)| old.gone.is_some());
-        let replaced = gone.filter(|(gateway, old)| self.is_replaced(**gateway, &old.locations));
+        let replaced = gone.filter(|(gateway, old)| {
+            self.is_replaced(**gateway, &old.locations) || self.is_succeeded(old)
+        });
         let replaced: Vec<Incarnation> = replaced.map(|(incarnation, _)| *incarnation).collect();
         for incarnation in replaced {
             self.end(incarnation);
@@ -314,6 +323,17 @@ impl Exchange {
             let tells = new.gone.is_none() && new.stored.is_some();
             *other != gateway && tells && new.is_at_one_of(locations)
         })
+    }
+
+    /// Whether another connected gateway with the same certificate and name has sent its agents.
+    fn is_succeeded(&self, old: &Neighbor) -> bool {
+        let is_certified = matches!(old.principal, Principal::Certificate(_));
+        let mut others = self.neighbors.values();
+        is_certified
+            && others.any(|new| {
+                let tells = new.gone.is_none() && new.stored.is_some();
+                tells && new.principal == old.principal && new.mts.name == old.mts.name
+            })
     }
 
     fn end(&mut self, gateway: Incarnation) {
@@ -622,6 +642,7 @@ impl Neighbor {
             mts,
             locations,
             mandate: Mandate::Unproved,
+            principal: Principal::Unproved,
             gone: None,
             state: SyncState::nothing(),
             under_way: None,
