@@ -302,6 +302,10 @@ impl Core {
     /// Resolves the receivers of a letter in the view, and sends it to them. Returns the number of
     /// outcomes, or the letter if a refresh of the directory may add receivers. After a refresh, an
     /// unknown receiver is final.
+    #[expect(
+        clippy::result_large_err,
+        reason = "the letter is moved in and back; a box would cost an allocation"
+    )]
     fn resolve(
         &mut self,
         now: Now,
