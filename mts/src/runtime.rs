@@ -4,6 +4,9 @@
 //! actions are carried out before the lock is released, so that parcels leave in the order in which
 //! the core decided. Transports never call back from within a dispatch, so this cannot deadlock.
 //!
+//! The core has a view of the directory, which is replaced when the directory has changed. Only a
+//! refresh of the directory, which may read files, is performed after the lock was released.
+//!
 //! A task that waits for an outcome or a letter first drives the transports for a short time on its
 //! own thread, and then sleeps until it is woken.
 
@@ -16,7 +19,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-use fipa_sds::{Change, Directory, Entry, Pattern};
+use fipa_sds::{Change, Directory, Entry, Pattern, View};
 use fipa_transport::{
     Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
     OwnerProcess, Transport, TransportError, TransportErrorKind,
@@ -132,6 +135,7 @@ impl Drop for ServiceHandle {
 struct Shared {
     state: Mutex<State>,
     transports: Vec<Arc<dyn Transport>>,
+    directory: Arc<dyn Directory>,
     config: RuntimeConfig,
     /// Wakes the timer when an action is due earlier than its wake-up, or the service is gone.
     timer: Arc<Notify>,
@@ -145,6 +149,10 @@ struct Shared {
 
 struct State {
     core: Core,
+    /// Generation of the directory before the core's view was taken.
+    generation: u64,
+    /// Replaced views, which are freed after the lock was released.
+    replaced: Vec<Arc<dyn View>>,
     unframed_deadline: Duration,
     /// Time at which the timer wakes up.
     armed: Option<Instant>,
@@ -182,6 +190,9 @@ struct Slot {
     complete: Notify,
 }
 
+/// Number of expected outcomes of a letter whose receivers are not resolved yet.
+const UNRESOLVED: usize = usize::MAX;
+
 #[derive(Default)]
 struct Outcomes {
     expected: usize,
@@ -218,11 +229,15 @@ impl Mts {
         transports: Vec<Arc<dyn Transport>>,
         handle: &Handle,
     ) -> Started {
+        let generation = directory.generation();
+        let core = Core::new(core, directory.view());
         let state = State {
             core: match &config.gate {
-                Some(gate) => Core::new(core, Arc::clone(&directory)).gated(Arc::clone(gate)),
-                None => Core::new(core, Arc::clone(&directory)),
+                Some(gate) => core.gated(Arc::clone(gate)),
+                None => core,
             },
+            generation,
+            replaced: Vec::new(),
             unframed_deadline: config.unframed_deadline,
             armed: None,
             sends: Map::default(),
@@ -231,6 +246,7 @@ impl Mts {
         let shared = Arc::new(Shared {
             state: Mutex::new(state),
             transports: transports.clone(),
+            directory: Arc::clone(&directory),
             config,
             timer: Arc::default(),
             closed: AtomicBool::new(false),
@@ -284,14 +300,14 @@ impl Mts {
     /// Opens connections to these services, by name and location, so that their greetings announce
     /// this service's locations; see [`Core::greet`].
     pub fn greet(&self, services: Vec<(Arc<str>, Location)>) {
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         state.core.greet(services);
         self.shared.carry_out(state);
     }
 
     /// Starts to accept letters for this agent. It must be in the directory, or be added soon.
     pub fn register(&self, name: Arc<str>, incarnation: Incarnation) {
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         let waiter = Arc::new(AgentWaiter::default());
         if self.shared.closed.load(Ordering::Acquire) {
             waiter.close();
@@ -302,7 +318,7 @@ impl Mts {
 
     /// Removes the agent; see [`Core::deregister`]. Returns the letters that are left in its queue.
     pub fn deregister(&self, incarnation: Incarnation) -> Vec<Received> {
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         let unread = std::iter::from_fn(|| state.core.take(incarnation)).collect();
         state.core.deregister(Now::read(), incarnation);
         if let Some(waiter) = state.agents.remove(&incarnation) {
@@ -315,7 +331,7 @@ impl Mts {
     /// Sets whether the [`Tap`] is notified of every letter. While it is off, watching costs only
     /// the check of a flag under the lock.
     pub fn watch(&self, watched: bool) {
-        self.shared.state.lock().core.watch(watched);
+        self.shared.lock().core.watch(watched);
     }
 
     /// Sends a letter. The future returns one outcome per receiver; the letter is submitted when
@@ -330,10 +346,11 @@ impl Mts {
         self.begin(|core| core.send(Now::read(), submission))
     }
 
-    fn begin(&self, send: impl FnOnce(&mut Core) -> (SendId, usize)) -> Sending {
+    fn begin(&self, send: impl FnOnce(&mut Core) -> (SendId, Option<usize>)) -> Sending {
         let slot = Arc::new(Slot::default());
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         let (id, expected) = send(&mut state.core);
+        let expected = expected.unwrap_or(UNRESOLVED);
         slot.outcomes.lock().expected = expected;
         if expected > 0 {
             state.sends.insert(id, Arc::clone(&slot));
@@ -347,7 +364,7 @@ impl Mts {
 
     /// Sends a letter to exactly this incarnation of an agent; see [`Core::send_to`].
     pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
-        self.begin(|core| (core.send_to(Now::read(), submission, entry), 1))
+        self.begin(|core| (core.send_to(Now::read(), submission, entry), Some(1)))
     }
 
     /// Replaces the orders of transports and the deadline of legacy peers' letters; see
@@ -358,7 +375,7 @@ impl Mts {
         routes: Vec<(Pattern, Vec<Kind>)>,
         unframed_deadline: Duration,
     ) {
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         state.unframed_deadline = unframed_deadline;
         state.core.reorder(Now::read(), order, routes);
         self.shared.carry_out(state);
@@ -371,7 +388,7 @@ impl Mts {
 
     /// Sets the services to keep in touch with; see [`Core::keep_in_touch`].
     pub fn keep_in_touch(&self, peers: Vec<Peer>) {
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         state.core.keep_in_touch(Now::read(), peers);
         self.shared.carry_out(state);
     }
@@ -379,7 +396,7 @@ impl Mts {
     /// Returns the states of the services to keep in touch with.
     #[must_use]
     pub fn peers(&self) -> Vec<PeerState> {
-        self.shared.state.lock().core.peers(Now::read())
+        self.shared.lock().core.peers(Now::read())
     }
 
     /// Returns the routes that letters from here to these agents would take now.
@@ -387,7 +404,7 @@ impl Mts {
     pub fn routes(&self, to: &[Arc<Entry>]) -> Vec<Route> {
         // In several parts, so that letters are not blocked meanwhile.
         let parts = to.chunks(ROUTES_AT_ONCE).flat_map(|part| {
-            let state = self.shared.state.lock();
+            let state = self.shared.lock();
             let now = Now::read();
             let routes = part.iter().map(|entry| state.core.route(now, entry));
             routes.collect::<Vec<_>>()
@@ -398,13 +415,13 @@ impl Mts {
     /// Returns the health and counters of each route; see [`Core::ways`].
     #[must_use]
     pub fn ways(&self) -> Vec<RouteState> {
-        self.shared.state.lock().core.ways(Now::read())
+        self.shared.lock().core.ways(Now::read())
     }
 
     /// Waits for the next letter for this agent; `None` when the agent was deregistered or the
     /// service closed.
     pub async fn receive(&self, agent: Incarnation) -> Option<Received> {
-        let waiter = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
+        let waiter = Arc::clone(self.shared.lock().agents.get(&agent)?);
         self.shared
             .wait(&waiter.notify, || {
                 if waiter.ready.load(Ordering::Acquire)
@@ -424,7 +441,7 @@ impl Mts {
     /// Waits until no more letters can arrive for this agent, because it was deregistered or the
     /// service closed.
     pub async fn gone(&self, agent: Incarnation) {
-        let Some(waiter) = self.shared.state.lock().agents.get(&agent).map(Arc::clone) else {
+        let Some(waiter) = self.shared.lock().agents.get(&agent).map(Arc::clone) else {
             return;
         };
         // Created before the check, so that a later notification is not missed.
@@ -436,7 +453,7 @@ impl Mts {
 
     /// Returns the next letter for this agent if there is one.
     pub fn try_receive(&self, agent: Incarnation) -> Option<Received> {
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         let received = state.core.take(agent);
         let more = state.core.waiting(agent) > 0;
         if let Some(waiter) = state.agents.get(&agent) {
@@ -454,7 +471,9 @@ impl Mts {
     /// Reports that an agent took a letter whose message cannot be decoded; see
     /// [`Core::handle_undecodable`].
     pub fn handle_undecodable(&self, receiver: &Arc<str>, received: &Received, why: String) {
-        let mut state = self.shared.state.lock();
+        // The sender may have been registered just now.
+        self.shared.directory.refresh();
+        let mut state = self.shared.lock();
         state
             .core
             .handle_undecodable(Now::read(), receiver, received, why);
@@ -470,8 +489,8 @@ impl Mts {
     /// `patience` to finish, then abandons them and closes the transports.
     pub async fn close(&self, patience: Duration) {
         let until = Instant::now() + patience;
-        self.shared.state.lock().core.refuse_custody();
-        while self.shared.state.lock().core.has_open_letters() && Instant::now() < until {
+        self.shared.lock().core.refuse_custody();
+        while self.shared.lock().core.has_open_letters() && Instant::now() < until {
             if !self.shared.drive() {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
@@ -487,7 +506,7 @@ impl Mts {
         for task in self.shared.tasks.lock().drain(..) {
             task.abort();
         }
-        let mut state = self.shared.state.lock();
+        let mut state = self.shared.lock();
         state.core.give_up(Now::read());
         for waiter in state.agents.values() {
             waiter.close();
@@ -529,9 +548,29 @@ impl Shared {
         did_something
     }
 
+    /// Locks the state, in which the core has the present view of the directory.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        let mut state = self.state.lock();
+        state.update_view(&*self.directory);
+        state
+    }
+
     /// Carries out all actions of the core, then releases the lock.
-    fn carry_out(&self, mut guard: MutexGuard<'_, State>) {
+    fn carry_out(&self, guard: MutexGuard<'_, State>) {
+        let mut refresh = self.perform(guard);
+        while let Some(number) = refresh {
+            self.directory.refresh();
+            let mut state = self.lock();
+            state.core.handle_refreshed(Now::read(), number);
+            refresh = self.perform(state);
+        }
+    }
+
+    /// Carries out the actions of the core, then releases the lock. Returns the number of the last
+    /// refresh of the directory that the core has requested.
+    fn perform(&self, mut guard: MutexGuard<'_, State>) -> Option<u64> {
         let state = &mut *guard;
+        let mut refresh = None;
         while let Some(action) = state.core.poll_action() {
             match action {
                 Action::Dispatch {
@@ -592,8 +631,12 @@ impl Shared {
                 } => {
                     if let Some(contacts) = &self.config.contacts {
                         contacts.heard(&name, agent, location);
+                        state.update_view(&*self.directory);
                     }
                 }
+                // One refresh is enough for all that were requested before it.
+                Action::Refresh { number } => refresh = Some(number),
+                Action::Resolved { send, outcomes } => state.resolved(send, outcomes),
                 Action::Notice(notice) => {
                     if let Some(tap) = &self.config.tap {
                         tap.notice(&notice);
@@ -609,10 +652,14 @@ impl Shared {
         }
         let due = state.core.poll_timeout();
         let earlier = due.is_some_and(|due| state.armed.is_none_or(|armed| due < armed));
+        let replaced = std::mem::take(&mut state.replaced);
         drop(guard);
+        // The last owner of a view frees the memory of all its entries.
+        drop(replaced);
         if earlier {
             self.timer.notify_one();
         }
+        refresh
     }
 
     /// Waits until `look` finds something: drives the transports for a while, then sleeps.
@@ -647,6 +694,31 @@ impl Drop for Shared {
 }
 
 impl State {
+    /// Gives the core the present view of the directory, if that has changed.
+    fn update_view(&mut self, directory: &dyn Directory) {
+        // Read before the view, so that a change in between causes another update.
+        let generation = directory.generation();
+        if self.generation != generation {
+            self.generation = generation;
+            self.replaced.push(self.core.set_view(directory.view()));
+        }
+    }
+
+    fn resolved(&mut self, send: SendId, outcomes: usize) {
+        let Some(slot) = self.sends.get(&send) else {
+            return;
+        };
+        let complete = {
+            let mut of_slot = slot.outcomes.lock();
+            of_slot.expected = outcomes;
+            of_slot.known.len() >= outcomes
+        };
+        if complete {
+            slot.complete.notify_one();
+            self.sends.remove(&send);
+        }
+    }
+
     fn outcome(&mut self, send: SendId, receiver: Arc<str>, outcome: Outcome) {
         let Some(slot) = self.sends.get(&send) else {
             return;
@@ -711,7 +783,7 @@ async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
             let Some(shared) = shared.upgrade() else {
                 return;
             };
-            let mut state = shared.state.lock();
+            let mut state = shared.lock();
             state.core.handle_timeout(Now::read());
             state.armed = state.core.poll_timeout();
             let due = state.armed;
@@ -726,6 +798,9 @@ async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
     }
 }
 
+/// Maximum number of changes that are handled under one lock.
+const CHANGES_AT_ONCE: usize = 64;
+
 /// Notifies the core of changes in the directory.
 async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
     let mut watch = directory.watch();
@@ -733,9 +808,15 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
         let Some(shared) = shared.upgrade() else {
             return;
         };
+        let mut changes = vec![change];
+        while changes.len() < CHANGES_AT_ONCE
+            && let Some(change) = watch.try_next()
+        {
+            changes.push(change);
+        }
         let now = Now::read();
-        let mut state = shared.state.lock();
-        for change in change.single() {
+        let mut state = shared.lock();
+        for change in changes.iter().flat_map(Change::single) {
             match change {
                 Change::Left(entry) => state.core.handle_departure(now, entry),
                 Change::Changed { before, after } if before.incarnation != after.incarnation => {

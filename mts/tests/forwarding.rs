@@ -596,5 +596,5 @@ fn a_note_lowers_the_predecessor_of_a_held_letter() {
 
 /// Parses the letter for this core.
 fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
-    Unframed::read(letter, via, legacy(from), &**core.directory()).unwrap()
+    Unframed::read(letter, via, legacy(from), &**core.view()).unwrap()
 }

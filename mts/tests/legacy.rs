@@ -40,7 +40,7 @@ impl Bench {
             window,
             ..CoreConfig::new("mts", Incarnation::from_u64(1), order)
         };
-        let mut core = Core::new(config, directory);
+        let mut core = Core::new(config, directory.view());
         core.register("rover".into(), ROVER);
         Self {
             core,

@@ -119,6 +119,38 @@ fn letters_to_agents_that_move_follow_or_fail() {
     );
 }
 
+/// Agents come to a host whose other processes learn of them late, and letters to them wait for a
+/// refresh, which takes time.
+#[test]
+fn letters_to_agents_that_the_sender_does_not_know_yet_wait_for_a_refresh() {
+    let weather = Weather {
+        moves: 80,
+        lag_ms: 300,
+        refresh_ms: 40,
+        news_ms: 60,
+        ..Weather::calm()
+    };
+    run(weather.with_liars(), FEW_SEEDS);
+    let rough = Weather {
+        loss: 0.05,
+        silence: 0.02,
+        answer_loss: 0.05,
+        deaths: 4,
+        restarts: 4,
+        ..weather
+    };
+    run(rough, SEEDS);
+    let found: u64 = seeds(SEEDS)
+        .into_iter()
+        .map(|seed| {
+            let mut world = World::new(seed, weather);
+            assert_eq!(world.run().err(), None, "seed {seed}");
+            world.found()
+        })
+        .sum();
+    assert!(found > 0, "no receiver was found by a refresh");
+}
+
 profiles! {
     in_calm_weather_everything_is_delivered = Weather::calm();
 

@@ -56,13 +56,13 @@ fn a_letter_to_an_earlier_registration_goes_to_the_current_one() {
     let arm = |life| Registration::new("arm", life, vec![location.clone()]);
     let shown = MemoryDirectory::new(Mts::new("mts", own));
     shown.register(arm(first)).unwrap();
-    let directory = Behind {
+    let directory = Arc::new(Behind {
         shown,
         news: Mutex::new(Some(arm(second))),
         gone: first,
-    };
+    });
     let config = CoreConfig::new("mts", own, vec![Kind::Shm]);
-    let mut core = Core::new(config, Arc::new(directory));
+    let mut core = Core::new(config, directory.view());
     let now = Now {
         instant: Instant::now(),
         utc: SystemTime::UNIX_EPOCH,
@@ -97,6 +97,11 @@ fn a_letter_to_an_earlier_registration_goes_to_the_current_one() {
                 core.handle_conclusion(now, attempt, Conclusion::Answered(answer));
             }
             Action::Outcome { outcome, .. } => outcomes.push(outcome),
+            Action::Refresh { number } => {
+                directory.refresh();
+                core.set_view(directory.view());
+                core.handle_refreshed(now, number);
+            }
             _ => {}
         }
     }

@@ -30,7 +30,7 @@ impl Bench {
         let directory = Arc::new(MemoryDirectory::new(mts));
         let order = vec![Kind::Shm, Kind::Udp, Kind::Tcp];
         let config = CoreConfig::new("mts", Incarnation::from_u64(1), order);
-        let shared: Arc<dyn fipa_sds::Directory> = Arc::clone(&directory) as _;
+        let shared: Arc<dyn fipa_sds::View> = Arc::clone(&directory) as _;
         let mut core = Core::new(config, shared);
         core.register("rover".into(), ROVER);
         let start = Instant::now();

@@ -41,7 +41,7 @@ fn core() -> (Core, Arc<dyn Directory>) {
         forwards: true,
         ..CoreConfig::new("gateway", Incarnation::from_u64(1), kinds)
     };
-    (Core::new(config, Arc::clone(&directory)), directory)
+    (Core::new(config, directory.view()), directory)
 }
 
 fn now() -> Now {

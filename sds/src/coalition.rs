@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Directory, Entry, NameError, Role, check_name};
+use crate::{Entry, NameError, Role, View, check_name};
 
 /// Members of a coalition, and its leader if it has one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -141,8 +141,8 @@ const MAX_AGENTS: usize = 256;
 
 /// Returns the agents to which a letter from `sender` to this coalition goes, and the names of
 /// members that have no entry or exceed the bounds.
-pub(crate) fn agents_of(
-    directory: &dyn Directory,
+pub(crate) fn agents_of<V: View + ?Sized>(
+    view: &V,
     coalition: &Entry,
     sender: &str,
 ) -> (Vec<Arc<Entry>>, Vec<Arc<str>>) {
@@ -150,7 +150,7 @@ pub(crate) fn agents_of(
         seen: HashSet::from([Arc::clone(&coalition.name)]),
         ..ResolvedMembers::default()
     };
-    resolved.add(directory, coalition, sender, 1);
+    resolved.add(view, coalition, sender, 1);
     (resolved.agents, resolved.missing)
 }
 
@@ -162,7 +162,7 @@ struct ResolvedMembers {
 }
 
 impl ResolvedMembers {
-    fn add(&mut self, directory: &dyn Directory, coalition: &Entry, sender: &str, depth: usize) {
+    fn add<V: View + ?Sized>(&mut self, view: &V, coalition: &Entry, sender: &str, depth: usize) {
         let Role::Coalition(members) = &coalition.role else {
             return;
         };
@@ -174,11 +174,11 @@ impl ResolvedMembers {
                 continue;
             }
             let full = self.agents.len() + self.missing.len() >= MAX_AGENTS;
-            match directory.lookup(name).filter(|_| !full) {
+            match view.named(name).filter(|_| !full) {
                 Some(entry) => match &entry.role {
                     Role::Agent => self.agents.push(entry),
                     Role::Coalition(_) if depth < MAX_DEPTH => {
-                        self.add(directory, &entry, sender, depth + 1);
+                        self.add(view, &entry, sender, depth + 1);
                     }
                     _ => self.missing.push(Arc::clone(name)),
                 },
@@ -193,7 +193,7 @@ mod tests {
     use fipa_transport::Incarnation;
 
     use super::*;
-    use crate::{MemoryDirectory, Mts, Registration, Resolution, resolve};
+    use crate::{Directory, MemoryDirectory, Mts, Registration, Resolution, resolve};
 
     fn directory(agents: &[&str]) -> MemoryDirectory {
         let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));

@@ -99,7 +99,7 @@ impl Default for ContactDirectory {
 }
 
 impl Directory for ContactDirectory {
-    reads_its_table!(table);
+    reads_its_table!(viewed table);
 }
 
 #[cfg(test)]

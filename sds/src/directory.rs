@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use fipa_transport::{Forked, Incarnation, Mandate};
 
-use crate::{Entry, EntryError, Query, Registration, Subscriber, Watch};
+use crate::{Entry, EntryError, Query, Registration, Snapshot, Subscriber, View, Watch};
 
 /// A view of the known agents.
 ///
@@ -49,8 +49,15 @@ pub trait Directory: Send + Sync {
         matching.cloned().collect()
     }
 
-    /// Returns a number that changes whenever the directory changes.
+    /// Returns a number that changes whenever the directory or its [view](Self::view) changes. A
+    /// change is complete when the number has changed.
     fn generation(&self) -> u64;
+
+    /// Returns a view of the present entries that does not change. Takes no time in proportion to
+    /// the number of entries in the back ends of this crate.
+    fn view(&self) -> Arc<dyn View> {
+        Arc::new(Snapshot::of(self.entries().iter()))
+    }
 
     /// Sends every later change to this subscriber.
     fn subscribe(&self, subscriber: &Subscriber);

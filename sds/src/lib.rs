@@ -3,7 +3,8 @@
 //!
 //! * [`Entry`] is the known data of one registration; [`Registration`] is the data that its owner
 //!   supplies.
-//! * [`Directory`] is the trait of all views; [`Watch`] reports changes of a view.
+//! * [`Directory`] is the trait of all back ends; [`Watch`] reports changes. [`View`] is a view of a
+//!   directory without I/O, for readers that must not wait.
 //! * [`MemoryDirectory`], [`StaticDirectory`], [`ContactDirectory`], [`HostDirectory`],
 //!   [`ExchangeDirectory`] and (feature `mdns`) `MdnsDirectory` are its back ends;
 //!   [`MergedDirectory`] merges several directories into one view.
@@ -39,6 +40,7 @@ mod merged;
 mod name;
 mod query;
 mod resolve;
+mod view;
 mod watch;
 
 pub use coalition::{Members, MembersError};
@@ -54,4 +56,5 @@ pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};
 pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
 pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
+pub use view::{Snapshot, View};
 pub use watch::{Change, Subscriber, Watch};

@@ -31,7 +31,7 @@ impl MemoryDirectory {
 }
 
 impl Directory for MemoryDirectory {
-    reads_its_table!(table);
+    reads_its_table!(viewed table);
 
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         let entry = Arc::new(registration.into_entry(&self.mts, Source::Memory)?);
@@ -100,5 +100,5 @@ impl StaticDirectory {
 }
 
 impl Directory for StaticDirectory {
-    reads_its_table!(table);
+    reads_its_table!(viewed table);
 }

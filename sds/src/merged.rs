@@ -1,14 +1,14 @@
 //! One view of several directories.
 
 use std::collections::HashMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use arc_swap::ArcSwapOption;
 use fipa_transport::{Incarnation, Mandate};
 
 use crate::{
     Change, DeregisterError, Directory, Entry, Reach, RegisterError, Registration, Role, Source,
-    Subscriber, Watch,
+    Subscriber, View, Watch,
 };
 
 /// Several directories merged into one view.
@@ -63,11 +63,14 @@ impl Directory for MergedDirectory {
     }
 
     fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        let found = |one: &Arc<dyn Directory>| one.known_incarnation(incarnation);
-        let entry = self.back_ends.iter().find_map(found)?;
-        // An agent that lost its name in the merged view is not part of the view.
-        self.known(&entry.name)
-            .filter(|holder| holder.incarnation == incarnation)
+        registered(&self.back_ends, incarnation)
+    }
+
+    fn view(&self) -> Arc<dyn View> {
+        Arc::new(Merged {
+            views: self.back_ends.iter().map(|one| one.view()).collect(),
+            sorted: OnceLock::new(),
+        })
     }
 
     fn refresh(&self) {
@@ -84,25 +87,7 @@ impl Directory for MergedDirectory {
         }
         // Taken before reading: a change during the read causes another read next time.
         let generations = self.generations().collect();
-        let mut merged: HashMap<Arc<str>, NameClaim> = HashMap::new();
-        for (at, one) in self.back_ends.iter().enumerate() {
-            for entry in one.entries().iter() {
-                if !counts(&self.back_ends, at, entry) {
-                    continue;
-                }
-                let claim = NameClaim {
-                    at,
-                    entry: Arc::clone(entry),
-                };
-                let holder = merged.get(&entry.name);
-                if holder.is_none_or(|holder| claim.is_better(holder, &self.back_ends)) {
-                    merged.insert(entry.name.clone(), claim);
-                }
-            }
-        }
-        let mut entries: Vec<_> = merged.into_values().map(|claim| claim.entry).collect();
-        entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
-        let entries: Arc<[_]> = entries.into();
+        let entries = merged_entries(&self.back_ends);
         self.sorted.store(Some(Arc::new(Sorted {
             generations,
             entries: Arc::clone(&entries),
@@ -163,9 +148,69 @@ impl Directory for MergedDirectory {
     }
 }
 
-fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
+/// Several views merged into one.
+struct Merged {
+    views: Vec<Arc<dyn View>>,
+    sorted: OnceLock<Arc<[Arc<Entry>]>>,
+}
+
+impl View for Merged {
+    fn named(&self, name: &str) -> Option<Arc<Entry>> {
+        holder(&self.views, name)
+    }
+
+    fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        registered(&self.views, incarnation)
+    }
+
+    fn all(&self) -> Arc<[Arc<Entry>]> {
+        Arc::clone(self.sorted.get_or_init(|| merged_entries(&self.views)))
+    }
+
+    fn is_authority(&self, mts: Incarnation) -> bool {
+        self.views.iter().any(|one| one.is_authority(mts))
+    }
+
+    fn mandate_of(&self, mts: Incarnation) -> Mandate {
+        mandate(&self.views, mts)
+    }
+}
+
+fn registered<V: View + ?Sized>(
+    back_ends: &[Arc<V>],
+    incarnation: Incarnation,
+) -> Option<Arc<Entry>> {
+    let mut found = back_ends.iter().map(|one| one.registered(incarnation));
+    let entry = found.find_map(|found| found)?;
+    // An agent that lost its name in the merged view is not part of the view.
+    holder(back_ends, &entry.name).filter(|holder| holder.incarnation == incarnation)
+}
+
+fn merged_entries<V: View + ?Sized>(back_ends: &[Arc<V>]) -> Arc<[Arc<Entry>]> {
+    let mut merged: HashMap<Arc<str>, NameClaim> = HashMap::new();
+    for (at, one) in back_ends.iter().enumerate() {
+        for entry in one.all().iter() {
+            if !counts(back_ends, at, entry) {
+                continue;
+            }
+            let claim = NameClaim {
+                at,
+                entry: Arc::clone(entry),
+            };
+            let holder = merged.get(&entry.name);
+            if holder.is_none_or(|holder| claim.is_better(holder, back_ends)) {
+                merged.insert(entry.name.clone(), claim);
+            }
+        }
+    }
+    let mut entries: Vec<_> = merged.into_values().map(|claim| claim.entry).collect();
+    entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+    entries.into()
+}
+
+fn holder<V: View + ?Sized>(back_ends: &[Arc<V>], name: &str) -> Option<Arc<Entry>> {
     let claims = back_ends.iter().enumerate().filter_map(|(at, one)| {
-        let entry = one.known(name)?;
+        let entry = one.named(name)?;
         counts(back_ends, at, &entry).then_some(NameClaim { at, entry })
     });
     let better = |best: NameClaim, next: NameClaim| match next.is_better(&best, back_ends) {
@@ -184,14 +229,14 @@ struct NameClaim {
 
 impl NameClaim {
     /// Whether this claim replaces the claim of an earlier directory.
-    fn is_better(&self, before: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
+    fn is_better<V: View + ?Sized>(&self, before: &Self, back_ends: &[Arc<V>]) -> bool {
         let (new, old) = (&self.entry, &before.entry);
         let is_moved = new.incarnation == old.incarnation
             && new.incarnation.is_known()
             && new.mts.incarnation != old.mts.incarnation;
         let speaks = |claim: &Self| {
             let back_end = back_ends.get(claim.at);
-            back_end.is_some_and(|it| it.speaks_for(claim.entry.mts.incarnation))
+            back_end.is_some_and(|it| it.is_authority(claim.entry.mts.incarnation))
         };
         match is_moved {
             true => speaks(self) && !speaks(before),
@@ -203,7 +248,7 @@ impl NameClaim {
 
     /// Whether this claim precedes `other` regardless of registration times: both are of other
     /// hosts, and this one is proved or from the configuration.
-    fn outranks(&self, other: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
+    fn outranks<V: View + ?Sized>(&self, other: &Self, back_ends: &[Arc<V>]) -> bool {
         if self.entry.reach == Reach::Local || other.entry.reach == Reach::Local {
             return false;
         }
@@ -215,22 +260,22 @@ impl NameClaim {
         }
     }
 
-    fn is_proved(&self, back_ends: &[Arc<dyn Directory>]) -> bool {
+    fn is_proved<V: View + ?Sized>(&self, back_ends: &[Arc<V>]) -> bool {
         let back_end = back_ends.get(self.at);
-        back_end.is_some_and(|it| it.mandate(self.entry.mts.incarnation).is_proved())
+        back_end.is_some_and(|it| it.mandate_of(self.entry.mts.incarnation).is_proved())
     }
 }
 
 /// Returns the mandate of the service from the first directory that has one.
-fn mandate(back_ends: &[Arc<dyn Directory>], mts: Incarnation) -> Mandate {
-    let mut mandates = back_ends.iter().map(|one| one.mandate(mts));
+fn mandate<V: View + ?Sized>(back_ends: &[Arc<V>], mts: Incarnation) -> Mandate {
+    let mut mandates = back_ends.iter().map(|one| one.mandate_of(mts));
     mandates.find(Mandate::is_proved).unwrap_or_default()
 }
 
 /// Whether an entry of a back end is visible. If the service has a mandate, the mandate must cover
 /// the agent. A coalition is visible only from the back end that [speaks](Directory::speaks_for)
 /// for its message transport service, if there is one.
-fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
+fn counts<V: View + ?Sized>(back_ends: &[Arc<V>], at: usize, entry: &Entry) -> bool {
     let is_agent = entry.reach != Reach::Local && entry.role != Role::Gateway;
     if is_agent && !mandate(back_ends, entry.mts.incarnation).speaks_for(&entry.name) {
         return false;
@@ -239,7 +284,7 @@ fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
         return true;
     }
     let mts = entry.mts.incarnation;
-    let speaker = back_ends.iter().position(|one| one.speaks_for(mts));
+    let speaker = back_ends.iter().position(|one| one.is_authority(mts));
     speaker.is_none_or(|speaker| speaker == at)
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::{Directory, Entry, Matcher, Pattern, PatternError, Query, Role, coalition, is_pattern};
+use crate::{Entry, Matcher, Pattern, PatternError, Query, Role, View, coalition, is_pattern};
 
 /// Entries that the name of a receiver stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,7 +22,20 @@ pub enum Resolution {
     None,
 }
 
-/// Resolves `receiver` in a letter from `sender`.
+impl Resolution {
+    /// Whether a [refresh](crate::Directory::refresh) of the directory adds nothing: every name has an
+    /// entry, and no pattern was matched.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        match self {
+            Self::Exact(_) => true,
+            Self::Coalition { missing, .. } => missing.is_empty(),
+            Self::Multicast(_) | Self::None => false,
+        }
+    }
+}
+
+/// Resolves `receiver` in a letter from `sender`, without a refresh.
 ///
 /// The name of a coalition resolves to its members without the sender, or to its leader. A name
 /// that [is a pattern](is_pattern) resolves to every agent whose whole name matches, except the
@@ -32,14 +45,14 @@ pub enum Resolution {
 ///
 /// # Errors
 /// Fails when the name is a pattern that is not valid.
-pub fn resolve(
-    directory: &dyn Directory,
+pub fn resolve<V: View + ?Sized>(
+    view: &V,
     receiver: &str,
     sender: &str,
 ) -> Result<Resolution, PatternError> {
-    if let Some(entry) = directory.lookup(receiver) {
+    if let Some(entry) = view.named(receiver) {
         return Ok(match &entry.role {
-            Role::Coalition(_) => match coalition::agents_of(directory, &entry, sender) {
+            Role::Coalition(_) => match coalition::agents_of(view, &entry, sender) {
                 (agents, missing) if agents.is_empty() && missing.is_empty() => Resolution::None,
                 (agents, missing) => Resolution::Coalition { agents, missing },
             },
@@ -50,11 +63,14 @@ pub fn resolve(
         return Ok(Resolution::None);
     }
     let pattern = Pattern::new(receiver)?;
-    // The failed lookup above has already refreshed the directory.
-    let mut found = directory.search(&Query::by_name(Matcher::Pattern(pattern)));
-    found.retain(|entry| {
-        *entry.name != *sender && entry.role == Role::Agent && !entry.is_platform_agent()
-    });
+    let query = Query::by_name(Matcher::Pattern(pattern));
+    let is_meant = |entry: &&Arc<Entry>| {
+        query.matches(entry)
+            && *entry.name != *sender
+            && entry.role == Role::Agent
+            && !entry.is_platform_agent()
+    };
+    let found: Vec<_> = view.all().iter().filter(is_meant).cloned().collect();
     Ok(if found.is_empty() {
         Resolution::None
     } else {
@@ -68,17 +84,17 @@ pub fn resolve(
 ///
 /// # Errors
 /// Fails when the name is a pattern that is not valid.
-pub fn resolve_legacy(
-    directory: &dyn Directory,
+pub fn resolve_legacy<V: View + ?Sized>(
+    view: &V,
     receiver: &str,
     sender: &str,
 ) -> Result<Resolution, PatternError> {
     if !receiver.contains('?') {
-        return resolve(directory, receiver, sender);
+        return resolve(view, receiver, sender);
     }
     match is_legacy_pattern(receiver) {
-        true => resolve(directory, receiver, sender),
-        false => resolve(directory, &receiver.replace('?', "."), sender),
+        true => resolve(view, receiver, sender),
+        false => resolve(view, &receiver.replace('?', "."), sender),
     }
 }
 
@@ -94,7 +110,7 @@ mod tests {
     use fipa_transport::Incarnation;
 
     use super::*;
-    use crate::{MemoryDirectory, Mts, Registration};
+    use crate::{Directory, MemoryDirectory, Mts, Registration};
 
     fn directory(names: &[&str]) -> MemoryDirectory {
         let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));

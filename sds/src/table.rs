@@ -5,12 +5,11 @@ use std::hash::Hash;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use arc_swap::ArcSwapOption;
 use fipa_transport::Incarnation;
 use parking_lot::RwLock;
 
 use crate::watch::Subscribers;
-use crate::{Change, Entry, Subscriber};
+use crate::{Change, Entry, Snapshot, Subscriber, View};
 
 /// Implements the part of [`Directory`](crate::Directory) that all back ends read from their
 /// [`Table`]. The argument is the path of the table's field from `self`.
@@ -36,6 +35,13 @@ macro_rules! reads_its_table {
             self.$($field).+.subscribe(subscriber);
         }
     };
+    (viewed $($field:ident).+) => {
+        reads_its_table!($($field).+);
+
+        fn view(&self) -> Arc<dyn crate::View> {
+            self.$($field).+.view()
+        }
+    };
 }
 
 /// Entries by the origin that claims them (a process, a record). When several origins claim a name,
@@ -45,7 +51,6 @@ macro_rules! reads_its_table {
 #[derive(Debug)]
 pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
-    sorted: ArcSwapOption<Sorted>,
     generation: AtomicU64,
     subscribers: Subscribers,
 }
@@ -57,16 +62,11 @@ struct Index<O> {
     /// Names that more than one proved origin claims.
     contested: BTreeSet<Arc<str>>,
     is_proved: fn(&O) -> bool,
-    incarnations: HashMap<Incarnation, Arc<Entry>>,
+    /// The entries that hold their names. Copied for a change while a view has them.
+    holders: Arc<Snapshot>,
     /// The latest name claimed by each origin of a single entry.
     #[cfg(feature = "mdns")]
     origins: HashMap<O, Arc<str>>,
-}
-
-#[derive(Debug)]
-struct Sorted {
-    generation: u64,
-    entries: Arc<[Arc<Entry>]>,
 }
 
 impl<O: Clone + Eq + Hash> Table<O> {
@@ -81,22 +81,21 @@ impl<O: Clone + Eq + Hash> Table<O> {
                 claims: HashMap::new(),
                 contested: BTreeSet::new(),
                 is_proved,
-                incarnations: HashMap::new(),
+                holders: Arc::default(),
                 #[cfg(feature = "mdns")]
                 origins: HashMap::new(),
             }),
-            sorted: ArcSwapOption::empty(),
             generation: AtomicU64::new(0),
             subscribers: Subscribers::default(),
         }
     }
 
     pub(crate) fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.index.read().holder(name).cloned()
+        self.index.read().holders.named(name)
     }
 
     pub(crate) fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.index.read().incarnations.get(&incarnation).cloned()
+        self.index.read().holders.registered(incarnation)
     }
 
     /// Returns the entry that holds the name, and its origin.
@@ -105,24 +104,9 @@ impl<O: Clone + Eq + Hash> Table<O> {
     }
 
     pub(crate) fn entries(&self) -> Arc<[Arc<Entry>]> {
-        if let Some(sorted) = &*self.sorted.load()
-            && sorted.generation == self.generation()
-        {
-            return Arc::clone(&sorted.entries);
-        }
-        let index = self.index.read();
-        // Changes happen under the write lock, so this number belongs to these entries.
-        let generation = self.generation();
-        let holders = index.claims.values().filter_map(|claims| claims.first());
-        let mut entries: Vec<_> = holders.map(|(_, entry)| Arc::clone(entry)).collect();
-        drop(index);
-        entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
-        let entries: Arc<[_]> = entries.into();
-        self.sorted.store(Some(Arc::new(Sorted {
-            generation,
-            entries: Arc::clone(&entries),
-        })));
-        entries
+        // Sorted without the lock.
+        let holders = Arc::clone(&self.index.read().holders);
+        holders.all()
     }
 
     /// Returns at most `most` pairs for names that more than one proved origin claims: the entry
@@ -145,6 +129,16 @@ impl<O: Clone + Eq + Hash> Table<O> {
     pub(crate) fn notify_reread(&self) {
         let _index = self.index.write();
         self.notify(Some(Change::Lagged));
+    }
+
+    /// Returns a view of the entries that hold their names.
+    pub(crate) fn view(&self) -> Arc<dyn View> {
+        Arc::clone(&self.index.read().holders) as Arc<dyn View>
+    }
+
+    /// Changes the generation, because data beside the entries changed.
+    pub(crate) fn touch(&self) {
+        self.generation.fetch_add(1, Ordering::Release);
     }
 
     pub(crate) fn generation(&self) -> u64 {
@@ -265,8 +259,11 @@ impl<O: Eq> Index<O> {
         let before = self.holder(&name).cloned();
         self.set(origin, &name, entry);
         let after = self.holder(&name).cloned();
-        self.reindex(before.as_ref(), after.as_ref());
-        Change::between(before, after)
+        let change = Change::between(before.clone(), after.clone());
+        if change.is_some() {
+            Arc::make_mut(&mut self.holders).set(before.as_ref(), after.as_ref());
+        }
+        change
     }
 
     fn set(&mut self, origin: O, name: &Arc<str>, entry: Option<Arc<Entry>>) {
@@ -303,21 +300,6 @@ impl<O: Eq> Index<O> {
         }
         if !claims.is_empty() {
             self.claims.insert(name.clone(), claims);
-        }
-    }
-
-    fn reindex(&mut self, before: Option<&Arc<Entry>>, after: Option<&Arc<Entry>>) {
-        if let Some(before) = before
-            && let Some(indexed) = self.incarnations.get(&before.incarnation)
-            && indexed.name == before.name
-        {
-            self.incarnations.remove(&before.incarnation);
-        }
-        if let Some(after) = after
-            && after.incarnation.is_known()
-        {
-            self.incarnations
-                .insert(after.incarnation, Arc::clone(after));
         }
     }
 }

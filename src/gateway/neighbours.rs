@@ -7,13 +7,14 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{ErrorChain, escape};
 use fipa_mts::core::Peer;
 use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
-    Role, Source, Subscriber, Watch,
+    Role, Source, Subscriber, View as DirectoryView, Watch,
 };
 use fipa_transport::{Incarnation, Introduction, Location, Mandate, Principal, TransportErrorKind};
 use parking_lot::Mutex;
@@ -25,6 +26,8 @@ use crate::routes::Connected;
 #[derive(Debug, Default)]
 pub(crate) struct Neighbours {
     state: Mutex<State>,
+    /// Number of changes of the neighbors' entries.
+    generation: AtomicU64,
     changed: Notify,
 }
 
@@ -144,6 +147,7 @@ impl Neighbours {
             tracing::info!(name = %peer.name, at = %peer.hop.location, "connected with a gateway");
         }
         state.present.insert(incarnation, neighbour);
+        self.generation.fetch_add(1, Ordering::Release);
         state
             .parted
             .retain(|(_, entry)| entry.incarnation != incarnation);
@@ -167,6 +171,7 @@ impl Neighbours {
         if known.connections > 0 {
             // A location that only this connection had is removed.
             if known.locate() {
+                self.generation.fetch_add(1, Ordering::Release);
                 self.changed.notify_one();
             }
             return;
@@ -177,6 +182,7 @@ impl Neighbours {
             }
             state.parted.push_back((now, gone.entry));
         }
+        self.generation.fetch_add(1, Ordering::Release);
         self.changed.notify_one();
         tracing::info!(name = %peer.name, at = %peer.hop.location, "no longer connected");
     }
@@ -324,7 +330,18 @@ impl Directory for View {
     }
 
     fn generation(&self) -> u64 {
-        self.all.generation()
+        let neighbours = self.neighbours.generation.load(Ordering::Acquire);
+        self.all.generation().wrapping_add(neighbours)
+    }
+
+    fn view(&self) -> Arc<dyn DirectoryView> {
+        let state = self.neighbours.state.lock();
+        let present = state.present.iter();
+        let present = present.map(|(gateway, it)| (*gateway, Arc::clone(&it.entry)));
+        Arc::new(PresentView {
+            all: self.all.view(),
+            neighbours: present.collect(),
+        })
     }
 
     fn subscribe(&self, subscriber: &Subscriber) {
@@ -341,6 +358,27 @@ impl Directory for View {
 
     fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
         self.all.deregister(name, incarnation)
+    }
+}
+
+/// A [`View`] at one time.
+struct PresentView {
+    all: Arc<dyn DirectoryView>,
+    neighbours: HashMap<Incarnation, Arc<Entry>>,
+}
+
+impl DirectoryView for PresentView {
+    fn named(&self, name: &str) -> Option<Arc<Entry>> {
+        self.all.named(name)
+    }
+
+    fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        let known = self.all.registered(incarnation);
+        known.or_else(|| self.neighbours.get(&incarnation).cloned())
+    }
+
+    fn all(&self) -> Arc<[Arc<Entry>]> {
+        self.all.all()
     }
 }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry};
+use fipa_sds::{Entry, View};
 use fipa_transport::{
     Answer, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location, Outcome,
     Parcel, Report, Signature, Stream, Ticket, TransportError, TransportErrorKind,
@@ -77,6 +77,20 @@ pub enum Action {
         location: Location,
         /// Kind of the failure.
         fault: TransportErrorKind,
+    },
+    /// Refresh the directory, without the core locked, and report the end with
+    /// [`Core::handle_refreshed`](super::Core::handle_refreshed) and this number.
+    Refresh {
+        /// Later refreshes have greater numbers.
+        number: u64,
+    },
+    /// The number of outcomes of a letter for which [`Core::send`](super::Core::send) has returned
+    /// none.
+    Resolved {
+        /// The submission.
+        send: SendId,
+        /// Number of outcomes, of which some may have been reported already.
+        outcomes: usize,
     },
     /// A letter was added to this agent's queue.
     Deliverable {
@@ -184,7 +198,7 @@ impl Note {
 /// State that all lanes share.
 pub(crate) struct AttemptTable {
     pub(crate) config: CoreConfig,
-    pub(crate) directory: Arc<dyn Directory>,
+    pub(crate) view: Arc<dyn View>,
     pub(crate) actions: VecDeque<Action>,
     pub(crate) attempts: Map<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
@@ -204,6 +218,10 @@ pub(crate) struct AttemptTable {
     /// Lanes that found no room on the route to a location, in order.
     waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
+    /// Lanes that wait for a refresh of the directory, with its number.
+    refreshing: VecDeque<(u64, LaneId)>,
+    /// Number of refreshes that were requested.
+    refreshes: u64,
 }
 
 #[derive(Debug)]
@@ -225,10 +243,10 @@ pub(super) fn leads_to_letters(location: &Location) -> bool {
 }
 
 impl AttemptTable {
-    pub(crate) fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
+    pub(crate) fn new(config: CoreConfig, view: Arc<dyn View>) -> Self {
         Self {
             config,
-            directory,
+            view,
             actions: VecDeque::new(),
             attempts: Map::default(),
             undelivered: VecDeque::new(),
@@ -242,7 +260,33 @@ impl AttemptTable {
             open_reports: Set::default(),
             waiting_for_room: Map::default(),
             next_attempt: 1,
+            refreshing: VecDeque::new(),
+            refreshes: 0,
         }
+    }
+
+    /// Requests a refresh of the directory, and returns its number.
+    pub(crate) fn want_refresh(&mut self) -> u64 {
+        self.refreshes += 1;
+        let number = self.refreshes;
+        self.actions.push_back(Action::Refresh { number });
+        number
+    }
+
+    /// Requests a refresh of the directory for a lane, and returns its number.
+    pub(crate) fn want_refresh_for(&mut self, lane: LaneId) -> u64 {
+        let number = self.want_refresh();
+        self.refreshing.push_back((number, lane));
+        number
+    }
+
+    /// Returns the next lane that waits for this refresh or an earlier one.
+    pub(crate) fn refreshed_lane(&mut self, number: u64) -> Option<LaneId> {
+        let (first, _) = self.refreshing.front()?;
+        if *first > number {
+            return None;
+        }
+        self.refreshing.pop_front().map(|(_, lane)| lane)
     }
 
     /// Returns the number of the next attempt, which is also the number of its hand-over.
@@ -306,7 +350,7 @@ impl AttemptTable {
     /// service.
     fn present_location(&self, note: &Note) -> Location {
         let service = note.location.incarnation();
-        let sender = self.directory.known_incarnation(note.parcel.stream.sender);
+        let sender = self.view.registered(note.parcel.stream.sender);
         let mut present: Vec<&Location> = Vec::new();
         if let Some(entry) = &sender {
             let locations = entry.locations.iter();
@@ -450,11 +494,11 @@ impl AttemptTable {
         });
     }
 
-    /// Resolves the receiver of a stream, if it is still in the directory.
+    /// Resolves the receiver of a stream, if it is in the view of the directory.
     pub(crate) fn receiver(&self, registration: Incarnation, name: &str) -> Option<Arc<Entry>> {
-        self.directory.by_incarnation(registration).or_else(|| {
+        self.view.registered(registration).or_else(|| {
             let nameless = registration == registration_by_name(name);
-            let entry = nameless.then(|| self.directory.lookup(name)).flatten();
+            let entry = nameless.then(|| self.view.named(name)).flatten();
             entry.filter(|entry| !entry.incarnation.is_known())
         })
     }

@@ -37,7 +37,7 @@ impl Core {
             FailureTarget::Ours(registration)
         } else {
             let named = stamp::sender(&received.letter);
-            let known = self.table.directory.known_incarnation(registration);
+            let known = self.table.view.registered(registration);
             match known {
                 Some(entry) if named.as_deref() == Some(&*entry.name) => {
                     FailureTarget::Remote { from: None }
@@ -121,7 +121,7 @@ impl Core {
                 continue;
             }
             // The directory has the sender, or a legacy peer's letter states its address.
-            let known = self.table.directory.lookup(report.sender.name());
+            let known = self.table.view.named(report.sender.name());
             let stated = match known {
                 Some(_) => None,
                 None => from.and_then(|from| stated_entry(&report, from)),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{DecodeError, Letter, Message};
-use fipa_sds::{Directory, Entry, Reach, Resolution, Role, Source};
+use fipa_sds::{Entry, Reach, Resolution, Role, Source, View};
 use fipa_transport::{
     Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel,
     Signature, Stream, Ticket, Verdict,
@@ -62,15 +62,16 @@ pub struct Unframed {
 }
 
 impl Unframed {
-    /// Parses the letter, which came from this source, and looks up its receivers.
+    /// Parses the letter, which came from this source, and looks up its receivers. Refresh the
+    /// directory before, and do not lock the core.
     ///
     /// # Errors
     /// Fails when the envelope cannot be parsed.
-    pub fn read(
+    pub fn read<V: View + ?Sized>(
         letter: Letter,
         via: Kind,
         from: LegacySource,
-        directory: &dyn Directory,
+        view: &V,
     ) -> Result<Self, DecodeError> {
         let mut names = stamp::receivers(&letter, MAX_UNFRAMED_RECEIVERS + 1)?;
         let (sender, fault) = match (too_many(&names), Message::decode(letter.payload())) {
@@ -85,7 +86,7 @@ impl Unframed {
         let resolved = |name: String| {
             let resolved = match fault {
                 Some(_) => Ok(Resolution::None),
-                None => fipa_sds::resolve_legacy(directory, &name, &named),
+                None => fipa_sds::resolve_legacy(view, &name, &named),
             };
             (name.into(), resolved.unwrap_or(Resolution::None))
         };
@@ -232,7 +233,7 @@ impl Core {
         if receiver.source != Source::Mdns || !receiver.locations.iter().any(is_legacy) {
             return None;
         }
-        let sender = self.table.directory.known_incarnation(sender)?;
+        let sender = self.table.view.registered(sender)?;
         // A registration in the future means that the clock was set back.
         let ago = now.utc.duration_since(sender.registered);
         let wait = FOUND_AFTER.checked_sub(ago.unwrap_or_default())?;
@@ -297,8 +298,8 @@ impl Core {
     /// Reports the sender of this stamped letter as a contact if it is unknown, so that it can be
     /// answered.
     fn report_contact(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
-        let directory = &self.table.directory;
-        if !agent.is_known() || directory.known_incarnation(agent).is_some() {
+        let view = &self.table.view;
+        if !agent.is_known() || view.registered(agent).is_some() {
             return;
         }
         // A letter that was forwarded by the receiver's previous gateway does not come from the
@@ -306,7 +307,7 @@ impl Core {
         let direct = stamp::count(letter).is_ok_and(|stamps| stamps <= 2);
         if let Some(name) = stamp::sender(letter)
             && direct
-            && directory.known(&name).is_none()
+            && view.named(&name).is_none()
         {
             let location = from.location.clone();
             self.table.actions.push_back(Action::Heard {
@@ -328,7 +329,7 @@ impl Core {
         if !self.table.config.forwards {
             return;
         }
-        if let Some(known) = self.table.directory.known(&name) {
+        if let Some(known) = self.table.view.named(&name) {
             let at = known.locations.first();
             let address = at.and_then(|at| at.authority().parse::<SocketAddr>().ok());
             let same = address.is_some_and(|address| address.ip().to_canonical() == from);

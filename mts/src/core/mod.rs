@@ -16,6 +16,12 @@
 //! * `routes`: reports of the routes of letters, and counters of each route.
 //! * `attempts`: state that lanes share: attempts, health of routes, pending actions.
 //! * `notice`: notifications for watchers.
+//! * `waiting`: letters that wait for a refresh of the directory.
+//!
+//! The core looks up receivers in a [`View`] of the directory, which does not change and takes no
+//! I/O to read. If a name or a registration is not in it, the letter waits, and the core emits
+//! [`Action::Refresh`]; [`Core::handle_refreshed`] resolves the letter again. So a letter to a name
+//! that was registered before the letter was sent does not fail as unknown.
 //!
 //! A letter is identified and ordered by its *stream* (one registration of the sender, one of the
 //! receiver) and its sequence number. Every copy names its predecessor, the letter that must be
@@ -35,6 +41,7 @@ mod principals;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
+mod waiting;
 #[doc(hidden)]
 pub mod work;
 
@@ -45,7 +52,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
+use fipa_sds::{Entry, Pattern, Resolution, Role, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
     Kind, Location, Outcome, Parcel, Report, Stream, TransportError, TransportErrorKind, Verdict,
@@ -60,6 +67,8 @@ pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey};
 use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
+
+use waiting::{Unresolved, WaitingLetters};
 
 use crate::{AccessGate, Map};
 use peers::Peers;
@@ -117,6 +126,7 @@ pub struct Core {
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
+    waiting: WaitingLetters,
     peers: Peers,
     principals: Principals,
     gate: Option<Arc<dyn AccessGate>>,
@@ -182,16 +192,17 @@ impl PartialEq for LateNote {
 impl Eq for LateNote {}
 
 impl Core {
-    /// Creates a core that looks up receivers in this directory.
+    /// Creates a core that looks up receivers in this view of the directory.
     #[must_use]
-    pub fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
+    pub fn new(config: CoreConfig, view: Arc<dyn View>) -> Self {
         Self {
-            table: AttemptTable::new(config, directory),
+            table: AttemptTable::new(config, view),
             lanes: Map::default(),
             lane_ids: Map::default(),
             agents: Map::default(),
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
+            waiting: WaitingLetters::default(),
             peers: Peers::default(),
             principals: Principals::default(),
             gate: None,
@@ -230,6 +241,10 @@ impl Core {
     /// Removes an agent of this process: its unread letters are dropped, and its open letters end
     /// as failed or unconfirmed.
     pub fn deregister(&mut self, now: Now, incarnation: Incarnation) {
+        // Their sequences are those of the agent.
+        for letter in self.waiting.remove(|letter| letter.sender == incarnation) {
+            self.fail_unresolved(letter, FailureReason::Closed);
+        }
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
             for (stream, back) in inbox.all_waiting() {
@@ -248,8 +263,10 @@ impl Core {
     }
 
     /// Sends a letter. Returns the number of outcomes that follow under this ID; outcomes that are
-    /// known at once are among the actions when this method returns.
-    pub fn send(&mut self, now: Now, submission: Submission) -> (SendId, usize) {
+    /// known at once are among the actions when this method returns. The number is `None` if a
+    /// receiver is not in the view, or is a pattern: [`Action::Resolved`] then reports it after the
+    /// directory was refreshed. Letters of one sender are resolved in the order of the calls.
+    pub fn send(&mut self, now: Now, submission: Submission) -> (SendId, Option<usize>) {
         let Submission {
             sender,
             letter,
@@ -265,29 +282,87 @@ impl Core {
                 self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
             self.table.undelivered.clear();
-            return (send, receivers.len());
+            return (send, Some(receivers.len()));
         }
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
-        let directory = Arc::clone(&self.table.directory);
+        let mut unresolved = Unresolved {
+            send,
+            sender,
+            letter,
+            receivers,
+            deadline,
+        };
+        if self.waiting.is_empty() || !self.waiting.has_any_of(sender) {
+            match self.resolve(now, unresolved, false) {
+                Ok(outcomes) => return (send, Some(outcomes)),
+                Err(back) => unresolved = back,
+            }
+        }
+        let len = unresolved.letter.len();
+        if self.waiting.has_room(sender, len, &self.table.config) {
+            let number = self.table.want_refresh();
+            self.waiting.push(number, unresolved);
+            return (send, None);
+        }
+        let outcomes = unresolved.receivers.len();
+        self.fail_receivers(unresolved, FailureReason::QueueFull);
+        self.send_failures(now);
+        (send, Some(outcomes))
+    }
+
+    /// Resolves the receivers of a letter in the view, and sends it to them. Returns the number of
+    /// outcomes, or the letter if a refresh of the directory may add receivers. After a refresh, an
+    /// unknown receiver is final.
+    #[expect(
+        clippy::result_large_err,
+        reason = "the letter is moved in and back; a box would cost an allocation"
+    )]
+    fn resolve(
+        &mut self,
+        now: Now,
+        unresolved: Unresolved,
+        is_fresh: bool,
+    ) -> Result<usize, Unresolved> {
+        let view = Arc::clone(&self.table.view);
+        let sender = unresolved.sender;
         let sender_name = self
             .agents
             .get(&sender)
             .map(|inbox| Arc::clone(&inbox.name));
-        let mut reached: Vec<Incarnation> = Vec::new();
-        let mut count = 0;
-        let only_one = receivers.len() == 1;
-        for receiver in receivers {
-            let own = sender_name.as_deref().unwrap_or_default();
-            let entries = match fipa_sds::resolve(&*directory, &receiver, own) {
+        let own = sender_name.as_deref().unwrap_or_default();
+        let send = unresolved.send;
+        let deadline = unresolved.deadline;
+        let mut resolved = Vec::new();
+        for receiver in &unresolved.receivers {
+            let resolution = fipa_sds::resolve(&*view, receiver, own);
+            match resolution {
                 // The common case, without the data structures that several receivers need.
-                Ok(Resolution::Exact(entry)) if only_one && entry.incarnation.is_known() => {
+                Ok(Resolution::Exact(entry))
+                    if unresolved.receivers.len() == 1 && entry.incarnation.is_known() =>
+                {
+                    let letter = unresolved.letter;
                     self.send_one(now, (send, sender), &entry, letter, deadline);
                     self.send_failures(now);
-                    return (send, 1);
+                    return Ok(1);
                 }
-                Ok(Resolution::Exact(entry)) => vec![entry],
-                Ok(Resolution::Multicast(entries)) => entries,
-                Ok(Resolution::Coalition { agents, missing }) => {
+                Ok(resolution) if !is_fresh && !resolution.is_complete() => {
+                    return Err(unresolved);
+                }
+                Ok(resolution) => resolved.push(resolution),
+                // Not a valid pattern, so no name matches it.
+                Err(_) => resolved.push(Resolution::None),
+            }
+        }
+        let Unresolved {
+            letter, receivers, ..
+        } = unresolved;
+        let mut reached: Vec<Incarnation> = Vec::new();
+        let mut count = 0;
+        for (receiver, resolution) in receivers.into_iter().zip(resolved) {
+            let entries = match resolution {
+                Resolution::Exact(entry) => vec![entry],
+                Resolution::Multicast(entries) => entries,
+                Resolution::Coalition { agents, missing } => {
                     count += missing.len();
                     for member in missing {
                         let reason = FailureReason::NoSuchAgent;
@@ -298,7 +373,7 @@ impl Core {
                     }
                     agents
                 }
-                Ok(Resolution::None) | Err(_) => Vec::new(),
+                Resolution::None => Vec::new(),
             };
             if entries.is_empty() {
                 count += 1;
@@ -316,7 +391,69 @@ impl Core {
             }
         }
         self.send_failures(now);
-        (send, count)
+        Ok(count)
+    }
+
+    /// Ends a letter whose receivers were not resolved.
+    fn fail_unresolved(&mut self, letter: Unresolved, reason: FailureReason) {
+        self.table.actions.push_back(Action::Resolved {
+            send: letter.send,
+            outcomes: letter.receivers.len(),
+        });
+        self.fail_receivers(letter, reason);
+    }
+
+    fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
+        let Unresolved {
+            send,
+            sender,
+            letter,
+            receivers,
+            ..
+        } = letter;
+        for receiver in receivers {
+            self.undeliverable(send, sender, receiver, letter.clone(), reason);
+        }
+    }
+
+    /// Replaces the view of the directory. Call it before other methods when the directory has
+    /// changed. Returns the previous view.
+    pub fn set_view(&mut self, view: Arc<dyn View>) -> Arc<dyn View> {
+        std::mem::replace(&mut self.table.view, view)
+    }
+
+    /// Handles the end of a refresh of the directory, which began after the core had emitted
+    /// [`Action::Refresh`] with this number. Call [`set_view`](Self::set_view) before. A refresh
+    /// covers all earlier numbers, too.
+    pub fn handle_refreshed(&mut self, now: Now, number: u64) {
+        while let Some(lane) = self.table.refreshed_lane(number) {
+            self.with_lane(now, lane, |lane, table| {
+                lane.refreshed(now.instant, number, table);
+            });
+        }
+        while let Some(letter) = self.waiting.pop(number) {
+            let send = letter.send;
+            if let Ok(outcomes) = self.resolve(now, letter, true) {
+                let resolved = Action::Resolved { send, outcomes };
+                self.table.actions.push_back(resolved);
+            }
+        }
+        self.send_failures(now);
+    }
+
+    /// Whether the view has an agent, coalition or gateway of exactly this name.
+    #[must_use]
+    pub fn knows(&self, name: &str) -> bool {
+        self.table.view.named(name).is_some()
+    }
+
+    /// Whether the directory is to be refreshed before a letter for this registration and name
+    /// arrives, because this service would forward it and does not know the receiver.
+    #[must_use]
+    pub fn misses(&self, registration: Incarnation, name: &str) -> bool {
+        self.table.config.forwards
+            && !self.agents.contains_key(&registration)
+            && self.table.receiver(registration, name).is_none()
     }
 
     /// Sends a letter to exactly this registration of an agent; the receivers in the submission are
@@ -475,10 +612,10 @@ impl Core {
         }
     }
 
-    /// Returns the directory in which receivers are looked up.
+    /// Returns the view of the directory in which receivers are looked up.
     #[must_use]
-    pub fn directory(&self) -> &Arc<dyn Directory> {
-        &self.table.directory
+    pub fn view(&self) -> &Arc<dyn View> {
+        &self.table.view
     }
 
     /// Turns watching on or off: while it is on, an [`Action::Notice`] reports every event of a
@@ -524,8 +661,8 @@ impl Core {
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
                 let sender = parcel.stream.sender;
-                let directory = &*self.table.directory;
-                if let Err(error) = self.principals.check_sender(sender, &from, directory) {
+                let view = &*self.table.view;
+                if let Err(error) = self.principals.check_sender(sender, &from, view) {
                     if error == PrincipalError::NotIntroduced {
                         return Verdict::Now(Answer::Busy);
                     }
@@ -697,7 +834,7 @@ impl Core {
         }
     }
 
-    /// Handles a change of the directory.
+    /// Handles a change of the directory, after [`set_view`](Self::set_view).
     pub fn handle_directory_change(&mut self, now: Now) {
         for lane in self.lanes_in_order() {
             self.with_lane(now, lane, |lane, table| {
@@ -738,6 +875,12 @@ impl Core {
         }
         for id in lanes {
             self.with_lane(now, id, |lane, table| lane.pump(now.instant, table));
+        }
+        if !self.waiting.is_empty() {
+            let late = |letter: &Unresolved| letter.deadline <= now.instant;
+            for letter in self.waiting.remove(late) {
+                self.fail_unresolved(letter, FailureReason::TimedOut);
+            }
         }
         let mut notes = Vec::new();
         while self
@@ -872,7 +1015,11 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
-        let others = [self.peers.due(), self.failure_limit.due()];
+        let others = [
+            self.peers.due(),
+            self.failure_limit.due(),
+            self.waiting.due(),
+        ];
         others.into_iter().chain([lanes, notes]).flatten().min()
     }
 
@@ -884,13 +1031,16 @@ impl Core {
     /// Whether any letter that was sent or taken into custody here has no outcome yet.
     #[must_use]
     pub fn has_open_letters(&self) -> bool {
-        self.lanes.values().any(|lane| !lane.is_empty())
+        !self.waiting.is_empty() || self.lanes.values().any(|lane| !lane.is_empty())
     }
 
     /// Abandons all open letters, because the service ends; later submissions fail as closed.
     /// Outcomes are among the actions, and follow from the conclusions of the abandoned attempts.
     pub fn give_up(&mut self, now: Now) {
         self.closed = true;
+        for letter in self.waiting.remove(|_| true) {
+            self.fail_unresolved(letter, FailureReason::Closed);
+        }
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {
                 lane.give_up(now.instant, &mut self.table);

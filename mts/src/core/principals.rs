@@ -8,7 +8,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use fipa_sds::{Directory, Entry, Reach, Role};
+use fipa_sds::{Entry, Reach, Role, View};
 use fipa_transport::{Hop, Incarnation, Introduction, Principal};
 
 use crate::Map;
@@ -139,12 +139,12 @@ impl Principals {
         &mut self,
         sender: Incarnation,
         from: &Hop,
-        directory: &dyn Directory,
+        view: &dyn View,
     ) -> Result<(), PrincipalError> {
         if !from.is_remote() || !sender.is_known() {
             return Ok(());
         }
-        let known = directory.known_incarnation(sender);
+        let known = view.registered(sender);
         // Letters of a service itself come only on its own links. A service that introduces itself
         // with the registration of an agent takes nothing from that agent.
         let is_agent = known.as_ref().is_some_and(|it| it.role == Role::Agent);

@@ -232,7 +232,7 @@ impl Core {
     /// for several receivers.
     #[must_use]
     pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
-        let entry = self.table.directory.lookup(receiver)?;
+        let entry = self.table.view.named(receiver)?;
         if matches!(entry.role, Role::Coalition(_)) {
             return None;
         }
@@ -268,11 +268,11 @@ impl Core {
         sender: Incarnation,
         receivers: impl IntoIterator<Item = &'a str>,
     ) -> Option<Kind> {
-        let directory = &*self.table.directory;
+        let view = &*self.table.view;
         let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
         let mut reached = Map::default();
         for receiver in receivers {
-            let entries = match fipa_sds::resolve(directory, receiver, own.unwrap_or_default()) {
+            let entries = match fipa_sds::resolve(view, receiver, own.unwrap_or_default()) {
                 Ok(Resolution::Exact(entry)) => vec![entry],
                 Ok(Resolution::Multicast(entries)) => entries,
                 Ok(Resolution::Coalition { agents, .. }) => agents,

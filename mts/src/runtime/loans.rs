@@ -38,7 +38,12 @@ impl Mts {
         let [receiver] = receivers else {
             return None;
         };
-        let state = self.shared.state.lock();
+        let mut state = self.shared.lock();
+        if !state.core.knows(receiver) {
+            drop(state);
+            self.shared.directory.refresh();
+            state = self.shared.lock();
+        }
         state.core.first_way(Now::read(), receiver)
     }
 
@@ -48,8 +53,10 @@ impl Mts {
         receivers: impl IntoIterator<Item = &'a str>,
         len: usize,
     ) -> Loaned {
+        // Receivers may have been registered just now.
+        self.shared.directory.refresh();
         let kind = {
-            let state = self.shared.state.lock();
+            let state = self.shared.lock();
             state.core.kind_for_many(Now::read(), sender, receivers)?
         };
         self.shared
@@ -88,8 +95,13 @@ impl Shared {
             tail,
         } = *arriving;
         let (route, stamp) = {
-            let state = self.state.lock();
+            let mut state = self.lock();
             let registration = stream.receiver;
+            if state.core.misses(registration, receiver) {
+                drop(state);
+                self.directory.refresh();
+                state = self.lock();
+            }
             state
                 .core
                 .first_way_onwards(Now::read(), registration, receiver)?

@@ -1,12 +1,12 @@
 //! The sink of the transports: passes their events to the core.
 
+use std::sync::Weak;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Weak};
 
 use fipa_acl::Letter;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
-    LegacySource, LoanedContent, Location, Sink, Verdict,
+    LegacySource, LoanedContent, Location, Parcel, Sink, Verdict,
 };
 
 use super::Shared;
@@ -24,9 +24,17 @@ impl Sink for TransportSink {
         let Some(shared) = self.shared.upgrade() else {
             return closing();
         };
-        let mut state = shared.state.lock();
+        let mut state = shared.lock();
         if shared.closed.load(Ordering::Acquire) {
             return closing();
+        }
+        let Parcel {
+            stream, receiver, ..
+        } = &arrival.parcel;
+        if state.core.misses(stream.receiver, receiver) {
+            drop(state);
+            shared.directory.refresh();
+            state = shared.lock();
         }
         let at_once = self.answers_at_once;
         let verdict = state
@@ -40,15 +48,15 @@ impl Sink for TransportSink {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
-        let directory = Arc::clone(shared.state.lock().core.directory());
-        let unframed = match Unframed::read(letter, via, from, &*directory) {
+        shared.directory.refresh();
+        let unframed = match Unframed::read(letter, via, from, &*shared.directory) {
             Ok(unframed) => unframed,
             Err(error) => {
                 tracing::warn!(%error, "dropping an unframed letter: its envelope is malformed");
                 return;
             }
         };
-        let mut state = shared.state.lock();
+        let mut state = shared.lock();
         let deadline = state.unframed_deadline;
         state.core.handle_unframed(Now::read(), deadline, unframed);
         shared.carry_out(state);
@@ -58,7 +66,7 @@ impl Sink for TransportSink {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
-        let mut state = shared.state.lock();
+        let mut state = shared.lock();
         state
             .core
             .handle_conclusion(Now::read(), attempt, conclusion);
@@ -73,9 +81,8 @@ impl Sink for TransportSink {
         let Some(shared) = self.shared.upgrade() else {
             return Vec::new();
         };
-        let directory = Arc::clone(shared.state.lock().core.directory());
         // All agents of a service have the same locations.
-        let entries = directory.entries();
+        let entries = shared.directory.entries();
         let mut entries = entries.iter();
         let Some(entry) = entries.find(|entry| entry.locations.contains(location)) else {
             return Vec::new();
@@ -93,7 +100,7 @@ impl Sink for TransportSink {
             return;
         };
         shared.locate(self.kind, locations, true);
-        let mut state = shared.state.lock();
+        let mut state = shared.lock();
         state.core.handle_reachable(Now::read(), None);
         shared.carry_out(state);
     }
@@ -102,7 +109,7 @@ impl Sink for TransportSink {
         let Some(shared) = self.shared.upgrade() else {
             return false;
         };
-        let state = shared.state.lock();
+        let state = shared.lock();
         state.core.accepts(peer)
     }
 
@@ -113,7 +120,7 @@ impl Sink for TransportSink {
         if let Some(contacts) = &shared.config.contacts {
             contacts.introduced(peer);
         }
-        let mut state = shared.state.lock();
+        let mut state = shared.lock();
         state.core.handle_introduced(Now::read(), peer);
         shared.carry_out(state);
     }
@@ -125,7 +132,7 @@ impl Sink for TransportSink {
         if let Some(contacts) = &shared.config.contacts {
             contacts.parted(peer);
         }
-        let mut state = shared.state.lock();
+        let mut state = shared.lock();
         state.core.handle_parted(Now::read(), peer);
         shared.carry_out(state);
     }

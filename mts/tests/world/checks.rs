@@ -42,6 +42,9 @@ pub(crate) enum Invariant {
     Liveness,
     /// A receiver remembers every letter that can be open.
     Remembered,
+    /// A letter to an agent that was registered on the sender's host before it was sent does not
+    /// fail as unknown.
+    Known,
     /// The reason of a failure is correct.
     Reason,
     /// A letter in the name of an honest agent was sent by it.
@@ -85,6 +88,21 @@ impl World {
         (hops + answers) * 2 + LONGEST_PENALTY + ATTEMPT_TIMEOUT + transfer + reading
     }
 
+    fn is_still_registered(&self, name: &str, registration: Incarnation) -> bool {
+        let mut hosts = 0..self.weather.hosts;
+        hosts.any(|host| self.agent_on(host, name) == Some(registration))
+    }
+
+    /// The agent of this name that a running process of this host has now.
+    pub(super) fn agent_on(&self, host: usize, name: &str) -> Option<Incarnation> {
+        let here = |at: &usize| self.processes[*at].host == host;
+        let mut agents = self
+            .robots()
+            .filter(here)
+            .flat_map(|at| &self.processes[at].agents);
+        agents.find(|(other, _)| **other == *name).map(|it| it.1)
+    }
+
     pub(super) fn check_deadline(&mut self, number: u64) {
         let sent = &self.sent[&number];
         let (known, expected) = (sent.outcomes.len(), sent.expected);
@@ -100,6 +118,15 @@ impl World {
         let Outcome::Failed { reason, attempts } = outcome else {
             return;
         };
+        let missed = self.sent.get(&number).and_then(|sent| sent.missed);
+        if let Some(missed) = missed
+            && *reason == FailureReason::NoSuchAgent
+            && self.is_still_registered(receiver, missed)
+        {
+            self.breach(Invariant::Known, || {
+                format!("letter {number} to {receiver}: {outcome}")
+            });
+        }
         let forgotten = |attempt: &Attempt| attempt.error.detail == "too long ago to tell";
         if attempts.iter().any(forgotten) && !self.is_liars_name(receiver) {
             self.breach(Invariant::Remembered, || {

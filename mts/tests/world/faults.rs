@@ -216,7 +216,7 @@ impl World {
     pub(super) fn news_times(&mut self, host: usize) -> Vec<Instant> {
         let times = (0..self.weather.hosts).map(|other| {
             let most = match other == host {
-                true => 0,
+                true => self.weather.lag_ms,
                 false => self.weather.news_ms,
             };
             self.now + Duration::from_micros(self.random.u64(..=most * 1000))

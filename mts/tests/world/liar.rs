@@ -72,6 +72,7 @@ impl World {
                 registry: Arc::clone(&self.registry),
                 host,
                 gateway,
+                mts: incarnation,
             };
             let config = CoreConfig::new("liar", incarnation, vec![Kind::Tcp]);
             at[place] = self.processes.len();
@@ -112,6 +113,8 @@ impl World {
                 host: self.processes[at[place]].host,
                 mts: self.processes[at[place]].incarnation,
                 role,
+                since: self.now,
+                ended: None,
                 known: known.clone(),
                 left: Vec::new(),
             });

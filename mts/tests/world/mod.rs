@@ -82,6 +82,13 @@ enum Event {
     Timer {
         at: usize,
     },
+    /// A refresh of a process's view of the directory ends.
+    Refreshed {
+        at: usize,
+        number: u64,
+        /// Time at which it began.
+        began: Instant,
+    },
     Read {
         at: usize,
         agent: Incarnation,
@@ -208,6 +215,8 @@ pub(crate) struct World {
     /// Number of letters that another registration of their receiver took than the one that was
     /// current when they were sent.
     followed: u64,
+    /// Number of letters whose receiver became known by a refresh.
+    found: u64,
     /// Maximum delivery time of a letter sent after the faults.
     slowest: Duration,
     /// Number of letters that had to be delivered within the bound.
@@ -265,6 +274,7 @@ impl World {
             reading: Set::default(),
             failures_told: 0,
             followed: 0,
+            found: 0,
             slowest: Duration::ZERO,
             bounded: 0,
             breaches: Breaches::new(),
@@ -298,6 +308,10 @@ impl World {
 
     pub(crate) fn followed(&self) -> u64 {
         self.followed
+    }
+
+    pub(crate) fn found(&self) -> u64 {
+        self.found
     }
 
     /// Steps of cores per received byte, and maximum for one arrival.
@@ -369,6 +383,7 @@ impl World {
             registry: Arc::clone(&self.registry),
             host,
             gateway,
+            mts: incarnation,
         };
         let mut process = Process {
             host,
@@ -405,6 +420,8 @@ impl World {
                 host,
                 mts: incarnation,
                 role,
+                since: self.now,
+                ended: None,
                 known: known.to_vec(),
                 left: Vec::new(),
             });
@@ -499,6 +516,13 @@ impl World {
                 }
                 Ok(())
             }
+            Event::Refreshed { at, number, began } => {
+                if self.processes[at].alive {
+                    self.refreshed(at, number, began);
+                    self.carry_out(at)?;
+                }
+                Ok(())
+            }
             Event::Read { at, agent } => self.read(at, agent),
             Event::Deadline { number } => {
                 self.check_deadline(number);
@@ -565,6 +589,17 @@ impl World {
                     let watching = &mut self.watching[self.processes[at].host];
                     watching.hear((instant, utc), at, &notice)?;
                 }
+                Action::Refresh { number } => {
+                    let began = self.now;
+                    match self.weather.refresh_ms {
+                        0 => self.refreshed(at, number, began),
+                        most => {
+                            let refreshed = Event::Refreshed { at, number, began };
+                            self.after_ms(most, refreshed);
+                        }
+                    }
+                }
+                Action::Resolved { send, outcomes } => self.resolved((at, send), outcomes),
                 Action::Deliverable { agent } => {
                     if self.reading.insert(agent) {
                         self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });
@@ -582,6 +617,16 @@ impl World {
         Ok(())
     }
 
+    /// Ends a refresh of a process's view, which shows the registrations on its host from before
+    /// the refresh began.
+    fn refreshed(&mut self, at: usize, number: u64, began: Instant) {
+        self.trace(|| format!("{at} has refreshed its view, number {number}"));
+        let now = self.clocks();
+        let process = &mut self.processes[at];
+        self.registry.lock().refreshed(process.incarnation, began);
+        process.core.handle_refreshed(now, number);
+    }
+
     fn robots(&self) -> impl Iterator<Item = usize> {
         let robot = |at: &usize| {
             let process = &self.processes[*at];
@@ -595,6 +640,7 @@ impl World {
             registry: Arc::clone(&self.registry),
             host: self.processes[at].host,
             gateway: self.processes[at].gateway,
+            mts: self.processes[at].incarnation,
         }
     }
 }

@@ -82,6 +82,8 @@ impl World {
             host: process.host,
             mts: process.incarnation,
             role: Role::Agent,
+            since: self.now,
+            ended: None,
             known: known.clone(),
             left: Vec::new(),
         });

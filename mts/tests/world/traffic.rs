@@ -30,6 +30,8 @@ pub(super) struct Sent {
     /// The registration of the only receiver that its sender knew of.
     pub(super) known: Option<Incarnation>,
     pub(super) expected: usize,
+    /// The receiver's registration on this host, if it was not in the sender's view.
+    pub(super) missed: Option<Incarnation>,
     pub(super) outcomes: BTreeMap<Arc<str>, Outcome>,
     pub(super) at: Instant,
     pub(super) deadline: Duration,
@@ -143,6 +145,8 @@ impl World {
             None => self.meant_by(at, name, receiver),
         };
         let now = self.clocks();
+        let missed = known.is_none();
+        let here = self.agent_on(self.processes[at].host, receiver);
         let (send, expected) = self.processes[at].core.send(now, submission);
         self.sends.insert((at, send), number);
         let bound = Some(self.bound(size))
@@ -164,7 +168,8 @@ impl World {
                 sender,
                 receivers,
                 known,
-                expected,
+                expected: expected.unwrap_or(usize::MAX),
+                missed: here.filter(|_| missed),
                 outcomes: BTreeMap::new(),
                 at: self.now,
                 deadline,
@@ -193,6 +198,31 @@ impl World {
             .collect()
     }
 
+    /// The receivers of a letter are known after a refresh.
+    pub(super) fn resolved(&mut self, (at, send): (usize, SendId), outcomes: usize) {
+        let Some(&number) = self.sends.get(&(at, send)) else {
+            return;
+        };
+        self.trace(|| format!("letter {number} has {outcomes} receivers"));
+        // A pattern may stand for other agents now than when the letter was sent. Only those that it
+        // was dispatched to or failed for count.
+        let view = self.view(at);
+        let Some(sent) = self.sent.get_mut(&number) else {
+            return;
+        };
+        sent.expected = outcomes;
+        let is_gone = |name: &Arc<str>| view.known(name).is_none();
+        if sent.receivers.len() > 1 {
+            for receiver in sent.receivers.extract_if(.., |it| is_gone(it)) {
+                let stream = (sent.sender, receiver);
+                let open = self.open.get_mut(&stream);
+                if open.is_some_and(|open| open.remove(&number)) {
+                    self.open_bytes -= sent.size;
+                }
+            }
+        }
+    }
+
     pub(super) fn outcome(
         &mut self,
         sent: (usize, SendId),
@@ -206,6 +236,14 @@ impl World {
         };
         self.trace(|| format!("letter {number} to {receiver}: {outcome}"));
         self.check_outcome(number, &receiver, &outcome);
+        if self
+            .sent
+            .get(&number)
+            .is_some_and(|sent| sent.missed.is_some())
+            && matches!(outcome, Outcome::Delivered { .. })
+        {
+            self.found += 1;
+        }
         let sent = self.sent.get_mut(&number).expect("it was sent");
         let stream = (sent.sender, Arc::clone(&receiver));
         if let Some(open) = self.open.get_mut(&stream)

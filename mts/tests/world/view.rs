@@ -21,6 +21,8 @@ pub(super) struct Registry {
     /// Entries as processes see them, by index of the registration, host of the viewer, and whether
     /// the viewer is its gateway. An entry changes only with its locations.
     seen: Map<(usize, usize, bool), (Reached, Arc<Entry>)>,
+    /// Time at which each process last began to refresh its view.
+    refreshed: Map<Incarnation, Instant>,
     pub(super) now: Option<Instant>,
 }
 
@@ -30,6 +32,8 @@ pub(super) struct Registered {
     pub(super) host: usize,
     pub(super) mts: Incarnation,
     pub(super) role: Role,
+    pub(super) since: Instant,
+    pub(super) ended: Option<Instant>,
     /// Time at which each host learns of it.
     pub(super) known: Vec<Instant>,
     /// Time at which each host learns of its end, once it has ended.
@@ -53,6 +57,34 @@ impl Registered {
 }
 
 impl Registry {
+    /// Records that this process has refreshed its view, which shows the registrations on its host
+    /// from before `began`.
+    pub(super) fn refreshed(&mut self, mts: Incarnation, began: Instant) {
+        let latest = self.refreshed.entry(mts).or_insert(began);
+        *latest = (*latest).max(began);
+    }
+
+    /// Whether the view shows this registration.
+    fn is_seen_by(&self, view: &View, registered: &Registered) -> bool {
+        let refreshed = self.refreshed.get(&view.mts);
+        if registered.host == view.host
+            && registered
+                .ended
+                .is_some_and(|ended| refreshed.is_some_and(|at| *at >= ended))
+        {
+            return false;
+        }
+        if registered.is_seen(view.host, self.now) {
+            return true;
+        }
+        let has_read = registered.mts == view.mts
+            || self
+                .refreshed
+                .get(&view.mts)
+                .is_some_and(|at| *at >= registered.since);
+        registered.host == view.host && registered.left.is_empty() && has_read
+    }
+
     pub(super) fn register(&mut self, registered: Registered) {
         let place = self.entries.len();
         self.by_incarnation.insert(registered.incarnation, place);
@@ -68,6 +100,7 @@ impl Registry {
     pub(super) fn end(&mut self, incarnation: Incarnation, left: &[Instant]) {
         if let Some(place) = self.by_incarnation.get(&incarnation) {
             self.entries[*place].left = left.to_vec();
+            self.entries[*place].ended = self.now;
         }
     }
 
@@ -107,12 +140,14 @@ pub(super) struct View {
     pub(super) registry: Arc<Mutex<Registry>>,
     pub(super) host: usize,
     pub(super) gateway: bool,
+    /// The process that has the view.
+    pub(super) mts: Incarnation,
 }
 
 impl View {
     fn entry(&self, registry: &mut Registry, place: usize) -> Option<Arc<Entry>> {
         let registered = registry.entries.get(place)?;
-        if !registered.is_seen(self.host, registry.now) {
+        if !registry.is_seen_by(self, registered) {
             return None;
         }
         let (locations, reach) = if registered.host == self.host {

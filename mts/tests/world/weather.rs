@@ -75,6 +75,11 @@ pub(crate) struct Weather {
     pub moves: u32,
     /// Maximum time for changes of registrations and addresses to reach another host.
     pub news_ms: u64,
+    /// Maximum time for a new agent to reach the views of other processes of its host, unless these
+    /// refresh them.
+    pub lag_ms: u64,
+    /// Maximum time of a refresh of a view.
+    pub refresh_ms: u64,
     /// Number of changes of a gateway's address of one kind; nothing reaches the old one.
     pub addresses: u32,
     /// Number of hosts.
@@ -140,6 +145,8 @@ impl Weather {
             restarts: 0,
             moves: 0,
             news_ms: 0,
+            lag_ms: 0,
+            refresh_ms: 0,
             addresses: 0,
             hosts: 2,
             outages: 0,

@@ -1,6 +1,6 @@
 //! The back end with the entries that neighbors sent.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
@@ -9,7 +9,7 @@ use parking_lot::Mutex;
 
 use super::{Agents, Exchange, ExchangeError};
 use crate::table::Table;
-use crate::{Directory, Entry, Role, Subscriber};
+use crate::{Directory, Entry, Role, Subscriber, View};
 
 /// The agents that neighbors sent.
 ///
@@ -100,7 +100,11 @@ impl ExchangeDirectory {
         if total + entries.len() > Exchange::MAX_TOTAL {
             return Err(ExchangeError::TooMany);
         }
-        let before = agents_of.insert(gateway, entries).unwrap_or_default();
+        let before = agents_of.insert(gateway, entries);
+        if before.is_none() {
+            self.table.touch();
+        }
+        let before = before.unwrap_or_default();
         let now = agents_of.get(&gateway);
         let left = before
             .into_keys()
@@ -123,7 +127,11 @@ impl ExchangeDirectory {
         let origin = self.origin(gateway);
         let mut agents_of = self.agents_of.lock();
         let total: usize = agents_of.values().map(Agents::len).sum();
-        let of_gateway = agents_of.entry(gateway).or_default();
+        let of_gateway = agents_of.entry(gateway).or_insert_with(|| {
+            // Readers of the new number wait for the lock that is held here.
+            self.table.touch();
+            Agents::new()
+        });
         let mut after = of_gateway.clone();
         let mut updates: Vec<Update> = Vec::new();
         for name in left {
@@ -188,13 +196,55 @@ impl ExchangeDirectory {
     pub(super) fn forget(&self, gateway: Incarnation) {
         let origin = self.origin(gateway);
         let mut agents_of = self.agents_of.lock();
-        let names = agents_of.remove(&gateway).unwrap_or_default().into_keys();
+        let removed = agents_of.remove(&gateway);
+        if removed.is_some() {
+            self.table.touch();
+        }
+        let names = removed.unwrap_or_default().into_keys();
         self.table.update(names.map(|name| (origin, name, None)));
+    }
+}
+
+/// The agents that neighbors had sent at one time.
+struct ExchangeView {
+    entries: Arc<dyn View>,
+    gateways: HashSet<Incarnation>,
+    mandates: Arc<HashMap<Incarnation, Mandate>>,
+}
+
+impl View for ExchangeView {
+    fn named(&self, name: &str) -> Option<Arc<Entry>> {
+        self.entries.named(name)
+    }
+
+    fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.entries.registered(incarnation)
+    }
+
+    fn all(&self) -> Arc<[Arc<Entry>]> {
+        self.entries.all()
+    }
+
+    fn is_authority(&self, mts: Incarnation) -> bool {
+        self.gateways.contains(&mts)
+    }
+
+    fn mandate_of(&self, mts: Incarnation) -> Mandate {
+        self.mandates.get(&mts).cloned().unwrap_or_default()
     }
 }
 
 impl Directory for ExchangeDirectory {
     reads_its_table!(table);
+
+    fn view(&self) -> Arc<dyn View> {
+        let agents_of = self.agents_of.lock();
+        Arc::new(ExchangeView {
+            entries: self.table.view(),
+            gateways: agents_of.keys().copied().collect(),
+            mandates: self.mandates.load_full(),
+        })
+    }
 
     /// The letters of a gateway apply atomically and contain all its coalitions.
     fn speaks_for(&self, mts: Incarnation) -> bool {

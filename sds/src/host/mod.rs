@@ -277,7 +277,7 @@ impl Drop for HostDirectory {
 }
 
 impl Directory for HostDirectory {
-    reads_its_table!(shared.table);
+    reads_its_table!(viewed shared.table);
 
     fn refresh(&self) {
         if let Err(error) = self.shared.refresh() {

@@ -262,7 +262,7 @@ impl Drop for MdnsDirectory {
 }
 
 impl Directory for MdnsDirectory {
-    reads_its_table!(shared.table);
+    reads_its_table!(viewed shared.table);
 
     /// Announces the agent. Its locations are those at which this gateway accepts letters for it.
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {

@@ -12,7 +12,7 @@ use super::super::attempts::{AttemptTable, Settlement};
 use super::super::routes::Tally;
 use super::super::rules::{self, AttemptEnd, Belief, CustodyReport};
 use super::custody::ASK_CUSTODIAN_AFTER;
-use super::delivery::State;
+use super::delivery::{Departure, State};
 use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
 
 impl Lane {
@@ -138,13 +138,8 @@ impl Lane {
                 reason: FailureReason::NoSuchAgent,
                 detail,
             } => {
-                if self.is_registered_no_more(index, table) {
-                    self.recovering = true;
-                    self.receiver_left(now, index, table);
-                } else {
-                    let reason = FailureReason::NoSuchAgent;
-                    self.refused(now, index, &location, (reason, detail), table);
-                }
+                let refused = Some((location, detail));
+                self.receiver_unknown(index, Departure::Unknown { refused }, table);
             }
             Answer::Failed { reason, detail } => {
                 self.refused(now, index, &location, (reason, detail), table);
@@ -202,15 +197,57 @@ impl Lane {
             self.moving = Some((registration, until));
             self.due_at(until);
         }
-        self.receiver_left(now, index, table);
+        self.receiver_unknown(index, Departure::Moved, table);
     }
 
-    /// Whether the letter's registration, which another service reports as unknown, is not in the
-    /// directory either: it may have just ended.
-    fn is_registered_no_more(&self, index: usize, table: &AttemptTable) -> bool {
-        table.directory.refresh();
-        self.entry(self.letters[index].registration, table)
-            .is_none()
+    /// Handles a letter whose registration another service reports as moved or unknown: the letter
+    /// waits for a refresh of the directory.
+    fn receiver_unknown(&mut self, index: usize, departure: Departure, table: &mut AttemptTable) {
+        self.letters[index].progress.departure = Some(Box::new(departure));
+        self.want_refresh(table);
+    }
+
+    /// Handles the end of a refresh of the directory.
+    pub(crate) fn refreshed(&mut self, now: Instant, number: u64, table: &mut AttemptTable) {
+        // A later refresh may have been requested.
+        if self.awaited.is_none_or(|awaited| awaited > number) {
+            return;
+        }
+        self.awaited = None;
+        self.is_fresh = true;
+        let departed = self.letters.iter();
+        let departed = departed.filter(|delivery| delivery.progress.departure.is_some());
+        let departed: Vec<u64> = departed.map(|delivery| delivery.sequence).collect();
+        for sequence in departed {
+            let Some(index) = self.index(sequence) else {
+                continue;
+            };
+            let departure = self.letters[index].progress.departure.take();
+            if !self.letters[index].is_waiting() {
+                continue;
+            }
+            let is_known = self
+                .entry(self.letters[index].registration, table)
+                .is_some();
+            match departure.map(|it| *it) {
+                Some(Departure::Unknown { refused }) if is_known => {
+                    let reason = FailureReason::NoSuchAgent;
+                    match refused {
+                        Some((location, detail)) => {
+                            self.refused(now, index, &location, (reason, detail), table);
+                        }
+                        None => self.fail(now, index, reason, table),
+                    }
+                }
+                Some(_) => {
+                    self.recovering = true;
+                    self.receiver_left(now, index, table);
+                }
+                None => {}
+            }
+        }
+        self.pump(now, table);
+        self.is_fresh = false;
     }
 
     /// Handles the final refusal of a letter by the other side.
@@ -376,12 +413,12 @@ impl Lane {
             },
             Outcome::Failed { reason, .. } => {
                 delivery.progress.attempts = attempts;
-                if reason == FailureReason::NoSuchAgent && self.is_registered_no_more(index, table)
-                {
-                    self.recovering = true;
-                    self.receiver_left(now, index, table);
-                } else {
-                    self.fail(now, index, reason, table);
+                match reason {
+                    FailureReason::NoSuchAgent => {
+                        let departure = Departure::Unknown { refused: None };
+                        self.receiver_unknown(index, departure, table);
+                    }
+                    _ => self.fail(now, index, reason, table),
                 }
                 return;
             }

@@ -59,6 +59,20 @@ pub(super) struct Progress {
     pub(super) unfit_since: Option<Instant>,
     /// Set when the letter came back because its predecessor was not taken.
     pub(super) hold: Option<Holding>,
+    /// Set while the letter waits for a refresh of the directory.
+    pub(super) departure: Option<Box<Departure>>,
+}
+
+/// Another service's report on the registration of a letter's receiver.
+#[derive(Debug)]
+pub(super) enum Departure {
+    /// It has left its host.
+    Moved,
+    /// It is not known there.
+    Unknown {
+        /// Location and detail of the refusal; `None` for a report.
+        refused: Option<(Location, String)>,
+    },
 }
 
 /// The event that a letter which came back as out of order waits for.
@@ -123,6 +137,7 @@ impl Delivery {
             busy: false,
             unfit_since: None,
             hold: None,
+            departure: None,
         };
         Self {
             origin,

@@ -98,6 +98,10 @@ pub(crate) struct Lane {
     failed: Vec<Attempt>,
     /// Whether a letter came back: nothing is dispatched until all letters in transit have ended.
     recovering: bool,
+    /// The refresh of the directory that the letters wait for.
+    awaited: Option<u64>,
+    /// Whether the directory has just been refreshed, so that an unknown receiver is final.
+    is_fresh: bool,
     paused_until: Option<Instant>,
     /// Whether the pause is for a lower letter, with whose end it ends.
     paused_for_lower: bool,
@@ -147,6 +151,8 @@ impl Lane {
             tally: None,
             failed: Vec::new(),
             recovering: false,
+            awaited: None,
+            is_fresh: false,
             paused_until: None,
             paused_for_lower: false,
             pauses: 0,
@@ -295,7 +301,10 @@ impl Lane {
             self.recovering = false;
             self.route = None;
         }
-        if !self.recovering && self.paused_until.is_none_or(|until| until <= now) {
+        if !self.recovering
+            && self.awaited.is_none()
+            && self.paused_until.is_none_or(|until| until <= now)
+        {
             self.paused_until = None;
             self.paused_for_lower = false;
             self.dispatch_waiting(now, table);
@@ -324,6 +333,10 @@ impl Lane {
                 break;
             }
             let Some(entry) = self.entry(registration, table) else {
+                if !self.is_fresh {
+                    self.want_refresh(table);
+                    break;
+                }
                 if self.receiver_left(now, index, table) {
                     continue;
                 }
@@ -503,7 +516,12 @@ impl Lane {
         self.due_at(until);
     }
 
-    /// Handles the end of the registration that the letter is for. Returns whether the lane may
+    /// Requests a refresh of the directory. The letters of the lane wait for it.
+    pub(super) fn want_refresh(&mut self, table: &mut AttemptTable) {
+        self.awaited = Some(table.want_refresh_for(self.id));
+    }
+
+    /// Handles the end of the registration that the letter is for, after a refresh. Returns whether the lane may
     /// continue with the letter at this index: another one, or the same for the new registration.
     fn receiver_left(&mut self, now: Instant, index: usize, table: &mut AttemptTable) -> bool {
         let delivery = &self.letters[index];
@@ -520,7 +538,7 @@ impl Lane {
             }
             return true;
         }
-        let successor = table.directory.lookup(&self.receiver);
+        let successor = table.view.named(&self.receiver);
         let successor = successor.map(|entry| registration_of(&entry));
         if let Some(successor) = successor.filter(|successor| *successor != registration) {
             let delivery = &mut self.letters[index];
