@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Principal, Report, Stream, Ticket, TransportError, TransportErrorKind,
@@ -28,6 +28,8 @@ struct Service {
     core: Core,
     directory: Arc<MemoryDirectory>,
     start: Instant,
+    /// The time of the last call.
+    now: Now,
 }
 
 impl Service {
@@ -41,21 +43,27 @@ impl Service {
             forwards,
             ..CoreConfig::new("mts", OWN, vec![Kind::Shm])
         };
-        let mut core = Core::new(config, Arc::clone(&directory) as Arc<dyn Directory>);
+        let mut core = Core::new(config, Arc::clone(&directory) as Arc<dyn View>);
         core.register("rover".into(), ROVER);
+        let start = Instant::now();
         Self {
             core,
             directory,
-            start: Instant::now(),
+            start,
+            now: Now {
+                instant: start,
+                utc: SystemTime::UNIX_EPOCH,
+            },
         }
     }
 
-    fn at(&self, ms: u64) -> Now {
+    fn at(&mut self, ms: u64) -> Now {
         let since = Duration::from_millis(ms);
-        Now {
+        self.now = Now {
             instant: self.start + since,
             utc: SystemTime::UNIX_EPOCH + since,
-        }
+        };
+        self.now
     }
 
     fn send(&mut self) {
@@ -69,7 +77,8 @@ impl Service {
             receivers: vec!["arm".into()],
             deadline: DEADLINE,
         };
-        self.core.send(self.at(ms), submission);
+        let now = self.at(ms);
+        self.core.send(now, submission);
     }
 
     /// A letter arrives for `arm`, in this transfer of the previous service.
@@ -122,8 +131,19 @@ impl Service {
         }
     }
 
+    /// Returns the next action, and refreshes the directory, which is in memory, when the core
+    /// requests it.
+    fn next_action(&mut self) -> Option<Action> {
+        loop {
+            match self.core.poll_action()? {
+                Action::Refresh { number } => self.core.handle_refreshed(self.now, number),
+                action => return Some(action),
+            }
+        }
+    }
+
     fn dispatched(&mut self) -> Option<(AttemptId, Parcel)> {
-        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+        std::iter::from_fn(|| self.next_action()).find_map(|action| match action {
             Action::Dispatch {
                 attempt, parcel, ..
             } => Some((attempt, parcel)),
@@ -132,7 +152,7 @@ impl Service {
     }
 
     fn outcome(&mut self) -> Option<Outcome> {
-        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+        std::iter::from_fn(|| self.next_action()).find_map(|action| match action {
             Action::Outcome { outcome, .. } => Some(outcome),
             _ => None,
         })
@@ -243,14 +263,16 @@ fn letters_for_an_ended_registration_wait_two_seconds_behind_one_for_its_success
     sender.directory.deregister("arm", ARM).unwrap();
     let new = Registration::new("arm", NEW, vec![shm(NEXT)]);
     sender.directory.register(new).unwrap();
-    sender.core.handle_directory_change(sender.at(10));
+    let now = sender.at(10);
+    sender.core.handle_directory_change(now);
     let moved = Body::Report(Report::Moved);
     let report = parcel(moving.sequence, moving.transfer, moved);
     sender.receive_from(20, Kind::Shm, shm(NEXT), report);
     let (attempt, again) = sender.dispatched().unwrap();
     assert_eq!(again.stream.receiver, NEW);
     // Any change of the directory.
-    sender.core.handle_directory_change(sender.at(30));
+    let now = sender.at(30);
+    sender.core.handle_directory_change(now);
     sender.answer(40, attempt, Answer::Accepted);
     let outcome = sender.outcome();
     assert!(
@@ -261,9 +283,10 @@ fn letters_for_an_ended_registration_wait_two_seconds_behind_one_for_its_success
     let mut ms = 50;
     let outcome = loop {
         ms += 10;
-        sender.core.handle_timeout(sender.at(ms));
+        let now = sender.at(ms);
+        sender.core.handle_timeout(now);
         let mut ended = None;
-        while let Some(action) = sender.core.poll_action() {
+        while let Some(action) = sender.next_action() {
             match action {
                 Action::Outcome { outcome, .. } => ended = Some(outcome),
                 // The custodian has the letter.
