@@ -110,15 +110,15 @@ impl Checks {
         let Some(monitored) = &self.0 else {
             return incoming;
         };
-        let Some(violation) = monitored.violation(&incoming.message) else {
+        let Some(violation) = monitored.violation(incoming.message()) else {
             return incoming;
         };
         // Not-understood and failure are never answered; otherwise two agents could answer each other
         // without end.
         let never_answered = [Performative::NotUnderstood, Performative::Failure];
         if monitored.answer
-            && !never_answered.contains(incoming.message.performative())
-            && let Some(answer) = answer(&incoming.message, violation.to_string())
+            && !never_answered.contains(incoming.message().performative())
+            && let Some(answer) = answer(incoming.message(), violation.to_string())
         {
             // The answer ends the conversation in the monitor, if the sender takes part in one.
             let _ = monitored.violation(&answer);

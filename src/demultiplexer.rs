@@ -286,7 +286,7 @@ impl Demultiplexer {
     }
 
     fn put(&self, endpoint: &Endpoint, received: Incoming) {
-        let id = received.message.conversation_id();
+        let id = received.message().conversation_id();
         let is_led = id.is_some_and(|id| self.state.lock().led.contains_key(id));
         let sender = received.sender;
         // Outside of the lock, because a miss reads the files of the directory.
@@ -339,7 +339,7 @@ impl State {
 
     /// Adds a message to the queue of its reader. `registered` is the directory's entry of the sender.
     fn put(&mut self, received: Incoming, registered: Option<&Entry>) {
-        let message = &received.message;
+        let message = received.message();
         let id = message.conversation_id();
         if let Some(conversations) = id.and_then(|id| self.led.get_mut(id)) {
             // The conversation that began last is the first choice.
@@ -365,7 +365,7 @@ impl State {
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {
             let dropped = self.others.pop_front();
             tracing::warn!(
-                message = dropped.map(|it| it.message.to_string()),
+                message = dropped.map(|it| it.message().to_string()),
                 "dropped a message: this agent serves protocols and reads no other messages; call \
                  Agent::receive to read them"
             );
@@ -380,7 +380,7 @@ impl Admitted {
         let Self::Parties(parties) = self else {
             return true;
         };
-        let message = &incoming.message;
+        let message = incoming.message();
         let Some(sender) = message.sender().map(|sender| sender.name()) else {
             return false;
         };
@@ -513,7 +513,7 @@ mod tests {
                 Some(&leg_entry),
             );
             let name = |taken: Option<Incoming>| {
-                let message = taken.unwrap().message;
+                let message = taken.unwrap().into_message();
                 message.sender().unwrap().name().to_owned()
             };
             assert_eq!(name(state.take(Reader::Conversation(&with_arm))), "arm");

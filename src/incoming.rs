@@ -10,9 +10,7 @@ use {fipa_monitor::Violation, fipa_transport::Incarnation};
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct Incoming {
-    /// The message. Its content may be in shared memory of the sender: it stays readable as long as
-    /// this value exists, but another process of the same user can change it.
-    pub message: Message,
+    message: Message,
     /// The letter that carried the message.
     pub letter: Letter,
     /// The transport that handed the letter to this process; `None` for a letter from this
@@ -39,6 +37,20 @@ impl Incoming {
         }
     }
 
+    /// Returns the message. Its content may be in shared memory of the sender: it stays readable as long
+    /// as this value or a clone of the content exists, but another process of the same user can change
+    /// it.
+    #[must_use]
+    pub fn message(&self) -> &Message {
+        &self.message
+    }
+
+    /// Returns the message by value.
+    #[must_use]
+    pub fn into_message(self) -> Message {
+        self.message
+    }
+
     /// Returns the violation of the message's protocol, if there is one and `monitor.check` is `warn`
     /// or `enforce`.
     ///
@@ -53,7 +65,7 @@ impl Incoming {
     ///         eprintln!("ignored: {violation}");
     ///         continue;
     ///     }
-    ///     println!("{}", incoming.message);
+    ///     println!("{}", incoming.message());
     /// }
     /// # }
     /// ```
