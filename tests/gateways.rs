@@ -148,7 +148,7 @@ async fn hosts_discover_each_other_and_exchange_letters() {
         let incoming = arm.receive().await.unwrap();
         assert_eq!(incoming.message().content().unwrap(), &number.to_string());
         assert!(
-            incoming.letter.parse_envelope().unwrap().extensions.len() >= 2,
+            incoming.letter().parse_envelope().unwrap().extensions.len() >= 2,
             "two stamps"
         );
     }
