@@ -152,7 +152,7 @@ impl Pair {
         runtime.block_on(async {
             assert!(rover.send(message).await.unwrap().all_succeeded());
             if asks {
-                let answer = rover.receive().await.unwrap().message;
+                let answer = rover.receive().await.unwrap().into_message();
                 assert_eq!(*answer.performative(), Performative::Inform);
             }
         });
@@ -169,7 +169,7 @@ impl Pair {
 /// Answers requests until a cancel without a conversation arrives.
 async fn answer(arm: &Agent) {
     loop {
-        let asked = arm.receive().await.unwrap().message;
+        let asked = arm.receive().await.unwrap().into_message();
         if *asked.performative() == Performative::Cancel {
             return;
         }

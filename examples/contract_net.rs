@@ -49,7 +49,7 @@ async fn call(rover: &Agent, arms: &[AgentId]) -> Result<(), DialogueError> {
 
 /// Runs a participant.
 async fn work(arm: &Agent, price: u32) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
-    let call = arm.receive().await?.message;
+    let call = arm.receive().await?.into_message();
     let mut task = arm.take_part(&call)?;
     if task.propose(price.to_string(), TIMEOUT).await? {
         task.reply(Reply::Inform("carried".into())).await?;

@@ -90,7 +90,7 @@ impl Checks {
         let Some(monitored) = &self.0 else {
             return Ok(());
         };
-        match monitored.violation(message) {
+        match monitored.violation(&Header::from(message)) {
             Some(violation) if monitored.enforce => Err(SendError::Violation(violation)),
             Some(violation) => {
                 tracing::warn!("sent a message that violates its protocol: {violation}");
@@ -110,18 +110,18 @@ impl Checks {
         let Some(monitored) = &self.0 else {
             return incoming;
         };
-        let Some(violation) = monitored.violation(&incoming.message) else {
+        let Some(violation) = monitored.violation(&Header::from(&incoming.view())) else {
             return incoming;
         };
         // Not-understood and failure are never answered; otherwise two agents could answer each other
         // without end.
         let never_answered = [Performative::NotUnderstood, Performative::Failure];
         if monitored.answer
-            && !never_answered.contains(incoming.message.performative())
-            && let Some(answer) = answer(&incoming.message, violation.to_string())
+            && !never_answered.contains(incoming.message().performative())
+            && let Some(answer) = answer(incoming.message(), violation.to_string())
         {
             // The answer ends the conversation in the monitor, if the sender takes part in one.
-            let _ = monitored.violation(&answer);
+            let _ = monitored.violation(&Header::from(&answer));
         }
         tracing::warn!("received a message that violates its protocol: {violation}");
         incoming.violates(violation);
@@ -130,7 +130,7 @@ impl Checks {
 }
 
 impl Monitored {
-    fn violation(&self, message: &Message) -> Option<Box<Violation>> {
+    fn violation(&self, header: &Header<'_>) -> Option<Box<Violation>> {
         let now = now();
         let mut monitor = self.monitor.lock();
         if monitor.poll_elapsed().is_some_and(|due| due <= now.elapsed) {
@@ -138,13 +138,8 @@ impl Monitored {
                 tracing::debug!(?event, "conversation");
             }
         }
-        let verdict = monitor.check(&Header::from(message), now);
-        tracing::trace!(
-            performative = %message.performative(),
-            conversation = message.conversation_id(),
-            accepted = verdict.is_accepted(),
-            "checked"
-        );
+        let verdict = monitor.check(header, now);
+        tracing::trace!(?header, accepted = verdict.is_accepted(), "checked");
         match verdict {
             Verdict::Violation(violation) => Some(violation),
             _ => None,

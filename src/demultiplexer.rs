@@ -286,9 +286,8 @@ impl Demultiplexer {
     }
 
     fn put(&self, endpoint: &Endpoint, received: Incoming) {
-        let id = received.message.conversation_id();
-        let is_led = id.is_some_and(|id| self.state.lock().led.contains_key(id));
         let sender = received.sender;
+        let is_led = self.state.lock().leads(&received);
         // Outside of the lock, because a miss reads the files of the directory.
         let registered = match is_led && sender.is_known() {
             true => endpoint.domain.directory().by_incarnation(sender),
@@ -325,6 +324,32 @@ impl State {
         }
     }
 
+    /// Whether calls lead conversations with the message's id.
+    fn leads(&self, received: &Incoming) -> bool {
+        // Most agents lead none.
+        !self.led.is_empty()
+            && received
+                .view()
+                .conversation_id()
+                .is_some_and(|id| self.led.contains_key(&*id.as_str()))
+    }
+
+    /// Returns the led conversation to which a message belongs.
+    fn conversation_of(
+        &mut self,
+        received: &Incoming,
+        registered: Option<&Entry>,
+    ) -> Option<&mut Conversation> {
+        if self.led.is_empty() {
+            return None;
+        }
+        let id = received.view().conversation_id()?;
+        let conversations = self.led.get_mut(&*id.as_str())?;
+        // The conversation that began last is the first choice.
+        let mut admitting = conversations.iter_mut().rev();
+        admitting.find(|it| it.from.admits(received, registered))
+    }
+
     fn has_room(&self) -> bool {
         let led = self.led.values().flatten().map(|it| it.queue.len());
         let served = self.served.iter().map(|server| server.queue.len());
@@ -339,33 +364,24 @@ impl State {
 
     /// Adds a message to the queue of its reader. `registered` is the directory's entry of the sender.
     fn put(&mut self, received: Incoming, registered: Option<&Entry>) {
-        let message = &received.message;
-        let id = message.conversation_id();
-        if let Some(conversations) = id.and_then(|id| self.led.get_mut(id)) {
-            // The conversation that began last is the first choice.
-            let mut admitting = conversations.iter_mut().rev();
-            let admitting = admitting.find(|it| it.from.admits(&received, registered));
-            if let Some(conversation) = admitting {
-                conversation.queue.push_back(received);
-                return;
-            }
+        if let Some(conversation) = self.conversation_of(&received, registered) {
+            conversation.queue.push_back(received);
+            return;
         }
         // An answer of the gateway, or the report of an undelivered question, after the end of the call.
-        let is_about_presence = message.ontology() == Some(presence::ONTOLOGY)
-            || id.is_some_and(|id| id.starts_with(presence::CONVERSATION));
-        if is_about_presence {
+        if is_about_presence(&received) {
             return;
         }
         let mut served = self.served.iter_mut();
         let is_legal = received.violation().is_none();
-        if let Some(server) = served.find(|server| is_legal && (server.opens)(message)) {
+        if let Some(server) = served.find(|server| is_legal && (server.opens)(received.message())) {
             server.queue.push_back(received);
             return;
         }
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {
             let dropped = self.others.pop_front();
             tracing::warn!(
-                message = dropped.map(|it| it.message.to_string()),
+                message = dropped.map(|it| it.message().to_string()),
                 "dropped a message: this agent serves protocols and reads no other messages; call \
                  Agent::receive to read them"
             );
@@ -374,14 +390,23 @@ impl State {
     }
 }
 
+/// Whether a message is about the presence of agents.
+fn is_about_presence(received: &Incoming) -> bool {
+    let view = received.view();
+    let id = view.conversation_id();
+    view.ontology()
+        .is_some_and(|name| name == presence::ONTOLOGY)
+        || id.is_some_and(|id| id.as_str().starts_with(presence::CONVERSATION))
+}
+
 impl Admitted {
     /// Whether a message with the id of the conversation belongs to it.
     fn admits(&self, incoming: &Incoming, registered: Option<&Entry>) -> bool {
         let Self::Parties(parties) = self else {
             return true;
         };
-        let message = &incoming.message;
-        let Some(sender) = message.sender().map(|sender| sender.name()) else {
+        let view = incoming.view();
+        let Some(sender) = view.sender().map(|sender| sender.name().as_str()) else {
             return false;
         };
         let is_own = incoming.via.is_none();
@@ -393,8 +418,10 @@ impl Admitted {
                 None => party.agent == agent,
             };
         }
-        let reports = *message.performative() == Performative::Failure
-            && message.ontology() == Some(MANAGEMENT_ONTOLOGY);
+        let reports = view.performative() == Performative::Failure
+            && view
+                .ontology()
+                .is_some_and(|name| name == MANAGEMENT_ONTOLOGY);
         // The service of this process, of a party, or of a legacy peer if a party is at one.
         reports
             && (is_own
@@ -438,7 +465,7 @@ mod tests {
             service: Incarnation::from_u64(1),
             remote: false,
         };
-        Incoming::new(message, received)
+        Incoming::new(received).unwrap()
     }
 
     fn entry(name: &str, incarnation: Incarnation) -> Arc<Entry> {
@@ -513,7 +540,7 @@ mod tests {
                 Some(&leg_entry),
             );
             let name = |taken: Option<Incoming>| {
-                let message = taken.unwrap().message;
+                let message = taken.unwrap().into_message();
                 message.sender().unwrap().name().to_owned()
             };
             assert_eq!(name(state.take(Reader::Conversation(&with_arm))), "arm");

@@ -147,12 +147,12 @@ impl Endpoint {
         self.mts().gone(self.incarnation).await;
     }
 
-    /// Decodes and checks a received letter. Returns `None` if the message cannot be decoded; the sender
+    /// Checks a received letter. Returns `None` if the message cannot be decoded; the sender
     /// then gets a failure message.
     pub(crate) fn decode(&self, received: Received) -> Option<Incoming> {
-        let message = match Message::decode(received.letter.payload()) {
-            Ok(message) => message,
-            Err(error) => {
+        let incoming = match Incoming::new(received) {
+            Ok(incoming) => incoming,
+            Err((error, received)) => {
                 tracing::warn!(
                     agent = %self.name, error = %ErrorChain(&error),
                     "ignored a received letter: its message cannot be decoded"
@@ -162,7 +162,6 @@ impl Endpoint {
                 return None;
             }
         };
-        let incoming = Incoming::new(message, received);
         Some(self.checks.arrived(incoming, |message, reason| {
             self.not_understood(message, reason)
         }))

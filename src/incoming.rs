@@ -1,6 +1,9 @@
 //! A received message.
 
-use fipa_acl::{Letter, Message};
+use std::sync::OnceLock;
+
+use bytes::Bytes;
+use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
 use fipa_mts::core::Received;
 use fipa_transport::Kind;
 #[cfg(feature = "monitor")]
@@ -10,11 +13,11 @@ use {fipa_monitor::Violation, fipa_transport::Incarnation};
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct Incoming {
-    /// The message. Its content may be in shared memory of the sender: it stays readable as long as
-    /// this value exists, but another process of the same user can change it.
-    pub message: Message,
-    /// The letter that carried the message.
-    pub letter: Letter,
+    letter: Letter,
+    /// Of the letter's payload, whose head and tail are private memory of this process.
+    index: MessageIndex,
+    /// Decoded when the application first reads it.
+    message: OnceLock<Box<Message>>,
     /// The transport that handed the letter to this process; `None` for a letter from this
     /// process itself.
     pub via: Option<Kind>,
@@ -27,16 +30,74 @@ pub struct Incoming {
 }
 
 impl Incoming {
-    pub(crate) fn new(message: Message, received: Received) -> Self {
-        Self {
-            message,
+    /// Checks the message of a received letter. The content of a bit-efficient message is not accessed.
+    pub(crate) fn new(received: Received) -> Result<Self, (DecodeError, Received)> {
+        let mut received = received;
+        let payload = received.letter.payload();
+        let is_text = matches!(
+            Representation::detect(&payload.head),
+            Some(Representation::String | Representation::Xml)
+        );
+        if is_text && payload.is_split() {
+            // Only bit-efficient messages are read in pieces.
+            let whole = payload.to_bytes();
+            received.letter = Letter::new(received.letter.envelope(), whole);
+        }
+        let index = match MessageIndex::of(received.letter.payload()) {
+            Ok(index) => index,
+            Err(error) => return Err((error, received)),
+        };
+        Ok(Self {
+            index,
+            message: OnceLock::new(),
             #[cfg(feature = "monitor")]
             sender: received.sender,
             letter: received.letter,
             via: received.via,
             #[cfg(feature = "monitor")]
             violation: None,
+        })
+    }
+
+    /// Returns the message, and decodes it on the first call. [`view`](Self::view) and
+    /// [`content`](Self::content) need no owned message and do not allocate.
+    ///
+    /// Its content may be in shared memory of the sender: it stays readable as long
+    /// as this value or a clone of the content exists, but another process of the same user can change
+    /// it.
+    #[must_use]
+    pub fn message(&self) -> &Message {
+        self.message
+            .get_or_init(|| Box::new(self.index.to_message(self.letter.payload())))
+    }
+
+    /// Returns the message by value.
+    #[must_use]
+    pub fn into_message(self) -> Message {
+        match self.message.into_inner() {
+            Some(message) => *message,
+            None => self.index.to_message(self.letter.payload()),
         }
+    }
+
+    /// Returns the parameters of the message without decoding it. The message was checked when it
+    /// arrived, and is not checked again.
+    #[must_use]
+    pub fn view(&self) -> MessageView<'_> {
+        self.index.view(self.letter.payload())
+    }
+
+    /// Returns the content of the message without decoding the other parameters. As of
+    /// [`message`](Self::message), it may be in shared memory of the sender.
+    #[must_use]
+    pub fn content(&self) -> Option<Bytes> {
+        self.index.content(self.letter.payload())
+    }
+
+    /// Returns the letter that carried the message.
+    #[must_use]
+    pub fn letter(&self) -> &Letter {
+        &self.letter
     }
 
     /// Returns the violation of the message's protocol, if there is one and `monitor.check` is `warn`
@@ -53,7 +114,7 @@ impl Incoming {
     ///         eprintln!("ignored: {violation}");
     ///         continue;
     ///     }
-    ///     println!("{}", incoming.message);
+    ///     println!("{}", incoming.message());
     /// }
     /// # }
     /// ```
@@ -71,6 +132,8 @@ impl Incoming {
     /// Separates the message from its violation.
     #[cfg(feature = "monitor")]
     pub(crate) fn into_parts(self) -> (Message, Option<Box<Violation>>) {
-        (self.message, self.violation)
+        let mut this = self;
+        let violation = this.violation.take();
+        (this.into_message(), violation)
     }
 }

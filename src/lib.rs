@@ -18,7 +18,7 @@
 //! let deliveries = agent.send(request).await?;
 //! println!("{deliveries}");
 //! let letter = agent.receive().await?;
-//! println!("{}", letter.message);
+//! println!("{}", letter.message());
 //! # Ok(())
 //! # }
 //! ```

@@ -128,7 +128,7 @@ pub async fn of_gateway(
     }
     let answer = async {
         loop {
-            let message = agent.receive().await?.message;
+            let message = agent.receive().await?.into_message();
             if message.in_reply_to() == Some(reference.as_str()) {
                 return Ok::<_, ReceiveError>(message);
             }

@@ -62,7 +62,7 @@ fn refused(outcome: &Outcome) -> Option<String> {
 
 async fn next(agent: &Agent) -> Message {
     let received = tokio::time::timeout(Duration::from_secs(60), agent.receive()).await;
-    received.unwrap().unwrap().message
+    received.unwrap().unwrap().into_message()
 }
 
 async fn rules_are_kept(kind: Kind) {

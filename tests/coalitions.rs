@@ -70,7 +70,7 @@ async fn send(from: &Agent, to: &str, content: &str) -> Deliveries {
 
 async fn receives(agent: &Agent, content: &str) {
     let received = agent.receive().await.unwrap();
-    assert_eq!(received.message.content().unwrap(), content);
+    assert_eq!(received.message().content().unwrap(), content);
 }
 
 fn to(deliveries: &Deliveries) -> BTreeSet<&str> {

@@ -64,13 +64,13 @@ async fn letters_arrive_in_both_directions_and_report_their_transport() {
         let asked = arm.receive().await.unwrap();
         assert_eq!(asked.via, Some(via));
         let answer = arm
-            .reply(&asked.message, Performative::Agree)
+            .reply(asked.message(), Performative::Agree)
             .build()
             .unwrap();
         assert!(arm.send(answer).await.unwrap().all_succeeded());
         let answered = rover.receive().await.unwrap();
-        assert_eq!(answered.message.in_reply_to(), Some(&*reply_with));
-        assert_eq!(answered.message.conversation_id(), Some(&*conversation));
+        assert_eq!(answered.message().in_reply_to(), Some(&*reply_with));
+        assert_eq!(answered.message().conversation_id(), Some(&*conversation));
         drop((rover, arm));
         here.close().await;
         there.close().await;
@@ -108,7 +108,7 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
         let mut seen = Vec::new();
         while seen.len() < total as usize {
             let incoming = arm.receive().await.unwrap();
-            let content = incoming.message.content().unwrap();
+            let content = incoming.message().content().unwrap();
             seen.push(u32::from_le_bytes(content[..].try_into().unwrap()));
         }
         seen
@@ -180,7 +180,7 @@ async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers()
     assert_eq!(reason(&blocked.unwrap()), FailureReason::QueueFull);
     // The sender gets a failure message. The next letter waits until the receiver reads.
     let failure = rover.receive().await.unwrap();
-    assert_eq!(*failure.message.performative(), Performative::Failure);
+    assert_eq!(*failure.message().performative(), Performative::Failure);
     let waiting = rover.send(inform(&rover, "slow", "in time"));
     let reading = async {
         let mut seen = Vec::new();
@@ -189,7 +189,7 @@ async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers()
                 slow.receive()
                     .await
                     .unwrap()
-                    .message
+                    .message()
                     .content()
                     .unwrap()
                     .to_vec(),
@@ -225,7 +225,7 @@ async fn a_pattern_reaches_all_but_the_sender() {
     assert!(deliveries.all_succeeded(), "{deliveries}");
     for arm in &others {
         assert_eq!(
-            arm.receive().await.unwrap().message.content().unwrap(),
+            arm.receive().await.unwrap().message().content().unwrap(),
             "stop"
         );
     }
@@ -240,7 +240,7 @@ async fn an_unknown_name_yields_one_failure_message() {
     for to in ["unknown", "unknown_.*", "broken("] {
         let deliveries = rover.send(inform(&rover, to, "hello")).await.unwrap();
         assert_eq!(reason(&deliveries), FailureReason::NoSuchAgent);
-        let failure = rover.receive().await.unwrap().message;
+        let failure = rover.receive().await.unwrap().into_message();
         assert_eq!(*failure.performative(), Performative::Failure);
         assert_eq!(failure.ontology(), Some("fipa-agent-management"));
         let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
@@ -277,7 +277,7 @@ async fn loaned_content_is_not_copied() {
         }
         assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
         let incoming = arm.receive().await.unwrap();
-        let content = incoming.message.content().unwrap();
+        let content = incoming.message().content().unwrap();
         assert_eq!(content.len(), len);
         assert!(
             content
@@ -295,7 +295,7 @@ async fn loaned_content_is_not_copied() {
         assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
         for receiver in [&arm, &other] {
             let incoming = receiver.receive().await.unwrap();
-            assert_eq!(incoming.message.content().unwrap(), &vec![7; len]);
+            assert_eq!(incoming.message().content().unwrap(), &vec![7; len]);
         }
     }
 }
@@ -332,7 +332,7 @@ async fn large_content_for_several_receivers_is_in_memory_once() {
         let mut places = HashSet::new();
         for arm in &arms {
             let incoming = arm.receive().await.unwrap();
-            let content = incoming.message.content().unwrap();
+            let content = incoming.message().content().unwrap();
             assert_eq!(content, &vec![7; 1 << 20]);
             assert!(is_shared_memory(content));
             places.insert(content.as_ptr());
@@ -345,7 +345,7 @@ async fn large_content_for_several_receivers_is_in_memory_once() {
     let sent = rover.send(message(&["arm_0", "unknown"])).await.unwrap();
     assert_eq!(sent.0.len(), 2, "{sent}");
     let incoming = arms[0].receive().await.unwrap();
-    assert_eq!(incoming.message.content().unwrap(), &vec![7; 1 << 20]);
+    assert_eq!(incoming.message().content().unwrap(), &vec![7; 1 << 20]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -380,7 +380,7 @@ async fn large_content_for_several_receivers_also_reaches_those_without_shared_m
     for (arm, via) in arms.iter().zip([Kind::Shm, Kind::Shm, Kind::Unix]) {
         let incoming = arm.receive().await.unwrap();
         assert_eq!(incoming.via, Some(via));
-        assert_eq!(incoming.message.content().unwrap(), &vec![9; 1 << 20]);
+        assert_eq!(incoming.message().content().unwrap(), &vec![9; 1 << 20]);
     }
 }
 
@@ -418,7 +418,7 @@ async fn a_letter_that_is_too_large_fails_with_that_reason() {
             .all_succeeded()
     );
     assert_eq!(
-        arm.receive().await.unwrap().message.content().unwrap(),
+        arm.receive().await.unwrap().message().content().unwrap(),
         "small"
     );
 }
@@ -440,7 +440,7 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     let [unread] = &unread[..] else {
         panic!("one message waited: {unread:?}");
     };
-    assert_eq!(unread.message.content().unwrap(), "first");
+    assert_eq!(unread.message().content().unwrap(), "first");
     let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
     let arm = there.register("arm").await.unwrap();
@@ -452,7 +452,7 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
             .all_succeeded()
     );
     assert_eq!(
-        arm.receive().await.unwrap().message.content().unwrap(),
+        arm.receive().await.unwrap().message().content().unwrap(),
         "second"
     );
 }
@@ -483,7 +483,7 @@ fn processes_without_a_runtime_have_the_same_calls() {
             .unwrap()
             .all_succeeded()
     );
-    assert_eq!(arm.receive().unwrap().message.content().unwrap(), "hello");
+    assert_eq!(arm.receive().unwrap().message().content().unwrap(), "hello");
     drop((rover, arm));
     here.close();
     there.close();
@@ -535,7 +535,7 @@ async fn calls_after_closing_the_domain_fail_and_do_not_hang() {
     let ended = loop {
         match rover.receive().await {
             // Failure messages from before the end may still be read.
-            Ok(incoming) => assert_eq!(*incoming.message.performative(), Performative::Failure),
+            Ok(incoming) => assert_eq!(*incoming.message().performative(), Performative::Failure),
             Err(error) => break error,
         }
     };

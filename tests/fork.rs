@@ -74,7 +74,7 @@ fn is_delivered(from: &Agent, to: &str) -> bool {
 }
 
 fn is_whole(incoming: &Incoming) -> bool {
-    let content = incoming.message.content();
+    let content = incoming.message().content();
     content.is_some_and(|content| content[..] == CONTENT)
 }
 

@@ -67,7 +67,7 @@ async fn large_contents() {
         let receivers = if to == "arm_0" { &arms[..1] } else { &arms };
         for receiver in receivers {
             let incoming = receiver.receive().await.unwrap();
-            assert_eq!(incoming.message.content().unwrap(), &vec![round; len]);
+            assert_eq!(incoming.message().content().unwrap(), &vec![round; len]);
             kept.push(incoming);
         }
         for delivery in sent.0 {

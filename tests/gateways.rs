@@ -122,7 +122,7 @@ async fn small_letters_use_udp_and_letters_too_large_for_it_use_tcp() {
                 _ => assert!(attempts.is_empty(), "{sent}"),
             }
             let incoming = arm.receive().await.unwrap();
-            assert_eq!(incoming.message.content().unwrap(), &content);
+            assert_eq!(incoming.message().content().unwrap(), &content);
         }
     }
 }
@@ -146,9 +146,9 @@ async fn hosts_discover_each_other_and_exchange_letters() {
     }
     for number in 0..20 {
         let incoming = arm.receive().await.unwrap();
-        assert_eq!(incoming.message.content().unwrap(), &number.to_string());
+        assert_eq!(incoming.message().content().unwrap(), &number.to_string());
         assert!(
-            incoming.letter.parse_envelope().unwrap().extensions.len() >= 2,
+            incoming.letter().parse_envelope().unwrap().extensions.len() >= 2,
             "two stamps"
         );
     }
@@ -158,7 +158,7 @@ async fn hosts_discover_each_other_and_exchange_letters() {
     loan.content_mut().fill(3);
     assert_eq!(via(&arm.send_loan(loan).await.unwrap()), Some(Kind::Tcp));
     assert_eq!(
-        rover.receive().await.unwrap().message.content().unwrap(),
+        rover.receive().await.unwrap().message().content().unwrap(),
         &vec![3; 1 << 20]
     );
 
@@ -287,14 +287,20 @@ async fn a_new_agent_that_sends_a_letter_can_be_answered_at_once() {
             .send(inform(&newcomer, arm.name(), "hello"))
             .await
             .unwrap());
-        let greeting = arm.receive().await.unwrap().message;
+        let greeting = arm.receive().await.unwrap().into_message();
         let from = greeting.sender().unwrap().name().to_owned();
         assert_eq!(
             via(&arm.send(inform(&arm, &from, "welcome")).await.unwrap()),
             Some(Kind::Tcp)
         );
         assert_eq!(
-            newcomer.receive().await.unwrap().message.content().unwrap(),
+            newcomer
+                .receive()
+                .await
+                .unwrap()
+                .message()
+                .content()
+                .unwrap(),
             "welcome"
         );
     }
@@ -381,7 +387,7 @@ async fn numbered(from: Arc<Agent>, to: String, numbers: std::ops::Range<u32>) -
 async fn numbers(agent: &Agent, count: u32) -> Vec<u32> {
     let mut all = Vec::new();
     while all.len() < count as usize {
-        let message = agent.receive().await.unwrap().message;
+        let message = agent.receive().await.unwrap().into_message();
         if *message.performative() == Performative::Inform {
             let content = message.content().unwrap().to_vec();
             all.push(String::from_utf8(content).unwrap().parse().unwrap());

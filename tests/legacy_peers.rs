@@ -90,7 +90,7 @@ async fn send_as_peer(letter: &[u8], at: &str) {
 
 async fn receive(agent: &Agent) -> Message {
     let received = timeout(PATIENCE, agent.receive()).await;
-    received.unwrap().unwrap().message
+    received.unwrap().unwrap().into_message()
 }
 
 fn read(letter: &[u8]) -> (Envelope, Letter, Message) {

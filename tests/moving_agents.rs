@@ -81,10 +81,10 @@ struct Taken {
 impl Taken {
     fn take(&self, incoming: &Incoming) {
         // Gateways may send failure messages.
-        if *incoming.message.performative() != Performative::Inform {
+        if *incoming.message().performative() != Performative::Inform {
             return;
         }
-        let text = String::from_utf8(incoming.message.content().unwrap().to_vec()).unwrap();
+        let text = String::from_utf8(incoming.message().content().unwrap().to_vec()).unwrap();
         self.numbers.lock().push(text.parse().unwrap());
         self.in_this_life.fetch_add(1, Ordering::Relaxed);
     }

@@ -76,7 +76,7 @@ async fn the_gateway_answers_an_unknown_ontology_with_not_understood() {
         .build()
         .unwrap();
     assert!(rover.send(request).await.unwrap().all_succeeded());
-    let answer = rover.receive().await.unwrap().message;
+    let answer = rover.receive().await.unwrap().into_message();
     assert_eq!(*answer.performative(), Performative::NotUnderstood);
     assert_eq!(answer.in_reply_to(), Some("1"));
     assert_eq!(answer.sender().unwrap().name(), gateway.name());
@@ -114,7 +114,7 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
             .build()
             .unwrap();
         assert!(from.send(message).await.unwrap().all_succeeded());
-        let received = to.receive().await.unwrap().message;
+        let received = to.receive().await.unwrap().into_message();
         assert_eq!(received.content().unwrap().as_ref(), b"hello");
     }
 
@@ -145,7 +145,7 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     knows_both.discovery = config(&[&knowing("far", &[&address(&far)])]).discovery;
     let near = Gateway::open(&knows_both).await.unwrap();
 
-    let failure = later.receive().await.unwrap().message;
+    let failure = later.receive().await.unwrap().into_message();
     assert_eq!(*failure.performative(), Performative::Failure);
     assert_eq!(failure.sender().unwrap().name(), near.name());
     let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();

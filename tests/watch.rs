@@ -224,7 +224,7 @@ async fn a_watcher_that_does_not_read_delays_no_agent_and_gets_the_count_of_lost
     let reading = tokio::spawn(async move {
         let mut last = String::new();
         while last != "end" {
-            let content = arm.receive().await.unwrap().message.content().cloned();
+            let content = arm.receive().await.unwrap().message().content().cloned();
             last = String::from_utf8(content.unwrap().to_vec()).unwrap();
         }
         arm

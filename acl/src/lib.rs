@@ -75,4 +75,4 @@ pub use message::Message;
 pub use performative::{Performative, PerformativeError, UserPerformative};
 pub use representation::{AclRepresentation, Representation};
 pub use time::{Base, Time, TimeError, Zone};
-pub use view::{AgentIdView, AgentIds, MessageView, Text};
+pub use view::{AgentIdView, AgentIds, MessageIndex, MessageView, Text};

@@ -49,7 +49,7 @@ impl Agent {
     ///
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
     /// let incoming = agent.receive().await?;
-    /// let mut task = agent.take_part(&incoming.message)?;
+    /// let mut task = agent.take_part(incoming.message())?;
     /// let reply = lift(&mut task).await?;
     /// task.reply(reply).await?;
     /// # Ok(())

@@ -13,6 +13,7 @@ use super::dialogue::{DialogueError, opens};
 use super::participant::{Farewell, Home, Reply, Task};
 use crate::agent::{Agent, AgentCore};
 use crate::demultiplexer::{Opens, ReaderKey};
+use crate::incoming::Incoming;
 
 /// Maximum number of handlers of one server that run at the same time. Further initiators are refused.
 const MAX_HANDLERS: usize = 1_024;
@@ -114,7 +115,7 @@ impl ServedQueue {
     pub(super) async fn next(&self) -> Option<Message> {
         let endpoint = &self.core.endpoint;
         let next = self.core.demultiplexer.next_served(endpoint, &self.key);
-        next.await.ok().map(|incoming| incoming.message)
+        next.await.ok().map(Incoming::into_message)
     }
 }
 

@@ -13,6 +13,7 @@ use fipa_transport::Incarnation;
 use super::partners::{PartnerEvent, Partners};
 use crate::agent::{Agent, AgentCore};
 use crate::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::incoming::Incoming;
 use crate::presence::{self, Asked};
 
 impl Agent {
@@ -32,7 +33,7 @@ impl Agent {
     /// agent.send(request.build()?).await?;
     /// partners.add("arm_1");
     /// tokio::select! {
-    ///     answer = agent.receive() => println!("{}", answer?.message),
+    ///     answer = agent.receive() => println!("{}", answer?.message()),
     ///     event = partners.next() => println!("{event:?}"),
     /// }
     /// # Ok(())
@@ -238,7 +239,7 @@ impl PartnerWatch {
                 demultiplexer.now_of(endpoint, &questions.key)
             }
         {
-            self.handle_answer(&answer.message);
+            self.handle_answer(answer.message());
         }
     }
 
@@ -275,7 +276,7 @@ async fn next_answer(core: &AgentCore, key: Option<&ReaderKey>) -> Option<Messag
     match key {
         Some(key) => {
             let answer = core.demultiplexer.next_of(&core.endpoint, key).await;
-            answer.ok().map(|answer| answer.message)
+            answer.ok().map(Incoming::into_message)
         }
         None => std::future::pending().await,
     }

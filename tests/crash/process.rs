@@ -210,16 +210,16 @@ fn fill(id: u64, content: &mut [u8]) {
 }
 
 fn take(incoming: &Incoming, own: &str) {
-    let content = incoming.message.content().cloned().unwrap_or_default();
+    let content = incoming.message().content().cloned().unwrap_or_default();
     // Other performatives report failures.
-    if incoming.message.performative() != &Performative::Inform {
+    if incoming.message().performative() != &Performative::Inform {
         return;
     }
     let Some(head) = content.first_chunk() else {
         return say!("corrupt 0");
     };
     let id = u64::from_le_bytes(*head);
-    let mut receivers = incoming.message.receivers().iter();
+    let mut receivers = incoming.message().receivers().iter();
     let index = receivers.position(|receiver| receiver.name() == own);
     let mut expected = vec![0; content.len()];
     fill(id, &mut expected);

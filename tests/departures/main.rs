@@ -187,7 +187,7 @@ async fn a_participant_learns_that_its_initiator_was_killed() {
     let domain = Domain::open(&config(&host)).await.unwrap();
     let rover = domain.register("rover").await.unwrap();
     let mut starter = Process::start("starter", &host);
-    let first = rover.receive().await.unwrap().message;
+    let first = rover.receive().await.unwrap().into_message();
     let mut task = rover.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     starter.kill();
@@ -206,7 +206,7 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let mut request = rover.request(request, PATIENCE).await.unwrap();
-        let first = arm.receive().await.unwrap().message;
+        let first = arm.receive().await.unwrap().into_message();
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         assert!(request.agreed().await.unwrap());
@@ -231,7 +231,7 @@ async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let request = rover.request(request, PATIENCE).await.unwrap();
-        let first = arm.receive().await.unwrap().message;
+        let first = arm.receive().await.unwrap().into_message();
         let done = arm.reply(&first, Performative::Inform).content("done");
         arm.send(done.build().unwrap()).await.unwrap();
         drop(arm);

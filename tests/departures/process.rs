@@ -81,7 +81,7 @@ async fn agent(config: &Config, name: &str, finish: &Arc<Semaphore>) {
         tokio::spawn(start(Arc::clone(&agent)));
     }
     loop {
-        let first = agent.receive().await.unwrap().message;
+        let first = agent.receive().await.unwrap().into_message();
         say(&format!("got {}", first.performative()));
         if let Ok(task) = agent.take_part(&first) {
             tokio::spawn(take_part(task, first, Arc::clone(finish)));

@@ -17,7 +17,7 @@ fn between<T: Send + 'static>(
     let rover = here.register("rover").unwrap();
     let arm = there.register("arm").unwrap();
     let arm = thread::spawn(move || {
-        let first = arm.receive().unwrap().message;
+        let first = arm.receive().unwrap().into_message();
         arm_does(&arm, &first)
     });
     rover_does(&rover);
@@ -41,7 +41,7 @@ fn a_request_is_answered_and_another_cancelled() {
             task.agree("").unwrap();
             assert_eq!(text(task.message()), "a crate");
             task.reply(Reply::Inform("lifted".into())).unwrap();
-            let second = arm.receive().unwrap().message;
+            let second = arm.receive().unwrap().into_message();
             let mut task = arm.take_part(&second).unwrap();
             task.agree("").unwrap();
             let mut asked = 1;
@@ -81,7 +81,7 @@ fn query_request_when_propose_and_subscribe() {
                     task.agree("").unwrap();
                 }
                 task.reply(reply).unwrap();
-                first = arm.receive().unwrap().message;
+                first = arm.receive().unwrap().into_message();
             }
             let mut task = arm.take_part(&first).unwrap();
             task.agree("").unwrap();
@@ -114,7 +114,7 @@ fn contract_nets() {
             let mut task = arm.take_part(first).unwrap();
             assert!(task.propose("10", PATIENCE).unwrap());
             task.reply(Reply::Inform("done".into())).unwrap();
-            let call = arm.receive().unwrap().message;
+            let call = arm.receive().unwrap().into_message();
             let mut task = arm.take_part(&call).unwrap();
             assert!(!task.propose("10", PATIENCE).unwrap());
             assert!(task.next_call(PATIENCE).unwrap().is_some());
@@ -146,7 +146,7 @@ fn auctions() {
             assert!(task.next_call(PATIENCE).unwrap().is_some());
             assert!(task.propose("", PATIENCE).unwrap());
             assert!(task.next_call(PATIENCE).unwrap().is_none());
-            let opening = arm.receive().unwrap().message;
+            let opening = arm.receive().unwrap().into_message();
             let mut second = arm.take_part(&opening).unwrap();
             assert!(second.next_call(PATIENCE).unwrap().is_some());
             assert!(second.propose("", PATIENCE).unwrap());
@@ -187,7 +187,7 @@ fn brokering_and_recruiting() {
             task.inform("passed on").unwrap();
             let answer = broker.message(Performative::Confirm).build().unwrap();
             task.forward(&answer).unwrap();
-            let second = broker.receive().unwrap().message;
+            let second = broker.receive().unwrap().into_message();
             let mut task = broker.take_part(&second).unwrap();
             task.agree("").unwrap();
             task.pass_on(query(), PATIENCE).unwrap();

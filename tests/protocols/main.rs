@@ -92,7 +92,7 @@ async fn a_request_is_agreed_to_and_answered() {
         assert_eq!(text(&request.result().await.unwrap()), "lifted");
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().into_message();
         assert_eq!(first.protocol(), Some("fipa-request"));
         assert!(first.reply_by().is_some() && first.reply_with().is_some());
         let handler = async |task: &mut Task| {
@@ -145,7 +145,7 @@ async fn each_kind_of_answer_yields_its_result_or_error() {
             Reply::Accept("".into()),
             Reply::Reject("".into()),
         ] {
-            let first = next_message(&arm).await.unwrap().message;
+            let first = next_message(&arm).await.unwrap().into_message();
             let when = *first.performative() == Performative::RequestWhen;
             let handler = async |task: &mut Task| {
                 if when {
@@ -168,15 +168,15 @@ async fn missing_and_invalid_answers_are_errors() {
         request.result().await,
         Err(DialogueError::TimedOut)
     ));
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     // No call leads the conversation, so its message goes to `receive`.
     let late = arm.reply(&first, Performative::Agree).build().unwrap();
     assert!(arm.send(late).await.unwrap().all_succeeded());
-    let late = next_message(&rover).await.unwrap().message;
+    let late = next_message(&rover).await.unwrap().into_message();
     assert_eq!(*late.performative(), Performative::Agree);
 
     let request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     let invalid = arm.reply(&first, Performative::Propose).build().unwrap();
     arm.send(invalid).await.unwrap();
     match request.result().await {
@@ -187,7 +187,7 @@ async fn missing_and_invalid_answers_are_errors() {
         other => panic!("{other:?}"),
     }
     let request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     let answer = arm
         .reply(&first, Performative::NotUnderstood)
         .build()
@@ -197,7 +197,7 @@ async fn missing_and_invalid_answers_are_errors() {
     assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
     // A reply that violates the protocol is not sent.
     let _request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     let wrong = respond(&arm, &first, async |_| Ok(Reply::Accept("".into()))).await;
     assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
 }
@@ -207,13 +207,13 @@ async fn other_messages_are_received_during_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     for number in 0..5 {
         let note = to(&arm, Performative::Inform, &rover, &number.to_string());
         arm.send(note.build().unwrap()).await.unwrap();
     }
     // Read before the result, and after it.
-    let early = next_message(&rover).await.unwrap().message;
+    let early = next_message(&rover).await.unwrap().into_message();
     assert_eq!(text(&early), "0");
     let result = tokio::join!(request.result(), async {
         respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
@@ -222,7 +222,7 @@ async fn other_messages_are_received_during_a_conversation() {
     });
     assert_eq!(text(&result.0.unwrap()), "done");
     for number in 1..5 {
-        let note = rover.try_receive().unwrap().unwrap().message;
+        let note = rover.try_receive().unwrap().unwrap().into_message();
         assert_eq!(text(&note), number.to_string());
     }
     assert!(rover.try_receive().unwrap().is_none());
@@ -237,7 +237,7 @@ async fn a_conversation_blocked_by_unread_messages_ends_with_the_domain() {
         tokio::time::timeout(PATIENCE, poses.next()).await.unwrap()
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().into_message();
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         // As many messages as can be set aside for `receive`, which the rover does not call.
@@ -266,7 +266,7 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
         poses.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().into_message();
         let handler = async |task: &mut Task| {
             task.agree("").await?;
             for number in 0..10 {
@@ -290,7 +290,7 @@ async fn a_request_is_cancelled() {
         request.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().into_message();
         let handler = async |task: &mut Task| {
             task.agree("").await?;
             tokio::select! {
@@ -316,7 +316,7 @@ async fn a_contract_net_with_several_participants() {
     called.push(AgentId::new("unknown").unwrap());
     let participants = async {
         let bid = async |arm: &Agent, price: &'static str| {
-            let call = next_message(arm).await.unwrap().message;
+            let call = next_message(arm).await.unwrap().into_message();
             respond(arm, &call, async |task| {
                 if task.propose(price, PATIENCE).await? {
                     return Ok(Reply::Inform("carried".into()));
@@ -327,7 +327,7 @@ async fn a_contract_net_with_several_participants() {
             .unwrap();
         };
         let refuse = async |arm: &Agent| {
-            let call = next_message(arm).await.unwrap().message;
+            let call = next_message(arm).await.unwrap().into_message();
             let answer = respond(arm, &call, async |_| Ok(Reply::Refuse("no".into())));
             answer.await.unwrap();
         };
@@ -383,7 +383,7 @@ async fn enforcing_refuses_to_send_messages_that_violate_a_protocol() {
         .build()
         .unwrap();
     arm.send(note).await.unwrap();
-    assert_eq!(text(&next_message(&rover).await.unwrap().message), "hello");
+    assert_eq!(text(next_message(&rover).await.unwrap().message()), "hello");
 }
 
 /// Registers agents in a process that checks messages, and in one that does not.
@@ -416,8 +416,8 @@ async fn a_received_message_that_violates_a_protocol_is_returned_as_a_violation(
         incoming.violation().unwrap().kind,
         ViolationKind::OutOfOrder
     );
-    assert_eq!(*incoming.message.performative(), Performative::Inform);
-    let answer = next_message(&arm).await.unwrap().message;
+    assert_eq!(*incoming.message().performative(), Performative::Inform);
+    let answer = next_message(&arm).await.unwrap().into_message();
     assert_eq!(*answer.performative(), Performative::NotUnderstood);
     assert!(text(&answer).contains("expected refuse, propose from arm to rover"));
 }
@@ -442,7 +442,7 @@ async fn violations_pass_and_are_marked_if_the_check_is_warn() {
     rover.send(illegal).await.unwrap();
     let incoming = next_message(&arm).await.unwrap();
     assert_eq!(
-        *incoming.message.performative(),
+        *incoming.message().performative(),
         Performative::AcceptProposal
     );
     assert!(incoming.violation().is_none(), "the arm does not check");
@@ -487,7 +487,7 @@ async fn protocols_of_the_configuration_are_read_and_checked() {
     let (rover, arm) = pair(&[&set]).await;
     let propose = message(&rover, Performative::Propose, &arm);
     rover.send(propose).await.unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     let mut task = arm.take_part(&first).unwrap();
     let inform = message(&rover, Performative::Inform, &arm);
     rover.send(inform).await.unwrap();

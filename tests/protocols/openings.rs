@@ -16,7 +16,7 @@ fn ids(names: &[&str]) -> Vec<AgentId> {
 
 /// Proposes the own name, and carries if the proposal is accepted.
 async fn bid(arm: &Agent) {
-    let call = next_message(arm).await.unwrap().message;
+    let call = next_message(arm).await.unwrap().into_message();
     let name = arm.name().to_owned();
     respond(arm, &call, async |task| {
         Ok(match task.propose(name, PATIENCE).await? {
@@ -103,7 +103,7 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
         .form("platoon", ["arm_1", "arm_2"], None, options)
         .unwrap();
     let bidder = async |arm: &Agent| {
-        let opening = next_message(arm).await.unwrap().message;
+        let opening = next_message(arm).await.unwrap().into_message();
         let mut task = arm.take_part(&opening).unwrap();
         assert!(task.next_call(PATIENCE).await.unwrap().is_some());
         task.propose("", PATIENCE).await.unwrap();
@@ -146,7 +146,7 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
     for one in ["led", ".*_2"] {
         let lift = rover.message(Performative::Request).receivers(ids(&[one]));
         let request = rover.request(lift, PATIENCE).await.unwrap();
-        let first = next_message(&arms[1]).await.unwrap().message;
+        let first = next_message(&arms[1]).await.unwrap().into_message();
         respond(&arms[1], &first, async |_| Ok(Reply::Inform("done".into())))
             .await
             .unwrap();
@@ -170,7 +170,7 @@ async fn only_a_message_that_opens_a_protocol_becomes_a_task() {
         let message = to(&rover, act.clone(), &arm, "").protocol(protocol);
         let message = message.conversation_id(format!("c-{act}")).build().unwrap();
         rover.send(message).await.unwrap();
-        let message = next_message(&arm).await.unwrap().message;
+        let message = next_message(&arm).await.unwrap().into_message();
         let refused = arm.take_part(&message);
         assert!(
             matches!(&refused, Err(DialogueError::NotOpening(_))),
@@ -190,7 +190,7 @@ async fn a_dropped_task_tells_its_initiator() {
     let ask = async |act| {
         let request = rover.request(to(&rover, act, &arm, "lift"), PATIENCE);
         let request = request.await.unwrap();
-        let first = next_message(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().into_message();
         (request, arm.take_part(&first).unwrap())
     };
     let (request, task) = ask(Performative::Request).await;
@@ -214,7 +214,7 @@ async fn a_dropped_task_tells_its_initiator() {
     // A bidder whose proposal is not decided on yet.
     let (dropped, is_dropped) = tokio::sync::oneshot::channel();
     let bidder = async {
-        let call = next_message(&arm).await.unwrap().message;
+        let call = next_message(&arm).await.unwrap().into_message();
         let mut task = arm.take_part(&call).unwrap();
         let late = task.propose("10", Duration::from_millis(50)).await;
         assert!(matches!(late, Err(DialogueError::TimedOut)));
@@ -302,7 +302,7 @@ async fn a_server_runs_a_handler_for_each_opening() {
     // Other messages, and openings of other protocols, go to `receive`.
     let note = to(&rover, Performative::Inform, &arm, "note");
     rover.send(note.build().unwrap()).await.unwrap();
-    assert_eq!(text(&next_message(&arm).await.unwrap().message), "note");
+    assert_eq!(text(next_message(&arm).await.unwrap().message()), "note");
     assert!(server.running() <= 1);
     drop(arm);
     let ended = tokio::time::timeout(PATIENCE, server.ended()).await;
@@ -349,7 +349,7 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
         let heat = other.message(Performative::Subscribe).receiver(battery);
         let _ = other.subscribe(heat.content("heat"), PATIENCE).await;
     });
-    let heat = next_message(&battery).await.unwrap().message;
+    let heat = next_message(&battery).await.unwrap().into_message();
     assert_eq!(text(&heat), "heat");
     unserved.abort();
 
@@ -388,7 +388,7 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     let mallory = arm.domain().register("mallory").await.unwrap();
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     let id = request.conversation_id().to_owned();
     for act in [Performative::Inform, Performative::Failure] {
         let forged = to(&mallory, act, &rover, "forged")
@@ -402,7 +402,7 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     let answered = async {
         // The forged messages arrive first.
         for _ in 0..2 {
-            let forged = next_message(&rover).await.unwrap().message;
+            let forged = next_message(&rover).await.unwrap().into_message();
             assert_eq!(forged.sender().unwrap().name(), "mallory");
         }
         respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
@@ -418,15 +418,15 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
         .protocol("fipa-request")
         .conversation_id(request.conversation_id());
     mallory.send(opening.build().unwrap()).await.unwrap();
-    let opening = next_message(&rover).await.unwrap().message;
+    let opening = next_message(&rover).await.unwrap().into_message();
     let task = rover.take_part(&opening).unwrap();
-    let first = next_message(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().into_message();
     respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
         .await
         .unwrap();
     assert_eq!(text(&request.result().await.unwrap()), "done");
     task.reply(Reply::Refuse("no".into())).await.unwrap();
-    let refused = next_message(&mallory).await.unwrap().message;
+    let refused = next_message(&mallory).await.unwrap().into_message();
     assert_eq!(*refused.performative(), Performative::Refuse);
 }
 

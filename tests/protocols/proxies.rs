@@ -31,7 +31,7 @@ fn query(from: &Agent, arm: &str) -> MessageBuilder {
 
 /// Agrees to a query and answers it.
 async fn answer(arm: &Agent) -> Message {
-    let first = next_message(arm).await.unwrap().message;
+    let first = next_message(arm).await.unwrap().into_message();
     assert_eq!(first.protocol(), Some("fipa-query"));
     respond(arm, &first, async |task| {
         task.agree("wait").await?;
@@ -59,7 +59,7 @@ async fn a_broker_forwards_answers() {
         assert!(matches!(&failed, Err(DialogueError::Failed(why)) if text(why) == "no more"));
     };
     let goes_between = async {
-        let first = next_message(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().into_message();
         let mut task = broker.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         let lost = task.pass_on(query(&broker, "unknown"), PATIENCE).await;
@@ -99,7 +99,7 @@ async fn recruited_agents_answer_the_initiator_directly() {
     };
     let (early, answered) = tokio::sync::oneshot::channel();
     let goes_between = async {
-        let first = next_message(&recruiter).await.unwrap().message;
+        let first = next_message(&recruiter).await.unwrap().into_message();
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&recruiter, "arm"), PATIENCE)
@@ -121,7 +121,7 @@ async fn recruited_agents_answer_the_initiator_directly() {
 
 /// Passes a call for proposals on to the arm, with this agent as its `reply-to`.
 async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
-    let first = next_message(recruiter).await.unwrap().message;
+    let first = next_message(recruiter).await.unwrap().into_message();
     let mut task = recruiter.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     let mut call = recruiter
@@ -137,7 +137,7 @@ async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
 }
 
 async fn propose(arm: &Agent) {
-    let first = next_message(arm).await.unwrap().message;
+    let first = next_message(arm).await.unwrap().into_message();
     respond(arm, &first, async |task| {
         assert!(task.propose("20", PATIENCE).await?);
         Ok(Reply::Inform(task.message().content().unwrap().clone()))
@@ -175,7 +175,7 @@ async fn a_designated_receiver_accepts_the_proposal_of_a_recruited_agent() {
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let designated = async {
-        let proposal = next_message(&base).await.unwrap().message;
+        let proposal = next_message(&base).await.unwrap().into_message();
         assert_eq!(*proposal.performative(), Performative::Propose);
         let accept = base.reply(&proposal, Performative::AcceptProposal);
         let accept = accept.content("do").build().unwrap();
@@ -183,7 +183,7 @@ async fn a_designated_receiver_accepts_the_proposal_of_a_recruited_agent() {
         // The protocol is enforced as for agents that began the conversation.
         let again = base.send(accept).await;
         assert!(matches!(again, Err(SendError::Violation(_))), "{again:?}");
-        let done = next_message(&base).await.unwrap().message;
+        let done = next_message(&base).await.unwrap().into_message();
         assert_eq!(*done.performative(), Performative::Inform);
     };
     let goes_between = recruit(&recruiter, Some(&base));
@@ -199,7 +199,7 @@ async fn recruited_agents_answer_the_designated_receiver() {
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = next_message(&recruiter).await.unwrap().message;
+        let first = next_message(&recruiter).await.unwrap().into_message();
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         let query = query(&recruiter, "arm").reply_to(base.id().clone());
@@ -208,7 +208,7 @@ async fn recruited_agents_answer_the_designated_receiver() {
     };
     let designated = async {
         for act in [Performative::Agree, Performative::Inform] {
-            let answer = next_message(&base).await.unwrap().message;
+            let answer = next_message(&base).await.unwrap().into_message();
             assert_eq!(*answer.performative(), act);
             assert_eq!(answer.sender().unwrap().name(), "arm");
         }
@@ -229,11 +229,11 @@ async fn a_broker_or_recruiter_may_refuse_or_find_no_agent() {
         assert!(matches!(silent.err(), Some(DialogueError::TimedOut)));
     };
     let goes_between = async {
-        let first = next_message(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().into_message();
         respond(&broker, &first, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
-        let first = next_message(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().into_message();
         respond(&broker, &first, async |task| {
             task.agree("").await?;
             Ok(Reply::Failure("no match".into()))
@@ -253,7 +253,7 @@ async fn brokering_is_cancelled() {
         answers.cancel(PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = next_message(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().into_message();
         let mut task = broker.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();

@@ -22,6 +22,11 @@ impl<'a> AgentIdView<'a> {
         Self { name, parts }
     }
 
+    /// Returns the encoding and the encoded parts behind the name.
+    pub(super) fn encoded_parts(&self) -> (Encoding, &'a [u8]) {
+        (self.parts.encoding, self.parts.rest)
+    }
+
     /// Name of the agent.
     #[must_use]
     pub fn name(&self) -> Text<'a> {
@@ -76,10 +81,10 @@ impl<'a> AgentIdView<'a> {
 
 /// The agent identifiers of a set or sequence in an encoded message or envelope.
 #[derive(Debug, Clone, Default)]
-pub struct AgentIds<'a>(Set<'a>);
+pub struct AgentIds<'a>(pub(super) Set<'a>);
 
 #[derive(Debug, Clone, Default)]
-enum Set<'a> {
+pub(super) enum Set<'a> {
     #[default]
     Empty,
     BitEfficient(&'a [u8]),

@@ -5,6 +5,7 @@
 
 mod agent_id;
 mod content;
+mod index;
 mod text;
 
 use std::borrow::Cow;
@@ -14,6 +15,7 @@ use bytes::Bytes;
 pub use agent_id::{AgentIdView, AgentIds};
 pub(crate) use agent_id::{Encoding, List, Part, check_name};
 pub(crate) use content::{Content, check_base64};
+pub use index::MessageIndex;
 pub use text::Text;
 
 use crate::error::{DecodeError, Problem};
@@ -250,6 +252,15 @@ impl<'a> MessageView<'a> {
                 .user_defined()
                 .map(|(name, value)| (name.as_str().into_owned(), value.as_str().into_owned()))
                 .collect(),
+        })
+    }
+
+    /// Converts the view of a checked message to an owned message. The reader has checked all that the
+    /// conversion checks, so the message with the performative alone is never used.
+    fn to_checked_message(&self, payload: &Payload) -> Message {
+        self.to_message(payload).unwrap_or_else(|error| {
+            debug_assert!(false, "a checked message is not whole: {error}");
+            Message::empty(self.performative())
         })
     }
 

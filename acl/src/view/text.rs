@@ -14,12 +14,12 @@ use crate::xml;
 /// [`as_str`](Self::as_str) borrows most texts. It allocates a text with escapes, a number or an
 /// expression.
 #[derive(Clone, Copy)]
-pub struct Text<'a>(Repr<'a>);
+pub struct Text<'a>(pub(super) Repr<'a>);
 
 /// The encoded bytes of a text. The reader has checked that they are UTF-8. They are not a `str`
 /// because making one checks them again, and many texts are never accessed.
 #[derive(Clone, Copy)]
-enum Repr<'a> {
+pub(super) enum Repr<'a> {
     /// The text itself.
     Plain(&'a [u8]),
     /// A `String 00` of the bit-efficient encodings: in quotation marks, behind a byte count, or

@@ -26,7 +26,24 @@ pub(crate) struct AgentSet<'a> {
     any: bool,
 }
 
-impl AgentSet<'_> {
+impl<'a> AgentSet<'a> {
+    /// Separates the set from the bytes of its document.
+    pub(crate) fn take_bytes(&self) -> (&'a [u8], AgentSet<'static>) {
+        (self.bytes, self.with_bytes(&[]))
+    }
+
+    /// Returns the set with other bytes.
+    pub(crate) fn with_bytes<'b>(&self, bytes: &'b [u8]) -> AgentSet<'b> {
+        AgentSet {
+            bytes,
+            at: self.at,
+            end: self.end,
+            tag: self.tag,
+            inside: self.inside,
+            any: self.any,
+        }
+    }
+
     /// Adds the agents in later elements of the same document.
     pub(crate) fn add(&mut self, others: &Self) {
         self.end = others.end;

@@ -83,7 +83,7 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
             Ok(incoming) => {
                 received += 1;
                 output::text(&line(&incoming))?;
-                if requires_answer(&incoming.message) {
+                if requires_answer(incoming.message()) {
                     answer(agent, &incoming).await;
                 }
             }
@@ -101,8 +101,8 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
 
 fn line(incoming: &Incoming) -> String {
     match incoming.via {
-        Some(via) => format!("via {via}: {}\n", incoming.message),
-        None => format!("{}\n", incoming.message),
+        Some(via) => format!("via {via}: {}\n", incoming.message()),
+        None => format!("{}\n", incoming.message()),
     }
 }
 
@@ -119,7 +119,7 @@ fn requires_answer(message: &Message) -> bool {
 
 /// Answers a message. A failed answer does not end the agent.
 async fn answer(agent: &Agent, incoming: &Incoming) {
-    let message = &incoming.message;
+    let message = incoming.message();
     // `Agent::reply` would set reply-with, which requests an answer to the answer.
     let reply = message.reply(Performative::Inform);
     let mut reply = reply.sender(agent.id().clone());

@@ -189,7 +189,7 @@ async fn converse(
         _ if arguments.json => {
             let mut json = json!({ "deliveries": output::deliveries(&deliveries) });
             if let Some(reply) = &answers.reply {
-                json["reply"] = message_to_json(&reply.message);
+                json["reply"] = message_to_json(reply.message());
             }
             if !answers.failures.is_empty() {
                 let failures = answers.failures.iter().map(FailureMessage::json);
@@ -200,7 +200,7 @@ async fn converse(
             }
             output::json(&json)?;
         }
-        Some(reply) => output::text(&format!("reply: {}\n", reply.message))?,
+        Some(reply) => output::text(&format!("reply: {}\n", reply.message()))?,
         None => {}
     }
     let without_reply = arguments.wait && any_succeeded && answers.timed_out;
@@ -330,8 +330,8 @@ async fn wait(
                 Ok(incoming) if incoming.violation().is_some() => {}
                 // A message of this process to its own agent; the outcomes have it already.
                 Ok(incoming) if incoming.via.is_none() => {}
-                Ok(incoming) if incoming.message.is_reply_to(message) => {
-                    match FailureMessage::of(&incoming.message) {
+                Ok(incoming) if incoming.message().is_reply_to(message) => {
+                    match FailureMessage::of(incoming.message()) {
                         Some(failure) => answers.failures.push(failure),
                         None => {
                             answers.reply = Some(incoming);
@@ -339,7 +339,7 @@ async fn wait(
                         }
                     }
                 }
-                Ok(other) => report::warn(&format!("ignored, not a reply: {}", other.message)),
+                Ok(other) => report::warn(&format!("ignored, not a reply: {}", other.message())),
                 Err(error) => {
                     return Err(Failure::failed(
                         format!("cannot wait for a reply: {}", ErrorChain(&error)),

@@ -183,7 +183,7 @@ impl Fleet {
         let (agent, accounts) = (Arc::clone(&self.parties[at].agent), self.accounts.clone());
         let task = async move {
             loop {
-                let message = agent.receive().await.unwrap().message;
+                let message = agent.receive().await.unwrap().into_message();
                 // A failed letter causes a failure message, too.
                 if *message.performative() != Performative::Inform {
                     continue;

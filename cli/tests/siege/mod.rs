@@ -319,7 +319,7 @@ impl Party {
             let mut taken = HashSet::new();
             loop {
                 let content = match agent.receive().await {
-                    Ok(incoming) => honest(&incoming.message).map(|it| (it, incoming)),
+                    Ok(incoming) => honest(incoming.message()).map(|it| (it, incoming)),
                     Err(_) => return,
                 };
                 let Some((content, incoming)) = content else {
@@ -327,7 +327,7 @@ impl Party {
                     continue;
                 };
                 assert!(taken.insert(content.clone()), "received twice: {content}");
-                let answer = agent.reply(&incoming.message, Performative::Inform);
+                let answer = agent.reply(incoming.message(), Performative::Inform);
                 // The other agent checks that the answer arrives.
                 drop(agent.send(answer.content(content).build().unwrap()));
             }
@@ -418,7 +418,7 @@ async fn round(agent: &Agent, to: &AgentId) -> Duration {
     let answered = async {
         loop {
             let incoming = agent.receive().await.unwrap();
-            if honest(&incoming.message).as_deref() == Some(&content) {
+            if honest(incoming.message()).as_deref() == Some(&content) {
                 return begun.elapsed();
             }
         }

@@ -252,7 +252,7 @@ fn id_in(content: &[u8]) -> Option<Id> {
 }
 
 fn take(shared: &Shared, agent: u64, incoming: &Incoming) {
-    let message = &incoming.message;
+    let message = incoming.message();
     // Gateways report failures in messages.
     if ![Performative::Inform, FORBIDDEN].contains(message.performative()) {
         return;

@@ -188,7 +188,7 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
                 Ok(incoming) => {
                     received += 1;
                     // Messages of a measurement are counted, but not reported.
-                    if incoming.message.protocol() != Some(MEASURING) {
+                    if incoming.message().protocol() != Some(MEASURING) {
                         emit(&Event::Received(received_message(&incoming)));
                     }
                     if let Err(error) = answer(&agent, &incoming).await {
@@ -367,7 +367,7 @@ async fn measure(agent: &Agent, to: &str, len: usize, rounds: usize) -> Result<E
 }
 
 fn received_message(incoming: &Incoming) -> Received {
-    let message = &incoming.message;
+    let message = incoming.message();
     let content = message.content().cloned().unwrap_or_default();
     let sent = message
         .user_defined()
@@ -412,7 +412,7 @@ fn is_in_shared_memory(bytes: &[u8]) -> bool {
 
 /// The participant's side of fipa-request (FIPA00026): agree, then inform of the result.
 async fn answer(agent: &Agent, incoming: &Incoming) -> Result<(), String> {
-    let message = &incoming.message;
+    let message = incoming.message();
     let is_request = *message.performative() == Performative::Request
         && message.protocol() == Some("fipa-request");
     if !is_request {
