@@ -69,6 +69,7 @@ mod check;
 mod effective;
 mod error;
 mod keys;
+mod machine;
 mod reader;
 mod sources;
 #[cfg(test)]

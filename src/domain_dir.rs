@@ -2,7 +2,8 @@
 //!
 //! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `/tmp/fipa-<uid>/<domain>`, which is the same for a
 //! login shell and a service of the same user. Both levels belong to the user and have mode 0700.
-//! The last process that leaves removes them.
+//! The last process that leaves removes them, but never `$FIPA_RUNTIME_DIR` itself, which belongs to
+//! its owner.
 //!
 //! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which
 //! systemd-tmpfiles respects, and renews the timestamps once a day for other cleaners.
@@ -48,6 +49,8 @@ const MAX_HOST: usize = 128;
 #[derive(Debug, Clone)]
 pub(crate) struct DomainDir {
     base: PathBuf,
+    /// Whether the owner named the base (`$FIPA_RUNTIME_DIR`), so that it is never removed.
+    is_named: bool,
     domain: String,
     /// The locks; set when the process has joined.
     locks: Option<Arc<DirLocks>>,
@@ -75,16 +78,14 @@ pub enum DomainDirError {
         source: io::Error,
     },
     /// Other users could read or change the contents of the directory.
-    #[error(
-        "{} must be a directory of this user with mode 700, but {problem}; remove it, or set \
-         FIPA_RUNTIME_DIR to another directory",
-        path.display()
-    )]
+    #[error("{} cannot be used: {problem}; {remedy}", path.display())]
     NotPrivate {
         /// The directory.
         path: PathBuf,
         /// The violated requirement, for example `its mode is 755`.
         problem: String,
+        /// The remedy, for example `run: chmod 700 /run/fipa`.
+        remedy: String,
     },
 }
 
@@ -110,12 +111,15 @@ impl DomainDir {
 
     /// Returns the directory of a domain without creating or examining it.
     pub(crate) fn of(domain: &str) -> Self {
-        let base = match std::env::var_os(VARIABLE).filter(|value| !value.is_empty()) {
+        let named = std::env::var_os(VARIABLE).filter(|value| !value.is_empty());
+        let is_named = named.is_some();
+        let base = match named {
             Some(base) => PathBuf::from(base),
             None => PathBuf::from(format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw())),
         };
         Self {
             base,
+            is_named,
             domain: domain.to_owned(),
             locks: None,
         }
@@ -254,7 +258,8 @@ impl DomainDir {
         names.all(|entry| entry.is_ok_and(|entry| entry.file_name() == HOST))
     }
 
-    /// Removes the empty directories. Those that other processes use are not empty and stay.
+    /// Removes the empty directories. Those that other processes use are not empty and stay, as does a
+    /// directory that the owner named.
     pub(crate) fn leave(&self) {
         // Fails if the directory is not empty or does not exist, and then nothing is to be done.
         let remove = |path: PathBuf| drop(fs::remove_dir(path));
@@ -265,7 +270,9 @@ impl DomainDir {
             let _ = fs::remove_file(self.path().join(HOST));
         }
         remove(self.path());
-        remove(self.base.clone());
+        if !self.is_named {
+            remove(self.base.clone());
+        }
     }
 }
 
@@ -370,20 +377,54 @@ fn check_private(path: &Path) -> Result<(), DomainDirError> {
         source,
     };
     let metadata = fs::symlink_metadata(path).map_err(io_error)?;
-    let problem = if metadata.is_symlink() {
-        "it is a symbolic link".to_owned()
+    let (problem, remedy) = if metadata.is_symlink() {
+        ("it is a symbolic link".to_owned(), ANOTHER.to_owned())
     } else if !metadata.is_dir() {
-        "it is a file".to_owned()
+        ("it is a file".to_owned(), ANOTHER.to_owned())
     } else if metadata.uid() != rustix::process::geteuid().as_raw() {
-        format!("it belongs to user {}", metadata.uid())
+        let owner = user_name(metadata.uid());
+        let problem = format!("it belongs to {owner}, and a domain belongs to one user");
+        let remedy = format!("run all processes of the domain as {owner}, or {ANOTHER}");
+        (problem, remedy)
     } else if metadata.mode() & 0o077 != 0 {
-        format!("its mode is {:03o}", metadata.mode() & 0o777)
+        let problem = format!(
+            "its mode is {:03o}, with which other users can enter it",
+            metadata.mode() & 0o777
+        );
+        let remedy = format!(
+            "run: chmod 700 {} (systemd: RuntimeDirectoryMode=0700)",
+            path.display()
+        );
+        (problem, remedy)
     } else {
         return Ok(());
     };
     Err(DomainDirError::NotPrivate {
         path: path.to_owned(),
         problem,
+        remedy,
+    })
+}
+
+/// The remedy for a directory that this user cannot repair.
+const ANOTHER: &str = "set FIPA_RUNTIME_DIR to another directory of this user";
+
+/// Returns the name of a user with its identifier. Users that are not in `/etc/passwd` have no name.
+pub(crate) fn user_name(uid: u32) -> String {
+    let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
+    match name_in(&users, uid) {
+        Some(name) => format!("user {} ({uid})", fipa_acl::escape(name)),
+        None => format!("user {uid}"),
+    }
+}
+
+/// Finds the name of a user in the text of `/etc/passwd`.
+fn name_in(users: &str, uid: u32) -> Option<&str> {
+    users.lines().find_map(|line| {
+        let mut fields = line.split(':');
+        let name = fields.next().filter(|name| !name.is_empty())?;
+        let found = fields.nth(1)?;
+        (found.parse() == Ok(uid)).then_some(name)
     })
 }
 
@@ -420,6 +461,7 @@ mod tests {
     fn prefixes_differ_by_domain_and_base() {
         let dir = |base: &str, domain: &str| DomainDir {
             base: base.into(),
+            is_named: false,
             domain: domain.into(),
             locks: None,
         };
@@ -433,6 +475,7 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let dir = DomainDir {
             base: home.path().join("base"),
+            is_named: false,
             domain: "domain".to_owned(),
             locks: None,
         };
@@ -466,6 +509,32 @@ mod tests {
         fs::remove_dir(dir.base.join("another")).unwrap();
         dir.leave();
         assert!(!dir.base.exists());
+    }
+
+    #[test]
+    fn a_directory_that_the_owner_named_is_not_removed() {
+        let (_home, dir) = created();
+        let named = DomainDir {
+            is_named: true,
+            ..dir
+        };
+        named.leave();
+        assert!(named.base.exists());
+        assert!(!named.path().exists());
+    }
+
+    #[test]
+    fn the_remedy_names_the_mode_or_the_user() {
+        let home = tempfile::tempdir().unwrap();
+        fs::set_permissions(home.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        let error = check_private(home.path()).unwrap_err().to_string();
+        let remedy = format!("chmod 700 {}", home.path().display());
+        assert!(error.contains(&remedy), "{error}");
+        assert!(error.contains("RuntimeDirectoryMode=0700"), "{error}");
+        let users = "root:x:0:0:root:/root:/bin/sh\nrobot:x:1001:1001::/home/robot:/bin/sh\n";
+        assert_eq!(name_in(users, 1001), Some("robot"));
+        assert_eq!(name_in(users, 1), None);
+        assert_eq!(name_in("broken\n:x:5\n", 5), None);
     }
 
     #[test]

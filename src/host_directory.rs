@@ -6,6 +6,26 @@ use fipa_sds::{Cancellation, HostConfig, HostDirectory, HostError};
 
 use crate::domain_dir::{DomainDir, RETRIES};
 use crate::error::OpenError;
+use crate::{Config, Domain};
+
+impl Domain {
+    /// Returns the names of the agents of a domain that its processes on this host list, sorted, without
+    /// joining the domain: it takes milliseconds, creates nothing and waits for no process. With a running
+    /// gateway the agents of other hosts are included. Meant for the completion of command lines.
+    ///
+    /// # Errors
+    /// If the directory of the domain cannot be used.
+    pub fn names(config: &Config) -> Result<Vec<String>, OpenError> {
+        let dir = DomainDir::of(&config.domain);
+        if !dir.exists()? {
+            return Ok(Vec::new());
+        }
+        let entries = HostDirectory::peek(&dir.part("directory"))?;
+        let mut names: Vec<String> = entries.iter().map(|entry| entry.name.to_string()).collect();
+        names.dedup();
+        Ok(names)
+    }
+}
 
 /// Creates the directory of the domain and joins the agent directory of the host in it.
 pub(crate) fn join(

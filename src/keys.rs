@@ -320,6 +320,39 @@ impl Keys {
     /// # Errors
     /// If no certificate matches, or if several match a fingerprint.
     pub fn revoke(&self, which: &str) -> Result<Vec<Certificate>, KeysError> {
+        let meant = self.trusted_as(which)?;
+        make_private(&self.dir.join("revoked"))?;
+        for certificate in &meant {
+            let fingerprint = certificate.fingerprint();
+            let (from, to) = (
+                self.file("trusted", fingerprint),
+                self.file("revoked", fingerprint),
+            );
+            rename(&from, &to)?;
+        }
+        Ok(meant)
+    }
+
+    /// Ends the trust in certificates, which [`trust`](Self::trust) can restore: those that
+    /// [`revoke`](Self::revoke) would revoke.
+    ///
+    /// # Errors
+    /// As for [`revoke`](Self::revoke).
+    pub fn distrust(&self, which: &str) -> Result<Vec<Certificate>, KeysError> {
+        let meant = self.trusted_as(which)?;
+        for certificate in &meant {
+            let path = self.file("trusted", certificate.fingerprint());
+            fs::remove_file(&path).map_err(|source| KeysError::Io { path, source })?;
+        }
+        Ok(meant)
+    }
+
+    /// Returns the trusted certificates that a name or the beginning of a fingerprint means; see
+    /// [`revoke`](Self::revoke).
+    ///
+    /// # Errors
+    /// If no certificate matches, or if several match a fingerprint.
+    pub fn trusted_as(&self, which: &str) -> Result<Vec<Certificate>, KeysError> {
         let (trusted, mut doubtful) = self.confirmed();
         let begins = |certificate: &Certificate| {
             let fingerprint = certificate.fingerprint().to_string();
@@ -338,15 +371,6 @@ impl Keys {
                 let unread = doubtful.pop().filter(|_| found == 0);
                 return Err(unread.unwrap_or(KeysError::Which { which, found }));
             }
-        }
-        make_private(&self.dir.join("revoked"))?;
-        for certificate in &meant {
-            let fingerprint = certificate.fingerprint();
-            let (from, to) = (
-                self.file("trusted", fingerprint),
-                self.file("revoked", fingerprint),
-            );
-            rename(&from, &to)?;
         }
         Ok(meant)
     }

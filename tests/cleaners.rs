@@ -25,7 +25,8 @@ fn with_runtime_dir(name: &str, runtime_dir: &Path) {
         .status()
         .unwrap();
     assert!(status.success(), "{name}: {status}");
-    assert!(!runtime_dir.exists(), "files are left");
+    let left = std::fs::read_dir(runtime_dir).into_iter().flatten();
+    assert_eq!(left.count(), 0, "files are left");
 }
 
 fn runtime_dir() -> PathBuf {

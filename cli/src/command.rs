@@ -5,6 +5,7 @@ mod ams;
 #[cfg(feature = "bench")]
 mod bench;
 mod coalition;
+mod completions;
 mod config;
 mod content;
 mod decode;
@@ -14,6 +15,7 @@ mod doctor;
 mod echo;
 mod encode;
 mod keys;
+mod man;
 mod protocol;
 mod routes;
 mod send;
@@ -47,6 +49,8 @@ pub(crate) enum Command {
     Protocol(protocol::Arguments),
     Keys(keys::Arguments),
     Config(config::Arguments),
+    Completions(completions::Arguments),
+    Man(man::Arguments),
 }
 
 /// Runs a command.
@@ -71,5 +75,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Protocol(arguments) => protocol::run(arguments, global),
         Command::Keys(arguments) => keys::run(arguments, global),
         Command::Config(arguments) => config::run(arguments, global),
+        Command::Completions(arguments) => completions::run(&arguments),
+        Command::Man(arguments) => man::run(&arguments),
     }
 }

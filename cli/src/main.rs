@@ -7,10 +7,12 @@
 //! * [`command`] has one file per command. A new one is a file there and a line in its enum.
 //! * [`membership`] has the code shared by the commands that join a domain: joining, registering,
 //!   errors and signals.
+//! * [`complete`] completes command lines for shells.
 //! * [`report`] prints errors and warnings; [`output`] prints results; [`input`] reads files and
 //!   standard input.
 
 mod command;
+mod complete;
 mod input;
 mod membership;
 mod options;
@@ -28,6 +30,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::{self, Writer};
 
 fn main() -> ExitCode {
+    complete::answer();
     let command_line = options::CommandLine::read();
     log_to_stderr(&command_line.global);
     match command::run(command_line.command, &command_line.global) {

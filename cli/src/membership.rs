@@ -6,7 +6,8 @@ use std::pin::pin;
 use std::time::Duration;
 
 use fipa::{
-    Agent, Config, Domain, ErrorChain, ListenError, OpenError, RegisterError, RegisterOptions,
+    Agent, Config, Domain, DomainDirError, ErrorChain, ListenError, OpenError, RegisterError,
+    RegisterOptions,
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
@@ -154,6 +155,15 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
             format!("mts.name {:?}", config.mts.name),
             "run `fipa doctor`; keys belong to one gateway: use its name (--set mts.name=NAME), or make \
              new keys in an empty directory (`fipa keys init --dir DIRECTORY`)",
+        ),
+        OpenError::DomainDir(DomainDirError::NotPrivate {
+            path,
+            problem,
+            remedy,
+        }) => Failure::failed(
+            format!("{} cannot be used: {problem}", path.display()),
+            domain,
+            remedy,
         ),
         OpenError::NoTransport(_) => Failure::failed(
             ErrorChain(&error).to_string(),

@@ -3,12 +3,15 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser};
+use clap::{
+    ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser, ValueHint,
+};
 use fipa::Config;
 use fipa::config::{ConfigError, Effective, Sources};
 use tokio::runtime::Runtime;
 
 use crate::command::Command;
+use crate::complete;
 use crate::report::Failure;
 
 /// Agent communication to the FIPA standards: through shared memory or Unix domain sockets on one
@@ -16,6 +19,7 @@ use crate::report::Failure;
 ///
 /// Every command reads one configuration file: the file given with --config, else the file named by
 /// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml. Without a file the defaults apply.
+/// A domain belongs to one user: processes of different users never share agents.
 #[derive(Debug, Parser)]
 #[command(
     name = "fipa",
@@ -38,7 +42,7 @@ impl CommandLine {
     /// and merged here, because clap's own global options lose the value given before the command
     /// when the option is also given after it.
     pub(crate) fn read() -> Self {
-        let matches = with_global_options(Self::command()).get_matches();
+        let matches = command().get_matches();
         let read = || {
             let mut line = Self::from_arg_matches(&matches)?;
             line.global = Global::of(&matches)?;
@@ -46,6 +50,11 @@ impl CommandLine {
         };
         read().unwrap_or_else(|error: clap::Error| error.exit())
     }
+}
+
+/// Builds the command line with its global options.
+pub(crate) fn command() -> Clap {
+    with_global_options(CommandLine::command())
 }
 
 fn with_global_options(command: Clap) -> Clap {
@@ -60,6 +69,7 @@ Exit codes:
 
 Environment:
   FIPA_CONFIG       configuration file, unless --config is given
+  FIPA_DOMAIN       domain, unless --set domain=NAME is given; overrides the file
   FIPA_RUNTIME_DIR  directory in which the processes of a domain meet; default: /tmp/fipa-<user id>
   RUST_LOG          log filter, for example fipa_mts=debug; overrides -v and -q
   NO_COLOR          when set, the output has no colors
@@ -74,11 +84,11 @@ Examples:
 #[derive(Debug, Args)]
 pub(crate) struct Global {
     /// Read this configuration file and no other
-    #[arg(long, value_name = "FILE", help_heading = "Global options")]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, help_heading = "Global options")]
     config: Option<PathBuf>,
 
     /// Override one configuration key, for example mts.deadline=9s; repeatable
-    #[arg(long, value_name = "KEY=VALUE", help_heading = "Global options")]
+    #[arg(long, value_name = "KEY=VALUE", add = complete::keys(), help_heading = "Global options")]
     set: Vec<String>,
 
     /// Log more: -v logs events, -vv debug details, -vvv every step
@@ -124,11 +134,16 @@ impl Global {
 
     /// Loads the configuration with the origin of every value.
     pub(crate) fn effective(&self) -> Result<Effective, ConfigError> {
-        Effective::load(&Sources {
+        Effective::load(&self.sources())
+    }
+
+    /// The sources of the configuration.
+    pub(crate) fn sources(&self) -> Sources {
+        Sources {
             file: self.config.clone(),
             set: self.set.clone(),
             ..Sources::from_environment()
-        })
+        }
     }
 }
 

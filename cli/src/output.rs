@@ -4,8 +4,9 @@
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
 
+use comfy_table::{Cell, ContentArrangement, Table, presets};
 use fipa::{Deliveries, Outcome};
 use fipa_acl::{escape, is_unprintable};
 use rustix::event::{PollFd, PollFlags, poll};
@@ -34,6 +35,37 @@ pub(crate) fn printable(text: &str) -> Cow<'_, str> {
             false => Cow::Borrowed(line),
         });
     Cow::Owned(lines.collect::<Vec<_>>().join("\n"))
+}
+
+/// Creates a table in the style of all commands. On a terminal it has at most the width of the terminal:
+/// long cells continue in further lines.
+pub(crate) fn table<T: Into<Cell>>(columns: impl IntoIterator<Item = T>) -> Table {
+    table_within(columns, terminal_width())
+}
+
+fn table_within<T: Into<Cell>>(
+    columns: impl IntoIterator<Item = T>,
+    width: Option<usize>,
+) -> Table {
+    let columns: Vec<Cell> = columns.into_iter().map(Into::into).collect();
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_header(columns);
+    for column in table.column_iter_mut() {
+        column.set_padding((0, 2));
+    }
+    if let Some(width) = width.and_then(|width| u16::try_from(width).ok()) {
+        table
+            .set_content_arrangement(ContentArrangement::Dynamic)
+            .set_width(width);
+    }
+    table
+}
+
+/// Columns of the terminal; `None` if standard output is not a terminal.
+pub(crate) fn terminal_width() -> Option<usize> {
+    let size = terminal_size::terminal_size();
+    size.filter(|_| io::stdout().is_terminal())
+        .map(|(width, _)| usize::from(width.0))
 }
 
 /// Prints bytes unchanged.
@@ -178,6 +210,22 @@ mod tests {
             );
             assert_eq!(serde_json::from_str::<Value>(&visible).unwrap(), value);
         }
+    }
+
+    #[test]
+    fn a_table_fits_the_terminal() {
+        let location = "tcp://[2001:db8:0:1:2:3:4:5]:7788#0123456789abcdef".to_owned();
+        let rows = |width| {
+            let mut table = table_within(["NAME", "LOCATIONS", "AGE"], width);
+            table.add_row(["manipulator_left", &location, "3days 4h 5m"]);
+            table.trim_fmt()
+        };
+        assert!(rows(None).contains(&location), "a file has whole lines");
+        let narrow = rows(Some(60));
+        assert!(
+            narrow.lines().all(|line| line.chars().count() <= 60),
+            "{narrow}"
+        );
     }
 
     #[test]

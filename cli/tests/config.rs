@@ -440,3 +440,96 @@ fn a_closed_pipe_is_not_a_failure() {
     command.stdout(writer);
     assert_eq!(Ran::from(command.output().unwrap()), ran(0, "", ""));
 }
+
+#[test]
+fn the_variable_sets_the_domain_unless_set_does() {
+    let env = Environment::new();
+    env.write("work/fipa.toml", "domain = \"of-file\"\n");
+    let domain = |arguments: &[&str]| {
+        let mut command = env.command(arguments);
+        let ran = Ran::from(command.env("FIPA_DOMAIN", "of-variable").output().unwrap());
+        ran.stdout.lines().next().unwrap_or_default().to_owned()
+    };
+    let shown = domain(&["config", "show"]);
+    assert!(
+        shown.starts_with("domain = \"of-variable\"") && shown.ends_with("# $FIPA_DOMAIN"),
+        "{shown}"
+    );
+    let shown = domain(&["config", "show", "--set", "domain=of-set"]);
+    assert!(shown.starts_with("domain = \"of-set\""), "{shown}");
+    let plain = env.run(&["config", "show"]).stdout;
+    assert!(plain.starts_with("domain = \"of-file\""), "{plain}");
+    let mut command = env.command(&["config", "check"]);
+    let wrong = Ran::from(command.env("FIPA_DOMAIN", "a b").output().unwrap());
+    assert_eq!(wrong.code, Some(2));
+    assert!(
+        wrong.stderr.contains("where: $FIPA_DOMAIN"),
+        "{}",
+        wrong.stderr
+    );
+}
+
+#[test]
+fn check_finds_all_mistakes_at_once_and_what_the_machine_lacks() {
+    let env = Environment::new();
+    env.write(
+        "work/broken.scxml",
+        "<scxml initial=\"1\"><state id=\"1\"/>\n",
+    );
+    env.write(
+        "work/fipa.toml",
+        "\
+[mts]
+queue = \"many\"
+[routes]
+\"arm_(\" = [\"shm\"]
+[transport.tcp]
+listen = [\"[fe80::1%fipa-none]:7788\"]
+[discovery]
+interfaces = [\"fipa-none\"]
+static = { crex = [\"udp://10.0.0.2:7788\"] }
+[security]
+keys = \"/nonexistent/keys\"
+[access]
+deny = { \"rover_[\" = [\"brake\"] }
+[monitor]
+protocols = [\"missing.scxml\", \"broken.scxml\"]
+",
+    );
+    let checked = env.run(&["config", "check", "--json"]);
+    assert_eq!(checked.code, Some(2), "{checked:?}");
+    let report: Value = serde_json::from_str(&checked.stdout).unwrap();
+    let mistakes = report["mistakes"].as_array().unwrap();
+    let mut found: Vec<(u64, &str)> = mistakes
+        .iter()
+        .map(|mistake| {
+            let what = mistake["what"].as_str().unwrap();
+            let key = what.split('`').nth(1).unwrap();
+            (mistake["place"]["line"].as_u64().unwrap(), key)
+        })
+        .collect();
+    found.sort_unstable();
+    assert_eq!(
+        found,
+        [
+            (2, "mts.queue"),
+            (4, "routes.\"arm_(\""),
+            (6, "transport.tcp.listen"),
+            (8, "discovery.interfaces"),
+            (9, "discovery.static.crex"),
+            (11, "security.keys"),
+            (13, "access.deny.\"rover_[\""),
+            (15, "monitor.protocols"),
+            (15, "monitor.protocols"),
+        ],
+        "{}",
+        checked.stdout
+    );
+    // Loading does not depend on the machine.
+    env.write(
+        "work/fipa.toml",
+        "[discovery]\ninterfaces = [\"fipa-none\"]\n",
+    );
+    assert_eq!(env.run(&["config", "show"]).code, Some(0));
+    assert_eq!(env.run(&["config", "check"]).code, Some(2));
+}

@@ -118,16 +118,20 @@ fn malformed_bytes_are_reported_with_offset_and_clause() {
     );
     assert!(output.contains("(FIPA00069"), "{output}");
     let letter = fs::read(vector("e01_simple.be")).unwrap();
-    for (input, clause) in [
-        (&letter[..9], "(FIPA00069"),
-        (b"", "FIPA"),
-        (b"hello", "FIPA"),
+    let output = host.run_with_input(&["decode"], &letter[..9]).failed(1);
+    assert!(
+        output.contains("(FIPA00069") && output.contains("where: standard input, byte "),
+        "{output}"
+    );
+    for (input, problem) in [
+        (&b""[..], "the input is empty"),
+        (b"hello", "begins with the byte 0x68"),
+        (b" \n", "begins with the byte 0x20"),
     ] {
-        let output = host.run_with_input(&["decode"], input).failed(1);
-        assert!(
-            output.contains(clause) && output.contains("where: standard input, byte "),
-            "{output}"
-        );
+        for arguments in [&["decode"][..], &["decode", "--explain"]] {
+            let output = host.run_with_input(arguments, input).failed(1);
+            assert!(output.contains(problem), "{output}");
+        }
     }
     let output = host.run(&["decode", "nothing.be"]).failed(1);
     assert!(output.contains("where: nothing.be\n"), "{output}");

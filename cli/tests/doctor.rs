@@ -82,6 +82,16 @@ fn files_of_a_killed_process_are_reported_until_the_next_process_removes_them() 
 }
 
 #[test]
+fn the_runtime_directory_that_the_owner_made_stays() {
+    let host = Host::new();
+    std::fs::create_dir(host.path("run")).unwrap();
+    set_permissions(host.path("run"), Permissions::from_mode(0o700)).unwrap();
+    host.run(&["agents"]).done();
+    assert!(host.path("run").exists());
+    assert!(host.left_behind().is_empty());
+}
+
+#[test]
 fn a_directory_that_others_may_enter_is_bad() {
     let host = Host::new();
     let _parrot = host.echo("parrot");
@@ -89,7 +99,14 @@ fn a_directory_that_others_may_enter_is_bad() {
     set_permissions(&domain, Permissions::from_mode(0o755)).unwrap();
     let (report, complaint) = host.run(&["doctor", "--json"]).failed_json();
     assert_eq!(report["verdict"], "bad");
-    assert_eq!(check(&report, "directory of the domain").0, "bad");
+    let (verdict, found) = check(&report, "directory of the domain");
+    assert_eq!(verdict, "bad");
+    assert!(
+        found.contains(&format!("chmod 700 {}", domain.display())),
+        "{found}"
+    );
+    let refused = host.run(&["agents"]).failed(1);
+    assert!(refused.contains("RuntimeDirectoryMode=0700"), "{refused}");
     assert!(complaint.contains("directory of the domain"), "{complaint}");
     set_permissions(&domain, Permissions::from_mode(0o700)).unwrap();
 }

@@ -101,7 +101,7 @@ fn only_hosts_that_trust_each_other_exchange_letters() {
     theirs.wait_for_log(&["connection refused"]);
 
     // Revoking the trust closes the connection without a restart.
-    crex.keys(&["revoke", &rover.name]);
+    crex.keys(&["revoke", "--yes", &rover.name]);
     theirs.wait_for_log(&["the keys were read again", "trusted=0"]);
     until("the connection has ended", || !rover.reaches(&arm));
     let output = rover
@@ -113,12 +113,37 @@ fn only_hosts_that_trust_each_other_exchange_letters() {
         "{output}"
     );
 
-    // A renewed key that the other host trusts is accepted.
+    // A renewed key that the other host trusts is accepted, until the trust ends, and again.
     rover.keys(&["renew"]);
     let next = rover.host.path("keys/next.pem").display().to_string();
     crex.keys(&["trust", &next]);
     rover.keys(&["renew", "--use"]);
     until("a letter is delivered again", || rover.reaches(&arm));
+    crex.keys(&["distrust", &rover.name]);
+    until("the connection has ended again", || !rover.reaches(&arm));
+    crex.keys(&["trust", &rover.certificate()]);
+    until("the letter after that is delivered", || rover.reaches(&arm));
+}
+
+#[test]
+fn a_certificate_is_not_revoked_without_confirmation() {
+    let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+    let own = crex.certificate();
+    rover.keys(&["trust", &own]);
+    let dir = rover.dir();
+    let revoke = ["keys", "revoke", &crex.name, "--dir", &dir];
+    let errors = rover.host.run(&revoke).failed(2);
+    assert!(
+        errors.contains("--yes") && errors.contains("distrust"),
+        "{errors}"
+    );
+    let count = |list: &str| rover.list()[list].as_array().unwrap().len();
+    assert_eq!((count("trusted"), count("revoked")), (1, 0));
+    rover.keys(&["distrust", &crex.name]);
+    assert_eq!((count("trusted"), count("revoked")), (0, 0));
+    rover.keys(&["trust", &own]);
+    rover.keys(&["revoke", &crex.name, "--yes"]);
+    assert_eq!((count("trusted"), count("revoked")), (0, 1));
 }
 
 #[test]

@@ -22,6 +22,13 @@ fn commands(below: &str) -> Vec<&'static str> {
         .collect()
 }
 
+/// The configuration below the README paragraph that begins with this text.
+fn configuration(below: &str) -> &'static str {
+    let (_, text) = README.split_once(below).unwrap();
+    let (_, block) = text.split_once("```toml\n").unwrap();
+    block.split_once("```").unwrap().0
+}
+
 /// A user on the host of the same name.
 struct User<'a> {
     name: &'a str,
@@ -100,8 +107,14 @@ fn inside_two_hosts_are_secured() {
         })
         .collect();
     assert!(lines.len() + swapped.len() < 10, "{lines:?}");
+    let configuration = configuration("Two hosts trust each other");
     for user in &users {
-        fs::create_dir(user.home()).unwrap();
+        let directory = user.home().join(".config/fipa");
+        fs::create_dir_all(&directory).unwrap();
+        let home = user.home().display().to_string();
+        let text = configuration.replace("/home/robot", &home);
+        assert_ne!(text, configuration);
+        fs::write(directory.join("fipa.toml"), text).unwrap();
     }
     let (last, before) = lines.split_last().unwrap();
     for (ours, theirs) in before.iter().zip(&swapped) {

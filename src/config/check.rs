@@ -66,11 +66,23 @@ const MAX_PROTOCOLS: usize = 128;
 pub(super) struct Finding {
     /// The path of the key.
     pub(super) path: Vec<String>,
+    /// Whether the values of other keys are part of the condition.
+    pub(super) on_several_values: bool,
     what: String,
     help: String,
 }
 
 impl Finding {
+    /// A finding about one key. `what` continues a sentence that begins with the key.
+    pub(super) fn new(path: &[&str], what: impl Display, help: impl Into<String>) -> Self {
+        Self {
+            path: path.iter().map(|&part| part.to_owned()).collect(),
+            on_several_values: false,
+            what: format!("`{}` {what}", dotted(path)),
+            help: help.into(),
+        }
+    }
+
     pub(super) fn at(self, place: Option<Origin>) -> Mistake {
         Mistake {
             place,
@@ -123,10 +135,14 @@ struct Findings(Vec<Finding>);
 impl Findings {
     /// Adds a finding. `what` continues a sentence that begins with the key.
     fn add(&mut self, path: &[&str], what: impl Display, help: impl Into<String>) {
+        self.0.push(Finding::new(path, what, help));
+    }
+
+    /// Adds a finding about a combination of values.
+    fn combined(&mut self, path: &[&str], what: impl Display, help: impl Into<String>) {
         self.0.push(Finding {
-            path: path.iter().map(|&part| part.to_owned()).collect(),
-            what: format!("`{}` {what}", dotted(path)),
-            help: help.into(),
+            on_several_values: true,
+            ..Finding::new(path, what, help)
         });
     }
 
@@ -174,21 +190,21 @@ impl Findings {
             );
         }
         if has_keys && security.insecure {
-            self.add(
+            self.combined(
                 &["security", "insecure"],
                 "is true, but security.keys is set, and with keys every connection is encrypted",
                 "remove one of the two",
             );
         }
         if has_keys && config.mts.transports.contains(&Kind::Udp) {
-            self.add(
+            self.combined(
                 &["mts", "transports"],
                 "lists udp, which is not encrypted, but security.keys is set",
                 "remove udp; tcp and quic are encrypted if security.keys is set",
             );
         }
         if !has_keys && config.mts.transports.contains(&Kind::Quic) {
-            self.add(
+            self.combined(
                 &["mts", "transports"],
                 "lists quic, which needs keys",
                 "make keys (`fipa keys init`) and set security.keys, or remove quic",
@@ -207,7 +223,7 @@ impl Findings {
             let mut addresses = listen.iter().filter(|text| is_numeric_address(text));
             let open = addresses.find(|text| !is_on_loopback(text));
             if let Some(open) = open.filter(|_| config.mts.transports.contains(&kind)) {
-                self.add(
+                self.combined(
                     &["transport", kind.name(), "listen"],
                     format_args!("lists {open}, where the gateway would accept every host"),
                     "make keys (`fipa keys init`) and set security.keys, or accept the risk with \
@@ -395,7 +411,7 @@ impl Findings {
                 );
             }
             if self.kinds(&path, transports) && !transports.iter().any(|kind| on.contains(kind)) {
-                self.add(
+                self.combined(
                     &path,
                     "lists only transports that are off",
                     "list one that is in `mts.transports`, or add one of these to `mts.transports`",
@@ -412,7 +428,7 @@ impl Findings {
                 "use 1MiB to 1TiB, and at most the size of /dev/shm",
             );
         } else if shm.max_letter > shm.capacity {
-            self.add(
+            self.combined(
                 &["transport", "shm", "max_letter"],
                 format_args!(
                     "is {} bytes, more than the {} of `transport.shm.capacity`",

@@ -10,7 +10,7 @@ use toml_edit::Value as Toml;
 use super::keys::{KEYS, MAPS};
 use super::reader::{Reader, bare_or_quoted, dotted};
 use super::sources::Found;
-use super::{Config, ConfigError, Origin, Sources};
+use super::{Config, ConfigError, Origin, Sources, machine};
 
 /// The configuration with the origin of every value.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,23 +53,44 @@ impl Effective {
     /// # Errors
     /// If a file cannot be read, or if the configuration has mistakes; the error lists all of them.
     pub fn load(sources: &Sources) -> Result<Self, ConfigError> {
-        Self::of(sources, sources.read()?)
+        Self::of(sources, sources.read()?, false)
     }
 
-    /// Reads and checks the file that was found and the `--set` arguments.
-    fn of(sources: &Sources, found: Option<Found>) -> Result<Self, ConfigError> {
+    /// Loads the configuration like [`load`](Self::load), and also checks what its values name on this
+    /// machine: the key directory, the protocol files, the network interfaces, and whether the
+    /// transports of static peers are on.
+    ///
+    /// [`load`](Self::load) does not check these, because one file serves all processes of a robot, and
+    /// an interface can appear later.
+    ///
+    /// # Errors
+    /// If a file cannot be read, or if there are mistakes; the error lists all of them.
+    pub fn check(sources: &Sources) -> Result<Self, ConfigError> {
+        Self::of(sources, sources.read()?, true)
+    }
+
+    /// Reads and checks the file that was found, `$FIPA_DOMAIN` and the `--set` arguments.
+    fn of(
+        sources: &Sources,
+        found: Option<Found>,
+        with_machine: bool,
+    ) -> Result<Self, ConfigError> {
         let mut reader = Reader::new(&sources.host_name);
         for assignment in sources.set.iter().rev() {
             reader.set(assignment);
         }
         // The arguments were read in reverse, because the last one for a key counts.
         reader.mistakes.reverse();
+        if let Some(domain) = sources.domain.as_deref().filter(|name| !name.is_empty()) {
+            reader.domain(domain);
+        }
         if let Some(found) = &found {
             reader.file(&found.path, &found.text);
         }
-        // A value that could not be read leaves its default in place, which needs no check.
-        if reader.mistakes.is_empty() {
-            reader.check();
+        reader.check();
+        if with_machine {
+            let findings = machine::findings(&reader.config);
+            findings.into_iter().for_each(|finding| reader.add(finding));
         }
         if !reader.mistakes.is_empty() {
             return Err(ConfigError::Mistakes(reader.mistakes));
@@ -81,7 +102,7 @@ impl Effective {
     #[cfg(feature = "fuzzing")]
     pub(crate) fn of_text(sources: &Sources, text: String) -> Result<Self, ConfigError> {
         let path = PathBuf::from("fipa.toml");
-        Self::of(sources, Some(Found { path, text }))
+        Self::of(sources, Some(Found { path, text }), false)
     }
 
     pub(super) fn new(reader: Reader, file: Option<PathBuf>) -> Self {
@@ -136,7 +157,7 @@ impl Effective {
     }
 
     /// Renders the configuration as one complete TOML file. A comment after every value states its
-    /// origin: `# default`, `# fipa.toml:12` or `# --set`.
+    /// origin: `# default`, `# fipa.toml:12`, `# $FIPA_DOMAIN` or `# --set`.
     #[must_use]
     pub fn render(&self) -> String {
         // Writing to a string cannot fail.

@@ -57,9 +57,11 @@ impl fmt::Display for Mistake {
 
 /// The origin of a value.
 ///
-/// Displayed as `default`, `fipa.toml:12` or `--set mts.deadline=9s`, without control characters.
+/// Displayed as `default`, `fipa.toml:12`, `$FIPA_DOMAIN` or `--set mts.deadline=9s`, without control
+/// characters.
 ///
-/// Serialized as `{"from": "default"}`, `{"from": "file", "path": "fipa.toml", "line": 12}` or
+/// Serialized as `{"from": "default"}`, `{"from": "file", "path": "fipa.toml", "line": 12}`,
+/// `{"from": "environment", "variable": "FIPA_DOMAIN"}` or
 /// `{"from": "set", "assignment": "mts.deadline=9s"}`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(tag = "from", rename_all = "lowercase")]
@@ -75,6 +77,11 @@ pub enum Origin {
         /// The line, counted from 1.
         line: usize,
     },
+    /// A variable of the environment.
+    Environment {
+        /// The name of the variable.
+        variable: &'static str,
+    },
     /// A `--set` argument.
     Set {
         /// The text after `--set`.
@@ -87,6 +94,7 @@ impl fmt::Display for Origin {
         match self {
             Self::Default => f.write_str("default"),
             Self::File { path, line } => write!(f, "{}:{line}", shown(path)),
+            Self::Environment { variable } => write!(f, "${variable}"),
             Self::Set { assignment } => write!(f, "--set {}", escape(assignment)),
         }
     }

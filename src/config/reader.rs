@@ -2,7 +2,7 @@
 //!
 //! Sources are read from the highest to the lowest priority: a value that is already set stays.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::Path;
 
@@ -17,6 +17,8 @@ pub(super) struct Reader {
     pub(super) config: Config,
     pub(super) origins: BTreeMap<Vec<String>, Origin>,
     pub(super) mistakes: Vec<Mistake>,
+    /// The paths of the values that could not be read.
+    invalid: BTreeSet<Vec<String>>,
 }
 
 impl Reader {
@@ -26,6 +28,7 @@ impl Reader {
             config: Config::for_host(host_name),
             origins: BTreeMap::new(),
             mistakes: Vec::new(),
+            invalid: BTreeSet::new(),
         }
     }
 
@@ -70,12 +73,28 @@ impl Reader {
         self.item(&layer, path, None, &Item::Value(set_value(shape, raw)));
     }
 
-    /// Checks the values that could be read, and adds the mistakes.
+    /// Reads `$FIPA_DOMAIN`.
+    pub(super) fn domain(&mut self, name: &str) {
+        let path = vec!["domain".to_owned()];
+        let item = Item::Value(Toml::from(name));
+        self.item(&Layer::Variable("FIPA_DOMAIN"), path, None, &item);
+    }
+
+    /// Checks the values that could be read, and adds the mistakes. If a value could not be read, its
+    /// default is in place, and conditions on several values are not checked.
     pub(super) fn check(&mut self) {
         for finding in check::findings(&self.config) {
-            let place = self.origin(&finding.path);
-            self.mistakes.push(finding.at(Some(place)));
+            let is_checked = self.invalid.is_empty() || !finding.on_several_values;
+            if is_checked && !self.invalid.contains(&finding.path) {
+                self.add(finding);
+            }
         }
+    }
+
+    /// Adds a finding, with the origin of its value.
+    pub(super) fn add(&mut self, finding: check::Finding) {
+        let place = self.origin(&finding.path);
+        self.mistakes.push(finding.at(Some(place)));
     }
 
     /// Returns the origin of the value at this path; for a table, that of its first entry.
@@ -161,11 +180,14 @@ impl Reader {
                 let origin = layer.origin(span);
                 self.origins.entry(path.to_vec()).or_insert(origin);
             }
-            Err(invalid) => self.mistake(
-                layer.origin(invalid.span.or(span)),
-                format!("`{}` is invalid: {}", quoted_path(path), invalid.reason),
-                format!("expected {expected}"),
-            ),
+            Err(invalid) => {
+                self.invalid.insert(path.to_vec());
+                self.mistake(
+                    layer.origin(invalid.span.or(span)),
+                    format!("`{}` is invalid: {}", quoted_path(path), invalid.reason),
+                    format!("expected {expected}"),
+                );
+            }
         }
     }
 
@@ -178,6 +200,7 @@ impl Reader {
 /// The source that is being read.
 enum Layer<'a> {
     File { path: &'a Path, text: &'a str },
+    Variable(&'static str),
     Set(&'a str),
 }
 
@@ -191,6 +214,7 @@ impl Layer<'_> {
                     line: newlines(before) + 1,
                 }
             }
+            Self::Variable(variable) => Origin::Environment { variable },
             Self::Set(assignment) => Origin::Set {
                 assignment: (*assignment).to_owned(),
             },

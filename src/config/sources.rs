@@ -24,6 +24,8 @@ pub struct Sources {
     pub set: Vec<String>,
     /// `$FIPA_CONFIG`: the file to read unless `file` is given. An empty path counts as not set.
     pub variable: Option<PathBuf>,
+    /// `$FIPA_DOMAIN`: the domain, unless `set` has one. An empty text counts as not set.
+    pub domain: Option<String>,
     /// The current directory: may contain `fipa.toml`, and relative paths start there.
     pub current_dir: Option<PathBuf>,
     /// The home directory: may contain `.config/fipa/fipa.toml`.
@@ -40,6 +42,7 @@ impl Sources {
             file: None,
             set: Vec::new(),
             variable: env::var_os("FIPA_CONFIG").map(PathBuf::from),
+            domain: env::var_os("FIPA_DOMAIN").map(|name| name.to_string_lossy().into_owned()),
             current_dir: env::current_dir().ok(),
             home: env::home_dir(),
             host_name: gethostname::gethostname().to_string_lossy().into_owned(),

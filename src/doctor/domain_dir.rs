@@ -28,7 +28,7 @@ fn directory(dir: &DomainDir) -> Check {
             CHECK,
             Verdict::Bad,
             ErrorChain(&error).to_string(),
-            "repair it; until then no process can join the domain",
+            "follow the remedy above; until then no process can join the domain",
         ),
     }
 }

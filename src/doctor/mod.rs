@@ -2,13 +2,16 @@
 //!
 //! Each area has a file with one function that examines it and adds its [`Check`]s. A new area is
 //! a file here and a line in [`examine`]. The checks change nothing on the machine; the check of
-//! multicast sends mDNS queries.
+//! multicast sends mDNS queries, and the check of static peers opens connections to them.
 
 mod domain_dir;
 #[cfg(feature = "net")]
 mod locations;
 #[cfg(feature = "mdns")]
 mod network;
+mod other_users;
+#[cfg(feature = "net")]
+mod peers;
 mod queues;
 #[cfg(feature = "net")]
 mod security;
@@ -49,12 +52,14 @@ pub enum Verdict {
     Bad,
 }
 
-/// Examines all areas that the configuration uses. Blocks for some milliseconds, or for three
-/// seconds if `discovery.mdns` is on, because the check of multicast waits for answers.
+/// Examines all areas that the configuration uses. Blocks for some milliseconds, for three seconds if
+/// `discovery.mdns` is on, because the check of multicast waits for answers, and for some seconds if
+/// static peers do not answer.
 #[must_use]
 pub fn examine(config: &Config) -> Vec<Check> {
     let mut checks = Vec::new();
     domain_dir::examine(config, &mut checks);
+    other_users::examine(config, &mut checks);
     #[cfg(feature = "shm")]
     if config.mts.transports.contains(&crate::Kind::Shm) {
         shm::examine(config, &mut checks);
@@ -65,6 +70,8 @@ pub fn examine(config: &Config) -> Vec<Check> {
     }
     #[cfg(feature = "net")]
     locations::examine(config, &mut checks);
+    #[cfg(feature = "net")]
+    peers::examine(config, &mut checks);
     #[cfg(feature = "net")]
     security::examine(config, &mut checks);
     queues::examine(config, &mut checks);

@@ -88,8 +88,15 @@ impl ConnectionEnd {
             ),
             Self::Hangup if !greeted => TransportError::new(
                 TransportErrorKind::Incompatible,
-                "the peer closed the connection before its hello; \
-                 is a fipa endpoint listening there?",
+                "the peer closed the connection before its hello: the peer requires keys and this host \
+                 has none (set security.keys here, see `fipa keys`), or no fipa gateway listens there",
+            ),
+            Self::Broken(what) if !greeted => TransportError::new(
+                TransportErrorKind::Broken,
+                format_args!(
+                    "{what}, before the peer's hello: the peer may require keys that this host has not \
+                     (set security.keys here, see `fipa keys`)"
+                ),
             ),
             other => other.after(),
         }

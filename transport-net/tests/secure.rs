@@ -358,8 +358,10 @@ fn a_peer_that_must_prove_its_identity_gets_no_unencrypted_bytes() {
     let to = party(crex.security(&[&rover]));
     // A fipa peer without keys, in both directions.
     let plain = Party::new();
-    assert_refused(&plain, &to);
-    assert_refused(&to, &plain);
+    let told = assert_refused(&plain, &to);
+    assert!(told.contains("set security.keys here"), "{told}");
+    let told = assert_refused(&to, &plain);
+    assert!(told.contains("set security.keys there"), "{told}");
     // A legacy peer's letter, and frames.
     for first in [&b"\xfe\x10"[..], b"fipa\x02\x01\0\0", b"<?xml", b"garbage"] {
         let address = to.location().address().to_owned();

@@ -359,7 +359,7 @@ impl DomainFiles {
         });
         listed.map_err(|e| ShmError::Iceoryx {
             what: "cannot list the nodes",
-            reason: format!("{e:?}"),
+            reason: crate::errors::words(&e),
             prefix: self.config.prefix.clone(),
         })?;
         Ok(nodes)

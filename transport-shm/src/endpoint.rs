@@ -116,7 +116,8 @@ impl Endpoint {
                 .signal_handling_mode(SignalHandlingMode::Disabled)
                 .create::<Svc>()
         });
-        let node = node.map_err(|e| failed("cannot create a node", format!("{e:?}"), shortage))?;
+        let node =
+            node.map_err(|e| failed("cannot create a node", crate::errors::words(&e), shortage))?;
         domain.restrict_permissions()?;
         let peer_segments = Arc::new(PeerSegments::new(domain.clone()));
         let wakeup = (doorbell.clone(), presence.polls());
@@ -486,7 +487,10 @@ impl Endpoint {
         let node = node.filter(|_| !self.is_closed()).ok_or_else(closed)?;
         let name = mailbox_name(peer.incarnation());
         let service = ServiceName::new(&name).map_err(|e| {
-            TransportError::new(TransportErrorKind::Unreachable, format_args!("{e:?}"))
+            TransportError::new(
+                TransportErrorKind::Unreachable,
+                format_args!("{}", crate::errors::words(&e)),
+            )
         })?;
         peer.opened(Outbox::open(Opening {
             node,

@@ -54,6 +54,32 @@ pub(crate) fn wire_error(error: WireError) -> TransportError {
     TransportError::new(fault, error)
 }
 
+/// Maximum number of names in [`words`].
+const MAX_NAMES: usize = 4;
+
+/// Writes an error of iceoryx2, which has no other text than the name of its variant, in words:
+/// `does not exist` for `DoesNotExist`. Of nested errors, the first names are written. Other parts of the
+/// `Debug` text, such as fields, are omitted.
+pub(crate) fn words(error: &dyn std::fmt::Debug) -> String {
+    let text = format!("{error:?}");
+    let names = text
+        .split(|c: char| !c.is_ascii_alphanumeric())
+        .filter(|name| name.starts_with(|c: char| c.is_ascii_uppercase()))
+        .take(MAX_NAMES);
+    let in_words = |name: &str| {
+        let mut words = String::new();
+        for c in name.chars() {
+            if c.is_ascii_uppercase() && !words.is_empty() {
+                words.push(' ');
+            }
+            words.push(c.to_ascii_lowercase());
+        }
+        words
+    };
+    let all: Vec<String> = names.map(in_words).collect();
+    all.join(": ")
+}
+
 pub(crate) fn open_error(error: RequestResponseOpenError) -> TransportError {
     use RequestResponseOpenError as E;
     let fault = match error {
@@ -70,7 +96,7 @@ pub(crate) fn open_error(error: RequestResponseOpenError) -> TransportError {
     };
     TransportError::new(
         fault,
-        format_args!("cannot open the mailbox ({error:?}){hint}"),
+        format_args!("cannot open the mailbox ({}){hint}", words(&error)),
     )
 }
 
@@ -81,7 +107,7 @@ pub(crate) fn create_error(error: ClientCreateError) -> TransportError {
     };
     TransportError::new(
         TransportErrorKind::Congested,
-        format_args!("cannot connect to the mailbox ({error:?}){hint}"),
+        format_args!("cannot connect to the mailbox ({}){hint}", words(&error)),
     )
 }
 
@@ -92,7 +118,7 @@ pub(crate) fn loan_error(error: LoanError) -> TransportError {
     };
     TransportError::new(
         TransportErrorKind::Congested,
-        format_args!("{hint} ({error:?})"),
+        format_args!("{hint} ({})", words(&error)),
     )
 }
 
@@ -105,6 +131,21 @@ pub(crate) fn send_error(error: RequestSendError) -> TransportError {
     };
     TransportError::new(
         TransportErrorKind::Congested,
-        format_args!("{hint} ({error:?})"),
+        format_args!("{hint} ({})", words(&error)),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_name_of_a_variant_is_written_in_words() {
+        assert_eq!(
+            words(&RequestResponseOpenError::DoesNotExist),
+            "does not exist"
+        );
+        let nested = Some(ClientCreateError::ExceedsMaxSupportedClients);
+        assert_eq!(words(&nested), "some: exceeds max supported clients");
+    }
 }

@@ -352,7 +352,7 @@ impl Inbox {
 }
 
 fn debug(error: impl std::fmt::Debug) -> String {
-    format!("{error:?}")
+    crate::errors::words(&error)
 }
 
 /// The owner of a request: this function alone, or together with the handed-out content.

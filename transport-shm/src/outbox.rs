@@ -681,7 +681,10 @@ impl Sent {
             Ok(None) if ended => broken("the other process ended before it answered".into()),
             Ok(None) if dropped => broken("the other process dropped it without an answer".into()),
             Ok(None) => None,
-            Err(e) => broken(format!("cannot receive the answer: {e:?}")),
+            Err(e) => broken(format!(
+                "cannot receive the answer: {}",
+                crate::errors::words(&e)
+            )),
         }
     }
 

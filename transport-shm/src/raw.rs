@@ -60,7 +60,7 @@ pub struct RawError {
 fn cannot<E: fmt::Debug>(what: &'static str) -> impl FnOnce(E) -> RawError {
     move |error| RawError {
         what,
-        reason: format!("{error:?}"),
+        reason: crate::errors::words(&error),
     }
 }
 
@@ -83,7 +83,7 @@ impl RawNode {
             .create::<Svc>()
             .map_err(|error| ShmError::Iceoryx {
                 what: "cannot create a node",
-                reason: format!("{error:?}"),
+                reason: crate::errors::words(&error),
                 prefix: config.prefix.clone(),
             })?;
         Ok(Self {

@@ -7,11 +7,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use comfy_table::{Table, presets};
 use fipa::{DirectoryView, Entry, Kind, Location, Matcher, Query, Reach, Role, Source, Time};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
+use crate::complete;
 use crate::membership;
 use crate::options::Global;
 use crate::output;
@@ -55,7 +55,7 @@ With --watch, one object on each line; the first lines are the agents present at
   { \"time\", \"change\": \"present\", \"joined\", \"changed\" or \"left\", \"agent\": as above }")]
 pub(crate) struct Arguments {
     /// Show only agents with this name or with a name that matches this pattern
-    #[arg(value_parser = Matcher::parse)]
+    #[arg(value_parser = Matcher::parse, add = complete::agents())]
     pattern: Option<Matcher>,
 
     /// Show only agents of this type or with a type that matches this pattern
@@ -167,11 +167,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             config.domain
         ));
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_header(COLUMNS);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
+    let mut table = output::table(COLUMNS);
     table.add_rows(listed.entries.into_iter().map(|row| row.cells));
     output::text(&format!("{}\n", table.trim_fmt()))
 }

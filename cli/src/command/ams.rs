@@ -1,7 +1,6 @@
 //! `fipa ams`: lists the agents of a platform.
 
 use clap::Args;
-use comfy_table::{Table, presets};
 use fipa::AgentId;
 use fipa::platform::{AmsDescription, ApDescription, State};
 use fipa_acl::escape;
@@ -94,13 +93,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let addresses = addresses.join(" ");
         text.push_str(&format!("{} {}\n", escape(name), escape(&addresses)));
     }
-    let mut table = Table::new();
-    table
-        .load_style(presets::NOTHING)
-        .set_header(["AGENT", "STATE", "OWNER"]);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
+    let mut table = output::table(["AGENT", "STATE", "OWNER"]);
     table.add_rows(agents.iter().map(|agent| {
         let state = agent.state.map(State::as_str);
         [

@@ -4,6 +4,7 @@ use clap::Args;
 use fipa::{AgentId, CoalitionError, Domain, ErrorChain, RegisterOptions};
 use fipa_acl::escape;
 
+use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
@@ -28,7 +29,7 @@ pub(crate) struct Arguments {
     name: AgentId,
 
     /// Names of the members
-    #[arg(required = true, value_name = "MEMBER")]
+    #[arg(required = true, value_name = "MEMBER", add = complete::agents())]
     members: Vec<AgentId>,
 
     /// Member that receives all messages to the coalition

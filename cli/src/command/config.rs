@@ -14,7 +14,7 @@ use crate::report::Failure;
 ///
 /// The configuration is one TOML file: the file given with --config, else the file named by
 /// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml. No other file is read. Keys that
-/// the file does not set have their defaults. --set KEY=VALUE overrides single keys.
+/// the file does not set have their defaults. $FIPA_DOMAIN overrides the domain of the file. --set KEY=VALUE overrides single keys.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -44,13 +44,17 @@ JSON:
     \"settings\": [ { \"path\": [\"mts\", \"deadline\"], \"value\": \"5s\",
                     \"origin\": { \"from\": \"default\" }
                             | { \"from\": \"file\", \"path\": path, \"line\": number }
+                            | { \"from\": \"environment\", \"variable\": name }
                             | { \"from\": \"set\", \"assignment\": \"key=value\" } } ] }")]
     Show(Json),
 
     /// Check the configuration for errors
     ///
-    /// Reports every error with file, line, key and the allowed values. The exit code is 0 if there is
-    /// no error and 2 otherwise, so that a script can check a file before it starts a robot.
+    /// Reports every error with file, line, key and the allowed values. It also reports values that name
+    /// something that this machine does not have: a key directory that cannot be used, protocol files that
+    /// are missing or have mistakes, network interfaces that do not exist, and static peers whose
+    /// transports are off. The exit code is 0 if there is no error and 2 otherwise, so that a script can
+    /// check a file before it starts a robot.
     #[command(after_help = "\
 Examples:
   fipa config check
@@ -75,8 +79,8 @@ struct Json {
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     match arguments.action {
         Action::Show(Json { json }) => show(&global.effective()?, json),
-        Action::Check(Json { json: false }) => check(&global.effective()?),
-        Action::Check(Json { json: true }) => check_json(global.effective()),
+        Action::Check(Json { json: false }) => check(&Effective::check(&global.sources())?),
+        Action::Check(Json { json: true }) => check_json(Effective::check(&global.sources())),
     }
 }
 

@@ -90,6 +90,14 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     if hex {
         bytes = from_hex(&bytes, &file)?;
     }
+    if let Some(problem) = unlike_any_message(&bytes) {
+        return Err(Failure::failed(
+            problem,
+            input::name(&file),
+            "give one complete message or letter as a file or on standard input; bytes in hexadecimal \
+             digits need --hex",
+        ));
+    }
     if explain {
         return explained::print(&bytes, json, &file);
     }
@@ -104,6 +112,22 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     } else {
         output::json(&json)
     }
+}
+
+/// The problem of an input that is clearly no message and no letter.
+fn unlike_any_message(bytes: &[u8]) -> Option<String> {
+    let Some(first) = bytes.first() else {
+        return Some("the input is empty: there is no message to decode".to_owned());
+    };
+    let is_envelope = matches!(first, 0xfd | 0xfe);
+    if is_envelope || Representation::detect(bytes).is_some() {
+        return None;
+    }
+    Some(format!(
+        "the input is no message: it begins with the byte {first:#04x}; a bit-efficient message begins \
+         with 0xfa, 0xfb or 0xfc, a bit-efficient letter with 0xfe or 0xfd, a message as text with ( and \
+         XML with <"
+    ))
 }
 
 /// Whether the input begins with an envelope: with a base (`FE`) or an extension (`FD`), FIPA00088

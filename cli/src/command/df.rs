@@ -3,7 +3,6 @@
 use std::time::SystemTime;
 
 use clap::{Args, Subcommand};
-use comfy_table::{Table, presets};
 use fipa::platform::{AgentDescription, Df, PlatformError, Property, ServiceDescription};
 use fipa::{Agent, AgentId, Config, Incarnation, RegisterOptions, Time};
 use fipa_acl::escape;
@@ -310,17 +309,7 @@ fn search(
     if found.is_empty() {
         return output::text(&format!("{} knows no such service\n", escape(df.name())));
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_header([
-        "AGENT",
-        "TYPE",
-        "SERVICE",
-        "PROPERTIES",
-        "LEASE",
-    ]);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
+    let mut table = output::table(["AGENT", "TYPE", "SERVICE", "PROPERTIES", "LEASE"]);
     table.add_rows(found.iter().flat_map(rows));
     output::text(&format!("{}\n", table.trim_fmt()))
 }

@@ -1,7 +1,6 @@
 //! `fipa doctor`: checks this machine.
 
 use clap::Args;
-use comfy_table::{Table, presets};
 use fipa::doctor::{Check, Verdict, examine};
 use fipa_acl::escape;
 use serde_json::json;
@@ -13,8 +12,9 @@ use crate::report::Failure;
 /// Check this machine for problems
 ///
 /// Checks the requirements of the configured transports: the size of /dev/shm, limits, permissions,
-/// files left by dead processes. If discovery.mdns is on, it also tests multicast on each network
-/// interface, which takes three seconds. It changes nothing.
+/// files left by dead processes, domains of other users, and the TCP ports of the peers in
+/// discovery.static. If discovery.mdns is on, it also tests multicast on each network interface, which
+/// takes three seconds. It changes nothing.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -64,13 +64,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 }
 
 fn table(checks: &[Check]) -> String {
-    let mut table = Table::new();
-    table
-        .load_style(presets::NOTHING)
-        .set_header(["VERDICT", "AREA", "CHECK", "FOUND"]);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
+    let mut table = output::table(["VERDICT", "AREA", "CHECK", "FOUND"]);
     for check in checks {
         let mut found = escape(&check.found).into_owned();
         if let Some(advice) = &check.advice {

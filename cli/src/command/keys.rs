@@ -1,11 +1,11 @@
 //! `fipa keys`: the keys of this host and the certificates that it trusts.
 
+use std::io::{self, IsTerminal};
 use std::path::{self, Path, PathBuf};
 use std::time::Duration;
 
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
-use comfy_table::{Table, presets};
 use fipa::ErrorChain;
 use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID};
 use fipa_acl::escape;
@@ -85,17 +85,34 @@ JSON:
         json: bool,
     },
 
-    /// Revoke the trust in a host
+    /// End the trust in a host
     ///
-    /// Open connections to the host are closed, and its certificate is never trusted again.
+    /// Open connections to the host are closed. `fipa keys trust` with the same file trusts the host again.
+    #[command(after_help = "\
+Examples:
+  fipa keys distrust crex-mts
+  fipa keys distrust 5d41402abc4b")]
+    Distrust {
+        /// Name of its gateway, or the first 8 or more digits of the fingerprint
+        #[arg(value_name = "NAME|FINGERPRINT")]
+        which: String,
+    },
+
+    /// Revoke the certificate of a host permanently
+    ///
+    /// For a private key that may be in other hands. Open connections to the host are closed, and its
+    /// certificate is never trusted again. On a terminal the command asks first; elsewhere it needs --yes.
     #[command(after_help = "\
 Examples:
   fipa keys revoke crex-mts
-  fipa keys revoke 5d41402abc4b")]
+  fipa keys revoke 5d41402abc4b --yes")]
     Revoke {
         /// Name of its gateway, or the first 8 or more digits of the fingerprint
         #[arg(value_name = "NAME|FINGERPRINT")]
         which: String,
+        /// Revoke without asking
+        #[arg(long, short)]
+        yes: bool,
     },
 
     /// Create the next key and certificate, or switch to them
@@ -168,18 +185,20 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             output::text(&text)
         }
         Action::List { json } => list(&keys, json).map_err(|error| failed(&error, &keys))?,
-        Action::Revoke { which } => {
+        Action::Distrust { which } => {
+            let distrusted = keys.distrust(&which);
+            let distrusted = distrusted.map_err(|error| failed(&error, &keys))?;
+            output::text(&all_described("no longer trusted:", &distrusted))
+        }
+        Action::Revoke { which, yes } => {
+            let meant = keys.trusted_as(&which);
+            let meant = meant.map_err(|error| failed(&error, &keys))?;
+            if !yes && !confirmed(&meant)? {
+                return output::text("nothing was revoked\n");
+            }
             let revoked = keys.revoke(&which);
             let revoked = revoked.map_err(|error| failed(&error, &keys))?;
-            let mut text = String::new();
-            for certificate in &revoked {
-                text.push_str(&format!(
-                    "revoked {}\n{}",
-                    escape(certificate.certified().mts()),
-                    described(certificate)
-                ));
-            }
-            output::text(&text)
+            output::text(&all_described("revoked", &revoked))
         }
         Action::Renew { switch, valid } => {
             let renewed = match switch {
@@ -198,6 +217,37 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             output::text(&format!("{done}\n{}", described(&renewed)))
         }
     }
+}
+
+/// Asks for the confirmation that these certificates are to be revoked.
+fn confirmed(certificates: &[Certificate]) -> Result<bool, Failure> {
+    if !io::stdin().is_terminal() {
+        return Err(Failure::wrong_usage(
+            "a revoked certificate is never trusted again, and standard input is no terminal to ask",
+            "the command line",
+            "add --yes, or end the trust until further notice with `fipa keys distrust`",
+        ));
+    }
+    output::text(&format!(
+        "{}These certificates will never be trusted again (`fipa keys distrust` can be undone).\n\
+         Revoke them? Type yes: ",
+        all_described("revoking", certificates)
+    ))?;
+    let mut answer = String::new();
+    // Without an answer nothing is revoked.
+    let _ = io::stdin().read_line(&mut answer);
+    Ok(answer.trim() == "yes")
+}
+
+fn all_described(done: &str, certificates: &[Certificate]) -> String {
+    let one = |certificate: &Certificate| {
+        format!(
+            "{done} {}\n{}",
+            escape(certificate.certified().mts()),
+            described(certificate)
+        )
+    };
+    certificates.iter().map(one).collect()
 }
 
 /// Returns the directory of the keys if neither `--dir` nor `security.keys` names one.
@@ -313,9 +363,7 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
     if all.iter().all(|(_, certificates)| certificates.is_empty()) {
         return Ok(output::text(&missing));
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING);
-    table.set_header(["", "gateway", "agents", "valid until", "fingerprint"]);
+    let mut table = output::table(["LIST", "GATEWAY", "AGENTS", "VALID UNTIL", "FINGERPRINT"]);
     for (list, certificates) in all {
         for certificate in certificates {
             table.add_row([
@@ -327,7 +375,10 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
             ]);
         }
     }
-    Ok(output::text(&format!("{dir}\n{table}\n{missing}")))
+    Ok(output::text(&format!(
+        "{dir}\n{}\n{missing}",
+        table.trim_fmt()
+    )))
 }
 
 fn to_json(certificate: &Certificate) -> Value {

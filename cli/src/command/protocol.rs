@@ -6,7 +6,6 @@ mod mermaid;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
-use comfy_table::{Table, presets};
 use fipa::monitor::projection::Projection;
 use fipa::monitor::scxml::MAX_FILE;
 use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
@@ -228,9 +227,7 @@ fn list(library: &Library, as_json: bool) -> Result<(), Failure> {
         };
         return output::json(&library.iter().map(one).collect::<Value>());
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING);
-    table.set_header(["PROTOCOL", "TITLE", "ALIASES"]);
+    let mut table = output::table(["PROTOCOL", "TITLE", "ALIASES"]);
     for machine in library.iter() {
         let aliases = machine.aliases().join(", ");
         table.add_row([

@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use clap::Args;
-use comfy_table::{Table, presets};
+use comfy_table::Table;
 use fipa::routes::{self, AskError, Report, Route, RouteState, Standing};
 use fipa::{Domain, ErrorChain, Incarnation, Matcher, Query, Reach, RegisterOptions, Role};
 use fipa_acl::escape;
 use serde_json::json;
 
+use crate::complete;
 use crate::membership;
 use crate::options::Global;
 use crate::output;
@@ -53,7 +54,7 @@ JSON:
     \"neighbours\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\" } ] }")]
 pub(crate) struct Arguments {
     /// Show only routes to agents with this name or with a name that matches this pattern
-    #[arg(value_parser = parse_receivers)]
+    #[arg(value_parser = parse_receivers, add = complete::agents())]
     pattern: Option<Receivers>,
 
     /// Print JSON
@@ -142,7 +143,7 @@ async fn gateway_report(
 
 fn described(process: &Report, gateway: Option<&Report>) -> String {
     let mut text = String::new();
-    let mut table = table(&["TO", "FROM", "ROUTE", "STATUS"]);
+    let mut table = output::table(["TO", "FROM", "ROUTE", "STATUS"]);
     for route in &process.routes {
         rows_of(&mut table, route, "this host");
         let remote = gateway.filter(|_| route.gateway.is_some());
@@ -163,7 +164,7 @@ fn gateway_described(gateway: &Report) -> String {
     let locations: Vec<String> = gateway.locations.iter().map(ToString::to_string).collect();
     let mut text = format!("\nGateway {}:\n", escape(&gateway.mts));
     text.push_str(&format!("listening on {}\n", locations.join(", ")));
-    let mut ways = table(&[
+    let mut ways = output::table([
         "ROUTE",
         "STATUS",
         "IN FLIGHT",
@@ -259,7 +260,7 @@ fn standing(standing: &Standing) -> String {
         }
         Standing::NotInOrder => "not used: transport not listed in mts.transports".to_owned(),
         Standing::Unsupported => "not used: unsupported transport".to_owned(),
-        other => format!("{other:?}"),
+        _ => "unknown state".to_owned(),
     }
 }
 
@@ -271,13 +272,4 @@ fn last_error(way: &RouteState) -> String {
         }
         _ => String::new(),
     }
-}
-
-fn table(columns: &[&str]) -> Table {
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_header(columns);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
-    table
 }

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use clap::Args;
-use fipa::{Change, Config, Entry, Gateway};
+use fipa::keys::Keys;
+use fipa::{Change, Config, Entry, Gateway, Reach};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
@@ -121,6 +122,7 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     for location in gateway.locations() {
         text.push_str(&format!("  listening on {location}\n"));
     }
+    text.push_str(&format!("  other hosts: {}\n", trusted_hosts(config)));
     let discovery = match (config.discovery.mdns, problem) {
         (false, _) => "off (discovery.mdns = false)".to_owned(),
         (true, None) => "mDNS".to_owned(),
@@ -130,6 +132,28 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
         "  discovery of other hosts: {discovery}\n  press Ctrl-C to stop\n"
     ));
     text
+}
+
+/// The hosts with which the gateway exchanges letters, and whether the letters are encrypted.
+fn trusted_hosts(config: &Config) -> String {
+    if config.security.keys.is_empty() {
+        return match config.security.insecure {
+            true => "any that can connect, not encrypted (security.insecure = true)".to_owned(),
+            false => {
+                "none without keys (security.keys is not set), except over loopback".to_owned()
+            }
+        };
+    }
+    let trusted = Keys::at(&config.security.keys).trusted();
+    let trusted = trusted.unwrap_or_default();
+    let names: Vec<_> = trusted
+        .iter()
+        .map(|it| escape(it.certified().mts()))
+        .collect();
+    match names.as_slice() {
+        [] => "none: no certificate is trusted yet (`fipa keys trust FILE`)".to_owned(),
+        names => format!("encrypted, with the certificates of {}", names.join(", ")),
+    }
 }
 
 fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Value {
@@ -159,9 +183,13 @@ fn log(change: &Change) {
 }
 
 fn log_entry(change: &str, entry: &Entry) {
+    let reach = match entry.reach {
+        Reach::Local => "this host",
+        Reach::Remote { .. } => "another host",
+    };
     tracing::info!(
         name = %entry.name,
-        reach = ?entry.reach,
+        reach,
         mts = %entry.mts.name,
         "{change}"
     );

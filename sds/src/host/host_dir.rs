@@ -139,6 +139,39 @@ impl HostDir {
         Ok(host_dir)
     }
 
+    /// Opens an existing directory for reading, without joining it. Returns `None` if there is none.
+    pub(super) fn look(path: &Path) -> Result<Option<Self>, HostError> {
+        let path: PathBuf = path.components().collect();
+        let dir = match open_existing(&path) {
+            Ok(dir) => dir,
+            Err(HostError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                return Ok(None);
+            }
+            Err(error) => return Err(error),
+        };
+        let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let name = Name::Domain;
+        let domain = match rustix::fs::openat(&dir, name.to_string(), flags, Mode::empty()) {
+            Ok(file) => check_file(file, &path, name)?,
+            Err(Errno::NOENT) => return Ok(None),
+            Err(error) => {
+                return Err(HostError::Io {
+                    what: "open",
+                    path: path.join(name.to_string()),
+                    source: error.into(),
+                });
+            }
+        };
+        Ok(Some(Self {
+            path,
+            dir,
+            domain,
+            threads: Mutex::default(),
+            id: Id(0),
+            process: Mutex::new(None),
+        }))
+    }
+
     fn try_join(&self, cancellation: &Cancellation) -> Result<bool, HostError> {
         let guard = self.lock_any(cancellation)?;
         if !guard.is_current()? {
@@ -593,6 +626,15 @@ fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
         // An existing path, which may be of any type, is checked below.
         _ => {}
     }
+    open_existing(path)
+}
+
+/// Opens a directory if it is private.
+fn open_existing(path: &Path) -> Result<OwnedFd, HostError> {
+    let io = |what| {
+        let path = path.to_owned();
+        move |source| HostError::Io { what, path, source }
+    };
     let refused = |why: String| HostError::NotPrivate {
         path: path.to_owned(),
         why,

@@ -22,7 +22,7 @@ mod watcher;
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -32,7 +32,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 
 pub use self::cancellation::Cancellation;
-use self::host_dir::{HostDir, Id};
+use self::host_dir::{HostDir, Id, Name};
 use self::shared::Shared;
 use self::watcher::Watcher;
 use crate::{
@@ -99,6 +99,30 @@ impl HostDirectory {
             runtime,
             task: Mutex::new(task),
         })
+    }
+
+    /// Reads the entries of the running processes of a domain once, without joining its directory:
+    /// nothing is created, and no other process is waited for or notified. Files that cannot be read are
+    /// skipped. The result is sorted by name and empty if there is no domain.
+    ///
+    /// # Errors
+    /// Fails when the directory is not private, or cannot be read.
+    pub fn peek(dir: &Path) -> Result<Vec<Arc<Entry>>, HostError> {
+        let Some(host_dir) = HostDir::look(dir)? else {
+            return Ok(Vec::new());
+        };
+        let mut found: Vec<Arc<Entry>> = Vec::new();
+        for name in host_dir.names()? {
+            if let Name::Entries(id) = name
+                && host_dir.is_running(id).unwrap_or(false)
+                && let Ok(Some(bytes)) = host_dir.read_entries(id)
+                && let Ok(entries) = file::read(&bytes)
+            {
+                found.extend(entries.into_values());
+            }
+        }
+        found.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(found)
     }
 
     /// Replaces the agents of other hosts that this gateway publishes to the processes of this

@@ -71,6 +71,7 @@ where
     F: Future<Output = io::Result<T>> + Send + 'static,
 {
     let several = addresses.len() > 1;
+    let all = addresses.join(", ");
     let attempts = addresses.into_iter().map(|address| {
         let connect = connect.clone();
         async move {
@@ -84,10 +85,18 @@ where
     let patience = limits.connect_timeout;
     match timeout(patience, race(attempts)).await {
         Ok(connected) => connected.map_err(|error| Unreachable(error.to_string())),
-        Err(_) => Err(Unreachable(format!(
-            "timed out connecting after {patience:?} (connect_timeout)"
-        ))),
+        Err(_) => Err(Unreachable(nothing_answered(&all, patience))),
     }
+}
+
+/// The error when no packet came back, which in most cases means that a firewall drops them.
+fn nothing_answered(addresses: &str, patience: Duration) -> String {
+    let seconds = patience.as_secs_f32();
+    let port = addresses.rsplit(':').next().unwrap_or_default();
+    format!(
+        "nothing answered on {addresses} for {seconds} s; check that a firewall there lets it in (for \
+         example: sudo ufw allow {port})"
+    )
 }
 
 /// Resolves an address and tries the results with `connect`.

@@ -74,12 +74,26 @@ fn handshake_timeout(patience: Duration) -> String {
     format!("TLS handshake not complete within {patience:?} (handshake_timeout)")
 }
 
+/// Whether the peer ended the connection without an alert, as a peer without TLS does.
+fn is_end(error: &io::Error) -> bool {
+    use io::ErrorKind as E;
+    matches!(
+        error.kind(),
+        E::UnexpectedEof | E::ConnectionReset | E::ConnectionAborted | E::BrokenPipe
+    )
+}
+
 fn handshake_error(error: &io::Error) -> String {
     let inner = error.get_ref().and_then(|it| it.downcast_ref());
     match inner {
         Some(inner) => format!(
             "TLS handshake failed: {error} ({})",
             advice::of_error(inner)
+        ),
+        None if is_end(error) => format!(
+            "the peer closed the connection during the TLS handshake ({error}): this host has keys and \
+             the peer has none; set security.keys there (`fipa keys init`) and trust each other's \
+             certificates, or remove security.keys here"
         ),
         None => format!("TLS handshake failed: {error}"),
     }

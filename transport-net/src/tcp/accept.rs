@@ -114,6 +114,9 @@ enum Waiting {
     QueueFull(UnprovedSlot, Full),
 }
 
+/// The first byte of a TLS handshake (RFC 8446 section 5.1), also for builds without TLS.
+const TLS_RECORD: u8 = 22;
+
 /// The first byte of a connection.
 enum First {
     Byte(u8),
@@ -185,6 +188,12 @@ async fn receive(
                 Ok(()) => return,
                 Err(refused) => refused.to_string(),
             }
+        }
+        First::Byte(TLS_RECORD) => {
+            "the peer has keys and began TLS, but this gateway has no keys: set \
+                                    security.keys here (`fipa keys init`) and trust each other's \
+                                    certificates, or remove security.keys there"
+                .to_owned()
         }
         First::Byte(byte) => format!("unknown protocol: the first byte is {byte:#04x}"),
         First::End => return,
@@ -360,7 +369,10 @@ async fn prove(
             return Some((waiting, stream));
         }
         First::Byte(_) => {
-            "the peer did not begin TLS, which it needs to prove its identity".to_owned()
+            "the peer did not begin TLS: it has no keys, but this gateway has and requires them of its \
+             peers; set security.keys there (`fipa keys init`) and trust each other's certificates, or \
+             remove security.keys here"
+                .to_owned()
         }
         First::End => return None,
         First::Broken(error) => error.to_string(),

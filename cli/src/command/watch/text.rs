@@ -11,6 +11,7 @@ use fipa_content::{Content, Printer, Profile};
 use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
 use super::checker::{CheckResult, Overdue};
+use crate::output;
 
 /// The properties of the terminal.
 #[derive(Debug, Clone, Copy, Default)]
@@ -31,13 +32,11 @@ pub(super) enum Ink {
 
 impl Look {
     pub(super) fn of_stdout() -> Self {
+        let width = output::terminal_width();
         let terminal = std::io::stdout().is_terminal();
         let plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
-        let size = terminal_size::terminal_size();
         Self {
-            width: size
-                .filter(|_| terminal)
-                .map(|(width, _)| usize::from(width.0)),
+            width,
             color: terminal && !plain,
         }
     }
@@ -63,6 +62,7 @@ pub(super) struct TextOutput {
 }
 
 /// Widths of the columns up to the verdict.
+#[derive(Debug, Clone, Copy)]
 struct Columns {
     time: usize,
     agents: usize,
@@ -103,15 +103,21 @@ const NARROW: Columns = Columns {
 /// Minimum width of the terminal for the wide columns.
 const WIDE_ENOUGH: usize = 140;
 
+/// Width of the terminal for which the narrow columns are made. Beyond it, the agents get the rest.
+const NARROW_WIDTH: usize = 80;
+
 impl TextOutput {
     pub(super) fn new(look: Look) -> Self {
         Self { look }
     }
 
-    fn columns(&self) -> &'static Columns {
+    fn columns(&self) -> Columns {
         match self.look.width {
-            Some(width) if width < WIDE_ENOUGH => &NARROW,
-            _ => &WIDE,
+            Some(width) if width < WIDE_ENOUGH => Columns {
+                agents: NARROW.agents + width.saturating_sub(NARROW_WIDTH),
+                ..NARROW
+            },
+            _ => WIDE,
         }
     }
 
@@ -129,7 +135,7 @@ impl TextOutput {
             "VIA",
             outcome,
         ];
-        let head = row(columns, names.map(str::to_owned), "VERDICT");
+        let head = row(&columns, names.map(str::to_owned), "VERDICT");
         first_line(domain, processes) + &self.look.paint(Ink::Quiet, head.trim_end()) + "\n"
     }
 
@@ -145,7 +151,11 @@ impl TextOutput {
         };
         let cells = [
             time_of_day(passage.at, columns.time),
-            format!("{} → {}", passage.sender().unwrap_or("?"), passage.receiver),
+            agents(
+                &escape(passage.sender().unwrap_or("?")),
+                &escape(&passage.receiver),
+                columns.agents,
+            ),
             message.map_or_else(
                 || "(unreadable)".to_owned(),
                 |it| it.performative().to_string(),
@@ -168,7 +178,7 @@ impl TextOutput {
             CheckResult::Violation(_) => look.paint(Ink::Bad, "VIOLATION"),
             _ => "-".to_owned(),
         };
-        let mut text = row(columns, cells, &verdict);
+        let mut text = row(&columns, cells, &verdict);
         if is_failure(&passage.fate) {
             text = look.paint(Ink::Warning, &text);
         }
@@ -180,7 +190,10 @@ impl TextOutput {
             below(Ink::Bad, &format!("✗ {violation}"));
         }
         if let Some(problem) = delivery_problem(&passage.fate) {
-            below(Ink::Warning, &problem);
+            below(
+                Ink::Warning,
+                &format!("to {}: {problem}", escape(&passage.receiver)),
+            );
         }
         if !passage.content.is_empty() {
             match formatted(passage) {
@@ -286,6 +299,21 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
         text.push_str(gap);
     }
     text + verdict
+}
+
+/// The sender and the receiver in at most this number of columns. If both are too long, each has half,
+/// and the column that is left over is the receiver's.
+fn agents(sender: &str, receiver: &str, width: usize) -> String {
+    const ARROW: &str = " → ";
+    let room = width.saturating_sub(ARROW.width());
+    let half = room / 2;
+    let for_receiver = match sender.width() <= half {
+        true => room - sender.width(),
+        false => receiver.width().min(room - half),
+    };
+    let receiver = cut(receiver, for_receiver);
+    let sender = cut(sender, room - receiver.width());
+    format!("{sender}{ARROW}{receiver}")
 }
 
 /// The text in exactly this number of columns: shortened, or padded with spaces.
@@ -403,6 +431,24 @@ mod tests {
         assert_eq!(fitted("manipulator", 5), "mani…");
         assert_eq!(fitted("机器人手臂", 6), "机器… ");
         assert_eq!(cut("x", 0), "");
+    }
+
+    #[test]
+    fn a_long_sender_does_not_hide_the_receiver() {
+        assert_eq!(agents("rover", "arm_1", 17), "rover → arm_1");
+        assert_eq!(
+            agents("fipa-send-0123456789abcdef", "arm_1", 17),
+            "fipa-sen… → arm_1"
+        );
+        assert_eq!(agents("rover", "manipulator_left", 17), "rover → manipula…");
+        assert_eq!(
+            agents("fipa-send-0123456789abcdef", "manipulator_left", 17),
+            "fipa-s… → manipu…"
+        );
+        for width in 0..40 {
+            let fits = agents("fipa-send-0123456789abcdef", "manipulator_left", width);
+            assert!(fits.width() <= width.max(3), "{width}: {fits}");
+        }
     }
 
     #[test]

@@ -74,8 +74,8 @@ impl Lane {
                 self.letters[index].ended(AttemptEnd::Unknown);
                 self.came_back(now, index, &location, error, table);
             }
-            other => {
-                let text = format!("unknown conclusion of the attempt: {other:?}");
+            _ => {
+                let text = "the transport reported an unknown conclusion of the attempt";
                 self.letters[index].ended(AttemptEnd::Unknown);
                 let error = TransportError::new(TransportErrorKind::Incompatible, text);
                 self.came_back(now, index, &location, error, table);
@@ -144,8 +144,8 @@ impl Lane {
             Answer::Failed { reason, detail } => {
                 self.refused(now, index, &location, (reason, detail), table);
             }
-            other => {
-                let detail = format!("unknown answer: {other:?}");
+            _ => {
+                let detail = "the receiving service gave an unknown answer".to_owned();
                 let refused = (FailureReason::Refused, detail);
                 self.refused(now, index, &location, refused, table);
             }

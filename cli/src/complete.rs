@@ -1,0 +1,127 @@
+//! Completion of command lines: the texts that depend on the configuration and the running agents.
+//!
+//! The shell runs this program with `$FIPA_COMPLETE`, and clap's engine completes commands and options
+//! by itself. Nothing here joins a domain, so that a completion takes milliseconds.
+
+use std::ffi::{OsStr, OsString};
+use std::path::PathBuf;
+
+use clap_complete::CompleteEnv;
+use clap_complete::engine::{ArgValueCompleter, CompletionCandidate};
+use fipa::Domain;
+use fipa::config::{Effective, Sources, Value};
+use fipa_acl::is_unprintable;
+
+use crate::options;
+
+/// The variable with which a shell asks for completions.
+pub(crate) const VARIABLE: &str = "FIPA_COMPLETE";
+
+/// Tables whose keys the user chooses.
+const TABLES: [&str; 4] = [
+    "routes.",
+    "discovery.static.",
+    "access.allow.",
+    "access.deny.",
+];
+
+/// Answers a shell that asks for completions, and ends the process. Returns if none does.
+pub(crate) fn answer() {
+    CompleteEnv::with_factory(options::command)
+        .var(VARIABLE)
+        .complete();
+}
+
+/// Completes the name of an agent of the domain.
+pub(crate) fn agents() -> ArgValueCompleter {
+    ArgValueCompleter::new(|current: &OsStr| {
+        let current = current.to_string_lossy();
+        let names = Effective::load(&sources(words()))
+            .ok()
+            .and_then(|effective| Domain::names(effective.config()).ok());
+        let names = names.unwrap_or_default().into_iter();
+        names
+            // A name with unprintable characters could change the terminal.
+            .filter(|name| name.starts_with(&*current) && !name.contains(is_unprintable))
+            .map(CompletionCandidate::new)
+            .collect()
+    })
+}
+
+/// Completes a key of the configuration, for `--set`.
+pub(crate) fn keys() -> ArgValueCompleter {
+    ArgValueCompleter::new(|current: &OsStr| {
+        let current = current.to_string_lossy();
+        let defaults = Effective::load(&Sources::default());
+        let settings = defaults.map(|all| all.settings()).unwrap_or_default();
+        let keys = settings.into_iter().map(|setting| {
+            let help = match setting.value {
+                Value::Text(text) => text,
+                Value::List(items) => items.join(", "),
+                Value::Truth(truth) => truth.to_string(),
+                Value::Number(number) => number.to_string(),
+                _ => String::new(),
+            };
+            (format!("{}=", setting.path.join(".")), help)
+        });
+        let tables = TABLES.map(|table| (table.to_owned(), String::new()));
+        keys.chain(tables)
+            .filter(|(key, _)| key.starts_with(&*current))
+            .map(|(key, help)| {
+                let help = Some(help).filter(|help| !help.is_empty());
+                CompletionCandidate::new(key)
+                    .help(help.map(|help| format!("default: {help}").into()))
+            })
+            .collect()
+    })
+}
+
+/// The words of the command line that is completed, which follow the first `--`.
+fn words() -> impl Iterator<Item = OsString> {
+    std::env::args_os().skip_while(|word| word != "--").skip(1)
+}
+
+/// The sources of the configuration that this command line names.
+fn sources(words: impl Iterator<Item = OsString>) -> Sources {
+    let mut sources = Sources::from_environment();
+    let mut words = words.map(|word| word.to_string_lossy().into_owned());
+    while let Some(word) = words.next() {
+        let (option, value) = match word.split_once('=') {
+            Some((option, value)) if option.starts_with("--") => (option, Some(value.to_owned())),
+            _ => (word.as_str(), None),
+        };
+        match option {
+            "--set" => sources.set.extend(value.or_else(|| words.next())),
+            "--config" => sources.file = value.or_else(|| words.next()).map(PathBuf::from),
+            _ => {}
+        }
+    }
+    // An assignment that is not complete yet.
+    sources.set.retain(|set| set.contains('='));
+    sources
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_options_of_the_command_line_select_the_configuration() {
+        let words = [
+            "fipa",
+            "--set",
+            "domain=a",
+            "send",
+            "--config",
+            "x.toml",
+            "--set=mts.queue=7",
+            "--to",
+            "arm",
+            "--set",
+            "mts.dead",
+        ];
+        let sources = sources(words.into_iter().map(OsString::from));
+        assert_eq!(sources.set, ["domain=a", "mts.queue=7"]);
+        assert_eq!(sources.file, Some(PathBuf::from("x.toml")));
+    }
+}

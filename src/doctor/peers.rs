@@ -1,0 +1,101 @@
+//! Tests whether the TCP ports of static peers let this host in.
+
+use std::io;
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs as _};
+use std::time::Duration;
+
+use super::{Area, Check, Verdict};
+use crate::{Config, Kind};
+
+const AREA: Area = Area("network");
+const PORTS: &str = "ports of static peers";
+
+/// Maximum number of locations that are checked, each in a thread of its own.
+const MAX_CHECKED: usize = 32;
+
+/// Time for an answer.
+const TIMEOUT: Duration = Duration::from_secs(2);
+
+pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
+    if !config.mts.transports.contains(&Kind::Tcp) {
+        return;
+    }
+    let peers = config.discovery.peers.iter();
+    let locations = peers.flat_map(|peer| {
+        let tcp = peer.locations.iter();
+        let tcp = tcp.filter(|location| location.kind() == Kind::Tcp);
+        tcp.map(|location| (peer.name.clone(), location.address().to_owned()))
+    });
+    let threads: Vec<_> = locations
+        .take(MAX_CHECKED)
+        .map(|(name, address)| std::thread::spawn(move || check(&name, &address)))
+        .collect();
+    // A thread that cannot report has panicked, and its check is missing.
+    checks.extend(threads.into_iter().filter_map(|thread| thread.join().ok()));
+}
+
+fn check(name: &str, address: &str) -> Check {
+    let found = |what: &str| format!("{name}, tcp://{address}: {what}");
+    let doubtful =
+        |what: &str, advice: String| AREA.problem(PORTS, Verdict::Doubtful, found(what), advice);
+    match connect(address) {
+        Ok(()) => AREA.fine(PORTS, found("accepts connections")),
+        Err(error) if error.kind() == io::ErrorKind::TimedOut => {
+            let port = address.rsplit(':').next().unwrap_or_default();
+            doubtful(
+                &format!("nothing answered for {} s", TIMEOUT.as_secs()),
+                format!(
+                    "check that a firewall there lets it in (for example: sudo ufw allow {port}/tcp), and \
+                     that the host is on"
+                ),
+            )
+        }
+        Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => doubtful(
+            "the host answers, but no process listens on this port",
+            "start `fipa up` there, with this port and an address of that host in transport.tcp.listen"
+                .to_owned(),
+        ),
+        Err(error) => doubtful(
+            &format!("cannot be reached: {error}"),
+            "check the address in discovery.static, and the network (`ip route`)".to_owned(),
+        ),
+    }
+}
+
+/// Opens a connection and closes it. The peer ignores a connection without a byte.
+fn connect(address: &str) -> io::Result<()> {
+    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    let addresses: Vec<SocketAddr> = address.to_socket_addrs()?.take(4).collect();
+    for address in addresses {
+        match TcpStream::connect_timeout(&address, TIMEOUT) {
+            Ok(_) => return Ok(()),
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+
+    use super::*;
+
+    #[test]
+    fn an_open_and_a_closed_port_are_told_apart() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let open = check("crex", &address);
+        assert_eq!(open.verdict, Verdict::Fine, "{}", open.found);
+        let wrong = check("crex", "name without port");
+        assert_eq!(wrong.verdict, Verdict::Doubtful);
+        drop(listener);
+        let closed = check("crex", &address);
+        assert_eq!(closed.verdict, Verdict::Doubtful, "{}", closed.found);
+        assert!(
+            closed.found.contains("no process listens"),
+            "{}",
+            closed.found
+        );
+    }
+}
