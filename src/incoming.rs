@@ -39,6 +39,13 @@ impl Incoming {
         }
     }
 
+    /// Returns the message. Its content may be in shared memory of the sender: it stays readable as long
+    /// as this value exists, but another process of the same user can change it.
+    #[must_use]
+    pub fn message(&self) -> &Message {
+        &self.message
+    }
+
     /// Returns the violation of the message's protocol, if there is one and `monitor.check` is `warn`
     /// or `enforce`.
     ///

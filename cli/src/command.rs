@@ -14,9 +14,13 @@ mod doctor;
 mod echo;
 mod encode;
 mod keys;
+mod listen;
+mod ping;
 mod protocol;
+mod request;
 mod routes;
 mod send;
+mod subscribe;
 mod up;
 mod watch;
 
@@ -32,6 +36,10 @@ pub(crate) enum Command {
     Agents(agents::Arguments),
     Send(Box<send::Arguments>),
     Echo(echo::Arguments),
+    Listen(listen::Arguments),
+    Request(request::Arguments),
+    Subscribe(subscribe::Arguments),
+    Ping(ping::Arguments),
     Coalition(coalition::Arguments),
     Df(df::Arguments),
     Ams(ams::Arguments),
@@ -56,6 +64,10 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Agents(arguments) => agents::run(arguments, global),
         Command::Send(arguments) => send::run(*arguments, global),
         Command::Echo(arguments) => echo::run(arguments, global),
+        Command::Listen(arguments) => listen::run(arguments, global),
+        Command::Request(arguments) => request::run(arguments, global),
+        Command::Subscribe(arguments) => subscribe::run(arguments, global),
+        Command::Ping(arguments) => ping::run(arguments, global),
         Command::Coalition(arguments) => coalition::run(arguments, global),
         Command::Df(arguments) => df::run(arguments, global),
         Command::Ams(arguments) => ams::run(arguments, global),
