@@ -181,7 +181,7 @@ fn two_hosts() {
 fn own_protocol() {
     prints(
         "own_protocol",
-        &["not sent: …", "arm: delivered…", "rover received confirm"],
+        &["not sent: …", "rover: delivered…", "rover received confirm"],
     );
 }
 

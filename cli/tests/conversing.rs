@@ -74,8 +74,10 @@ fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
     match action.as_str() {
         "fail" => Ok(Reply::Failure("it fell".into())),
         "wait" => {
-            task.cancelled(PATIENCE)?;
-            let reply = task.confirm_cancel()?;
+            let reply = match task.cancelled(PATIENCE)? {
+                true => task.confirm_cancel()?,
+                false => return Ok(Reply::Failure("no cancel".into())),
+            };
             mark("canceled");
             Ok(reply)
         }

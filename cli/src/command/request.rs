@@ -18,8 +18,8 @@ use crate::options::{self, Global};
 use crate::output;
 use crate::report::{self, Failure};
 
-/// Deadline of the message that cancels a conversation at the end of the command.
-pub(super) const CANCEL_WITHIN: Duration = Duration::from_secs(1);
+/// Maximum wait for the confirmation of a cancel at the end of the command. A second signal ends it.
+pub(super) const CANCEL_WITHIN: Duration = Duration::from_secs(3);
 
 /// Request an action from an agent (FIPA00026)
 ///
@@ -159,6 +159,7 @@ async fn converse(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Resu
             match unless_stopped(lead, &mut reachability, stop).await {
                 Some(ended) => ended,
                 None => {
+                    Stop::ending();
                     cancel(agent, &arguments.name, &id).await;
                     return Err(stopped());
                 }
@@ -234,8 +235,23 @@ async fn cancel(agent: &Agent, to: &AgentId, conversation: &str) {
         .reply_with(agent.unique_id());
     match agent.send_within(cancel, CANCEL_WITHIN).await {
         Ok(deliveries) if deliveries.all_succeeded() => {}
-        Ok(deliveries) => report::warn(&format!("the cancel was not delivered: {deliveries}")),
-        Err(error) => report::warn(&format!("cannot cancel: {}", ErrorChain(&error))),
+        Ok(deliveries) => {
+            return report::warn(&format!("the cancel was not delivered: {deliveries}"));
+        }
+        Err(error) => return report::warn(&format!("cannot cancel: {}", ErrorChain(&error))),
+    }
+    let confirmed = async {
+        while let Ok(incoming) = agent.receive().await {
+            let message = incoming.message();
+            if message.conversation_id() == Some(conversation) {
+                return *message.performative() != Performative::Failure;
+            }
+        }
+        false
+    };
+    let confirmed = tokio::time::timeout(CANCEL_WITHIN, confirmed).await;
+    if !confirmed.unwrap_or(false) {
+        report::warn("the agent has not confirmed the cancel");
     }
 }
 

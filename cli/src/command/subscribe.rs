@@ -99,6 +99,7 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
     match unless_stopped(print, &mut reachability, stop).await {
         Some(Err(failure)) => Err(failure),
         Some(Ok(())) | None => {
+            Stop::ending();
             if let Err(error) = subscription.cancel(CANCEL_WITHIN).await {
                 report::warn(&format!("the subscription was not canceled: {error}"));
             }
