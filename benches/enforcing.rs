@@ -3,7 +3,7 @@
 //! of some milliseconds, so other load affects them alike. A ratio is the median of the ratios of turns.
 //!
 //! ```console
-//! $ cargo bench --features monitor --bench enforcing
+//! $ cargo bench --features protocols --bench enforcing
 //! ```
 
 #![expect(clippy::unwrap_used, reason = "a bench that cannot go on has failed")]

@@ -1,63 +1,54 @@
-//! A rover calls three arms for proposals and awards the cheapest.
+//! A rover calls three arms for proposals and awards the cheapest (FIPA00029).
 //!
 //! ```console
-//! $ cargo run --example contract_net --features monitor
+//! $ cargo run --example contract_net
 //! ```
+
+#![allow(clippy::print_stdout, reason = "an example prints")]
 
 use std::time::Duration;
 
-use fipa::config::Sources;
-use fipa::protocol::{DialogueError, Reply};
-use fipa::{Agent, AgentId, Config, Domain, Performative};
+use fipa::protocol::{Reply, Task};
+use fipa::{Agent, Domain, Performative::Cfp};
 
 /// Maximum wait for the answers of a step.
-const TIMEOUT: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 #[tokio::main]
-async fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let domain = Domain::open(&Config::load(&Sources::from_environment())?).await?;
+async fn main() -> fipa::Result<()> {
+    let domain = Domain::from_environment().await?;
     let rover = domain.register("rover").await?;
     let mut arms = Vec::new();
     for (name, price) in [("arm_1", 30), ("arm_2", 10), ("arm_3", 20)] {
         let arm = domain.register(name).await?;
-        arms.push(arm.id().clone());
-        tokio::spawn(async move { work(&arm, price).await });
+        let server = arm.serve("fipa-contract-net", move |task| bid(task, price))?;
+        arms.push((arm, server));
     }
-    call(&rover, &arms).await?;
+    call(&rover).await?;
     domain.close().await;
     Ok(())
 }
 
 /// Runs the initiator.
-async fn call(rover: &Agent, arms: &[AgentId]) -> Result<(), DialogueError> {
-    let call = rover.message(Performative::Cfp).content("(carry crate)");
-    let mut net = rover.contract_net(call, arms, TIMEOUT).await?;
-    let price = |bid: &fipa::Message| {
-        let text = String::from_utf8_lossy(bid.content()?).into_owned();
-        text.parse::<u32>().ok()
-    };
-    let best = net.bids().proposals.iter().min_by_key(|bid| price(bid));
-    let best: Vec<_> = best.into_iter().cloned().collect();
-    for awarded in net.award(&best, "", TIMEOUT).await? {
+async fn call(rover: &Agent) -> fipa::Result<()> {
+    let carry = rover.message(Cfp).content("(carry crate)");
+    let mut net = rover.contract_net(carry, &["arm_.*"], TIMEOUT).await?;
+    let mut bids = net.bids().proposals.clone();
+    bids.sort_by_key(|bid| bid.parse::<u32>().unwrap_or(u32::MAX));
+    println!("{} proposals", bids.len());
+    for awarded in net.award(bids.get(..1).unwrap_or(&[]), "", TIMEOUT).await? {
         match awarded.result {
-            Ok(done) => print(&format!("{}: {done}", awarded.agent)),
-            Err(error) => print(&format!("{}: {error}", awarded.agent)),
+            Ok(done) => println!("{}: {:?}", awarded.agent, done.text()),
+            Err(error) => println!("{}: {error}", awarded.agent),
         }
     }
     Ok(())
 }
 
 /// Runs a participant.
-async fn work(arm: &Agent, price: u32) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
-    let call = arm.receive().await?.into_message();
-    let mut task = arm.take_part(&call)?;
-    if task.propose(price.to_string(), TIMEOUT).await? {
-        task.reply(Reply::Inform("carried".into())).await?;
+async fn bid(mut task: Task, price: u32) -> fipa::Result<Reply> {
+    match task.propose(price.to_string(), TIMEOUT).await? {
+        true => Ok(Reply::Inform("carried".into())),
+        false => Ok(Reply::Nothing),
     }
-    Ok(())
-}
-
-#[expect(clippy::print_stdout, reason = "an example prints its results")]
-fn print(text: &str) {
-    println!("{text}");
 }

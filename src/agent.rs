@@ -2,10 +2,13 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{AgentId, AgentIdError, ErrorChain, Letter, Message, MessageBuilder, Performative};
-use fipa_mts::{LetterDraft, PostError, letter_for};
+use fipa_acl::{
+    AgentId, AgentIdError, BuildError, ErrorChain, Message, MessageBuilder, Performative,
+};
+use fipa_mts::{LetterDraft, letter_for};
 use fipa_sds::{Cancellation, DeregisterError, RegisterError, Registration};
 use fipa_transport::{Incarnation, LoanedContent};
 
@@ -17,10 +20,22 @@ use crate::endpoint::Endpoint;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
 
-/// An agent of this process. Dropping it deregisters the agent.
+/// An agent of this process.
+///
+/// A clone is a further handle of the same agent, so that several tasks can use it. The agent is
+/// deregistered when [`deregister`](Self::deregister) is called on one of the handles, or when the last
+/// handle is dropped. A server or conversation of the agent is not a handle.
+#[derive(Clone)]
 pub struct Agent {
     pub(crate) core: Arc<AgentCore>,
-    registered: bool,
+    registration: Arc<RegistrationGuard>,
+}
+
+/// The registration that the handles of an agent share.
+struct RegistrationGuard {
+    core: Arc<AgentCore>,
+    /// Whether [`Agent::deregister`] was called.
+    is_over: AtomicBool,
 }
 
 /// The parts of an agent that its conversations share. They may outlast the [`Agent`], and end with an
@@ -95,13 +110,15 @@ impl Domain {
         match service.host.register_unless(registration, cancellation) {
             Ok(_) => {
                 warn_of_name(&id);
-                Ok(Agent {
-                    core: Arc::new(AgentCore {
-                        endpoint: Endpoint::new(self.clone(), id, name, incarnation),
-                        demultiplexer: Demultiplexer::default(),
-                    }),
-                    registered: true,
-                })
+                let core = Arc::new(AgentCore {
+                    endpoint: Endpoint::new(self.clone(), id, name, incarnation),
+                    demultiplexer: Demultiplexer::default(),
+                });
+                let registration = Arc::new(RegistrationGuard {
+                    core: Arc::clone(&core),
+                    is_over: AtomicBool::new(false),
+                });
+                Ok(Agent { core, registration })
             }
             Err(error) => {
                 // The name was never visible, so the queue holds no letters.
@@ -156,18 +173,33 @@ impl Agent {
         self.core.endpoint.reply(to, performative)
     }
 
-    /// Sends a message to its receivers, each the name of an agent or a pattern of names. Waits until
-    /// every receiver has an outcome, at most for the deadline of the configuration (`mts.deadline`).
+    /// Sends a message, or the message of a builder, to its receivers, each the name of an agent or a
+    /// pattern of names. Waits until every receiver has an outcome, at most for the deadline of the
+    /// configuration (`mts.deadline`).
     ///
     /// Letters are sent in the order of the calls, independently of the order in which the futures are awaited. Dropping
     /// the future does not stop the letter.
     ///
+    /// ```no_run
+    /// # async fn example(rover: fipa::Agent) -> fipa::Result<()> {
+    /// use fipa::Performative::Request;
+    ///
+    /// let lift = rover.message(Request).receiver("arm_1").content("(lift crate)");
+    /// println!("{}", rover.send(lift).await?); // for example: arm_1: delivered via shm
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
     /// # Errors
-    /// If the message cannot be sent at all. Failures of delivery are in the outcomes.
-    pub fn send(
+    /// If the message cannot be sent at all, for example because a receiver's name is invalid. Failures
+    /// of delivery are in the outcomes.
+    pub fn send<M>(
         &self,
-        message: Message,
-    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
+        message: M,
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<M>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
         self.send_within(message, self.core.endpoint.domain.inner.deadline)
     }
 
@@ -175,13 +207,31 @@ impl Agent {
     ///
     /// # Errors
     /// See [`send`](Self::send).
-    pub fn send_within(
+    pub fn send_within<M>(
         &self,
-        message: Message,
+        message: M,
         deadline: Duration,
-    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        let letter = letter_for(&message, SystemTime::now());
-        self.post(&message, letter, deadline)
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<M>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
+        let sending = self.built(message).and_then(|message| {
+            let letter = letter_for(&message, SystemTime::now());
+            self.core.endpoint.send(&message, letter, deadline)
+        });
+        async move { Ok(deliveries(sending?).await) }
+    }
+
+    /// Builds a message that this agent sends.
+    fn built<M>(&self, message: M) -> Result<Message, SendError>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
+        if self.registration.is_over.load(Ordering::Acquire) {
+            return Err(SendError::Deregistered);
+        }
+        let message = message.try_into();
+        message.map_err(|error| SendError::Build(error.into()))
     }
 
     /// Loans memory of `len` bytes for the content of a message, in shared memory where possible. The
@@ -193,10 +243,28 @@ impl Agent {
     /// [`send_loan`](Self::send_loan) works in all cases.
     ///
     /// # Errors
-    /// If the message cannot be sent at all.
-    pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
+    /// If the message cannot be sent at all, or if the letter would be larger than the limit
+    /// ([`SendError::TooLarge`]).
+    pub fn loan<M>(&self, message: M, len: usize) -> Result<Loan, SendError>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
+        let message = self.built(message)?;
         self.core.endpoint.check(&message)?;
+        let limit = self.core.endpoint.domain.inner.max_letter;
+        let too_large = |len: usize| SendError::TooLarge {
+            len: len as u64,
+            limit,
+        };
+        // Checked before the length of the content is encoded, which FIPA00069 limits to 32 bits.
+        if len as u64 > limit {
+            return Err(too_large(len));
+        }
         let draft = LetterDraft::new(message, len, SystemTime::now())?;
+        let letter_len = draft.head_len() + len + draft.tail_len();
+        if letter_len as u64 > limit {
+            return Err(too_large(letter_len));
+        }
         let receivers = draft.message().receivers().iter();
         let receivers: Vec<&str> = receivers.map(AgentId::name).collect();
         let name = receivers.iter().map(|name| name.len()).max();
@@ -231,31 +299,35 @@ impl Agent {
         async move { Ok(deliveries(sending?).await) }
     }
 
-    /// Sends a letter before it returns; the future yields the outcomes.
-    fn post(
-        &self,
-        message: &Message,
-        letter: Result<Letter, PostError>,
-        deadline: Duration,
-    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        let sending = self.core.endpoint.send(message, letter, deadline);
-        async move { Ok(deliveries(sending?).await) }
-    }
-
-    /// Waits for the next message for this agent. Dropping the future loses no message.
+    /// Waits for the next message for this agent. Dropping the future loses no message. Of several
+    /// calls at the same time, on one handle or on clones, each message goes to one of them.
     ///
     /// A message that violates its protocol is returned like others, and
     /// [`Incoming::violation`](crate::Incoming::violation) has the violation.
     ///
     /// # Errors
-    /// If the agent can receive no further message, because the domain is closed. No message of another
-    /// agent causes an error.
+    /// If the agent can receive no further message, because it is deregistered or the domain is closed.
+    /// No message of another agent causes an error.
     pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
         self.core.endpoint.domain.inner.owner.check()?;
         self.core
             .demultiplexer
             .next_other(&self.core.endpoint)
             .await
+    }
+
+    /// Waits for the next message for this agent; returns `None` if none arrives within `patience`.
+    ///
+    /// # Errors
+    /// See [`receive`](Self::receive).
+    pub async fn receive_within(
+        &self,
+        patience: Duration,
+    ) -> Result<Option<Incoming>, ReceiveError> {
+        match tokio::time::timeout(patience, self.receive()).await {
+            Ok(received) => received.map(Some),
+            Err(_) => Ok(None),
+        }
     }
 
     /// Returns the next message for this agent, if one is available now.
@@ -272,11 +344,18 @@ impl Agent {
     /// received, in order. The name can be registered again at once, here or on another host. Letters
     /// in transit follow the name there, or fail.
     ///
+    /// The registration ends for all handles: `receive` on another handle fails with
+    /// [`ReceiveError::Closed`], `send` with [`SendError::Deregistered`], and a second `deregister` with
+    /// [`DeregisterError::NotRegistered`].
+    ///
     /// # Errors
     /// If the directory cannot be written. The agent then receives no further messages either, and
     /// the messages that were not received are dropped.
-    pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
-        self.registered = false;
+    pub fn deregister(self) -> Result<Unread, DeregisterError> {
+        if self.registration.is_over.swap(true, Ordering::AcqRel) {
+            let name = Arc::clone(&self.core.endpoint.name);
+            return Err(DeregisterError::NotRegistered(name));
+        }
         let unread = self.core.endpoint.deregister()?;
         let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
@@ -298,10 +377,11 @@ impl fmt::Debug for Agent {
 /// them.
 pub type Unread = Vec<Incoming>;
 
-impl Drop for Agent {
+impl Drop for RegistrationGuard {
     fn drop(&mut self) {
+        let is_over = *self.is_over.get_mut();
         // In a forked child, the agent stays registered for the parent.
-        if self.registered && self.core.endpoint.domain.inner.owner.is_this() {
+        if !is_over && self.core.endpoint.domain.inner.owner.is_this() {
             match self.core.endpoint.deregister() {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}

@@ -2,41 +2,50 @@
 //!
 //! A background thread receives and acknowledges letters while the application does other work. It
 //! sleeps when it has nothing to do.
+//!
+//! ```no_run
+//! use fipa::{Performative::Request, blocking::Domain};
+//!
+//! fn main() -> fipa::Result<()> {
+//!     let domain = Domain::from_environment()?;
+//!     let rover = domain.register("rover")?;
+//!     rover.send(rover.message(Request).receiver("arm_1").content("(lift crate)"))?;
+//!     println!("{}", rover.receive()?.message());
+//!     Ok(())
+//! }
+//! ```
+//!
+//! The calls also work on a thread of a tokio runtime, for example in a function that asynchronous code
+//! calls. They block that thread; other tasks on it wait until the call returns.
 
 #[cfg(feature = "monitor")]
 mod platform;
 #[cfg(feature = "monitor")]
 mod protocol;
 
-use std::ops::Deref;
+use std::pin::pin;
 use std::sync::Arc;
+use std::task::{Context, Poll, Wake, Waker};
+use std::thread::{self, Thread};
 use std::time::Duration;
 
-use fipa_acl::{Message, MessageBuilder, Performative};
+use fipa_acl::{BuildError, Message, MessageBuilder, Performative};
 use fipa_sds::{Cancellation, DeregisterError, RegisterError};
-use tokio::runtime::{Builder, Runtime};
+use tokio::runtime::{Builder, Handle, Runtime};
 
+use crate::config::Sources;
 use crate::owner::Owner;
+use crate::routes::Report;
 use crate::{
-    AgentId, Config, Deliveries, DirectoryView, Incoming, Loan, ReceiveError, SendError, Unread,
+    AgentId, Change, Coalition, CoalitionError, Config, Deliveries, DirectoryView, Entry,
+    Incarnation, Incoming, Loan, OpenError, Query, ReceiveError, RegisterOptions, SendError,
+    Unread, Watch,
 };
 
 #[cfg(feature = "monitor")]
 pub use self::platform::{Ams, Df, Notifications};
 #[cfg(feature = "monitor")]
 pub use self::protocol::Side;
-
-/// The error of [`Domain::open`].
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum OpenError {
-    /// The background thread cannot be started.
-    #[error("cannot start the background thread")]
-    Thread(#[from] std::io::Error),
-    /// The domain cannot be joined.
-    #[error(transparent)]
-    Domain(#[from] crate::OpenError),
-}
 
 /// The membership of this process in a domain; see [`crate::Domain`].
 #[derive(Debug, Clone)]
@@ -46,19 +55,39 @@ pub struct Domain {
     runtime: Background,
 }
 
-/// An agent of this process; see [`crate::Agent`].
-#[derive(Debug)]
+/// An agent of this process; see [`crate::Agent`]. A clone is a further handle, for example for another
+/// thread.
+#[derive(Debug, Clone)]
 pub struct Agent {
     agent: crate::Agent,
+    runtime: Background,
+}
+
+/// The changes of a directory; see [`crate::Domain::changes`]. The iterator ends when the domain is closed.
+#[derive(Debug)]
+pub struct Changes {
+    changes: Watch,
     runtime: Background,
 }
 
 /// The runtime of the background thread.
 #[derive(Debug, Clone)]
 struct Background {
-    runtime: Arc<Runtime>,
+    waiter: Waiter,
+    /// Ends with the last owner.
+    _runtime: Arc<OwnedRuntime>,
+}
+
+#[derive(Debug)]
+struct OwnedRuntime {
+    /// `None` only while it is dropped.
+    runtime: Option<Runtime>,
     owner: Owner,
 }
+
+/// Waits on the calling thread for futures of the background thread's runtime.
+#[derive(Debug, Clone)]
+struct Waiter(Handle);
 
 impl Background {
     fn start() -> std::io::Result<Self> {
@@ -68,26 +97,71 @@ impl Background {
             .enable_all()
             .build()?;
         Ok(Self {
-            runtime: Arc::new(runtime),
-            owner: Owner::this(),
+            waiter: Waiter(runtime.handle().clone()),
+            _runtime: Arc::new(OwnedRuntime {
+                runtime: Some(runtime),
+                owner: Owner::this(),
+            }),
         })
     }
 }
 
-impl Deref for Background {
-    type Target = Runtime;
+impl std::ops::Deref for Background {
+    type Target = Waiter;
 
-    fn deref(&self) -> &Runtime {
-        &self.runtime
+    fn deref(&self) -> &Waiter {
+        &self.waiter
     }
 }
 
-impl Drop for Background {
+impl Drop for OwnedRuntime {
     fn drop(&mut self) {
+        let Some(runtime) = self.runtime.take() else {
+            return;
+        };
         if !self.owner.is_this() {
             // A forked child does not have the thread, and the runtime would wait for its end forever.
-            std::mem::forget(Arc::clone(&self.runtime));
+            std::mem::forget(runtime);
+        } else if Handle::try_current().is_ok() {
+            // A thread of another runtime must not wait for the end of this one.
+            runtime.shutdown_background();
         }
+    }
+}
+
+impl Waiter {
+    /// Waits for a future, also on a thread of another runtime.
+    fn block_on<F: Future>(&self, future: F) -> F::Output {
+        if Handle::try_current().is_err() {
+            return self.0.block_on(future);
+        }
+        // tokio refuses to block such a thread. The background thread serves timers and sockets, so this
+        // one needs only to be parked. Without the budget of a task, which only a return would renew.
+        let mut future = pin!(tokio::task::unconstrained(future));
+        let waker = Waker::from(Arc::new(Unpark(thread::current())));
+        let mut context = Context::from_waker(&waker);
+        loop {
+            let polled = {
+                let _runtime = self.0.enter();
+                future.as_mut().poll(&mut context)
+            };
+            match polled {
+                Poll::Ready(output) => return output,
+                Poll::Pending => thread::park(),
+            }
+        }
+    }
+
+    fn enter(&self) -> tokio::runtime::EnterGuard<'_> {
+        self.0.enter()
+    }
+}
+
+struct Unpark(Thread);
+
+impl Wake for Unpark {
+    fn wake(self: Arc<Self>) {
+        self.0.unpark();
     }
 }
 
@@ -97,9 +171,18 @@ impl Domain {
     /// # Errors
     /// If the background thread cannot be started, or as for [`crate::Domain::open`].
     pub fn open(config: &Config) -> Result<Self, OpenError> {
-        let runtime = Background::start()?;
+        let runtime = Background::start().map_err(OpenError::Thread)?;
         let domain = runtime.block_on(crate::Domain::open(config))?;
         Ok(Self { domain, runtime })
+    }
+
+    /// Joins the domain of the configuration that the environment selects; see
+    /// [`crate::Domain::from_environment`].
+    ///
+    /// # Errors
+    /// See [`crate::Domain::from_environment`].
+    pub fn from_environment() -> Result<Self, OpenError> {
+        Self::open(&Config::load(&Sources::from_environment())?)
     }
 
     /// Registers an agent with a name and without further description.
@@ -107,7 +190,7 @@ impl Domain {
     /// # Errors
     /// See [`crate::Domain::register_with`].
     pub fn register(&self, name: &str) -> Result<Agent, RegisterError> {
-        self.register_with(name, crate::RegisterOptions::default())
+        self.register_with(name, RegisterOptions::default())
     }
 
     /// Registers an agent; see [`crate::Domain::register_with`].
@@ -117,7 +200,7 @@ impl Domain {
     pub fn register_with(
         &self,
         name: &str,
-        options: crate::RegisterOptions,
+        options: RegisterOptions,
     ) -> Result<Agent, RegisterError> {
         let agent = self
             .domain
@@ -134,9 +217,70 @@ impl Domain {
         self.domain.directory()
     }
 
+    /// Returns the known agents; see [`crate::Domain::agents`].
+    #[must_use]
+    pub fn agents(&self) -> Vec<Arc<Entry>> {
+        self.domain.agents()
+    }
+
+    /// Returns the known agents of this type; see [`crate::Domain::agents_of_type`].
+    #[must_use]
+    pub fn agents_of_type(&self, agent_type: &str) -> Vec<Arc<Entry>> {
+        self.domain.agents_of_type(agent_type)
+    }
+
+    /// Returns the changes of the directory from now on; see [`crate::Domain::changes`].
+    #[must_use]
+    pub fn changes(&self) -> Changes {
+        Changes {
+            changes: self.domain.changes(),
+            runtime: self.runtime.clone(),
+        }
+    }
+
+    /// Forms a coalition; see [`crate::Domain::form`].
+    ///
+    /// # Errors
+    /// See [`crate::Domain::form`].
+    pub fn form<N: Into<Arc<str>>>(
+        &self,
+        name: &str,
+        members: impl IntoIterator<Item = N>,
+        leader: Option<&str>,
+        options: RegisterOptions,
+    ) -> Result<Coalition, CoalitionError> {
+        self.domain.form(name, members, leader, options)
+    }
+
+    /// Reports the routes of letters; see [`crate::Domain::routes`].
+    #[must_use]
+    pub fn routes(&self, to: &Query) -> Report {
+        self.domain.routes(to)
+    }
+
     /// Leaves the domain; see [`crate::Domain::close`].
     pub fn close(self) {
         self.runtime.block_on(self.domain.close());
+    }
+}
+
+impl Changes {
+    /// Waits for the next change; returns `None` if there is none within `patience`, or if the domain is
+    /// closed.
+    pub fn next_within(&mut self, patience: Duration) -> Option<Change> {
+        let changes = &mut self.changes;
+        let next = self
+            .runtime
+            .block_on(async { tokio::time::timeout(patience, changes.next()).await });
+        next.ok().flatten()
+    }
+}
+
+impl Iterator for Changes {
+    type Item = Change;
+
+    fn next(&mut self) -> Option<Change> {
+        self.runtime.block_on(self.changes.next())
     }
 }
 
@@ -153,6 +297,27 @@ impl Agent {
         self.agent.id()
     }
 
+    /// Returns the random identifier of this registration.
+    #[must_use]
+    pub fn incarnation(&self) -> Incarnation {
+        self.agent.incarnation()
+    }
+
+    /// Returns the domain in which the agent is registered.
+    #[must_use]
+    pub fn domain(&self) -> Domain {
+        Domain {
+            domain: self.agent.domain().clone(),
+            runtime: self.runtime.clone(),
+        }
+    }
+
+    /// Returns a unique text for a `conversation-id` or a `reply-with`; see [`crate::Agent::unique_id`].
+    #[must_use]
+    pub fn unique_id(&self) -> String {
+        self.agent.unique_id()
+    }
+
     /// Starts a message with this agent as its sender.
     pub fn message(&self, performative: Performative) -> MessageBuilder {
         self.agent.message(performative)
@@ -163,11 +328,15 @@ impl Agent {
         self.agent.reply(to, performative)
     }
 
-    /// Sends a message and waits for its outcomes; see [`crate::Agent::send`].
+    /// Sends a message, or the message of a builder, and waits for its outcomes; see
+    /// [`crate::Agent::send`].
     ///
     /// # Errors
     /// See [`crate::Agent::send`].
-    pub fn send(&self, message: Message) -> Result<Deliveries, SendError> {
+    pub fn send<M>(&self, message: M) -> Result<Deliveries, SendError>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
         self.runtime.block_on(self.agent.send(message))
     }
 
@@ -175,11 +344,10 @@ impl Agent {
     ///
     /// # Errors
     /// See [`crate::Agent::send`].
-    pub fn send_within(
-        &self,
-        message: Message,
-        deadline: Duration,
-    ) -> Result<Deliveries, SendError> {
+    pub fn send_within<M>(&self, message: M, deadline: Duration) -> Result<Deliveries, SendError>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
         self.runtime
             .block_on(self.agent.send_within(message, deadline))
     }
@@ -188,7 +356,10 @@ impl Agent {
     ///
     /// # Errors
     /// See [`crate::Agent::loan`].
-    pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
+    pub fn loan<M>(&self, message: M, len: usize) -> Result<Loan, SendError>
+    where
+        M: TryInto<Message, Error: Into<BuildError>>,
+    {
         self.agent.loan(message, len)
     }
 
@@ -213,12 +384,16 @@ impl Agent {
     /// # Errors
     /// See [`crate::Agent::receive`].
     pub fn receive_within(&self, patience: Duration) -> Result<Option<Incoming>, ReceiveError> {
-        self.runtime.block_on(async {
-            match tokio::time::timeout(patience, self.agent.receive()).await {
-                Ok(received) => received.map(Some),
-                Err(_) => Ok(None),
-            }
-        })
+        self.runtime.block_on(self.agent.receive_within(patience))
+    }
+
+    /// Returns the next message for this agent, if one is available now; see
+    /// [`crate::Agent::try_receive`].
+    ///
+    /// # Errors
+    /// See [`crate::Agent::try_receive`].
+    pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
+        self.agent.try_receive()
     }
 
     /// Removes the name from the directory; see [`crate::Agent::deregister`].

@@ -1,4 +1,4 @@
-//! The types of `checks.rs` in a build without the feature `monitor`: they check nothing.
+//! The types of `checks.rs` in a build without the feature `protocols`: they check nothing.
 
 use fipa_acl::Message;
 
@@ -12,7 +12,7 @@ impl Rules {
     pub(crate) fn load(config: &config::Monitor) -> Result<Self, OpenError> {
         if config.check != Check::Off {
             tracing::warn!(
-                "monitor.check has no effect: this program was built without the feature `monitor`"
+                "monitor.check has no effect: this program was built without the feature `protocols`"
             );
         }
         Ok(Self)

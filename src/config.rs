@@ -298,7 +298,7 @@ impl Access {
     }
 }
 
-/// `[monitor]`: the checks of messages against their protocols. They need the feature `monitor`.
+/// `[monitor]`: the checks of messages against their protocols. They need the feature `protocols`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Monitor {
@@ -388,6 +388,13 @@ impl fmt::Display for Interface {
             Self::Name(name) => f.pad(name),
             Self::Address(address) => fmt::Display::fmt(address, f),
         }
+    }
+}
+
+/// The defaults for this host. No file is read.
+impl Default for Config {
+    fn default() -> Self {
+        Self::for_host(&gethostname::gethostname().to_string_lossy())
     }
 }
 

@@ -1,4 +1,4 @@
-//! The type of `demultiplexer.rs` in a build without the feature `monitor`: no call leads a
+//! The type of `demultiplexer.rs` in a build without the feature `protocols`: no call leads a
 //! conversation, so `receive` reads everything.
 
 use crate::endpoint::Endpoint;

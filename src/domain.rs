@@ -4,10 +4,11 @@ use std::fmt;
 use std::sync::Arc;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
-use fipa_sds::{Cancellation, Query};
+use fipa_sds::{Cancellation, Entry, Query, Watch};
 use tokio::runtime::Handle;
 
 use crate::checks::Rules;
+use crate::config::Sources;
 use crate::directory_view::DirectoryView;
 use crate::error::OpenError;
 use crate::owner::Owner;
@@ -34,6 +35,8 @@ pub(crate) struct Inner {
     pub(crate) service: Service,
     pub(crate) owner: Owner,
     pub(crate) deadline: std::time::Duration,
+    /// Maximum length of a letter, in bytes.
+    pub(crate) max_letter: u64,
     pub(crate) rules: Rules,
 }
 
@@ -64,6 +67,16 @@ pub struct RegisterOptions {
 }
 
 impl Domain {
+    /// Joins the domain of the configuration that the environment of this process selects: the file
+    /// named by `$FIPA_CONFIG`, else `./fipa.toml`, else `~/.config/fipa/fipa.toml`, else the defaults.
+    /// See [`open`](Self::open).
+    ///
+    /// # Errors
+    /// If the file cannot be read or has mistakes, or as for [`open`](Self::open).
+    pub async fn from_environment() -> Result<Self, OpenError> {
+        Self::open(&Config::load(&Sources::from_environment())?).await
+    }
+
     /// Joins the domain that the configuration names. Must be called within a tokio runtime, which
     /// then runs the background tasks.
     ///
@@ -108,6 +121,7 @@ impl Domain {
                 service,
                 owner: Owner::this(),
                 deadline,
+                max_letter: config.transport.shm.max_letter,
                 rules,
             }),
         })
@@ -118,6 +132,52 @@ impl Domain {
     #[must_use]
     pub fn directory(&self) -> DirectoryView<'_> {
         DirectoryView::of(&*self.inner.service.host)
+    }
+
+    /// Returns the known agents, sorted by name: those of this host and, if a gateway is running, those
+    /// that it has discovered on other hosts. Gateways with their agents, and coalitions, are not
+    /// included; [`directory`](Self::directory) has them, too.
+    #[must_use]
+    pub fn agents(&self) -> Vec<Arc<Entry>> {
+        self.directory().refresh();
+        let mut agents = routes::agents(&*self.inner.service.host, &Query::all());
+        agents.retain(|entry| !entry.is_platform_agent());
+        agents
+    }
+
+    /// Returns the [`agents`](Self::agents) that were registered with exactly this type
+    /// ([`RegisterOptions::agent_type`]).
+    #[must_use]
+    pub fn agents_of_type(&self, agent_type: &str) -> Vec<Arc<Entry>> {
+        let mut agents = self.agents();
+        agents.retain(|entry| entry.agent_type == agent_type);
+        agents
+    }
+
+    /// Returns the changes from now on of the agents, coalitions and gateways in the directory, as a
+    /// [`Stream`](futures_core::Stream). For a complete picture, call this first and then
+    /// [`agents`](Self::agents); an agent that joined in between appears in both.
+    ///
+    /// ```no_run
+    /// # async fn example(domain: fipa::Domain) {
+    /// use fipa::Change;
+    ///
+    /// let mut changes = domain.changes();
+    /// for arm in domain.agents_of_type("arm") {
+    ///     println!("{} is here", arm.name);
+    /// }
+    /// while let Some(change) = changes.next().await {
+    ///     match change {
+    ///         Change::Joined(entry) => println!("{} has joined", entry.name),
+    ///         Change::Left(entry) => println!("{} has left", entry.name),
+    ///         _ => {}
+    ///     }
+    /// }
+    /// # }
+    /// ```
+    #[must_use]
+    pub fn changes(&self) -> Watch {
+        self.directory().watch()
     }
 
     /// Reports the routes that letters from this process to the matching agents would take now, and

@@ -1,41 +1,86 @@
-//! Agent communication for robots after the FIPA standards, as a library for robot processes.
+//! Agent communication for robots after the FIPA standards.
 //!
-//! A process joins a [`Domain`] and registers [`Agent`]s in it. The agents exchange FIPA messages
-//! with all agents of the domain: through shared memory or Unix domain sockets on one host, and
-//! through the gateway of the host with agents on other hosts.
+//! # Concepts
+//!
+//! A process joins a [`Domain`] and registers [`Agent`]s in it. An agent is a name that sends and
+//! receives messages. All agents of a domain exchange messages: through shared memory or Unix domain
+//! sockets on one host, and through the gateways (`fipa up`) of the hosts between them.
+//!
+//! A [`Message`] (FIPA00061) has a [`Performative`], such as `request` or `inform`, receivers, and a
+//! content of any bytes. A letter is a message in its envelope. [`Agent::send`] returns one outcome per
+//! receiver, within the deadline: delivered, with the transport; or failed, with the reason.
+//!
+//! # Send and receive
 //!
 //! ```no_run
-//! use fipa::{AgentId, Config, Domain, Performative};
+//! use fipa::{Domain, Performative::Request};
 //!
-//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
-//! let domain = Domain::open(&Config::load(&fipa::config::Sources::from_environment())?).await?;
-//! let agent = domain.register("rover").await?;
-//! let request = agent
-//!     .message(Performative::Request)
-//!     .receiver(AgentId::new("arm_1")?)
-//!     .content("(lift sample-3)")
-//!     .build()?;
-//! let deliveries = agent.send(request).await?;
-//! println!("{deliveries}");
-//! let letter = agent.receive().await?;
-//! println!("{}", letter.message());
+//! #[tokio::main]
+//! async fn main() -> fipa::Result<()> {
+//!     let domain = Domain::from_environment().await?;
+//!     let rover = domain.register("rover").await?;
+//!     let lift = rover.message(Request).receiver("arm_1").content("(lift crate)");
+//!     println!("{}", rover.send(lift).await?); // for example: arm_1: delivered via shm
+//!     let letter = rover.receive().await?;
+//!     println!("{}", letter.message().text());
+//!     domain.close().await;
+//!     Ok(())
+//! }
+//! ```
+//!
+//! A receiver may be a pattern such as `arm_.*`, or a [`Coalition`], one name for several agents.
+//! [`Agent::reply`] starts an answer. [`Agent::loan`] loans memory for large content, which the
+//! receivers on this host read in place. [`Message::parse`] reads a value from a content. Every error of
+//! this crate converts into [`Error`].
+//!
+//! # Converse
+//!
+//! Calls lead the interaction protocols of FIPA, so that a program needs no state machines of its own
+//! ([`protocol`]):
+//!
+//! ```no_run
+//! # use std::time::Duration;
+//! # use fipa::Performative::{Cfp, Request};
+//! # async fn example(rover: fipa::Agent) -> fipa::Result<()> {
+//! let patience = Duration::from_secs(30);
+//! let lift = rover.message(Request).receiver("arm_1").content("(lift crate)");
+//! println!("{}", rover.request(lift, patience).await?.result().await?.text());
+//!
+//! let carry = rover.message(Cfp).content("(carry crate)");
+//! let mut net = rover.contract_net(carry, &["arm_.*"], patience).await?;
+//! let best = net.bids().proposals.first().cloned();
+//! println!("{:?}", net.award(best.as_slice(), "", patience).await?);
 //! # Ok(())
 //! # }
 //! ```
 //!
-//! * [`Domain`] is the membership of this process in a domain. [`Agent`] is a registered name,
-//!   [`Coalition`] a name for several agents.
-//! * [`watch`] observes the letters of all processes of a domain on this host.
-//! * [`config`] is the configuration, one TOML file.
-//! * [`blocking`] has the same calls for processes without an async runtime.
-//! * [`routes`] reports the routes that letters would take now, and the reasons.
-//! * [`doctor`] checks whether a machine meets the requirements.
-//! * [`keys`] (feature `secure`) manages the keys of this host and the certificates of its peers.
-//! * [`platform`] (feature `monitor`) registers and finds services with the directory facilitator of a
-//!   gateway, and lists agents with its agent management system.
-//! * [`Gateway`] (feature `net`) is the gateway that `fipa up` runs; robot processes do not need it.
+//! [`Agent::serve`] answers the other side, one task per conversation. [`Agent::publisher`] and
+//! [`Agent::subscribe`] notify many agents. `monitor.check = "enforce"` checks all messages of a process
+//! against the protocols.
 //!
-//! Not in this crate: delivery (`fipa-mts`), the transports, and terminal output (`fipa-cli`).
+//! # Find
+//!
+//! [`Domain::agents`] and [`Domain::agents_of_type`] list the agents, [`Domain::changes`] is a stream of
+//! the changes, and [`Domain::directory`] looks up and searches. [`Agent::df`] registers and finds
+//! services with the directory facilitator of a gateway ([`platform`]).
+//!
+//! # Configure
+//!
+//! [`Domain::from_environment`] reads the file named by `$FIPA_CONFIG`, else `./fipa.toml`, else
+//! `~/.config/fipa/fipa.toml`; without a file it uses the defaults, as [`Config::default`] does.
+//! [`Domain::open`] takes a [`Config`]. The module [`config`] has all keys.
+//!
+//! # Without an async runtime
+//!
+//! [`blocking`] has the same calls for threads.
+//!
+//! # Examples and tools
+//!
+//! The directory `examples` of the repository has a program per topic. [`watch`] observes the letters of
+//! all processes of a domain on this host, [`routes`] reports the routes that letters would take now,
+//! [`doctor`] checks a machine, [`keys`] (feature `secure`) manages the keys of this host, and
+//! [`Gateway`] (feature `net`) is the gateway that `fipa up` runs. `docs/architecture.md` describes the
+//! other crates: delivery, transports and protocols.
 //!
 #![cfg_attr(
     not(feature = "net"),
@@ -100,11 +145,11 @@ pub use domain::{Domain, RegisterOptions};
 pub use domain_dir::DomainDirError;
 #[cfg(feature = "monitor")]
 pub use error::ProtocolError;
-pub use error::{OpenError, ReceiveError, SendError};
+pub use error::{Error, OpenError, ReceiveError, Result, SendError};
 pub use fipa_acl::{
-    AgentId, AgentIdError, BuildError, DecodeError, EncodeError, Envelope, EnvelopeParams,
-    ErrorChain, Letter, Message, MessageBuilder, Payload, Performative, PerformativeError, Problem,
-    Time, TimeError,
+    AgentId, AgentIdError, BuildError, ContentError, DecodeError, EncodeError, Envelope,
+    EnvelopeParams, ErrorChain, Letter, Message, MessageBuilder, Payload, Performative,
+    PerformativeError, Problem, Time, TimeError,
 };
 #[cfg(feature = "monitor")]
 pub use fipa_monitor as monitor;

@@ -10,7 +10,7 @@ use fipa::routes::AskError;
 use fipa::{
     CoalitionError, DeregisterError, DomainDirError, EncodeError, EntryError, ErrorChain,
     HostError, Kind, ListenError, MembersError, NameError, OpenError, PostError, RegisterError,
-    SendError, blocking,
+    SendError,
 };
 
 const CAUSE: &str = "the disk is on fire";
@@ -117,7 +117,7 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
             format!("cannot send the request to the gateway: cannot encode the letter: {encode}"),
         ),
         (
-            Box::new(blocking::OpenError::Thread(cause())),
+            Box::new(OpenError::Thread(cause())),
             format!("cannot start the background thread: {CAUSE}"),
         ),
     ];
@@ -169,4 +169,30 @@ fn an_error_and_its_sources_say_each_cause_once() {
             next = source;
         }
     }
+}
+
+#[test]
+fn every_error_of_the_crate_converts_into_the_top_error() {
+    let exported = include_str!("../src/lib.rs");
+    let (_, exported) = exported.split_once("\npub use ").unwrap();
+    let names = regex::Regex::new(r"\b[A-Z][A-Za-z]*Error\b").unwrap();
+    let top = include_str!("../src/error.rs");
+    let names: std::collections::BTreeSet<&str> = names
+        .find_iter(exported)
+        .map(|found| found.as_str())
+        .collect();
+    assert!(names.len() > 15, "{names:?}");
+    for name in names {
+        assert!(top.contains(&format!("(#[from] {name}),")), "{name}");
+    }
+}
+
+#[test]
+fn the_top_error_has_the_text_of_the_error_and_its_causes() {
+    let error = OpenError::Watch(cause());
+    let text = ErrorChain(&error).to_string();
+    let top = fipa::Error::from(error);
+    assert_eq!(ErrorChain(&top).to_string(), text);
+    // The form in which the result of `main` is printed.
+    assert_eq!(format!("{top:?}"), text);
 }

@@ -1,5 +1,6 @@
 //! The agent identifier (FIPA00023 clause 3.1).
 
+use std::convert::Infallible;
 use std::fmt;
 use std::str::FromStr;
 
@@ -182,6 +183,36 @@ impl FromStr for AgentId {
     }
 }
 
+impl TryFrom<&str> for AgentId {
+    type Error = AgentIdError;
+
+    fn try_from(name: &str) -> Result<Self, Self::Error> {
+        Self::new(name)
+    }
+}
+
+impl TryFrom<String> for AgentId {
+    type Error = AgentIdError;
+
+    fn try_from(name: String) -> Result<Self, Self::Error> {
+        Self::new(name)
+    }
+}
+
+impl TryFrom<&String> for AgentId {
+    type Error = AgentIdError;
+
+    fn try_from(name: &String) -> Result<Self, Self::Error> {
+        Self::new(name.as_str())
+    }
+}
+
+impl From<&Self> for AgentId {
+    fn from(agent: &Self) -> Self {
+        agent.clone()
+    }
+}
+
 /// Writes the name. The alternate form (`{:#}`) writes the whole identifier in the form of FIPA00070.
 impl fmt::Display for AgentId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -226,6 +257,13 @@ pub enum AgentIdError {
          or control characters"
     )]
     UserDefinedName(String),
+}
+
+/// A conversion that cannot fail has no error.
+impl From<Infallible> for AgentIdError {
+    fn from(never: Infallible) -> Self {
+        match never {}
+    }
 }
 
 #[cfg(test)]

@@ -1,18 +1,25 @@
 //! The builder of messages. It refuses values that an encoding cannot represent.
 
+use std::convert::Infallible;
+
 use bytes::Bytes;
 
 use crate::word::is_token;
-use crate::{AgentId, Message, Performative, Time};
+use crate::{AgentId, AgentIdError, Message, Performative, Time};
 
 /// A builder of a message: see [`Message::builder`] and [`Message::reply`].
 ///
 /// Setting a parameter again replaces its value. Receivers, reply-to and user-defined parameters
 /// add up.
+///
+/// An agent is given as an [`AgentId`] or as its name. An invalid name is an error of
+/// [`build`](Self::build).
 #[derive(Debug, Clone)]
 #[must_use]
 pub struct MessageBuilder {
     message: Message,
+    /// The error of the first invalid agent.
+    invalid_agent: Option<AgentIdError>,
 }
 
 /// Error of building a message.
@@ -39,6 +46,9 @@ pub enum BuildError {
     /// The content is longer than [`Message::MAX_CONTENT`].
     #[error("content of {0} bytes is too long for a message (maximum 4294967295)")]
     ContentTooLong(usize),
+    /// The name of a receiver is invalid.
+    #[error(transparent)]
+    Agent(#[from] AgentIdError),
 }
 
 /// Starts with the parameters of an existing message.
@@ -54,7 +64,24 @@ impl MessageBuilder {
     }
 
     pub(crate) fn of(message: Message) -> Self {
-        Self { message }
+        Self {
+            message,
+            invalid_agent: None,
+        }
+    }
+
+    /// Converts an agent. Keeps the error of the first one that is invalid.
+    fn agent<A>(&mut self, agent: A) -> Option<AgentId>
+    where
+        A: TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
+        match agent.try_into() {
+            Ok(agent) => Some(agent),
+            Err(error) => {
+                self.invalid_agent.get_or_insert(error.into());
+                None
+            }
+        }
     }
 
     /// Sets the sender.
@@ -63,27 +90,44 @@ impl MessageBuilder {
         self
     }
 
-    /// Adds a receiver.
-    pub fn receiver(mut self, receiver: AgentId) -> Self {
-        self.message.receivers.push(receiver);
-        self
+    /// Adds a receiver: an [`AgentId`] or a name.
+    pub fn receiver<A>(self, receiver: A) -> Self
+    where
+        A: TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
+        self.receivers([receiver])
     }
 
-    /// Adds receivers.
-    pub fn receivers(mut self, receivers: impl IntoIterator<Item = AgentId>) -> Self {
-        self.message.receivers.extend(receivers);
+    /// Adds receivers: [`AgentId`]s or names.
+    pub fn receivers<A>(mut self, receivers: impl IntoIterator<Item = A>) -> Self
+    where
+        A: TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
+        for receiver in receivers {
+            if let Some(receiver) = self.agent(receiver) {
+                self.message.receivers.push(receiver);
+            }
+        }
         self
     }
 
     /// Sets the receivers, and removes those that were set before.
-    pub fn replace_receivers(mut self, receivers: impl IntoIterator<Item = AgentId>) -> Self {
+    pub fn replace_receivers<A>(mut self, receivers: impl IntoIterator<Item = A>) -> Self
+    where
+        A: TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
         self.message.receivers.clear();
         self.receivers(receivers)
     }
 
     /// Adds an agent that receives replies instead of the sender.
-    pub fn reply_to(mut self, agent: AgentId) -> Self {
-        self.message.reply_to.push(agent);
+    pub fn reply_to<A>(mut self, agent: A) -> Self
+    where
+        A: TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
+        if let Some(agent) = self.agent(agent) {
+            self.message.reply_to.push(agent);
+        }
         self
     }
 
@@ -152,6 +196,9 @@ impl MessageBuilder {
     /// # Errors
     /// A message cannot have one of the values: see [`BuildError`].
     pub fn build(self) -> Result<Message, BuildError> {
+        if let Some(error) = self.invalid_agent {
+            return Err(error.into());
+        }
         let message = self.message;
         let texts = [
             ("language", &message.language),
@@ -186,6 +233,22 @@ impl MessageBuilder {
     }
 }
 
+impl TryFrom<MessageBuilder> for Message {
+    type Error = BuildError;
+
+    /// Builds the message; see [`MessageBuilder::build`].
+    fn try_from(builder: MessageBuilder) -> Result<Self, BuildError> {
+        builder.build()
+    }
+}
+
+/// A message that is built already has no error.
+impl From<Infallible> for BuildError {
+    fn from(never: Infallible) -> Self {
+        match never {}
+    }
+}
+
 fn short(text: &str) -> String {
     text.chars().take(60).collect()
 }
@@ -211,6 +274,26 @@ mod tests {
             assert!(built(|b| b.protocol(wrong)).is_err(), "{wrong:?}");
             assert!(built(|b| b.user_defined(wrong, "")).is_err(), "{wrong:?}");
         }
+    }
+
+    #[test]
+    fn agents_are_given_by_name_or_identifier_and_a_bad_name_is_an_error_of_build() {
+        let id = AgentId::new("c").unwrap();
+        let message = built(|b| {
+            let b = b.receiver("a").receivers([String::from("b")]);
+            b.receiver(&id).receiver(id.clone()).reply_to("d")
+        });
+        let message = message.unwrap();
+        let names: Vec<&str> = message.receivers().iter().map(AgentId::name).collect();
+        assert_eq!(names, ["a", "b", "c", "c"]);
+        assert_eq!(message.reply_to()[0].name(), "d");
+        let nul = Err(BuildError::Agent(AgentIdError::Nul("name")));
+        // The first error counts, and removing the receivers does not remove it.
+        assert_eq!(
+            built(|b| b.receivers(["a", "b\0", ""]).replace_receivers(["a"])),
+            nul
+        );
+        assert!(built(|b| b.reply_to("")).is_err());
     }
 
     #[test]

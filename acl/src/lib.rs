@@ -71,7 +71,7 @@ pub use error_chain::ErrorChain;
 pub use escape::{escape, is_unprintable};
 pub use explain::{Explanation, Span, explain};
 pub use letter::{Letter, Payload};
-pub use message::Message;
+pub use message::{ContentError, Message};
 pub use performative::{Performative, PerformativeError, UserPerformative};
 pub use representation::{AclRepresentation, Representation};
 pub use time::{Base, Time, TimeError, Zone};

@@ -1,6 +1,8 @@
 //! The message (FIPA00061), independent of its encoding.
 
+use std::error::Error;
 use std::fmt;
+use std::str::{FromStr, Utf8Error};
 
 use bytes::Bytes;
 
@@ -121,6 +123,41 @@ impl Message {
         self.content.as_ref()
     }
 
+    /// Returns a copy of the content as text. Bytes that are not UTF-8 become U+FFFD. Missing content
+    /// is empty text.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let content = self.content.as_deref().unwrap_or_default();
+        // Copied before it is decoded: another process may change shared memory meanwhile.
+        let copy = content.to_vec();
+        String::from_utf8(copy)
+            .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned())
+    }
+
+    /// Parses the content as text, without white space at both ends.
+    ///
+    /// ```
+    /// # use fipa_acl::{Message, Performative};
+    /// let bid = Message::builder(Performative::Propose).content("2.5\n").build()?;
+    /// assert_eq!(bid.parse::<f64>()?, 2.5);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// If the message has no content, or if the content is not UTF-8 text or not a value of the type.
+    pub fn parse<T>(&self) -> Result<T, ContentError>
+    where
+        T: FromStr<Err: Into<Box<dyn Error + Send + Sync>>>,
+    {
+        let content = self.content.as_ref().ok_or(ContentError::Missing)?.to_vec();
+        let text = std::str::from_utf8(&content).map_err(ContentError::NotText)?;
+        let text = text.trim();
+        text.parse().map_err(|error: T::Err| ContentError::Parse {
+            text: text.chars().take(SHOWN).collect(),
+            source: error.into(),
+        })
+    }
+
     /// The language of the content.
     #[must_use]
     pub fn language(&self) -> Option<&str> {
@@ -199,6 +236,26 @@ impl Message {
             user_defined: Vec::new(),
         }
     }
+}
+
+/// Error of [`Message::parse`].
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ContentError {
+    /// The message has no content.
+    #[error("the message has no content")]
+    Missing,
+    /// The content is not UTF-8 text.
+    #[error("the content is not text")]
+    NotText(#[source] Utf8Error),
+    /// The content is not a value of the type. `text` has its first 80 characters.
+    #[error("cannot parse the content \"{}\"", escape(text))]
+    Parse {
+        /// The beginning of the content.
+        text: String,
+        /// The error of the type.
+        source: Box<dyn Error + Send + Sync>,
+    },
 }
 
 /// Maximum number of characters of a text or content that [`Message`]'s `Display` shows.
@@ -343,6 +400,25 @@ mod tests {
             !asked.is_reply_to(&asked),
             "a message is no reply to itself"
         );
+    }
+
+    #[test]
+    fn content_is_read_as_text_and_as_a_value() {
+        let of = |content: &'static [u8]| {
+            let builder = Message::builder(Performative::Inform).content(content);
+            builder.build().unwrap()
+        };
+        assert_eq!(of(b" 12\n").parse::<u8>().unwrap(), 12);
+        assert_eq!(of(b" 12\n").text(), " 12\n");
+        assert_eq!(of(b"a\xffb").text(), "a\u{fffd}b");
+        let none = Message::empty(Performative::Inform);
+        assert_eq!(none.text(), "");
+        assert!(matches!(none.parse::<u8>(), Err(ContentError::Missing)));
+        let parsed = of(b"\xff").parse::<u8>();
+        assert!(matches!(parsed, Err(ContentError::NotText(_))));
+        let error = of(b"300\x1b").parse::<u8>().unwrap_err();
+        assert_eq!(error.to_string(), r#"cannot parse the content "300\u{1b}""#);
+        assert!(error.source().is_some());
     }
 
     #[test]

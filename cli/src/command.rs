@@ -16,9 +16,13 @@ mod echo;
 mod encode;
 mod keys;
 mod man;
+mod listen;
+mod ping;
 mod protocol;
+mod request;
 mod routes;
 mod send;
+mod subscribe;
 mod up;
 mod watch;
 
@@ -34,6 +38,10 @@ pub(crate) enum Command {
     Agents(agents::Arguments),
     Send(Box<send::Arguments>),
     Echo(echo::Arguments),
+    Listen(listen::Arguments),
+    Request(request::Arguments),
+    Subscribe(subscribe::Arguments),
+    Ping(ping::Arguments),
     Coalition(coalition::Arguments),
     Df(df::Arguments),
     Ams(ams::Arguments),
@@ -60,6 +68,10 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Agents(arguments) => agents::run(arguments, global),
         Command::Send(arguments) => send::run(*arguments, global),
         Command::Echo(arguments) => echo::run(arguments, global),
+        Command::Listen(arguments) => listen::run(arguments, global),
+        Command::Request(arguments) => request::run(arguments, global),
+        Command::Subscribe(arguments) => subscribe::run(arguments, global),
+        Command::Ping(arguments) => ping::run(arguments, global),
         Command::Coalition(arguments) => coalition::run(arguments, global),
         Command::Df(arguments) => df::run(arguments, global),
         Command::Ams(arguments) => ams::run(arguments, global),

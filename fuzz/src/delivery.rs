@@ -816,6 +816,7 @@ fn way_error(input: &mut Input<'_>) -> TransportError {
     let fault = input.one_of(&[
         TransportErrorKind::Unreachable,
         TransportErrorKind::Congested,
+        TransportErrorKind::NoRoom,
         TransportErrorKind::Broken,
         TransportErrorKind::TooLarge,
         TransportErrorKind::WrongIncarnation,

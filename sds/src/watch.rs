@@ -1,8 +1,11 @@
 //! Notifications of changes in a directory.
 
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll, ready};
 
+use futures_core::Stream;
 use parking_lot::Mutex;
 use tokio::sync::mpsc;
 
@@ -83,6 +86,8 @@ impl Change {
 ///
 /// Bounded: when more than [`Watch::CAPACITY`] changes are unread, they are replaced by one
 /// [`Change::Lagged`].
+///
+/// Also a [`Stream`], which ends when the directory is gone.
 pub struct Watch {
     changes: mpsc::Receiver<Change>,
     lagged: Arc<AtomicBool>,
@@ -158,6 +163,26 @@ impl Watch {
         match &mut self.merged {
             Some(view) => view.translate(raw),
             None => Some(raw),
+        }
+    }
+}
+
+impl Stream for Watch {
+    type Item = Change;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Change>> {
+        let this = self.get_mut();
+        loop {
+            let raw = match this.lags() {
+                true => Some(Change::Lagged),
+                false => ready!(this.changes.poll_recv(context)),
+            };
+            let Some(raw) = raw else {
+                return Poll::Ready(None);
+            };
+            if let Some(change) = this.translate(raw) {
+                return Poll::Ready(Some(change));
+            }
         }
     }
 }

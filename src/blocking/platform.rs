@@ -2,9 +2,7 @@
 
 use std::time::Duration;
 
-use tokio::runtime::Runtime;
-
-use super::Agent;
+use super::{Agent, Background};
 use crate::AgentId;
 use crate::platform::{
     self, AgentDescription, AmsDescription, ApDescription, Constraints, PlatformError,
@@ -15,7 +13,7 @@ use crate::platform::{
 #[derive(Debug, Clone)]
 pub struct Df<'a> {
     df: platform::Df<'a>,
-    runtime: &'a Runtime,
+    runtime: &'a Background,
 }
 
 /// A subscription to a directory facilitator; see [`crate::platform::Notifications`].
@@ -23,14 +21,14 @@ pub struct Df<'a> {
 #[must_use = "next() returns the notifications"]
 pub struct Notifications<'a> {
     notifications: platform::Notifications,
-    runtime: &'a Runtime,
+    runtime: &'a Background,
 }
 
 /// An agent management system; see [`crate::platform::Ams`].
 #[derive(Debug, Clone)]
 pub struct Ams<'a> {
     ams: platform::Ams<'a>,
-    runtime: &'a Runtime,
+    runtime: &'a Background,
 }
 
 impl Agent {

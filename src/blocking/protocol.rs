@@ -7,14 +7,13 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::{Message, MessageBuilder, Performative};
-use tokio::runtime::Handle;
 
-use super::{Agent, Background};
-use crate::AgentId;
+use super::{Agent, Background, Waiter};
 use crate::protocol::{
     Auction, Awarded, Bids, ContractNet, Decision, DialogueError, PartnerEvent, PartnerWatch,
     Proxied, Publisher, Reply, Request, Server, Subscription, Task,
 };
+use crate::{AgentId, AgentIdError};
 
 /// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
 /// [`Auction`], [`Proxied`] or [`Task`], or a [`Server`], [`Publisher`] or [`PartnerWatch`]. Dereferences to that type for the calls that do not wait.
@@ -22,7 +21,7 @@ use crate::protocol::{
 #[must_use = "the conversation goes on with the calls of the inner type"]
 pub struct Side<T> {
     inner: T,
-    runtime: Handle,
+    runtime: Waiter,
     /// Keeps the background thread running; `None` for a conversation that runs on it.
     _background: Option<Background>,
 }
@@ -47,7 +46,7 @@ impl Agent {
     fn side_of<T>(&self, inner: T) -> Side<T> {
         Side {
             inner,
-            runtime: self.runtime.handle().clone(),
+            runtime: self.runtime.waiter.clone(),
             _background: Some(self.runtime.clone()),
         }
     }
@@ -131,12 +130,15 @@ impl Agent {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn contract_net(
+    pub fn contract_net<A>(
         &self,
         call: MessageBuilder,
-        receivers: &[AgentId],
+        receivers: &[A],
         patience: Duration,
-    ) -> Result<Side<ContractNet>, DialogueError> {
+    ) -> Result<Side<ContractNet>, DialogueError>
+    where
+        A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
         self.side(self.agent.contract_net(call, receivers, patience))
     }
 
@@ -144,12 +146,15 @@ impl Agent {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn iterated_contract_net(
+    pub fn iterated_contract_net<A>(
         &self,
         call: MessageBuilder,
-        receivers: &[AgentId],
+        receivers: &[A],
         patience: Duration,
-    ) -> Result<Side<ContractNet>, DialogueError> {
+    ) -> Result<Side<ContractNet>, DialogueError>
+    where
+        A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
         self.side(self.agent.iterated_contract_net(call, receivers, patience))
     }
 
@@ -234,7 +239,7 @@ impl Agent {
         E: Display + Send + 'static,
     {
         let handler = Arc::new(handler);
-        let runtime = self.runtime.handle().clone();
+        let runtime = self.runtime.waiter.clone();
         let _context = self.runtime.enter();
         let server = self.agent.serve(protocol, move |task| {
             let (handler, side) = (Arc::clone(&handler), of_served(task, &runtime));
@@ -265,7 +270,7 @@ impl Agent {
 }
 
 /// Creates the side of a handler, which must not keep the runtime that it runs on.
-fn of_served(task: Task, runtime: &Handle) -> Side<Task> {
+fn of_served(task: Task, runtime: &Waiter) -> Side<Task> {
     Side {
         inner: task,
         runtime: runtime.clone(),

@@ -4,13 +4,13 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_acl::{AgentId, AgentIdError, Message, MessageBuilder, Performative};
 use fipa_mts::Sending;
 
 use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, settle, unreached};
 use super::reachability::Reachability;
-use super::receivers::expand;
+use super::receivers::{expand, identified};
 use crate::agent::{Agent, AgentCore};
 use crate::delivery::deliveries;
 
@@ -18,17 +18,16 @@ impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have
     /// answered, at most for `patience`. Receivers that cannot be reached, or are gone, count as silent.
     ///
-    /// A pattern or a coalition among the receivers stands for the agents known now, which
+    /// The receivers are [`AgentId`]s or names. A pattern or a coalition among them stands for the agents known now, which
     /// [`ContractNet::called`] returns. A name that is given twice counts once.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
     /// use std::time::Duration;
-    /// use fipa::{AgentId, Performative};
+    /// use fipa::Performative;
     ///
     /// let call = agent.message(Performative::Cfp).content("(carry crate)");
-    /// let arms = ["arm_1", "arm_2"].map(AgentId::new).into_iter().collect::<Result<Vec<_>, _>>()?;
-    /// let mut net = agent.contract_net(call, &arms, Duration::from_secs(2)).await?;
+    /// let mut net = agent.contract_net(call, &["arm_1", "arm_2"], Duration::from_secs(2)).await?;
     /// let best = net.bids().proposals.first().cloned();
     /// if let Some(best) = best {
     ///     let done = net.award(&[best], "", Duration::from_secs(60)).await?;
@@ -40,13 +39,17 @@ impl Agent {
     ///
     /// # Errors
     /// If the message does not begin the protocol, or cannot be sent.
-    pub async fn contract_net(
+    pub async fn contract_net<A>(
         &self,
         call: MessageBuilder,
-        receivers: &[AgentId],
+        receivers: &[A],
         patience: Duration,
-    ) -> Result<ContractNet, DialogueError> {
-        ContractNet::begin(&self.core, "fipa-contract-net", call, receivers, patience).await
+    ) -> Result<ContractNet, DialogueError>
+    where
+        A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
+        let receivers = identified(receivers)?;
+        ContractNet::begin(&self.core, "fipa-contract-net", call, &receivers, patience).await
     }
 
     /// Calls for proposals like [`contract_net`](Self::contract_net), with the iterated protocol
@@ -54,14 +57,18 @@ impl Agent {
     ///
     /// # Errors
     /// See [`contract_net`](Self::contract_net).
-    pub async fn iterated_contract_net(
+    pub async fn iterated_contract_net<A>(
         &self,
         call: MessageBuilder,
-        receivers: &[AgentId],
+        receivers: &[A],
         patience: Duration,
-    ) -> Result<ContractNet, DialogueError> {
+    ) -> Result<ContractNet, DialogueError>
+    where
+        A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
+    {
         let protocol = "fipa-iterated-contract-net";
-        ContractNet::begin(&self.core, protocol, call, receivers, patience).await
+        let receivers = identified(receivers)?;
+        ContractNet::begin(&self.core, protocol, call, &receivers, patience).await
     }
 }
 

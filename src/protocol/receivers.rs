@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use fipa_acl::{AgentId, MessageBuilder};
+use fipa_acl::{AgentId, AgentIdError, BuildError, MessageBuilder};
 use fipa_sds::{Directory, Entry, Resolution, resolve};
 
 use super::dialogue::DialogueError;
@@ -56,6 +56,16 @@ fn ids<'e>(entries: impl IntoIterator<Item = &'e std::sync::Arc<Entry>>) -> Vec<
     entries
         .filter_map(|entry| AgentId::new(&*entry.name).ok())
         .collect()
+}
+
+/// Converts receivers that are given as identifiers or names.
+pub(super) fn identified<A>(receivers: &[A]) -> Result<Vec<AgentId>, DialogueError>
+where
+    A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
+{
+    let ids = receivers.iter().map(|receiver| receiver.clone().try_into());
+    let ids: Result<Vec<AgentId>, _> = ids.collect();
+    ids.map_err(|error| BuildError::from(error.into()).into())
 }
 
 /// Replaces the receivers of an opening message for one agent by that agent.

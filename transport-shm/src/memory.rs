@@ -129,7 +129,7 @@ impl Budget {
         let used = self.used();
         if used.saturating_add(need) > self.capacity {
             return Err(TransportError::new(
-                TransportErrorKind::Congested,
+                TransportErrorKind::NoRoom,
                 format_args!(
                     "{need} more bytes of shared memory are needed, and {used} of this domain's {} \
                      are in use; raise transport.shm.capacity",
@@ -222,7 +222,7 @@ pub(crate) fn open_owned(
 
 pub(crate) fn no_room_error(need: u64, what: &str) -> TransportError {
     TransportError::new(
-        TransportErrorKind::Congested,
+        TransportErrorKind::NoRoom,
         format_args!("{need} more bytes of shared memory are needed, and {SHM} {what}; enlarge it"),
     )
 }

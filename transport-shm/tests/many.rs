@@ -137,7 +137,7 @@ fn exceeding_the_capacity_with_shared_content_is_an_error() {
     assert_eq!(refused(9 << 20).fault, TransportErrorKind::TooLarge);
     let held = content(&sender, 5 << 20, 1);
     let error = refused(4 << 20);
-    assert_eq!(error.fault, TransportErrorKind::Congested);
+    assert_eq!(error.fault, TransportErrorKind::NoRoom);
     assert!(error.detail.contains("capacity"), "{error}");
     // An idle segment is released to make room.
     drop(held);

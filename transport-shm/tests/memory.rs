@@ -257,7 +257,7 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
         assert!(taken < 10);
     };
     assert!(taken > 2, "{taken}");
-    assert_eq!(refused.fault, TransportErrorKind::Congested);
+    assert_eq!(refused.fault, TransportErrorKind::NoRoom);
     assert!(refused.detail.contains("capacity"), "{refused}");
     sender
         .dispatch(attempt(), &to, parcel(pattern(500)))

@@ -136,11 +136,13 @@ pub enum FailureReason {
     Inexpressible,
     /// The receiver has only locations of unsupported transports, which the attempts list.
     Unsupported,
+    /// This side had no memory for the letter until the deadline.
+    NoRoom,
 }
 
 impl FailureReason {
     /// All reasons. The position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 11] = [
+    pub(crate) const CODES: [Self; 12] = [
         Self::NoSuchAgent,
         Self::QueueFull,
         Self::Unreachable,
@@ -152,6 +154,7 @@ impl FailureReason {
         Self::Closed,
         Self::Inexpressible,
         Self::Unsupported,
+        Self::NoRoom,
     ];
 }
 
@@ -169,6 +172,7 @@ impl fmt::Display for FailureReason {
             Self::Closed => "closed",
             Self::Inexpressible => "not expressible in the peer's dialect",
             Self::Unsupported => "unsupported transport",
+            Self::NoRoom => "no memory for the letter",
         })
     }
 }

@@ -427,7 +427,7 @@ pub enum TransportErrorKind {
     WrongIncarnation,
     /// The letter is longer than this transport's limit.
     TooLarge,
-    /// The window for the location is full, or memory is temporarily short. A later attempt may
+    /// The window for the location is full, or another part is temporarily short. A later attempt may
     /// succeed.
     Congested,
     /// The connection broke, or the other process ended, before an answer came.
@@ -446,11 +446,13 @@ pub enum TransportErrorKind {
     Inexpressible,
     /// There is no transport of this kind.
     Unsupported,
+    /// Loans and letters that are not received yet use up the memory. A later attempt may succeed.
+    NoRoom,
 }
 
 impl TransportErrorKind {
     /// All faults. The position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 12] = [
+    pub(crate) const CODES: [Self; 13] = [
         Self::Unreachable,
         Self::WrongIncarnation,
         Self::TooLarge,
@@ -463,7 +465,14 @@ impl TransportErrorKind {
         Self::Exhausted,
         Self::Inexpressible,
         Self::Unsupported,
+        Self::NoRoom,
     ];
+
+    /// Whether an attempt failed for lack of a place that the end of another attempt may free.
+    #[must_use]
+    pub fn waits_for_room(self) -> bool {
+        matches!(self, Self::Congested | Self::NoRoom)
+    }
 
     fn description(self) -> &'static str {
         match self {
@@ -479,6 +488,7 @@ impl TransportErrorKind {
             Self::Exhausted => "out of resources",
             Self::Inexpressible => "the peer's dialect cannot express it",
             Self::Unsupported => "unsupported transport",
+            Self::NoRoom => "no memory",
         }
     }
 }

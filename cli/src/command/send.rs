@@ -1,7 +1,10 @@
 //! `fipa send`: sends one message and prints its outcomes.
 
 mod advice;
+mod repeat;
+mod settle;
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
@@ -18,6 +21,8 @@ use crate::options::{self, Global};
 use crate::report::{self, Failure};
 use crate::{complete, input, membership, output};
 
+use self::settle::Settled;
+
 /// Send one message and print its outcome
 ///
 /// Registers a temporary agent, sends the message to every receiver and prints one outcome per
@@ -29,6 +34,13 @@ use crate::{complete, input, membership, output};
 /// (`fipa up`). The exit code is 0 only if no outcome is failed and, with --wait, a reply was
 /// received. The wait ends at once when the receiver leaves or dies. A FIPA failure message about the letter from a message transport service does not count
 /// as a reply.
+///
+/// With --answers the command waits for several replies. At the end of the wait it answers every
+/// proposal: with accept-proposal if --accept names its sender, and otherwise with reject-proposal. It
+/// then waits for the results of the accepted ones.
+///
+/// With --count or --rate the message is sent repeatedly. The command then prints failed outcomes, and a
+/// summary at the end.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -37,15 +49,25 @@ Examples:
   fipa send --to 'arm_.*' --content stop               to all agents whose names match
   fipa send --to camera --content-file picture.raw --deadline 30s
   head -c 4096 /dev/urandom | fipa send --to camera --content-file - --json
+  fipa send --to camera --content x --rate 10 --count 100
+  fipa send --to 'arm_.*' -p cfp --protocol fipa-contract-net --content '(carry crate)' \\
+      --wait --answers 3 --accept arm_2
 
 JSON:
   { \"deliveries\": [ { \"receiver\": name, \"outcome\": \"delivered\", \"sent\" or \"failed\",
                       \"via\": transport, unless failed, \"reason\": text, if failed,
                       \"attempts\": [ { \"via\", \"location\", \"error\" } ] } ],
-    \"reply\": the reply as `fipa decode` prints it, if one was received,
+    \"reply\": the reply as `fipa decode` prints it, if one was received; with --answers
+             \"replies\": [ reply ],
+    \"accepted\" and \"rejected\": [ name ], the senders of proposals, if there are any,
+    \"results\": [ the last messages of the accepted agents ],
     \"failures\": [ { \"from\": name, \"receiver\": name or null, \"reason\": text } ], the failure
                 messages about the letter, if any were received with --wait,
-    \"gone\": [ name ], the receivers that left or died before they replied, if there are any }")]
+    \"gone\": [ name ], the receivers that left or died before they replied, if there are any }
+
+With --count or --rate, one object on each line:
+  { \"number\": of the message, from 1, \"deliveries\": as above }
+  { \"messages\": number, \"delivered\" and \"failed\": numbers of outcomes, \"seconds\": number }  at the end")]
 pub(crate) struct Arguments {
     /// Name of the receiver, or a pattern such as 'arm_.*'; repeatable
     #[arg(long, required = true, value_name = "NAME", add = complete::agents())]
@@ -75,7 +97,26 @@ pub(crate) struct Arguments {
     #[arg(long)]
     wait: bool,
 
-    /// Maximum wait for a reply, for example 10s
+    /// Number of replies to wait for
+    #[arg(long, value_name = "N", requires = "wait",
+          value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    answers: Option<u32>,
+
+    /// Accept the proposal of this agent; others are rejected; repeatable
+    #[arg(long, value_name = "NAME", requires = "wait")]
+    accept: Vec<AgentId>,
+
+    /// Send the message this number of times [default with --rate: until Ctrl-C]
+    #[arg(long, value_name = "N", conflicts_with = "wait",
+          value_parser = clap::value_parser!(u64).range(1..))]
+    count: Option<u64>,
+
+    /// Send this number of messages per second, for example 10 or 0.5 [default with --count: each one
+    /// after the outcome of the one before]
+    #[arg(long, value_name = "N", conflicts_with = "wait", value_parser = repeat::rate)]
+    rate: Option<f64>,
+
+    /// Maximum wait for the replies, for example 10s
     #[arg(long, value_name = "TIME", default_value = "10s", requires = "wait",
           value_parser = options::duration)]
     timeout: Duration,
@@ -137,17 +178,12 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
         (None, Some(file)) => Some(input::read(file, Message::MAX_CONTENT)?),
         (None, None) => None,
     };
+    if arguments.count.is_some() || arguments.rate.is_some() {
+        return options::block_on(repeat::send(&arguments, content, &config))?;
+    }
     membership::run(async {
         let domain = membership::join(&config).await?;
-        let name = match &arguments.from {
-            Some(id) => id.name().to_owned(),
-            None => format!("fipa-send-{}", Incarnation::random()),
-        };
-        let options = RegisterOptions {
-            agent_type: "fipa-send".to_owned(),
-            ..RegisterOptions::default()
-        };
-        let agent = membership::register(&domain, &name, options, &config).await?;
+        let agent = register(&domain, &arguments, &config).await?;
         let done = converse(&agent, &arguments, content, &config).await;
         drop(agent);
         domain.close().await;
@@ -155,7 +191,32 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
     })
 }
 
-/// Sends the message, waits for the reply if requested, and prints the outcomes and the reply.
+/// Registers the sending agent.
+async fn register(
+    domain: &fipa::Domain,
+    arguments: &Arguments,
+    config: &Config,
+) -> Result<Agent, Failure> {
+    let name = match &arguments.from {
+        Some(id) => id.name().to_owned(),
+        None => format!("fipa-send-{}", Incarnation::random()),
+    };
+    let options = RegisterOptions {
+        agent_type: "fipa-send".to_owned(),
+        ..RegisterOptions::default()
+    };
+    membership::register(domain, &name, options, config).await
+}
+
+fn not_sent(error: &fipa::SendError) -> Failure {
+    Failure::failed(
+        format!("cannot send the message: {}", ErrorChain(error)),
+        "this process",
+        "`fipa send --help` describes the parameters of a message",
+    )
+}
+
+/// Sends the message, waits for the replies if requested, and prints the outcomes and the replies.
 async fn converse(
     agent: &Agent,
     arguments: &Arguments,
@@ -165,56 +226,65 @@ async fn converse(
     let message = message(agent, arguments, content)?;
     let deadline = arguments.deadline.unwrap_or(config.mts.deadline);
     // Before the message is sent, so that no departure is missed.
-    let partners = agent.watch_partners();
+    let mut partners = agent.watch_partners();
     let sent = agent.send_within(message.clone(), deadline).await;
-    let deliveries = sent.map_err(|error| {
-        Failure::failed(
-            format!("cannot send the message: {}", ErrorChain(&error)),
-            "this process",
-            "`fipa send --help` describes the parameters of a message",
-        )
-    })?;
+    let deliveries = sent.map_err(|error| not_sent(&error))?;
     if !arguments.json {
         output::text(&format!("{deliveries}\n"))?;
     }
     let any_succeeded = deliveries.0.iter().any(|one| one.outcome.is_success());
     let mut answers = Answers::default();
+    let mut settled = Settled::default();
     if arguments.wait && any_succeeded {
         let sent = deliveries.0.iter().filter(|one| one.outcome.is_success());
         let reached: Vec<&str> = sent.map(|one| &*one.receiver).collect();
-        answers = wait(agent, &message, partners, &reached, arguments.timeout).await?;
+        answers = wait(agent, &message, &mut partners, &reached, arguments).await?;
+        settled = settle::proposals(agent, &message, &answers, arguments).await?;
     }
-    match &answers.reply {
-        _ if arguments.json => {
-            let mut json = json!({ "deliveries": output::deliveries(&deliveries) });
-            if let Some(reply) = &answers.reply {
-                json["reply"] = message_to_json(reply.message());
-            }
-            if !answers.failures.is_empty() {
-                let failures = answers.failures.iter().map(FailureMessage::json);
-                json["failures"] = failures.collect();
-            }
-            if !answers.gone.is_empty() {
-                json["gone"] = json!(answers.gone);
-            }
-            output::json(&json)?;
+    if arguments.json {
+        let mut json = json!({ "deliveries": output::deliveries(&deliveries) });
+        let mut replies = answers
+            .replies
+            .iter()
+            .map(|it| message_to_json(it.message()));
+        if arguments.answers.is_some() {
+            json["replies"] = replies.collect();
+        } else if let Some(reply) = replies.next() {
+            json["reply"] = reply;
         }
-        Some(reply) => output::text(&format!("reply: {}\n", reply.message()))?,
-        None => {}
+        settled.add_to(&mut json);
+        if !answers.failures.is_empty() {
+            let failures = answers.failures.iter().map(FailureMessage::json);
+            json["failures"] = failures.collect();
+        }
+        if !answers.gone.is_empty() {
+            json["gone"] = json!(answers.gone);
+        }
+        output::json(&json)?;
     }
-    let without_reply = arguments.wait && any_succeeded && answers.timed_out;
-    let no_reply = without_reply.then(|| no_reply(&deliveries, arguments.timeout));
+    let no_reply = answers
+        .timed_out
+        .then(|| no_reply(&deliveries, &answers, arguments));
     let failures = advice::failures(&deliveries, agent, config);
     let reported = answers.failures.iter().map(FailureMessage::failure);
-    let gone = answers.reply.is_none().then(|| gone(&answers.gone));
+    let is_short = answers.replies.len() < arguments.replies();
+    let gone = is_short.then(|| gone(&answers.gone));
     let all = failures.into_iter().chain(reported);
-    Failure::all(all.chain(gone.flatten()).chain(no_reply))
+    let all = all.chain(gone.flatten()).chain(no_reply);
+    Failure::all(all.chain(settled.failures))
+}
+
+impl Arguments {
+    /// Number of replies to wait for.
+    fn replies(&self) -> usize {
+        self.answers.map_or(1, |answers| answers as usize)
+    }
 }
 
 /// The messages received during the wait for a reply.
 #[derive(Debug, Default)]
 struct Answers {
-    reply: Option<Incoming>,
+    replies: Vec<Incoming>,
     failures: Vec<FailureMessage>,
     /// The receivers that left or died before they replied.
     gone: Vec<String>,
@@ -300,21 +370,21 @@ fn message(
     })
 }
 
-/// Waits for the first reply of the `reached` receivers, and collects failure messages about the letter.
-/// The wait ends early when each receiver is gone or has a failure message.
+/// Waits for the replies of the `reached` receivers, prints them, and collects failure messages about the
+/// letter. The wait ends early when no further reply can come.
 async fn wait(
     agent: &Agent,
     message: &Message,
-    mut partners: PartnerWatch,
+    partners: &mut PartnerWatch,
     reached: &[&str],
-    timeout: Duration,
+    arguments: &Arguments,
 ) -> Result<Answers, Failure> {
     let mut answers = Answers::default();
     for receiver in reached {
         partners.add(receiver);
     }
-    let first = async {
-        while answers.failures.len() + answers.gone.len() < reached.len() {
+    let all = async {
+        while !answers.are_complete(reached, arguments.replies()) {
             let received = tokio::select! {
                 // A reply that has arrived precedes the end of its sender.
                 biased;
@@ -333,8 +403,10 @@ async fn wait(
                     match FailureMessage::of(incoming.message()) {
                         Some(failure) => answers.failures.push(failure),
                         None => {
-                            answers.reply = Some(incoming);
-                            break;
+                            if !arguments.json {
+                                output::text(&format!("reply: {}\n", incoming.message()))?;
+                            }
+                            answers.replies.push(incoming);
                         }
                     }
                 }
@@ -350,7 +422,7 @@ async fn wait(
         }
         Ok(())
     };
-    match tokio::time::timeout(timeout, first).await {
+    match tokio::time::timeout(arguments.timeout, all).await {
         Ok(ended) => ended?,
         Err(_) => answers.timed_out = true,
     }
@@ -358,6 +430,27 @@ async fn wait(
 }
 
 impl Answers {
+    /// Whether there are as many replies as wanted, or no further one can come: each receiver is gone or
+    /// has a failure message, or has replied if one reply of each is enough.
+    fn are_complete(&self, reached: &[&str], wanted: usize) -> bool {
+        let ended = self.failures.len() + self.gone.len();
+        if self.replies.len() >= wanted || ended >= reached.len() {
+            return true;
+        }
+        let repliers = self.replies.iter().filter_map(|it| it.message().sender());
+        let failed = self
+            .failures
+            .iter()
+            .filter_map(|it| it.failure.receiver.as_deref());
+        let gone = self.gone.iter().map(String::as_str);
+        let ended: HashSet<&str> = repliers
+            .map(AgentId::name)
+            .chain(failed)
+            .chain(gone)
+            .collect();
+        wanted <= reached.len() && reached.iter().all(|name| ended.contains(name))
+    }
+
     /// Notes an event of a receiver, and prints it unless the command ends with it.
     fn note(&mut self, event: PartnerEvent) {
         match event {
@@ -387,11 +480,15 @@ fn gone(names: &[String]) -> Option<Failure> {
     })
 }
 
-fn no_reply(deliveries: &Deliveries, timeout: Duration) -> Failure {
+fn no_reply(deliveries: &Deliveries, answers: &Answers, arguments: &Arguments) -> Failure {
     let reached = deliveries.0.iter().filter(|one| one.outcome.is_success());
     let reached: Vec<&str> = reached.map(|one| &*one.receiver).collect();
+    let timeout = humantime::format_duration(arguments.timeout);
     Failure::failed(
-        format!("no reply within {}", humantime::format_duration(timeout)),
+        match answers.replies.len() {
+            0 => format!("no reply within {timeout}"),
+            some => format!("{some} of {} replies within {timeout}", arguments.replies()),
+        },
         advice::receivers(&reached),
         "check whether the receiver answers such messages, or wait longer with --timeout",
     )

@@ -151,6 +151,13 @@ impl Ran {
         (serde_json::from_slice(&self.stdout).unwrap(), self.stderr)
     }
 
+    /// Returns standard output and standard error. Requires exit code 1.
+    #[track_caller]
+    pub(crate) fn failed_text(self) -> (String, String) {
+        assert_eq!(self.code, Some(1), "{self:?}");
+        (String::from_utf8(self.stdout).unwrap(), self.stderr)
+    }
+
     /// Returns standard error. Requires this exit code and an empty standard output.
     #[track_caller]
     pub(crate) fn failed(self, code: i32) -> String {

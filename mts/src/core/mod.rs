@@ -759,7 +759,7 @@ impl Core {
                 // here would make it retry and fail, until the route counts as broken.
                 let made_room = !matches!(
                     &conclusion,
-                    Conclusion::NotSent(error) if error.fault == TransportErrorKind::Congested
+                    Conclusion::NotSent(error) if error.fault.waits_for_room()
                 );
                 self.with_lane(now, id, |lane, table| {
                     route = lane.route_of(sequence).filter(|_| made_room).cloned();

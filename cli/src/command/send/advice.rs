@@ -68,6 +68,11 @@ fn advice(reason: FailureReason, config: &Config) -> String {
              configuration of both hosts",
             config.transport.shm.max_letter
         ),
+        FailureReason::NoRoom => format!(
+            "shared memory is used up by letters that agents keep, and by loans: release them, or raise \
+             transport.shm.capacity (now {} bytes here)",
+            config.transport.shm.capacity
+        ),
         FailureReason::Inexpressible => {
             "change or omit the parameter named above, which the peer's dialect cannot encode"
                 .to_owned()

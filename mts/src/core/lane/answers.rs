@@ -277,7 +277,7 @@ impl Lane {
         if let Some(tally) = self.tally() {
             tally.fail(now, &error);
         }
-        if error.fault == TransportErrorKind::Congested && self.congested < CONGESTED_TRIES {
+        if error.fault.waits_for_room() && self.congested < CONGESTED_TRIES {
             // The end of another attempt, in this lane or another, makes room.
             self.congested += 1;
             self.letters[index]

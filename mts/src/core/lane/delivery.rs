@@ -214,6 +214,16 @@ impl Delivery {
         reason
     }
 
+    /// The reason when no route was open: each attempt failed for lack of memory, or there was no
+    /// route.
+    fn without_route(&self) -> FailureReason {
+        let mut attempts = self.progress.attempts.iter();
+        match attempts.all(|attempt| attempt.error.fault == TransportErrorKind::NoRoom) {
+            true => FailureReason::NoRoom,
+            false => FailureReason::Unreachable,
+        }
+    }
+
     /// The reason when its deadline has passed. `behind_full_queue` is whether an earlier letter
     /// met a full queue.
     pub(super) fn reason_at_deadline(&self, behind_full_queue: bool) -> FailureReason {
@@ -225,7 +235,7 @@ impl Delivery {
         } else if progress.attempts.is_empty() {
             FailureReason::TimedOut
         } else {
-            self.unfit().unwrap_or(FailureReason::Unreachable)
+            self.unfit().unwrap_or_else(|| self.without_route())
         }
     }
 

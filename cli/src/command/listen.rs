@@ -1,0 +1,119 @@
+//! `fipa listen`: an agent that prints its letters.
+
+use clap::Args;
+use fipa::{AgentId, Config, ErrorChain, Incoming, RegisterOptions};
+use fipa_acl::escape;
+use fipa_acl::json::message_to_json;
+use serde_json::json;
+
+use crate::membership::{self, Stop};
+use crate::options::{self, Global};
+use crate::output::{self, Reader};
+use crate::report::Failure;
+
+/// Run an agent that prints each message and answers none
+///
+/// The agent prints one line per received message, until Ctrl-C. It works with and without a gateway.
+/// `fipa echo` answers messages; `fipa watch` shows the letters of other agents.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa listen monitor_1
+  fipa listen monitor_1 --count 1            ends after one message
+  fipa listen monitor_1 --json | jq -r .message.content
+
+In another terminal:
+  fipa send --to monitor_1 --content hello
+
+JSON, one object on each line:
+  { \"agent\": name, \"domain\": text }          when the agent is ready
+  { \"via\": transport, or null for a message of this process,
+    \"violation\": text, if the message violates its protocol (monitor.check),
+    \"message\": the message as `fipa decode` prints it }")]
+pub(crate) struct Arguments {
+    /// Name of the agent
+    name: AgentId,
+
+    /// Type of the agent, for `fipa agents --type`
+    #[arg(long = "type", value_name = "TYPE", default_value = "")]
+    agent_type: String,
+
+    /// Description of the agent, for `fipa agents --description`
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    description: String,
+
+    /// End after this number of messages
+    #[arg(long, value_name = "N")]
+    count: Option<u64>,
+
+    /// Print JSON, one object on a line
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    options::block_on(listen(arguments, &config))?
+}
+
+async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
+    let mut stop = Stop::listen()?;
+    let domain = membership::join(config).await?;
+    let options = RegisterOptions {
+        agent_type: arguments.agent_type,
+        description: arguments.description,
+    };
+    let agent = membership::register(&domain, arguments.name.name(), options, config).await?;
+    match arguments.json {
+        true => output::json_line(&json!({ "agent": agent.name(), "domain": config.domain }))?,
+        false => output::text(&format!(
+            "agent {} of domain {} is listening; press Ctrl-C to stop\n",
+            escape(agent.name()),
+            config.domain
+        ))?,
+    }
+    let print_all = async {
+        let mut received = 0;
+        while arguments.count.is_none_or(|count| received < count) {
+            let incoming = agent.receive().await.map_err(|error| {
+                Failure::failed(
+                    ErrorChain(&error).to_string(),
+                    format!("agent {:?}", agent.name()),
+                    "restart the agent",
+                )
+            })?;
+            received += 1;
+            print(&incoming, arguments.json)?;
+        }
+        Ok(())
+    };
+    let mut reader = Reader::of_output();
+    let ended = tokio::select! {
+        ended = print_all => ended,
+        () = stop.requested() => Ok(()),
+        () = reader.gone() => Ok(()),
+    };
+    Stop::ending();
+    drop(agent);
+    domain.close().await;
+    ended
+}
+
+fn print(incoming: &Incoming, json: bool) -> Result<(), Failure> {
+    let violation = incoming.violation().map(ToString::to_string);
+    let via = incoming.via.map(|via| via.name());
+    if json {
+        let mut line = json!({ "via": via, "message": message_to_json(incoming.message()) });
+        if let Some(violation) = violation {
+            line["violation"] = violation.into();
+        }
+        return output::json_line(&line);
+    }
+    let via = via.map(|via| format!("via {via}: ")).unwrap_or_default();
+    let violation = violation.map(|it| format!(" (violation: {it})"));
+    let message = incoming.message();
+    output::text(&format!(
+        "{via}{message}{}\n",
+        violation.unwrap_or_default()
+    ))
+}

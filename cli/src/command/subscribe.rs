@@ -1,0 +1,127 @@
+//! `fipa subscribe`: prints the notifications of an agent.
+
+use std::time::Duration;
+
+use clap::Args;
+use fipa::protocol::{DialogueError, Subscription};
+use fipa::{Agent, AgentId, Performative};
+use fipa_acl::escape;
+use serde_json::json;
+
+use super::request::{CANCEL_WITHIN, Opening, failed, line, unless_stopped};
+use crate::membership::{self, Stop};
+use crate::options::{self, Global};
+use crate::output::{self, Reader};
+use crate::report::{self, Failure};
+
+/// Subscribe to the notifications of an agent (FIPA00035)
+///
+/// Leads the protocol fipa-subscribe: prints each notification until Ctrl-C, which cancels the
+/// subscription. A silent host of the agent is reported and does not end the command. The exit code is 1
+/// if the agent refuses, ends the subscription, leaves or dies.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa subscribe battery charge
+  fipa subscribe battery charge --count 1
+  fipa subscribe battery charge --json | jq -r .notification.content
+
+JSON, one object on each line:
+  { \"subscribed\": name }                     when the agent has agreed
+  { \"notification\": the message as `fipa decode` prints it }")]
+pub(crate) struct Arguments {
+    /// Name of the agent
+    name: AgentId,
+
+    /// Content of the subscription: for an agent of this project, the topic of the publisher
+    content: String,
+
+    /// End after this number of notifications
+    #[arg(long, value_name = "N")]
+    count: Option<u64>,
+
+    /// Maximum wait for the agreement, for example 10s
+    #[arg(long, value_name = "TIME", default_value = "10s", value_parser = options::duration)]
+    timeout: Duration,
+
+    /// Print JSON, one object on a line
+    #[arg(long)]
+    json: bool,
+
+    #[command(flatten)]
+    opening: Opening,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    options::block_on(async {
+        let mut stop = Stop::listen()?;
+        let domain = membership::join(&config).await?;
+        let agent = arguments
+            .opening
+            .register(&domain, "subscribe", &config)
+            .await;
+        let done = match &agent {
+            Ok(agent) => follow(agent, &arguments, &mut stop).await,
+            Err(_) => Ok(()),
+        };
+        Stop::ending();
+        let registered = agent.map(drop);
+        domain.close().await;
+        registered.and(done)
+    })?
+}
+
+async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result<(), Failure> {
+    let Arguments { name, content, .. } = arguments;
+    let act = Performative::Subscribe;
+    let opening = arguments.opening.message(agent, act, name, content);
+    let subscribed = tokio::select! {
+        subscribed = agent.subscribe(opening, arguments.timeout) => subscribed,
+        () = stop.requested() => return Ok(()),
+    };
+    let mut subscription = subscribed.map_err(|error| failed(&error, name))?;
+    let mut reachability = subscription.reachability();
+    match arguments.json {
+        true => output::json_line(&json!({ "subscribed": name.name() }))?,
+        false => output::text(&format!(
+            "subscribed to {}; press Ctrl-C to stop\n",
+            escape(name.name())
+        ))?,
+    }
+    let mut reader = Reader::of_output();
+    let print = async {
+        tokio::select! {
+            printed = print_all(&mut subscription, arguments) => printed,
+            () = reader.gone() => Ok(()),
+        }
+    };
+    match unless_stopped(print, &mut reachability, stop).await {
+        Some(Err(failure)) => Err(failure),
+        Some(Ok(())) | None => {
+            Stop::ending();
+            if let Err(error) = subscription.cancel(CANCEL_WITHIN).await {
+                report::warn(&format!("the subscription was not canceled: {error}"));
+            }
+            Ok(())
+        }
+    }
+}
+
+async fn print_all(subscription: &mut Subscription, arguments: &Arguments) -> Result<(), Failure> {
+    let mut count = 0;
+    while arguments.count.is_none_or(|most| count < most) {
+        let message = match subscription.next().await {
+            Ok(message) => message,
+            // Reported as a change of the reachability.
+            Err(DialogueError::Unreachable { .. }) => continue,
+            Err(error) => return Err(failed(&error, &arguments.name)),
+        };
+        count += 1;
+        match arguments.json {
+            true => output::json_line(&line("notification", &message))?,
+            false => output::text(&format!("{message}\n"))?,
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,390 @@
+//! `fipa listen`, `request`, `subscribe` and `ping`, and `fipa send` that repeats and that collects
+//! proposals. The agents are those of a process of its own.
+
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::thread;
+use std::time::Duration;
+
+use common::Host;
+use fipa::Config;
+use fipa::blocking::{Domain, Side};
+use fipa::config::Sources;
+use fipa::protocol::{DialogueError, Reply, Task};
+use fipa_acl::is_unprintable;
+use fipa_testbed::{ChildGuard, ignored_test, until};
+use serde_json::{Value, json};
+
+/// Longer than any step takes, also on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A text that controls a terminal and forges a line.
+const HOSTILE: &str = "x\u{1b}]0;t\u{7}\u{9b}31m\u{202e}\r\nerror: forged";
+
+#[test]
+#[ignore = "is run by the other tests as a process of its own"]
+fn inside_agents() {
+    let domain = env::var("FIPA_TEST_DOMAIN").unwrap();
+    let config = Config::load(&Sources {
+        set: vec![
+            format!("domain={domain}"),
+            "discovery.mdns=false".to_owned(),
+        ],
+        ..Sources::default()
+    });
+    let domain = Domain::open(&config.unwrap()).unwrap();
+    let mut servers = Vec::new();
+    let mut arms = Vec::new();
+    for (name, price) in [("arm_1", "30"), ("arm_2", "10"), ("arm_3", "20")] {
+        let arm = domain.register(name).unwrap();
+        servers.push(arm.serve("fipa-request", act).unwrap());
+        let bid = move |mut task: Side<Task>| match task.propose(price, PATIENCE)? {
+            true => Ok::<_, DialogueError>(Reply::Inform("carried".into())),
+            false => {
+                mark(&format!("rejected-{name}"));
+                Ok(Reply::Nothing)
+            }
+        };
+        servers.push(arm.serve("fipa-contract-net", bid).unwrap());
+        arms.push(arm);
+    }
+    let battery = domain.register("battery").unwrap();
+    let charge = battery.publisher("charge").unwrap();
+    mark("ready");
+    loop {
+        charge.publish("80.5");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Handles a request, depending on its content.
+fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
+    let action = task.message().text();
+    match action.as_str() {
+        "refuse" => return Ok(Reply::Refuse("too heavy".into())),
+        "hostile" => return Ok(Reply::Refuse(HOSTILE.into())),
+        _ => task.agree("")?,
+    }
+    match action.as_str() {
+        "fail" => Ok(Reply::Failure("it fell".into())),
+        "wait" => {
+            let reply = match task.cancelled(PATIENCE)? {
+                true => task.confirm_cancel()?,
+                false => return Ok(Reply::Failure("no cancel".into())),
+            };
+            mark("canceled");
+            Ok(reply)
+        }
+        _ => Ok(Reply::Inform("lifted".into())),
+    }
+}
+
+/// Creates an empty file for the test.
+fn mark(name: &str) {
+    let directory = env::var_os("FIPA_TEST_DIR").unwrap();
+    fs::write(Path::new(&directory).join(name), "").unwrap();
+}
+
+/// Starts the process of the agents.
+fn agents(host: &Host) -> ChildGuard {
+    let process = ChildGuard::start(
+        ignored_test("inside_agents")
+            .env("FIPA_TEST_DOMAIN", &host.domain)
+            .env("FIPA_TEST_DIR", host.path(""))
+            .env("FIPA_RUNTIME_DIR", host.path("run"))
+            .stdin(Stdio::null())
+            .stdout(Stdio::null()),
+    );
+    until("the agents are ready", || host.path("ready").exists());
+    process
+}
+
+#[track_caller]
+fn harmless(text: &str) {
+    let found = text.chars().find(|&c| c != '\n' && is_unprintable(c));
+    assert_eq!(found, None, "{text:?}");
+    assert!(
+        !text.lines().any(|line| line.starts_with("error: forged")),
+        "{text}"
+    );
+}
+
+#[test]
+fn listen_prints_messages_and_answers_none() {
+    let host = Host::new();
+    let mut listen = host.start(&["listen", "monitor", "--count", "2"]);
+    let ready = format!("agent monitor of domain {} is listening", host.domain);
+    assert!(listen.ready.starts_with(&ready), "{}", listen.ready);
+    let send = [
+        "send",
+        "--to",
+        "monitor",
+        "--from",
+        "rover",
+        "-p",
+        "query-ref",
+    ];
+    host.run(&[&send[..], &["--content", HOSTILE]].concat())
+        .done();
+    let line = listen.line();
+    assert!(
+        line.starts_with("via shm: (query-ref :sender rover"),
+        "{line}"
+    );
+    harmless(&line);
+    let unanswered = ["--content", "x", "--wait", "--timeout", "50ms", "--json"];
+    let (json, _) = host.run(&[&send[..], &unanswered].concat()).failed_json();
+    assert_eq!(json.get("reply"), None);
+    assert!(listen.line().contains("\"x\""));
+    assert_eq!(listen.end(), (Some(0), String::new()));
+
+    let mut listen = host.start(&["listen", "monitor", "--json"]);
+    let ready: Value = serde_json::from_str(&listen.ready).unwrap();
+    assert_eq!(ready, json!({ "agent": "monitor", "domain": host.domain }));
+    host.run(&[&send[..], &["--content", HOSTILE]].concat())
+        .done();
+    let line = listen.line();
+    harmless(&line);
+    let line: Value = serde_json::from_str(&line).unwrap();
+    assert_eq!(
+        (&line["via"], &line["message"]["content"]),
+        (&json!("shm"), &json!(HOSTILE))
+    );
+    assert_eq!(listen.signal("-INT"), (Some(0), String::new()));
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn request_prints_the_agreement_and_the_result() {
+    let host = Host::new();
+    let _agents = agents(&host);
+    let printed = host.run(&["request", "arm_1", "lift"]).done();
+    let (agreed, result) = printed.split_once('\n').unwrap();
+    assert_eq!(agreed, "arm_1 agreed");
+    assert!(
+        result.starts_with("result: (inform :sender arm_1"),
+        "{result}"
+    );
+    let json = host
+        .run(&["request", "arm_1", "lift", "--json"])
+        .done_json();
+    assert_eq!(
+        (&json["agreed"], &json["result"]["content"]),
+        (&json!(true), &json!("lifted"))
+    );
+
+    let error = host.run(&["request", "arm_1", "refuse"]).failed(1);
+    assert!(
+        error.starts_with("error: the other side refused: (refuse "),
+        "{error}"
+    );
+    assert!(error.contains("too heavy"), "{error}");
+    harmless(&host.run(&["request", "arm_1", "hostile"]).failed(1));
+    let (json, _) = host
+        .run(&["request", "arm_1", "fail", "--json"])
+        .failed_json();
+    assert_eq!(
+        (&json["agreed"], &json["failed"]["content"]),
+        (&json!(true), &json!("it fell"))
+    );
+    let error = host.run(&["request", "unknown", "lift"]).failed(1);
+    assert!(error.contains("no such agent"), "{error}");
+}
+
+#[test]
+fn a_signal_cancels_a_request() {
+    let host = Host::new();
+    let _agents = agents(&host);
+    let request = host.start(&["request", "arm_1", "wait"]);
+    assert_eq!(request.ready, "arm_1 agreed");
+    let (code, error) = request.signal("-INT");
+    assert_eq!(code, Some(1));
+    assert!(error.starts_with("error: canceled by a signal"), "{error}");
+    until("the arm knows it", || host.path("canceled").exists());
+}
+
+#[test]
+fn subscribe_prints_notifications_until_its_end() {
+    let host = Host::new();
+    let _agents = agents(&host);
+    let printed = host
+        .run(&["subscribe", "battery", "charge", "--count", "2"])
+        .done();
+    let lines: Vec<&str> = printed.lines().collect();
+    assert_eq!(lines[0], "subscribed to battery; press Ctrl-C to stop");
+    assert_eq!(lines.len(), 3, "{printed}");
+    assert!(lines[1].contains(":content \"80.5\""), "{printed}");
+
+    let mut subscription = host.start(&["subscribe", "battery", "charge", "--json"]);
+    assert_eq!(subscription.ready, "{\"subscribed\":\"battery\"}");
+    let line: Value = serde_json::from_str(&subscription.line()).unwrap();
+    assert_eq!(line["notification"]["content"], "80.5");
+    assert_eq!(subscription.signal("-INT"), (Some(0), String::new()));
+
+    let nothing = ["subscribe", "battery", "voltage", "--timeout", "100ms"];
+    assert!(host.run(&nothing).failed(1).starts_with("error: "));
+}
+
+#[test]
+fn ping_measures_round_trips() {
+    let host = Host::new();
+    let _echo = host.start(&["listen", "arm_1"]);
+    let ping = ["ping", "arm_1", "--interval", "1ms"];
+    let printed = host.run(&[&ping[..], &["--count", "3"]].concat()).done();
+    let lines: Vec<&str> = printed.lines().collect();
+    assert_eq!(lines.len(), 4, "{printed}");
+    assert!(
+        lines[0].starts_with("arm_1: ping 1, delivered via shm, "),
+        "{printed}"
+    );
+    let summary = "arm_1: 3 pings, 3 delivered; round trip min/avg/max/mdev = ";
+    let times = lines[3]
+        .strip_prefix(summary)
+        .unwrap()
+        .strip_suffix(" ms")
+        .unwrap();
+    let times: Vec<f64> = times.split('/').map(|time| time.parse().unwrap()).collect();
+    assert!(
+        times[0] <= times[1] && times[1] <= times[2] && times[3] >= 0.0,
+        "{printed}"
+    );
+
+    let mut running = host.start(&[&ping[..], &["--json"]].concat());
+    let line: Value = serde_json::from_str(&running.ready).unwrap();
+    assert_eq!((&line["ping"], &line["via"]), (&json!(1), &json!("shm")));
+    running.send_signal("-INT");
+    let last = std::iter::from_fn(|| running.next_line()).last().unwrap();
+    let last: Value = serde_json::from_str(&last).unwrap();
+    assert!(
+        last["pings"].as_u64() >= Some(1) && last["mdev"].is_number(),
+        "{last}"
+    );
+    assert_eq!(running.end(), (Some(0), String::new()));
+
+    let (_, error) = host.run(&["ping", "unknown", "--count", "1"]).failed_text();
+    assert!(
+        error.starts_with("error: 1 of 1 pings were not delivered\n"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_message_is_sent_at_a_rate() {
+    let host = Host::new();
+    let mut listen = host.start(&["listen", "monitor", "--count", "20"]);
+    let send = ["send", "--to", "monitor", "--content", "x"];
+    let repeated = ["--rate", "500", "--count", "20", "--json"];
+    let printed = host.run(&[&send[..], &repeated].concat()).done();
+    let lines: Vec<Value> = printed
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(lines.len(), 21);
+    let mut numbers: Vec<u64> = lines
+        .iter()
+        .filter_map(|it| it["number"].as_u64())
+        .collect();
+    numbers.sort_unstable();
+    assert_eq!(numbers, (1..=20).collect::<Vec<_>>());
+    let summary = lines.last().unwrap();
+    assert_eq!(
+        (
+            &summary["messages"],
+            &summary["delivered"],
+            &summary["failed"]
+        ),
+        (&json!(20), &json!(20), &json!(0))
+    );
+    assert_eq!(listen.end(), (Some(0), String::new()));
+
+    let unknown = ["send", "--to", "unknown", "--count", "2"];
+    let (printed, error) = host.run(&unknown).failed_text();
+    assert!(
+        printed.starts_with("message 1: unknown: failed: no such agent\n"),
+        "{printed}"
+    );
+    assert!(
+        printed.contains(": 0 outcomes delivered, 2 failed\n"),
+        "{printed}"
+    );
+    assert!(
+        error.starts_with("error: 2 outcomes are failures\n"),
+        "{error}"
+    );
+
+    // Without a count, until a signal.
+    let _listen = host.start(&["listen", "monitor"]);
+    let mut endless = host.start(&[&send[..], &["--rate", "100", "--json"]].concat());
+    assert!(
+        endless.ready.starts_with("{\"deliveries\""),
+        "{}",
+        endless.ready
+    );
+    endless.send_signal("-INT");
+    let last = std::iter::from_fn(|| endless.next_line()).last().unwrap();
+    assert!(last.contains("\"seconds\""), "{last}");
+    assert_eq!(endless.end(), (Some(0), String::new()));
+    for wrong in [
+        &["--rate", "0"][..],
+        &["--count", "0"],
+        &["--rate", "1", "--wait"],
+    ] {
+        host.run(&[&send[..], wrong].concat()).failed(2);
+    }
+}
+
+#[test]
+fn a_call_for_proposals_shows_all_bids_and_answers_each() {
+    let host = Host::new();
+    let _agents = agents(&host);
+    let call = [
+        "send",
+        "--to",
+        "arm_.*",
+        "-p",
+        "cfp",
+        "--protocol",
+        "fipa-contract-net",
+    ];
+    let wait = ["--wait", "--answers", "3", "--timeout", "60s"];
+    let printed = host
+        .run(&[&call[..], &wait, &["--accept", "arm_2"]].concat())
+        .done();
+    let begin = |text: &str| {
+        printed
+            .lines()
+            .filter(|line| line.starts_with(text))
+            .count()
+    };
+    assert_eq!(begin("reply: (propose :sender arm_"), 3, "{printed}");
+    for line in ["accepted: arm_2", "rejected: arm_1", "rejected: arm_3"] {
+        assert_eq!(begin(line), 1, "{printed}");
+    }
+    assert_eq!(begin("result: (inform :sender arm_2"), 1, "{printed}");
+    for name in ["arm_1", "arm_3"] {
+        let rejected = host.path(&format!("rejected-{name}"));
+        until("the arm knows it", || rejected.exists());
+    }
+    assert!(!host.path("rejected-arm_2").exists());
+
+    let json = host
+        .run(&[&call[..], &wait, &["--json"]].concat())
+        .done_json();
+    assert_eq!(json["replies"].as_array().unwrap().len(), 3);
+    assert_eq!(json["accepted"], json!([]));
+    assert_eq!(json["rejected"].as_array().unwrap().len(), 3);
+    until("the arm knows it", || host.path("rejected-arm_2").exists());
+
+    let absent = [&call[..], &wait, &["--accept", "arm_9"]].concat();
+    let (_, error) = host.run(&absent).failed_text();
+    assert!(
+        error.contains("no proposal to accept\nwhere: \"arm_9\""),
+        "{error}"
+    );
+}
