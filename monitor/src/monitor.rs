@@ -49,6 +49,8 @@ pub struct Monitor {
     refused: Refused,
     deadlines: Deadlines,
     hasher: RandomState,
+    /// Whether all messages belong to one conversation.
+    single: bool,
     /// Buffer that is reused.
     moves: Vec<Move>,
     forgotten: u64,
@@ -134,6 +136,7 @@ impl Monitor {
             refused: Refused::default(),
             deadlines: Deadlines::default(),
             hasher,
+            single: false,
             moves: Vec::new(),
             forgotten: 0,
             last: Now::from(UNIX_EPOCH),
@@ -159,6 +162,28 @@ impl Monitor {
     pub fn with_history(mut self, history: History) -> Self {
         self.history = history;
         self
+    }
+
+    /// Makes all messages with one identifier belong to one conversation. By default, an agent that does
+    /// not lead a conversation can begin another one with the same identifier. A caller that knows that
+    /// a message continues its conversation forbids this: the message is then a violation, unless its
+    /// protocol may run within the conversation now.
+    #[must_use]
+    pub fn with_one_conversation(mut self) -> Self {
+        self.single = true;
+        self
+    }
+
+    /// Changes the extent of the knowledge of the monitor: see [`with_history`](Self::with_history).
+    pub fn set_history(&mut self, history: History) {
+        self.history = history;
+    }
+
+    /// Records that a conversation with this identifier may have begun without the monitor: before it,
+    /// or between other agents of which one names the monitored agent in a `reply-to`. A message that
+    /// continues it is then [unchecked](Unchecked::UnknownHistory) instead of a violation.
+    pub fn expect(&mut self, id: &str) {
+        self.remember_removed(id);
     }
 
     /// Protocols of the monitor.
@@ -352,7 +377,11 @@ impl Monitor {
             return self.open(id, NONE, machine, header, &observed, now);
         };
         let machine = self.machine_of(&self.library, main);
-        let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
+        let follows = |name| {
+            // Within a conversation, the cancel meta-protocol is part of every protocol.
+            machine.is_some_and(|machine: &Machine| machine.is_called(name))
+                || is_cancel_of_conversation(&self.library, name, header.act())
+        };
         if header.protocol_name().is_none_or(follows) {
             let projection = machine.and_then(|machine| machine.projection.clone());
             let slot = self.table.slot(main);
@@ -401,7 +430,7 @@ impl Monitor {
     fn unknown_protocol(&self, name: &str) -> Denied {
         /// Maximum length of a name that is compared with the known ones.
         const MAX_COMPARED: usize = 128;
-        if self.policy.spelling && name.len() <= MAX_COMPARED {
+        if self.policy.spelling && !self.policy.exempts(name) && name.len() <= MAX_COMPARED {
             let name = name.to_ascii_lowercase();
             let near = |machine: &Machine| {
                 let mut aliases = machine.aliases().iter().map(String::as_str);
@@ -444,7 +473,7 @@ impl Monitor {
             return local;
         }
         let (rank, .., at) = best?;
-        if rank == 2 {
+        if rank == 2 || self.single {
             return Some(at);
         }
         let begins = |machine: &Machine| {
@@ -779,13 +808,14 @@ impl Monitor {
         if !protocol.may_follow(observed.act) {
             return Denied::NotOpened(machine);
         }
+        let certain = self.is_certain(id);
         if self.agent.is_none() || observed.own {
-            if self.is_certain(id) {
+            if certain {
                 return Denied::NotOpened(machine);
             }
             return Denied::Unchecked(Unchecked::UnknownHistory);
         }
-        if self.policy.unsolicited && !self.policy.exempts(protocol.name()) {
+        if certain && self.policy.unsolicited && !self.policy.exempts(protocol.name()) {
             return Denied::Refused(Kind::Unsolicited, None);
         }
         // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
@@ -1206,6 +1236,19 @@ impl Passed {
 
 /// Number of receivers that are looked at to find the conversation of a message.
 const MAX_LOOKED_AT: usize = 16;
+
+/// Whether a message of this protocol, in a conversation of another one, cancels the conversation or
+/// answers the cancel.
+fn is_cancel_of_conversation(library: &Library, protocol: &str, act: crate::act::Act<'_>) -> bool {
+    use crate::act::{CANCEL, FAILURE, INFORM};
+    [CANCEL, INFORM, FAILURE, NOT_UNDERSTOOD].contains(&act)
+        && library
+            .find(protocol)
+            .is_some_and(|machine| machine.is_called(CANCEL_PROTOCOL))
+}
+
+/// The name of the cancel meta-protocol as a protocol of its own.
+const CANCEL_PROTOCOL: &str = "fipa-cancel";
 
 /// Whether the message names more agents in `reply-to` than a conversation keeps.
 fn is_crowded(conversation: &Conversation, names: &Names, header: &Header<'_>) -> bool {

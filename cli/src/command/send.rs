@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
+use fipa::monitor::History;
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
     Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
@@ -149,6 +150,10 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
             ..RegisterOptions::default()
         };
         let agent = membership::register(&domain, &name, options, &config).await?;
+        if arguments.from.is_none() {
+            // No earlier agent had this name.
+            agent.set_history(History::Complete);
+        }
         let done = converse(&agent, &arguments, content, &config).await;
         drop(agent);
         domain.close().await;
@@ -172,7 +177,7 @@ async fn converse(
         Failure::failed(
             format!("cannot send the message: {}", ErrorChain(&error)),
             "this process",
-            "`fipa send --help` describes the parameters of a message",
+            advice::not_sent(&error),
         )
     })?;
     if !arguments.json {
