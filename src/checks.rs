@@ -237,7 +237,14 @@ impl Monitored {
         message: &Message,
         may_continue: impl FnOnce(&Earlier<'_>) -> bool,
     ) -> Option<Box<Violation>> {
-        let violation = self.check(header)?;
+        let violation = self.check(header);
+        tracing::trace!(
+            performative = %message.performative(),
+            conversation = message.conversation_id(),
+            violates = violation.is_some(),
+            "checked"
+        );
+        let violation = violation?;
         let is_unknown = matches!(
             violation.kind,
             ViolationKind::NotOpened | ViolationKind::Unsolicited
@@ -264,10 +271,7 @@ impl Monitored {
         }
         match monitor.check(header, now) {
             Verdict::Violation(violation) => Some(violation),
-            verdict => {
-                tracing::trace!(accepted = verdict.is_accepted(), "checked");
-                None
-            }
+            _ => None,
         }
     }
 }

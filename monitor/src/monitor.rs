@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use smallvec::SmallVec;
 
-use crate::act::NOT_UNDERSTOOD;
+use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
@@ -276,7 +276,7 @@ impl Monitor {
                         &mut slot.conversation,
                         &self.names,
                         (sender, receiver),
-                        (act_number(act), act == crate::act::CANCEL, reply_with),
+                        (act_number(act), act == CANCEL, reply_with),
                     )
                 {
                     self.touch(main, now.millis());
@@ -378,9 +378,8 @@ impl Monitor {
         };
         let machine = self.machine_of(&self.library, main);
         let follows = |name| {
-            // Within a conversation, the cancel meta-protocol is part of every protocol.
             machine.is_some_and(|machine: &Machine| machine.is_called(name))
-                || is_cancel_of_conversation(&self.library, name, header.act())
+                || self.is_cancel_of(main, name, observed.sender, observed.act)
         };
         if header.protocol_name().is_none_or(follows) {
             let projection = machine.and_then(|machine| machine.projection.clone());
@@ -558,6 +557,30 @@ impl Monitor {
             part = if part == at { slot.child } else { slot.sibling };
         }
         false
+    }
+
+    /// Whether a message of this protocol, in a conversation of another one, cancels the conversation or
+    /// answers the cancel: the cancel meta-protocol is part of every protocol. If it may run within the
+    /// conversation as a subprotocol, it does.
+    fn is_cancel_of(&self, main: u32, protocol: &str, sender: &str, act: Act<'_>) -> bool {
+        let named = self.library.find(protocol);
+        if ![CANCEL, INFORM, FAILURE, NOT_UNDERSTOOD].contains(&act)
+            || named.is_none_or(|machine| !machine.is_called(CANCEL_PROTOCOL))
+        {
+            return false;
+        }
+        let mut part = main;
+        while let Some(slot) = self.table.slot(part) {
+            let inner = part != main;
+            let machine = self.machine_of(&self.library, part);
+            if inner && machine.is_some_and(|machine| machine.is_called(protocol))
+                || self.may_begin(&self.library, part, protocol, sender)
+            {
+                return false;
+            }
+            part = if inner { slot.sibling } else { slot.child };
+        }
+        true
     }
 
     /// Whether the first message of a protocol begins another conversation than this one.
@@ -1237,16 +1260,6 @@ impl Passed {
 /// Number of receivers that are looked at to find the conversation of a message.
 const MAX_LOOKED_AT: usize = 16;
 
-/// Whether a message of this protocol, in a conversation of another one, cancels the conversation or
-/// answers the cancel.
-fn is_cancel_of_conversation(library: &Library, protocol: &str, act: crate::act::Act<'_>) -> bool {
-    use crate::act::{CANCEL, FAILURE, INFORM};
-    [CANCEL, INFORM, FAILURE, NOT_UNDERSTOOD].contains(&act)
-        && library
-            .find(protocol)
-            .is_some_and(|machine| machine.is_called(CANCEL_PROTOCOL))
-}
-
 /// The name of the cancel meta-protocol as a protocol of its own.
 const CANCEL_PROTOCOL: &str = "fipa-cancel";
 
@@ -1401,7 +1414,7 @@ fn take_back(
             made.next_state.echo,
         );
         // The other side answers the message before it, and need not be told which.
-        if act != act_number(crate::act::CANCEL) {
+        if act != act_number(CANCEL) {
             party.asked[index] = 0;
         }
     }
