@@ -1,8 +1,11 @@
 //! The types of `checks.rs` in a build without the feature `protocols`: they check nothing.
 
 use fipa_acl::Message;
+use fipa_mts::core::Received;
+use fipa_sds::Directory;
 
 use crate::config::{self, Check};
+use crate::delivery::Deliveries;
 use crate::error::{OpenError, SendError};
 use crate::incoming::Incoming;
 
@@ -18,23 +21,46 @@ impl Rules {
         Ok(Self)
     }
 
-    pub(crate) fn checks(&self, _agent: &str) -> Checks {
+    pub(crate) fn checks(&self, _agent: &str, _ids: String, _directory: &dyn Directory) -> Checks {
         Checks
     }
 }
 
 pub(crate) struct Checks;
 
+pub(crate) struct Origin;
+
+/// There is none, because nothing is checked.
+pub(crate) enum Unsettled {}
+
 impl Checks {
-    pub(crate) fn leaving(&self, _message: &Message) -> Result<(), SendError> {
-        Ok(())
+    pub(crate) fn leaving(
+        &self,
+        _message: &Message,
+        _directory: &dyn Directory,
+    ) -> Result<Option<Unsettled>, SendError> {
+        Ok(None)
     }
 
     pub(crate) fn arrived(
         &self,
         incoming: Incoming,
+        _origin: Origin,
+        _directory: &dyn Directory,
         _answer: impl FnOnce(&Message, String) -> Option<Message>,
     ) -> Incoming {
         incoming
+    }
+}
+
+impl Origin {
+    pub(crate) fn of(_received: &Received) -> Self {
+        Self
+    }
+}
+
+impl Unsettled {
+    pub(crate) fn settle(self, _deliveries: &Deliveries) {
+        match self {}
     }
 }

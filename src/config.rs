@@ -55,6 +55,7 @@
 //! idle = "24h"                        # a conversation without a message is kept for this time
 //! conversations = 100000              # maximum number of conversations of an agent
 //! bytes = "64MiB"                     # of them; a peer has at most an eighth
+//! exempt = []                         # protocols without the rules about unknown conversations
 //! [platform]
 //! ams = true                          # false: no agent management system; or its name
 //! df = true                           # false: no directory facilitator; or its name
@@ -321,6 +322,12 @@ pub struct Monitor {
     /// `bytes`: the maximum size of the conversations of an agent. Those of one peer have at most an
     /// eighth of it.
     pub bytes: u64,
+    /// `exempt`: names of protocols to which the rules about messages of unknown conversations do not
+    /// apply; at most 128. Without it, a message with a known protocol needs a `conversation-id`, the
+    /// name of a protocol may not differ from a known one by a typing error, and a message may not
+    /// continue a conversation that did not begin. Letters of legacy peers that break these rules are
+    /// only logged.
+    pub exempt: Vec<String>,
 }
 
 /// The reaction to messages that violate their protocol.
@@ -463,6 +470,7 @@ impl Config {
                 idle: Duration::from_secs(24 * 60 * 60),
                 conversations: 100_000,
                 bytes: 64 << 20,
+                exempt: Vec::new(),
             },
             platform: Platform::default(),
         }

@@ -7,6 +7,8 @@ use fipa_acl::escape;
 use fipa_mts::Sending;
 use fipa_transport::Outcome;
 
+use crate::checks::Unsettled;
+
 /// The outcomes of a message, one [`Delivery`] per receiver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Deliveries(pub Vec<Delivery>);
@@ -39,9 +41,26 @@ impl fmt::Display for Deliveries {
     }
 }
 
+/// A message that was sent.
+pub(crate) struct Sent {
+    sending: Sending,
+    /// The checks that the outcomes concern.
+    unsettled: Option<Unsettled>,
+}
+
+impl Sent {
+    pub(crate) fn new(sending: Sending, unsettled: Option<Unsettled>) -> Self {
+        Self { sending, unsettled }
+    }
+}
+
 /// Waits until every receiver has an outcome.
-pub(crate) async fn deliveries(sending: Sending) -> Deliveries {
-    let outcomes = sending.outcomes().await.into_iter();
+pub(crate) async fn deliveries(sent: Sent) -> Deliveries {
+    let outcomes = sent.sending.outcomes().await.into_iter();
     let delivered = outcomes.map(|(receiver, outcome)| Delivery { receiver, outcome });
-    Deliveries(delivered.collect())
+    let deliveries = Deliveries(delivered.collect());
+    if let Some(unsettled) = sent.unsettled {
+        unsettled.settle(&deliveries);
+    }
+    deliveries
 }

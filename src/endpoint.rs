@@ -7,11 +7,12 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Letter, Message, MessageBuilder, Performative};
 use fipa_mts::core::{Received, Submission};
-use fipa_mts::{Mts, PostError, Sending, letter_for};
+use fipa_mts::{Mts, PostError, letter_for};
 use fipa_sds::{DeregisterError, Directory};
 use fipa_transport::Incarnation;
 
-use crate::checks::Checks;
+use crate::checks::{Checks, Origin};
+use crate::delivery::Sent;
 use crate::domain::Domain;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
@@ -24,7 +25,7 @@ pub(crate) struct Endpoint {
     pub(crate) incarnation: Incarnation,
     /// Number of unique texts issued so far.
     unique_ids: AtomicU64,
-    checks: Checks,
+    pub(crate) checks: Checks,
 }
 
 /// Whether a message is checked against its protocol before it is sent.
@@ -43,7 +44,11 @@ impl Endpoint {
         incarnation: Incarnation,
     ) -> Self {
         Self {
-            checks: domain.inner.rules.checks(&name),
+            checks: domain.inner.rules.checks(
+                &name,
+                unique_ids_of(incarnation),
+                &*domain.inner.service.host,
+            ),
             domain,
             id,
             name,
@@ -58,9 +63,7 @@ impl Endpoint {
 
     pub(crate) fn unique_id(&self) -> String {
         let number = self.unique_ids.fetch_add(1, Ordering::Relaxed);
-        // The letter at the beginning is for JADE, which parses text that begins with a digit as a
-        // number.
-        format!("c{}-{number}", self.incarnation)
+        format!("{}{number}", unique_ids_of(self.incarnation))
     }
 
     pub(crate) fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
@@ -91,7 +94,7 @@ impl Endpoint {
         message: &Message,
         letter: Result<Letter, PostError>,
         deadline: Duration,
-    ) -> Result<Sending, SendError> {
+    ) -> Result<Sent, SendError> {
         self.submit(message, letter, deadline, Checked::Yes)
     }
 
@@ -101,19 +104,24 @@ impl Endpoint {
         letter: Result<Letter, PostError>,
         deadline: Duration,
         checked: Checked,
-    ) -> Result<Sending, SendError> {
+    ) -> Result<Sent, SendError> {
         self.check(message)?;
         let letter = letter?;
-        if checked == Checked::Yes {
-            self.checks.leaving(message)?;
-        }
+        let unsettled = match checked {
+            Checked::Yes => {
+                let directory = &*self.domain.inner.service.host;
+                self.checks.leaving(message, directory)?
+            }
+            Checked::No => None,
+        };
         let receivers = message.receivers().iter();
-        Ok(self.mts().send(Submission {
+        let sending = self.mts().send(Submission {
             sender: self.incarnation,
             letter,
             receivers: receivers.map(|id| id.name().into()).collect(),
             deadline,
-        }))
+        });
+        Ok(Sent::new(sending, unsettled))
     }
 
     /// Waits for the next message of any conversation. Skips letters that cannot be decoded.
@@ -150,6 +158,7 @@ impl Endpoint {
     /// Checks a received letter. Returns `None` if the message cannot be decoded; the sender
     /// then gets a failure message.
     pub(crate) fn decode(&self, received: Received) -> Option<Incoming> {
+        let origin = Origin::of(&received);
         let incoming = match Incoming::new(received) {
             Ok(incoming) => incoming,
             Err((error, received)) => {
@@ -162,9 +171,9 @@ impl Endpoint {
                 return None;
             }
         };
-        Some(self.checks.arrived(incoming, |message, reason| {
-            self.not_understood(message, reason)
-        }))
+        let directory = &*self.domain.inner.service.host;
+        let answer = |message: &Message, reason| self.not_understood(message, reason);
+        Some(self.checks.arrived(incoming, origin, directory, answer))
     }
 
     /// Answers a message that violates its protocol. Returns the answer if it was sent.
@@ -178,11 +187,11 @@ impl Endpoint {
             .and_then(|answer| {
                 let letter = letter_for(&answer, SystemTime::now());
                 let deadline = self.domain.inner.deadline;
-                let sending = self
+                let sent = self
                     .submit(&answer, letter, deadline, Checked::No)
                     .map_err(|error| ErrorChain(&error).to_string())?;
                 // No caller waits for its outcomes.
-                drop(sending);
+                drop(sent);
                 Ok(answer)
             });
         sent.inspect_err(|error| tracing::warn!(%error, "cannot answer a protocol violation"))
@@ -197,4 +206,10 @@ impl Endpoint {
         let unread = service.mts.deregister(self.incarnation);
         removed.map(|()| unread)
     }
+}
+
+/// Returns the beginning of the unique texts of a registration.
+fn unique_ids_of(incarnation: Incarnation) -> String {
+    // The letter at the beginning is for JADE, which parses text that begins with a digit as a number.
+    format!("c{incarnation}-")
 }

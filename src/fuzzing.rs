@@ -20,6 +20,12 @@ pub fn config(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
     Effective::of_text(&sources, text.to_owned())
 }
 
+/// Runs the questions of gateways about registrations with these letters. Panics if a rule is broken.
+#[cfg(feature = "net")]
+pub fn presence(bytes: &[u8]) {
+    crate::gateway::play_presence(bytes);
+}
+
 /// The access rules, and the rates of senders.
 #[derive(Debug)]
 pub struct Access(access::Access);

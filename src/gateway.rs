@@ -37,6 +37,8 @@ use self::guard::Guard;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::platform_agents::PlatformAgents;
+#[cfg(feature = "fuzzing")]
+pub(crate) use self::presence::play as play_presence;
 use self::publisher::{PublishTask, Publisher};
 use crate::config::ConfigError;
 use crate::directory_view::DirectoryView;

@@ -37,6 +37,8 @@ mod input;
 mod mdns;
 #[path = "../fuzz/src/platform.rs"]
 mod platform;
+#[path = "../fuzz/src/recording.rs"]
+mod recording;
 #[path = "../fuzz/src/seeds.rs"]
 mod seeds;
 #[path = "../fuzz/src/shm.rs"]
@@ -49,6 +51,7 @@ mod udt;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
+use fipa::fuzzing;
 
 /// Number of inputs per target, unless a time is set.
 const INPUTS: usize = 150;
@@ -115,7 +118,12 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, config, datagrams, delivery, exchange, framed, host, http, mdns, platform, shm,
-        texts, udt
+        access, config, datagrams, delivery, exchange, framed, host, http, mdns, platform,
+        recording, shm, texts, udt
     );
+
+    #[test]
+    fn presence() {
+        plays("presence", fuzzing::presence);
+    }
 }

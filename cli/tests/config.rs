@@ -139,6 +139,7 @@ protocols = []                       # default
 idle = \"1day\"                        # default
 conversations = 100000               # default
 bytes = \"64MiB\"                      # default
+exempt = []                          # default
 
 [platform]
 ams = true                           # default

@@ -141,3 +141,75 @@ fn protocols_of_the_configuration_are_listed_first() {
     assert_eq!(json[0]["name"], "lift");
     assert_eq!(json.as_array().unwrap().len(), 14);
 }
+
+#[test]
+fn a_protocol_is_exported_as_a_file_that_is_read_again() {
+    let host = Host::new();
+    let exported = host.path("mine.scxml");
+    let path = exported.to_str().unwrap();
+    let args = ["protocol", "export", "contractNet", "--output", path];
+    host.run(&args).done();
+    let checked = host.run(&["protocol", "check", path]).done();
+    assert!(checked.contains("fipa-contract-net"), "{checked}");
+    assert!(!checked.contains("warning"), "{checked}");
+    let printed = host
+        .run(&["protocol", "export", "fipa-contract-net"])
+        .done();
+    assert_eq!(printed, fs::read_to_string(&exported).unwrap());
+    // A file of the configuration replaces the built-in one.
+    let own = printed.replace("Calling for proposals", "Our calls for proposals");
+    fs::write(&exported, &own).unwrap();
+    let set = format!("monitor.protocols={path}");
+    let args = ["--set", &set, "protocol", "export", "fipa-contract-net"];
+    assert_eq!(host.run(&args).done(), own);
+    let unknown = host.run(&["protocol", "export", "fipa-dance"]).failed(1);
+    assert!(unknown.contains("no protocol"), "{unknown}");
+}
+
+#[test]
+fn a_check_warns_of_near_performatives_and_ignored_attributes() {
+    let host = Host::new();
+    let file = host.path("lift.scxml");
+    let text = LIFT.replace(
+        "performative=\"request\"",
+        "performative=\"reqest\" optional=\"yes\"",
+    );
+    fs::write(&file, text).unwrap();
+    let file = file.to_str().unwrap();
+    let checked = host.run(&["protocol", "check", file]).done();
+    for warning in [
+        "warning, line 3: \"reqest\" is no performative of FIPA00037; did you mean \"request\"?",
+        "warning, line 3: the attribute \"optional\" of <transition> has no effect",
+    ] {
+        assert!(checked.contains(warning), "{warning}: {checked}");
+    }
+    let json = host.run(&["protocol", "check", "--json", file]).done_json();
+    assert_eq!(json[0]["warnings"].as_array().unwrap().len(), 2);
+}
+
+#[test]
+fn the_transitions_of_every_protocol_are_drawn_on_request() {
+    let host = Host::new();
+    for format in ["svg", "mermaid"] {
+        let draw = |name, defaults: &[&str]| {
+            let args = ["protocol", "draw", name, "--format", format];
+            host.run(&[&args, defaults].concat()).done()
+        };
+        let plain = draw("fipa-request", &[]);
+        assert!(!plain.contains("cancelling"), "{plain}");
+        let drawn = draw("fipa-request", &["--defaults"]);
+        for text in [
+            "not-understood from any role",
+            "cancel from initiator",
+            "failure from a message transport service",
+            "cancelled",
+            "undelivered",
+        ] {
+            assert!(drawn.contains(text), "{text}: {drawn}");
+        }
+        // An English auction cannot be canceled.
+        let auction = draw("fipa-auction-english", &["--defaults"]);
+        assert!(!auction.contains("cancelling"), "{auction}");
+        assert!(auction.contains("undelivered"), "{auction}");
+    }
+}

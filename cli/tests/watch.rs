@@ -363,3 +363,120 @@ fn the_files_of_a_killed_watcher_are_removed() {
     arm.signal("-INT");
     assert_eq!(host.left_behind(), Vec::<std::path::PathBuf>::new());
 }
+
+/// Sends a message in a conversation of this protocol. The echo agent does not reply to it.
+fn say(host: &Host, act: &str, protocol: &str, id: &str) {
+    let message = format!(
+        "--from rover --to arm_1 --performative {act} --protocol {protocol} --conversation-id {id} \
+         --in-reply-to x"
+    );
+    send(host, &message.split(' ').collect::<Vec<_>>());
+}
+
+#[test]
+fn recorded_letters_are_judged_later() {
+    let host = Host::new();
+    let (good, bad) = (host.path("good.rec"), host.path("bad.rec"));
+    let (good, bad) = (good.to_str().unwrap(), bad.to_str().unwrap());
+    let _arm = host.echo("arm_1");
+    for (file, acts) in [
+        (good, &["cfp"][..]),
+        (bad, &["cfp", "inform", "accept-proposal"]),
+    ] {
+        // Filters do not apply to the recording.
+        let mut watching = watch(&host, &["--record", file]);
+        for act in acts {
+            say(&host, act, "fipa-contract-net", file);
+            next_of(&mut watching, "letter");
+        }
+        let (code, errors) = watching.signal("-INT");
+        assert_eq!((code, errors.as_str()), (Some(0), ""));
+    }
+    let shown = host.run(&["protocol", "replay", good]).done();
+    assert!(
+        shown.starts_with("letters: 1, accepted: 1, violations: 0,"),
+        "{shown}"
+    );
+    let replayed = host.run(&["protocol", "replay", bad, "--json"]);
+    assert_eq!(replayed.code, Some(1));
+    let lines = String::from_utf8(replayed.stdout).unwrap();
+    let lines: Vec<Value> = lines
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    let events: Vec<&Value> = lines.iter().map(|line| &line["event"]).collect();
+    assert_eq!(events, ["violation", "violation", "summary"], "{lines:#?}");
+    assert_eq!(
+        (&lines[0]["number"], &lines[1]["number"]),
+        (&2.into(), &3.into())
+    );
+    assert_eq!(lines[1]["kind"], "out-of-order");
+    assert_eq!(
+        (&lines[2]["letters"], &lines[2]["violations"]),
+        (&3.into(), &2.into())
+    );
+    assert_eq!(lines[2]["complete"], true);
+    // Only another protocol is judged.
+    let other = ["protocol", "replay", bad, "--protocol", "fipa-request"];
+    let shown = host.run(&other).done();
+    assert!(shown.contains("violations: 0"), "{shown}");
+    let named = ["protocol", "replay", bad, "--protocol", "contractNet"];
+    assert_eq!(host.run(&named).code, Some(1));
+    // Files that are no recordings, and one that was not closed.
+    let file = fs::read(good).unwrap();
+    let cut = host.path("cut.rec");
+    fs::write(&cut, &file[..file.len() - 3]).unwrap();
+    let cut = host.run(&["protocol", "replay", cut.to_str().unwrap()]);
+    assert_eq!(cut.code, Some(0));
+    assert!(
+        cut.stderr.contains("ends within a letter"),
+        "{}",
+        cut.stderr
+    );
+    for (name, bytes) in [
+        ("no.rec", &b"<scxml/>"[..]),
+        ("huge.rec", b"fipa-rec\x01\0\0\0\xff\xff\xff\xff"),
+    ] {
+        let path = host.path(name);
+        fs::write(&path, bytes).unwrap();
+        let failed = host
+            .run(&["protocol", "replay", path.to_str().unwrap()])
+            .failed(1);
+        assert!(failed.contains(name), "{failed}");
+    }
+}
+
+#[test]
+fn protocols_of_the_configuration_and_files_without_an_extension_are_checked() {
+    let host = Host::new();
+    let protocol = |name: &str, act: &str| {
+        let text = format!(
+            r#"<scxml initial="1">
+            <state id="1"><transition performative="{act}" from="a" to="b" target="2"/></state>
+            <state id="2" final="yes"/></scxml>"#
+        );
+        (host.path(name), text)
+    };
+    let (configured, text) = protocol("lift.scxml", "request");
+    fs::write(&configured, text).unwrap();
+    let directory = host.path("protocols");
+    fs::create_dir(&directory).unwrap();
+    let (_, text) = protocol("wave", "propose");
+    fs::write(directory.join("wave"), text).unwrap();
+    // Not a protocol.
+    fs::write(directory.join("README"), "Protocols of the arm").unwrap();
+    let _arm = host.echo("arm_1");
+    let set = format!("monitor.protocols={}", configured.display());
+    let directory = directory.to_str().unwrap();
+    let mut watching = host.start(&["--set", &set, "watch", "--json", "--protocols", directory]);
+    for (act, name, id, verdict) in [
+        ("request", "lift", "c1", "accepted"),
+        ("inform", "lift", "c2", "violation"),
+        ("propose", "wave", "c3", "accepted"),
+        ("request", "wave", "c4", "violation"),
+    ] {
+        say(&host, act, name, id);
+        let seen = next_of(&mut watching, "letter");
+        assert_eq!(seen["verdict"]["verdict"], verdict, "{name}: {seen:#}");
+    }
+}

@@ -11,6 +11,7 @@ pub mod http;
 pub mod input;
 pub mod mdns;
 pub mod platform;
+pub mod recording;
 pub mod seeds;
 pub mod shm;
 pub mod texts;

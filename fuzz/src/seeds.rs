@@ -36,6 +36,16 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
             seeds
         }
         "http" => crate::http::seeds(),
+        "recording" => crate::recording::seeds(),
+        "presence" => {
+            let mut seeds = drawn(24, 200);
+            let texts: [&[u8]; 2] = [
+                br#"{"version":1,"ask":[{"id":"0000000000000001","mts":"0000000000000002"}]}"#,
+                br#"{"version":1,"here":["0000000000000001"],"gone":[],"unsupported":[]}"#,
+            ];
+            seeds.extend(texts.map(<[u8]>::to_vec));
+            seeds
+        }
         "texts" => texts(),
         "config" => config(),
         "host" => vec![HOST.to_vec(), HOST[..120].to_vec()],

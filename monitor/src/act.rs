@@ -3,6 +3,8 @@
 use fipa_acl::Performative;
 use regex::Regex;
 
+use crate::policy::one_edit_apart;
+
 /// The bits of all standard performatives.
 const STANDARD: u32 = (1 << 22) - 1;
 
@@ -64,6 +66,18 @@ impl<'a> Act<'a> {
             Self::Other(name) => name,
         }
     }
+}
+
+/// Returns the standard performative from which a user-defined one differs by a typing error.
+pub(crate) fn near_standard(name: &str) -> Option<&'static str> {
+    /// Longer names are no misspelled standard ones.
+    const MAX: usize = 32;
+    if !is_word(name) || name.len() > MAX || matches!(Act::named(name), Act::Standard(_)) {
+        return None;
+    }
+    let name = name.to_ascii_lowercase();
+    let mut standard = (0..22).map(standard_name);
+    standard.find(|known| one_edit_apart(known, &name))
 }
 
 fn standard_name(number: u8) -> &'static str {

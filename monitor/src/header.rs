@@ -150,11 +150,19 @@ impl<'a> Header<'a> {
         self
     }
 
+    /// Returns the performative.
+    #[must_use]
+    pub fn performative(&self) -> &Performative {
+        &self.performative
+    }
+
     pub(crate) fn act(&self) -> Act<'_> {
         Act::of(&self.performative)
     }
 
-    pub(crate) fn sender_name(&self) -> Option<&str> {
+    /// Returns the name of the sender, if the message names one.
+    #[must_use]
+    pub fn sender_name(&self) -> Option<&str> {
         self.sender.as_deref()
     }
 
@@ -209,11 +217,15 @@ impl<'a> Header<'a> {
         &self.reply_to
     }
 
-    pub(crate) fn protocol_name(&self) -> Option<&str> {
+    /// Returns the name of the protocol, if the message names one.
+    #[must_use]
+    pub fn protocol_name(&self) -> Option<&str> {
         self.protocol.as_deref()
     }
 
-    pub(crate) fn conversation(&self) -> Option<&str> {
+    /// Returns the conversation identifier, if the message has one.
+    #[must_use]
+    pub fn conversation(&self) -> Option<&str> {
         self.conversation_id.as_deref()
     }
 

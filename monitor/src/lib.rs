@@ -3,6 +3,7 @@
 //! * [`Machine`]: a protocol, read from an SCXML file (see [`scxml`] for the format).
 //! * [`projection`]: protocols with three or more roles, as each role sees them.
 //! * [`Library`]: protocols by name. [`Library::standard`] has those of FIPA.
+//! * [`recording`]: letters in a file, to be checked later.
 //! * [`Monitor`]: checks the messages of any number of conversations, as an observer or for one
 //!   participating agent, and returns a [`Verdict`] for each. It reads a [`Header`], without the
 //!   content.
@@ -32,6 +33,7 @@ mod monitor;
 mod names;
 mod policy;
 pub mod projection;
+pub mod recording;
 mod report;
 mod roles;
 pub mod scxml;

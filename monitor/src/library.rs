@@ -56,6 +56,19 @@ impl Library {
         }
     }
 
+    /// Returns the SCXML text of the standard protocol with this name or alias. Case is ignored.
+    #[must_use]
+    pub fn standard_text(name: &str) -> Option<&'static str> {
+        let library = Self::standard();
+        let name = library.find(name)?.name();
+        let mut files = STANDARD.iter();
+        let file = files.find(|(file, text)| {
+            let read = Machine::read(file, text);
+            read.is_ok_and(|machine| machine.name() == name)
+        });
+        file.map(|(_, text)| *text)
+    }
+
     /// Adds a protocol. It replaces a protocol with the same name. Its aliases take precedence over
     /// those of earlier protocols.
     ///
@@ -167,6 +180,24 @@ mod tests {
             }
         }
         assert!(library.find("fipa").is_none());
+    }
+
+    #[test]
+    fn the_text_of_each_standard_protocol_is_that_of_its_file() {
+        for machine in Library::standard().iter() {
+            for called in machine
+                .aliases()
+                .iter()
+                .map(String::as_str)
+                .chain([machine.name()])
+            {
+                let text = Library::standard_text(called).unwrap();
+                let read = Machine::read("exported", text).unwrap();
+                assert_eq!(read.name(), machine.name(), "{called}");
+                assert_eq!(read.states().len(), machine.states().len());
+            }
+        }
+        assert_eq!(Library::standard_text("fipa-dance"), None);
     }
 
     #[test]

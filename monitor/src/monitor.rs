@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use smallvec::SmallVec;
 
-use crate::act::NOT_UNDERSTOOD;
+use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
@@ -49,6 +49,8 @@ pub struct Monitor {
     refused: Refused,
     deadlines: Deadlines,
     hasher: RandomState,
+    /// Whether all messages belong to one conversation.
+    single: bool,
     /// Buffer that is reused.
     moves: Vec<Move>,
     forgotten: u64,
@@ -134,6 +136,7 @@ impl Monitor {
             refused: Refused::default(),
             deadlines: Deadlines::default(),
             hasher,
+            single: false,
             moves: Vec::new(),
             forgotten: 0,
             last: Now::from(UNIX_EPOCH),
@@ -159,6 +162,28 @@ impl Monitor {
     pub fn with_history(mut self, history: History) -> Self {
         self.history = history;
         self
+    }
+
+    /// Makes all messages with one identifier belong to one conversation. By default, an agent that does
+    /// not lead a conversation can begin another one with the same identifier. A caller that knows that
+    /// a message continues its conversation forbids this: the message is then a violation, unless its
+    /// protocol may run within the conversation now.
+    #[must_use]
+    pub fn with_one_conversation(mut self) -> Self {
+        self.single = true;
+        self
+    }
+
+    /// Changes the extent of the knowledge of the monitor: see [`with_history`](Self::with_history).
+    pub fn set_history(&mut self, history: History) {
+        self.history = history;
+    }
+
+    /// Records that a conversation with this identifier may have begun without the monitor: before it,
+    /// or between other agents of which one names the monitored agent in a `reply-to`. A message that
+    /// continues it is then [unchecked](Unchecked::UnknownHistory) instead of a violation.
+    pub fn expect(&mut self, id: &str) {
+        self.remember_removed(id);
     }
 
     /// Protocols of the monitor.
@@ -251,7 +276,7 @@ impl Monitor {
                         &mut slot.conversation,
                         &self.names,
                         (sender, receiver),
-                        (act_number(act), act == crate::act::CANCEL, reply_with),
+                        (act_number(act), act == CANCEL, reply_with),
                     )
                 {
                     self.touch(main, now.millis());
@@ -352,7 +377,10 @@ impl Monitor {
             return self.open(id, NONE, machine, header, &observed, now);
         };
         let machine = self.machine_of(&self.library, main);
-        let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
+        let follows = |name| {
+            machine.is_some_and(|machine: &Machine| machine.is_called(name))
+                || self.is_cancel_of(main, name, observed.sender, observed.act)
+        };
         if header.protocol_name().is_none_or(follows) {
             let projection = machine.and_then(|machine| machine.projection.clone());
             let slot = self.table.slot(main);
@@ -401,7 +429,7 @@ impl Monitor {
     fn unknown_protocol(&self, name: &str) -> Denied {
         /// Maximum length of a name that is compared with the known ones.
         const MAX_COMPARED: usize = 128;
-        if self.policy.spelling && name.len() <= MAX_COMPARED {
+        if self.policy.spelling && !self.policy.exempts(name) && name.len() <= MAX_COMPARED {
             let name = name.to_ascii_lowercase();
             let near = |machine: &Machine| {
                 let mut aliases = machine.aliases().iter().map(String::as_str);
@@ -444,7 +472,7 @@ impl Monitor {
             return local;
         }
         let (rank, .., at) = best?;
-        if rank == 2 {
+        if rank == 2 || self.single {
             return Some(at);
         }
         let begins = |machine: &Machine| {
@@ -529,6 +557,30 @@ impl Monitor {
             part = if part == at { slot.child } else { slot.sibling };
         }
         false
+    }
+
+    /// Whether a message of this protocol, in a conversation of another one, cancels the conversation or
+    /// answers the cancel: the cancel meta-protocol is part of every protocol. If it may run within the
+    /// conversation as a subprotocol, it does.
+    fn is_cancel_of(&self, main: u32, protocol: &str, sender: &str, act: Act<'_>) -> bool {
+        let named = self.library.find(protocol);
+        if ![CANCEL, INFORM, FAILURE, NOT_UNDERSTOOD].contains(&act)
+            || named.is_none_or(|machine| !machine.is_called(CANCEL_PROTOCOL))
+        {
+            return false;
+        }
+        let mut part = main;
+        while let Some(slot) = self.table.slot(part) {
+            let inner = part != main;
+            let machine = self.machine_of(&self.library, part);
+            if inner && machine.is_some_and(|machine| machine.is_called(protocol))
+                || self.may_begin(&self.library, part, protocol, sender)
+            {
+                return false;
+            }
+            part = if inner { slot.sibling } else { slot.child };
+        }
+        true
     }
 
     /// Whether the first message of a protocol begins another conversation than this one.
@@ -779,13 +831,14 @@ impl Monitor {
         if !protocol.may_follow(observed.act) {
             return Denied::NotOpened(machine);
         }
+        let certain = self.is_certain(id);
         if self.agent.is_none() || observed.own {
-            if self.is_certain(id) {
+            if certain {
                 return Denied::NotOpened(machine);
             }
             return Denied::Unchecked(Unchecked::UnknownHistory);
         }
-        if self.policy.unsolicited && !self.policy.exempts(protocol.name()) {
+        if certain && self.policy.unsolicited && !self.policy.exempts(protocol.name()) {
             return Denied::Refused(Kind::Unsolicited, None);
         }
         // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
@@ -1207,6 +1260,9 @@ impl Passed {
 /// Number of receivers that are looked at to find the conversation of a message.
 const MAX_LOOKED_AT: usize = 16;
 
+/// The name of the cancel meta-protocol as a protocol of its own.
+const CANCEL_PROTOCOL: &str = "fipa-cancel";
+
 /// Whether the message names more agents in `reply-to` than a conversation keeps.
 fn is_crowded(conversation: &Conversation, names: &Names, header: &Header<'_>) -> bool {
     let reply_to = header.reply_to_names();
@@ -1358,7 +1414,7 @@ fn take_back(
             made.next_state.echo,
         );
         // The other side answers the message before it, and need not be told which.
-        if act != act_number(crate::act::CANCEL) {
+        if act != act_number(CANCEL) {
             party.asked[index] = 0;
         }
     }

@@ -15,10 +15,13 @@ pub struct Policy {
     pub conversation_id: bool,
     /// Whether a protocol name that differs from a known one by one typing error is refused.
     pub spelling: bool,
-    /// Whether a received message that continues an unknown conversation is refused. Without it, such a
-    /// message is [unchecked](crate::Unchecked::UnknownHistory).
+    /// Whether a received message that continues a conversation which did not begin is refused. Without
+    /// it, such a message is [unchecked](crate::Unchecked::UnknownHistory). If the conversation may have
+    /// begun without the monitor, the message is unchecked in any case: see [`History`] and
+    /// [`Monitor::expect`](crate::Monitor::expect).
     pub unsolicited: bool,
-    /// Names of protocols to which this policy does not apply. Case is ignored.
+    /// Names of protocols to which this policy does not apply, and names that are no misspelled ones. Case
+    /// is ignored.
     pub exempt: BTreeSet<String>,
 }
 

@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use fipa_monitor::scxml::{MAX_FILE, Problem, ScxmlError};
+use fipa_monitor::scxml::{Doubt, MAX_FILE, Problem, ScxmlError, Warning};
 use fipa_monitor::{After, Cancel, Machine, Scope};
 use proptest::prelude::*;
 
@@ -559,6 +559,43 @@ fn overlapping_transitions_to_one_state_are_allowed() {
     assert!(file(["b", "a", "2"], ["b", "c", "3"]).is_ok());
     let error = file(["b", "a", "2"], ["b", "a|c", "3"]).unwrap_err();
     assert!(matches!(error.mistakes[0].problem, Problem::Ambiguous(_)));
+}
+
+#[test]
+fn near_performatives_and_ignored_attributes_are_warnings() {
+    let text = r#"<scxml version="1.0" initial="1" name="lift" xmlns:f="urn:fipa-rs:protocol">
+        <state id="1" label="begin">
+            <transition performative="reqest" from="a" to="b" target="2" optional="yes"/>
+        </state>
+        <state id="2">
+            <transition performative="agree|refuze" from="b" to="a" target="3"/>
+            <transition performative="my-act" from="b" to="a" target="3"/>
+        </state>
+        <state id="3" final="yes"/></scxml>"#;
+    let (machine, warnings) = Machine::read_with_warnings("own", text).unwrap();
+    assert_eq!(machine.name(), "own");
+    let shown = |warning: &Warning| match &warning.doubt {
+        Doubt::NearPerformative {
+            performative,
+            standard,
+        } => (warning.line, format!("{performative} {standard}")),
+        Doubt::Ignored {
+            element, attribute, ..
+        } => (warning.line, format!("{element} {attribute}")),
+        other => panic!("{other}"),
+    };
+    let found: Vec<(usize, String)> = warnings.iter().map(shown).collect();
+    let expected = [
+        (1, "scxml name"),
+        (2, "state label"),
+        (3, "transition optional"),
+        (3, "reqest request"),
+        (6, "refuze refuse"),
+    ];
+    let expected = expected.map(|(line, text)| (line, text.to_owned()));
+    assert_eq!(found, expected);
+    let (_, none) = Machine::read_with_warnings("plain", PLAIN).unwrap();
+    assert_eq!(none, []);
 }
 
 /// A reader with quadratic time would take very long for the largest allowed file.

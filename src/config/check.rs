@@ -58,7 +58,7 @@ const MIN_HEARTBEAT: Duration = Duration::from_millis(100);
 /// Upper bound of `monitor.heartbeat`.
 const MAX_HEARTBEAT: Duration = Duration::from_secs(3600);
 
-/// Maximum number of entries of `monitor.protocols`.
+/// Maximum number of entries of `monitor.protocols` and of `monitor.exempt`.
 const MAX_PROTOCOLS: usize = 128;
 
 /// A value that is not allowed.
@@ -349,6 +349,14 @@ impl Findings {
         if monitor.idle.is_zero() {
             let what = format_args!("cannot be 0");
             self.add(&["monitor", "idle"], what, "use a duration such as 24h");
+        }
+        let path = ["monitor", "exempt"];
+        if monitor.exempt.len() > MAX_PROTOCOLS {
+            let what = format_args!("lists {} protocols", monitor.exempt.len());
+            self.add(&path, what, format!("use at most {MAX_PROTOCOLS}"));
+        }
+        if monitor.exempt.iter().any(String::is_empty) {
+            self.add(&path, "lists an empty name", "list names of protocols");
         }
     }
 

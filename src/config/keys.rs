@@ -299,6 +299,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| size_text(config.monitor.bytes),
     },
     Key {
+        path: &["monitor", "exempt"],
+        shape: Shape::List,
+        expected: r#"a list of protocols such as ["fipa-query"]"#,
+        write: |config, value| items(value, text).map(|all| config.monitor.exempt = all),
+        read: |config| Value::list(&config.monitor.exempt),
+    },
+    Key {
         path: &["platform", "ams"],
         shape: Shape::Text,
         expected: PLATFORM_AGENT,

@@ -131,6 +131,7 @@ fn every_key_is_read() {
         answer = true
         heartbeat = "2s"
         protocols = ["lift.scxml"]
+        exempt = ["lift"]
         [platform]
         ams = false
         df = "yellow pages"
@@ -178,6 +179,7 @@ fn every_key_is_read() {
     assert!(config.monitor.answer);
     assert_eq!(config.monitor.heartbeat, Duration::from_secs(2));
     assert_eq!(config.monitor.protocols, ["lift.scxml"]);
+    assert_eq!(config.monitor.exempt, ["lift"]);
     assert_eq!(config.platform.ams, PlatformAgent::Off);
     let named = PlatformAgent::Named("yellow pages".to_owned());
     assert_eq!(config.platform.df, named);
@@ -356,6 +358,7 @@ protocols = []                       # default
 idle = "1day"                        # default
 conversations = 100000               # default
 bytes = "64MiB"                      # default
+exempt = []                          # default
 
 [platform]
 ams = true                           # default

@@ -319,6 +319,80 @@ impl GatewayAgent {
     }
 }
 
+/// Runs [`Questions`] with questions of agents and answers of gateways, for the fuzz target.
+///
+/// * Every content is a question or an answer, or is refused. Those that are read are the same after
+///   they are written and read again.
+/// * A gateway is asked for its own registrations, and its answers count for these only.
+/// * The memory is bounded.
+#[cfg(feature = "fuzzing")]
+pub(crate) fn play(bytes: &[u8]) {
+    if let Ok(asked) = presence::read_question(bytes) {
+        let again = presence::read_question(&presence::question(&asked));
+        assert!(again.is_ok_and(|again| again == asked));
+    }
+    if let Ok(answer) = presence::read_answer(bytes) {
+        let again = presence::read_answer(&presence::answer(answer.clone()));
+        assert!(again.is_ok_and(|again| again == answer));
+    }
+    let id = |number: u8| Incarnation::from_u64(u64::from(number) + 1);
+    let (mut questions, mut now) = (Questions::default(), Instant::now());
+    // The gateways that were asked for each registration.
+    let mut asked_at: HashSet<(Incarnation, Incarnation)> = HashSet::new();
+    for step in bytes.chunks_exact(4) {
+        let &[kind, one, other, gateway] = step else {
+            continue;
+        };
+        let from = id(gateway % 4);
+        let replies = match kind % 4 {
+            0 => {
+                let conversation = (one % 8).to_string();
+                let question = Message::builder(Performative::QueryRef);
+                let Ok(question) = question.conversation_id(conversation).build() else {
+                    continue;
+                };
+                let asked = [one, other].map(|number| Asked {
+                    id: id(number),
+                    mts: from,
+                });
+                questions.handle_question(now, id(other % 4), &question, asked.to_vec());
+                Vec::new()
+            }
+            1 => {
+                let answer = Answer {
+                    here: vec![id(one)],
+                    gone: vec![id(other)],
+                    ..Answer::default()
+                };
+                questions.handle_answer(now, from, Some(&answer))
+            }
+            2 => questions.handle_answer(now, from, None),
+            _ => {
+                now += Duration::from_millis(u64::from(one) * 20);
+                questions.forget(now);
+                Vec::new()
+            }
+        };
+        for Reply { answer, .. } in replies {
+            let mut told = answer.here.iter().chain(&answer.gone);
+            assert!(told.all(|id| asked_at.contains(&(*id, from))));
+            let mut told = answer.unsupported.iter();
+            assert!(told.all(|id| asked_at.contains(&(*id, from))));
+        }
+        let mut letters = 0;
+        while let Some((gateway, ask)) = questions.poll_letter(now) {
+            letters += 1;
+            assert!(letters <= 4, "one letter to each gateway at a time");
+            assert!(ask.len() <= MAX_ASKED);
+            for Asked { id, mts } in ask {
+                assert_eq!(mts, gateway);
+                asked_at.insert((id, gateway));
+            }
+        }
+        assert!(questions.open.len() <= MAX_QUESTIONS && questions.of.len() <= 4);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

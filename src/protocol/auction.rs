@@ -5,13 +5,13 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
-use fipa_mts::Sending;
 
 use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, settle, unreached};
 use super::reachability::Reachability;
 use super::receivers::expand;
 use crate::agent::{Agent, AgentCore};
+use crate::delivery::Sent;
 
 impl Agent {
     /// Opens an English auction (FIPA00031), in which the price rises. The message, an `inform`,
@@ -240,7 +240,7 @@ impl Auction {
 
     /// Rejects the undecided bids without waiting for the outcomes, so that an unreachable bidder does
     /// not delay the others.
-    fn reject_undecided(&mut self) -> Result<Vec<Sending>, DialogueError> {
+    fn reject_undecided(&mut self) -> Result<Vec<Sent>, DialogueError> {
         let mut rejections = Vec::new();
         while let Some(bid) = self.undecided.pop() {
             let act = Performative::RejectProposal;

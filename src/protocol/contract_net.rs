@@ -5,14 +5,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, AgentIdError, Message, MessageBuilder, Performative};
-use fipa_mts::Sending;
 
 use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, settle, unreached};
 use super::reachability::Reachability;
 use super::receivers::{expand, identified};
 use crate::agent::{Agent, AgentCore};
-use crate::delivery::deliveries;
+use crate::delivery::{Sent, deliveries};
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have
@@ -82,7 +81,7 @@ pub struct ContractNet {
     /// The agents with which the conversation has not ended.
     open: Vec<AgentId>,
     /// Rejections in transit.
-    rejections: Vec<Sending>,
+    rejections: Vec<Sent>,
 }
 
 /// The result of an accepted proposal.

@@ -10,14 +10,15 @@ use fipa_acl::{
 use fipa_monitor::{
     Header, Library, Monitor, Policy, Unchecked, Verdict, Violation, ViolationKind,
 };
-use fipa_mts::{Sending, letter_for};
+use fipa_mts::letter_for;
 use fipa_transport::{FailureReason, Incarnation, Outcome};
 
 use super::partners::PartnerEvent;
 use super::reachability::{Reachability, ReachabilitySender};
 use super::watching::PartnerWatch;
 use crate::agent::AgentCore;
-use crate::delivery::{Deliveries, Delivery, deliveries};
+use crate::checks::header_of_outcomes;
+use crate::delivery::{Deliveries, Delivery, Sent, deliveries};
 use crate::demultiplexer::{Admitted, Party, ReaderKey};
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
@@ -175,6 +176,8 @@ pub(super) struct Speaker {
     over: bool,
     /// Number of sent messages.
     replies: u32,
+    /// The last sent message, without its content.
+    last: Option<Header<'static>>,
 }
 
 impl Dialogue {
@@ -320,7 +323,13 @@ impl Dialogue {
         message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Deliveries, DialogueError> {
-        Ok(deliveries(self.post(message, due)?).await)
+        let sent = self.post(message, due)?;
+        Ok(self.outcomes(sent).await)
+    }
+
+    /// Waits for the outcomes of the last message.
+    pub(super) async fn outcomes(&mut self, sent: Sent) -> Deliveries {
+        self.speaker.outcomes(sent).await
     }
 
     /// Sends a message like [`send`](Self::send), without waiting for the outcomes.
@@ -328,7 +337,7 @@ impl Dialogue {
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
-    ) -> Result<Sending, DialogueError> {
+    ) -> Result<Sent, DialogueError> {
         self.speaker.post(message, due)
     }
 
@@ -338,7 +347,7 @@ impl Dialogue {
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
-    ) -> Result<Sending, DialogueError> {
+    ) -> Result<Sent, DialogueError> {
         self.speaker.post_within(message, due)
     }
 
@@ -350,8 +359,8 @@ impl Dialogue {
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
-        let sending = self.post_answer(to, act, content, due)?;
-        only_delivered(&deliveries(sending).await)
+        let sent = self.post_answer(to, act, content, due)?;
+        only_delivered(&self.outcomes(sent).await)
     }
 
     /// Answers a message without waiting for the outcome, so that an unreachable agent does not delay
@@ -362,7 +371,7 @@ impl Dialogue {
         act: Performative,
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
-    ) -> Result<Sending, DialogueError> {
+    ) -> Result<Sent, DialogueError> {
         self.speaker.post_answer(to, act, content, due)
     }
 
@@ -375,8 +384,8 @@ impl Dialogue {
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
         let answer = self.agent().endpoint.reply(to, act).content(content);
-        let sending = self.post_within(answer, due)?;
-        only_delivered(&deliveries(sending).await)
+        let sent = self.post_within(answer, due)?;
+        only_delivered(&self.outcomes(sent).await)
     }
 
     /// Waits for the next message until `due`. A message that violates the protocol is an error, and so
@@ -555,14 +564,28 @@ impl Speaker {
         let mut policy = Policy::default();
         policy.unsolicited = true;
         Self {
-            monitor: Monitor::agent(library, &core.endpoint.name).with_policy(policy),
+            monitor: Monitor::agent(library, &core.endpoint.name)
+                .with_policy(policy)
+                .with_one_conversation(),
             core: Arc::clone(core),
             protocol: protocol.to_owned(),
             id,
             state: String::new(),
             over: false,
             replies: 0,
+            last: None,
         }
+    }
+
+    /// Waits for the outcomes of the last message. If it was not delivered, it may be sent again.
+    pub(super) async fn outcomes(&mut self, sent: Sent) -> Deliveries {
+        let deliveries = deliveries(sent).await;
+        if let Some(last) = &self.last {
+            for receiver in unreached(&deliveries) {
+                self.monitor.undelivered(last, receiver, SystemTime::now());
+            }
+        }
+        deliveries
     }
 
     /// Sends a message in the protocol of the conversation, without waiting for the outcomes.
@@ -570,7 +593,7 @@ impl Speaker {
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
-    ) -> Result<Sending, DialogueError> {
+    ) -> Result<Sent, DialogueError> {
         let message = message.protocol(self.protocol.as_str());
         self.post_within(message, due)
     }
@@ -579,7 +602,7 @@ impl Speaker {
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
-    ) -> Result<Sending, DialogueError> {
+    ) -> Result<Sent, DialogueError> {
         let mut message = message
             .conversation_id(self.id.as_str())
             .reply_with(format!("{}--{}", self.id, self.replies + 1));
@@ -595,6 +618,7 @@ impl Speaker {
         let message = message.build()?;
         self.check(&message).map_err(CheckFailure::on_sent)?;
         self.replies += 1;
+        self.last = header_of_outcomes(&message);
         let letter = letter_for(&message, SystemTime::now());
         Ok(self.core.endpoint.send(&message, letter, deadline)?)
     }
@@ -606,7 +630,7 @@ impl Speaker {
         act: Performative,
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
-    ) -> Result<Sending, DialogueError> {
+    ) -> Result<Sent, DialogueError> {
         self.post(self.core.endpoint.reply(to, act).content(content), due)
     }
 
@@ -724,7 +748,7 @@ impl CheckFailure {
 
 /// Waits for the outcomes of these messages, at most until `due`. The outcomes are ignored: an agent
 /// that has ended needs no rejection.
-pub(super) async fn settle(sent: impl IntoIterator<Item = Sending>, due: Option<Instant>) {
+pub(super) async fn settle(sent: impl IntoIterator<Item = Sent>, due: Option<Instant>) {
     for sending in sent {
         let settled = deliveries(sending);
         match due {

@@ -345,8 +345,8 @@ impl Task {
             let agents = to_initiator.receivers().iter().cloned();
             message = agents.fold(message, MessageBuilder::reply_to);
         }
-        let sending = self.dialogue.post_within(message, after(patience))?;
-        let sent = deliveries(sending).await;
+        let sent = self.dialogue.post_within(message, after(patience))?;
+        let sent = self.dialogue.outcomes(sent).await;
         let lost: Vec<&str> = unreached(&sent).collect();
         let all = built.receivers().iter().map(|agent| agent.name());
         let reached: Vec<String> = all

@@ -17,13 +17,18 @@ use crate::presence::{Answer, Asked};
 
 /// Time between the proof that a registration has ended and the event. Letters that the agent sent
 /// before, and the new registration of an agent that moves, may arrive in the meantime.
+///
+/// The host of an agent that leaves cannot know whether the agent registers elsewhere later, and a call
+/// ends within 100 ms of the proof. So an agent moves if it is registered again within this time, and has
+/// left otherwise.
 const SETTLE: Duration = Duration::from_millis(50);
 
 /// A change that concerns a partner.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PartnerEvent {
-    /// The agent left, died, or has registered again without having moved.
+    /// The agent left, died, or has registered again without having moved. An agent that moves to another
+    /// host is registered there within 50 ms after it has left.
     Gone {
         /// The name of the agent.
         agent: String,

@@ -13,6 +13,7 @@ mod proxies;
 mod selling;
 #[path = "../support/mod.rs"]
 mod support;
+mod unknown;
 mod verdicts;
 
 use std::time::Duration;

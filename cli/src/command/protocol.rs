@@ -1,13 +1,15 @@
 //! `fipa protocol`: lists, shows, checks and draws interaction protocols.
 
+mod defaults;
 mod drawing;
 mod mermaid;
+mod replay;
 
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use fipa::monitor::projection::Projection;
-use fipa::monitor::scxml::MAX_FILE;
+use fipa::monitor::scxml::{MAX_FILE, Mistake, Warning};
 use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
 use fipa_acl::escape;
 use serde_json::{Value, json};
@@ -17,7 +19,7 @@ use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
 
-/// List, show, check and draw interaction protocols
+/// List, show, export, check and draw interaction protocols, and judge recorded letters
 ///
 /// The protocols of the FIPA standards are built in. Files in `monitor.protocols` of the
 /// configuration take precedence over them. A file is SCXML in the format of fipa_acl. Attributes in
@@ -27,9 +29,11 @@ use crate::report::Failure;
 Examples:
   fipa protocol list
   fipa protocol show fipa-contract-net
+  fipa protocol export fipa-request > my.scxml
   fipa protocol check protocols/*.scxml
   fipa protocol draw fipa-request --output request.svg
-  fipa protocol draw my.scxml --format mermaid")]
+  fipa protocol draw my.scxml --format mermaid
+  fipa protocol replay letters.rec")]
 pub(crate) struct Arguments {
     #[command(subcommand)]
     action: Action,
@@ -72,10 +76,24 @@ JSON:
         json: bool,
     },
 
+    /// Print the SCXML file of a protocol, as a start for a protocol of one's own
+    #[command(after_help = "\
+Examples:
+  fipa protocol export fipa-request
+  fipa protocol export fipa-contract-net --output my.scxml")]
+    Export {
+        /// Name of a protocol
+        protocol: String,
+        /// Write the file to this path instead of standard output
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+
     /// Check protocol files for errors
     ///
     /// Reports every error with its line: unknown and unreachable states, ambiguous transitions, roles
-    /// that no agent can take. The exit code is 0 if there is no error.
+    /// that no agent can take. The exit code is 0 if there is no error. Warns of performatives that
+    /// differ from standard ones by a typing error, and of attributes that have no effect.
     ///
     /// A protocol with three or more roles is projected onto each role, so that each agent checks what it
     /// sees. If this is not possible, the protocol is only watched, and the reasons are printed: a role
@@ -88,7 +106,7 @@ Examples:
 
 JSON:
   [ { \"file\", \"name\": text or null, \"mistakes\": [ { \"line\", \"what\" } ],
-      \"defects\": [ text ] } ]")]
+      \"warnings\": [ { \"line\", \"what\" } ], \"defects\": [ text ] } ]")]
     Check {
         /// SCXML files; - for standard input
         #[arg(required = true)]
@@ -102,6 +120,7 @@ JSON:
     #[command(after_help = "\
 Examples:
   fipa protocol draw fipa-request --output request.svg
+  fipa protocol draw fipa-request --defaults --output request.svg
   fipa protocol draw my.scxml --format mermaid")]
     Draw {
         /// Name of a protocol, or an SCXML file
@@ -109,10 +128,32 @@ Examples:
         /// Output format
         #[arg(long, value_enum, default_value_t = Format::Svg)]
         format: Format,
+        /// Draw also the transitions that every protocol has: not-understood, cancel, and the report
+        /// of an undelivered message
+        #[arg(long)]
+        defaults: bool,
         /// Write the drawing to this file instead of standard output
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
+
+    /// Judge the letters of a recording
+    ///
+    /// Reads a file of `fipa watch --record` and checks every letter against the protocol of its
+    /// conversation. Prints the violations. The exit code is 1 if there is one, or if the file is
+    /// no recording.
+    #[command(after_help = "\
+Examples:
+  fipa watch --record letters.rec
+  fipa protocol replay letters.rec
+  fipa protocol replay letters.rec --protocol fipa-contract-net
+  fipa protocol replay letters.rec --protocol my.scxml --json
+
+JSON, one object on a line:
+  { \"event\": \"violation\", \"number\": of the letter, \"time\", \"kind\", \"text\" }
+  { \"event\": \"summary\", \"letters\", \"accepted\", \"violations\", \"unchecked\",
+    \"excluded\", \"complete\": false if the file ends within a letter }")]
+    Replay(replay::Arguments),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -133,26 +174,48 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             }
             output::text(&as_text(&machine))
         }
+        Action::Export { protocol, output } => write(&exported(&protocol, global)?, output),
         Action::Check { files, json } => check(&files, json),
         Action::Draw {
             protocol,
             format,
+            defaults,
             output,
         } => {
             let machine = find(&protocol, global)?;
             let drawn = match format {
-                Format::Svg => drawing::svg(&machine),
-                Format::Mermaid => mermaid::diagram(&machine),
+                Format::Svg => drawing::svg(&machine, defaults),
+                Format::Mermaid => mermaid::diagram(&machine, defaults),
             };
-            match output {
-                None => output::text(&drawn),
-                Some(path) => std::fs::write(&path, drawn).map_err(|error| {
-                    let help = "give a file that this user can write";
-                    let problem = format!("cannot write the drawing: {error}");
-                    Failure::failed(problem, input::name(&path), help)
-                }),
-            }
+            write(&drawn, output)
         }
+        Action::Replay(arguments) => replay::run(&arguments, global),
+    }
+}
+
+/// Writes a text to a file, or to standard output.
+fn write(text: &str, to: Option<PathBuf>) -> Result<(), Failure> {
+    let Some(path) = to else {
+        return output::text(text);
+    };
+    std::fs::write(&path, text).map_err(|error| {
+        let help = "give a file that this user can write";
+        let problem = format!("cannot write the file: {error}");
+        Failure::failed(problem, input::name(&path), help)
+    })
+}
+
+/// Returns the file of a protocol: of the configuration, else the built-in one.
+fn exported(named: &str, global: &Global) -> Result<String, Failure> {
+    for file in global.config()?.monitor.protocols.iter().rev() {
+        let path = Path::new(file);
+        if read(path)?.is_called(named) {
+            return text_of(path);
+        }
+    }
+    match Library::standard_text(named) {
+        Some(text) => Ok(text.to_owned()),
+        None => Err(unknown(named, &library(global)?)),
     }
 }
 
@@ -179,21 +242,27 @@ fn find(named: &str, global: &Global) -> Result<Machine, Failure> {
     match library.find(named) {
         Some(machine) => Ok(machine.clone()),
         None if named == "-" || named.contains(['/', '.']) || path.is_file() => read(path),
-        None => {
-            let names: Vec<&str> = library.iter().map(Machine::name).collect();
-            Err(Failure::failed(
-                format!("no protocol and no file has the name {named:?}"),
-                "the command line",
-                format!("give a file, or one of {}", names.join(", ")),
-            ))
-        }
+        None => Err(unknown(named, &library)),
     }
 }
 
+fn unknown(named: &str, library: &Library) -> Failure {
+    let names: Vec<&str> = library.iter().map(Machine::name).collect();
+    Failure::failed(
+        format!("no protocol and no file has the name {named:?}"),
+        "the command line",
+        format!("give a file, or one of {}", names.join(", ")),
+    )
+}
+
 fn read(path: &Path) -> Result<Machine, Failure> {
+    read_with_warnings(path).map(|(machine, _)| machine)
+}
+
+fn read_with_warnings(path: &Path) -> Result<(Machine, Vec<Warning>), Failure> {
     let text = text_of(path)?;
     let name = input::name(path);
-    Machine::read(&name, &text).map_err(|error| {
+    Machine::read_with_warnings(&name, &text).map_err(|error| {
         let all = error.mistakes.iter().map(|mistake| {
             let place = format!("{name}:{}", mistake.line);
             Failure::failed(mistake.problem.to_string(), place, "fix the file")
@@ -243,14 +312,18 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     if !as_json {
         let mut failures = Vec::new();
         for file in files {
-            match read(file) {
-                Ok(machine) => {
+            match read_with_warnings(file) {
+                Ok((machine, warnings)) => {
                     output::text(&format!(
                         "{}: {}, states: {}, no errors\n",
                         input::name(file),
                         escape(machine.name()),
                         machine.states().len()
                     ))?;
+                    for Warning { line, doubt } in warnings {
+                        let doubt = doubt.to_string();
+                        output::text(&format!("  warning, line {line}: {}\n", escape(&doubt)))?;
+                    }
                     for defect in defects(&machine) {
                         output::text(&format!("  only watched: {defect}\n"))?;
                     }
@@ -264,20 +337,28 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     let mut invalid = false;
     for file in files {
         let name = input::name(file);
-        let read = Machine::read(&name, &text_of(file)?);
+        let read = Machine::read_with_warnings(&name, &text_of(file)?);
         invalid |= read.is_err();
         let mistakes: Vec<Value> = match &read {
             Ok(_) => Vec::new(),
             Err(error) => {
                 let mistakes = error.mistakes.iter();
-                let one = |mistake: &fipa::monitor::scxml::Mistake| json!({ "line": mistake.line, "what": mistake.problem.to_string() });
+                let one = |mistake: &Mistake| json!({ "line": mistake.line, "what": mistake.problem.to_string() });
                 mistakes.map(one).collect()
             }
         };
-        let name_of = read.as_ref().ok().map(Machine::name);
-        let defects = read.as_ref().map(defects).unwrap_or_default();
+        let (machine, warnings) = match read {
+            Ok((machine, warnings)) => (Some(machine), warnings),
+            Err(_) => (None, Vec::new()),
+        };
+        let one =
+            |warning: &Warning| json!({ "line": warning.line, "what": warning.doubt.to_string() });
+        let warnings: Vec<Value> = warnings.iter().map(one).collect();
+        let name_of = machine.as_ref().map(Machine::name);
+        let defects = machine.as_ref().map(defects).unwrap_or_default();
         results.push(json!({
-            "file": name, "name": name_of, "mistakes": mistakes, "defects": defects
+            "file": name, "name": name_of, "mistakes": mistakes, "warnings": warnings,
+            "defects": defects
         }));
     }
     output::json(&results)?;

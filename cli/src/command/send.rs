@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
+use fipa::monitor::History;
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
     Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
@@ -205,14 +206,19 @@ async fn register(
         agent_type: "fipa-send".to_owned(),
         ..RegisterOptions::default()
     };
-    membership::register(domain, &name, options, config).await
+    let agent = membership::register(domain, &name, options, config).await?;
+    if arguments.from.is_none() {
+        // No earlier agent had this name.
+        agent.set_history(History::Complete);
+    }
+    Ok(agent)
 }
 
 fn not_sent(error: &fipa::SendError) -> Failure {
     Failure::failed(
         format!("cannot send the message: {}", ErrorChain(error)),
         "this process",
-        "`fipa send --help` describes the parameters of a message",
+        advice::not_sent(error),
     )
 }
 

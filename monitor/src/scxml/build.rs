@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::document::{self, Document};
-use super::{Ambiguity, Mistake, Problem};
-use crate::act::{Acts, is_word, whole};
+use super::{Ambiguity, Doubt, MAX_MISTAKES, Mistake, Problem, Warning};
+use crate::act::{Acts, is_word, near_standard, whole};
 use crate::machine::{
     After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
@@ -16,10 +16,14 @@ use crate::projection::Projection;
 /// Maximum number of transitions of a state, including those behind optional transitions.
 const MAX_STEPS: usize = 100;
 
-pub(super) fn machine(document: &Document, file_name: &str) -> Result<Machine, Vec<Mistake>> {
+pub(super) fn machine(
+    document: &Document,
+    file_name: &str,
+) -> Result<(Machine, Vec<Warning>), Vec<Mistake>> {
     let mut builder = Builder {
         document,
         mistakes: Vec::new(),
+        warnings: Vec::new(),
         roles: Vec::new(),
         ids: HashMap::new(),
         known_acts: HashMap::new(),
@@ -27,7 +31,7 @@ pub(super) fn machine(document: &Document, file_name: &str) -> Result<Machine, V
     };
     let made = builder.machine(file_name);
     match made {
-        Some(machine) if builder.mistakes.is_empty() => Ok(machine),
+        Some(machine) if builder.mistakes.is_empty() => Ok((machine, builder.warnings)),
         _ => Err(builder.mistakes),
     }
 }
@@ -35,6 +39,7 @@ pub(super) fn machine(document: &Document, file_name: &str) -> Result<Machine, V
 struct Builder<'d> {
     document: &'d Document,
     mistakes: Vec<Mistake>,
+    warnings: Vec<Warning>,
     roles: Vec<String>,
     ids: HashMap<&'d str, u16>,
     /// Compiled patterns. Most files repeat the same few.
@@ -261,6 +266,19 @@ impl<'d> Builder<'d> {
         }
         match Acts::new(text) {
             Ok(acts) => {
+                // The words of a choice such as `agree|refuse`.
+                for word in text.split(['|', '(', ')']) {
+                    if let Some(standard) = near_standard(word)
+                        && self.warnings.len() < MAX_MISTAKES
+                    {
+                        let performative = word.to_owned();
+                        let doubt = Doubt::NearPerformative {
+                            performative,
+                            standard,
+                        };
+                        self.warnings.push(Warning { line, doubt });
+                    }
+                }
                 self.known_acts.insert(text, acts.clone());
                 Some(acts)
             }

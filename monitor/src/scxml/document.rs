@@ -7,7 +7,7 @@ use quick_xml::events::{BytesStart, Event};
 use quick_xml::name::{Namespace, ResolveResult};
 use quick_xml::reader::NsReader;
 
-use super::{MAX_FILE, Mistake, NAMESPACE, Problem};
+use super::{Doubt, MAX_FILE, MAX_MISTAKES, Mistake, NAMESPACE, Problem, Warning};
 
 /// Maximum nesting depth of elements. A protocol needs three levels. Other elements are skipped.
 const MAX_DEPTH: usize = 32;
@@ -64,7 +64,7 @@ pub(super) struct Subprotocol {
 }
 
 /// Reads a document up to its first mistake.
-pub(super) fn read(text: &str) -> Result<Document, Mistake> {
+pub(super) fn read(text: &str) -> Result<(Document, Vec<Warning>), Mistake> {
     if text.len() > MAX_FILE {
         let problem = Problem::TooLarge(text.len());
         return Err(Mistake { line: 1, problem });
@@ -75,8 +75,10 @@ pub(super) fn read(text: &str) -> Result<Document, Mistake> {
         counted: 0,
         line: 1,
         transitions: 0,
+        warnings: Vec::new(),
     };
-    reader.document()
+    let document = reader.document()?;
+    Ok((document, reader.warnings))
 }
 
 struct Reader<'a> {
@@ -87,6 +89,7 @@ struct Reader<'a> {
     /// Line at that offset.
     line: usize,
     transitions: usize,
+    warnings: Vec<Warning>,
 }
 
 enum Tag<'a> {
@@ -164,7 +167,13 @@ impl<'a> Reader<'a> {
                 (true, "scope") => document.scope = value,
                 (true, "cancel") => document.cancel = value,
                 (true, other) => return Err(self.unknown("scxml", other, KNOWN)),
-                (false, _) => {}
+                // SCXML requires the version.
+                (false, "version" | "datamodel") => {}
+                (false, other) => self.ignored(
+                    "scxml",
+                    other,
+                    "initial, and in the namespace: name, aliases, title, scope, cancel",
+                ),
             }
         }
         let mut bindings = self.xml.resolver().bindings();
@@ -184,7 +193,7 @@ impl<'a> Reader<'a> {
                 (false, "id") => id = Some(value),
                 (false, "final") => state.is_final = Some(value),
                 (true, other) => return Err(self.unknown("state", other, "none")),
-                (false, _) => {}
+                (false, other) => self.ignored("state", other, "id, final"),
             }
         }
         state.id = self.required("state", "id", id)?;
@@ -236,7 +245,12 @@ impl<'a> Reader<'a> {
                 (true, "at-most") => transition.at_most = value,
                 (true, "when") => transition.when = value,
                 (true, other) => return Err(self.unknown("transition", other, KNOWN)),
-                (false, _) => {}
+                (false, other) => self.ignored(
+                    "transition",
+                    other,
+                    "performative, from, to, target, and in the namespace: optional, after, \
+                     at-most, when",
+                ),
             }
         }
         transition.target = self.required("transition", "target", target)?;
@@ -251,7 +265,7 @@ impl<'a> Reader<'a> {
                 (false, "from") => from = Some(value),
                 (false, "proxied_to") => proxied_to = Some(value).filter(|role| !role.is_empty()),
                 (true, other) => return Err(self.unknown("subprotocol", other, "none")),
-                (false, _) => {}
+                (false, other) => self.ignored("subprotocol", other, "name, from, proxied_to"),
             }
         }
         Ok(Subprotocol {
@@ -278,6 +292,9 @@ impl<'a> Reader<'a> {
             let value = attribute
                 .normalized_value(XmlVersion::Implicit1_0)
                 .map_err(|error| self.wrong(Problem::Xml(error.to_string())))?;
+            if attribute.key.as_namespace_binding().is_some() {
+                continue;
+            }
             let (namespace, key) = self.xml.resolver().resolve_attribute(attribute.key);
             let ours = namespace == ResolveResult::Bound(Namespace(NAMESPACE));
             // Attributes of other namespaces are ignored.
@@ -358,6 +375,18 @@ impl<'a> Reader<'a> {
             attribute: attribute.to_owned(),
             known,
         })
+    }
+
+    fn ignored(&mut self, element: &'static str, attribute: &str, known: &'static str) {
+        if self.warnings.len() < MAX_MISTAKES {
+            let doubt = Doubt::Ignored {
+                element,
+                attribute: attribute.to_owned(),
+                known,
+            };
+            let line = self.line;
+            self.warnings.push(Warning { line, doubt });
+        }
     }
 
     fn misplaced(&self, element: &str, inside: &str) -> Mistake {

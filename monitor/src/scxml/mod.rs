@@ -57,9 +57,25 @@ impl Machine {
     /// # Errors
     /// The file has mistakes. The error has all of them, each with its line.
     pub fn read(file: &str, text: &str) -> Result<Self, ScxmlError> {
+        Self::read_with_warnings(file, text).map(|(machine, _)| machine)
+    }
+
+    /// Reads a protocol like [`read`](Self::read), and returns also what is probably not meant: a
+    /// performative that differs from a standard one by a typing error, and attributes that have no
+    /// effect. The warnings are in the order of their lines, at most 50.
+    ///
+    /// # Errors
+    /// See [`read`](Self::read).
+    pub fn read_with_warnings(file: &str, text: &str) -> Result<(Self, Vec<Warning>), ScxmlError> {
         let made = document::read(text)
             .map_err(|mistake| vec![mistake])
-            .and_then(|document| build::machine(&document, protocol_name(file)));
+            .and_then(|(document, mut warnings)| {
+                let (machine, near) = build::machine(&document, protocol_name(file))?;
+                warnings.extend(near);
+                warnings.sort_by_key(|warning| warning.line);
+                warnings.truncate(MAX_MISTAKES);
+                Ok((machine, warnings))
+            });
         made.map_err(|mut mistakes| {
             mistakes.truncate(MAX_MISTAKES);
             mistakes.sort_by_key(|mistake| mistake.line);
@@ -105,6 +121,41 @@ impl fmt::Display for ScxmlError {
         }
         Ok(())
     }
+}
+
+/// A part of a file that is valid and probably not meant.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Warning {
+    /// Line, counted from 1.
+    pub line: usize,
+    /// The doubt.
+    pub doubt: Doubt,
+}
+
+/// The reason of a [`Warning`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Doubt {
+    /// A user-defined performative is similar to a standard one.
+    #[error("{performative:?} is no performative of FIPA00037; did you mean {standard:?}?")]
+    NearPerformative {
+        /// The performative.
+        performative: String,
+        /// The standard one.
+        standard: &'static str,
+    },
+    /// An attribute without a namespace has no effect.
+    #[error(
+        "the attribute {attribute:?} of <{element}> has no effect; effective attributes: {known}"
+    )]
+    Ignored {
+        /// The element.
+        element: &'static str,
+        /// Name of the attribute.
+        attribute: String,
+        /// Attributes of the element that have an effect.
+        known: &'static str,
+    },
 }
 
 /// A problem of a protocol.

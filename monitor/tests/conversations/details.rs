@@ -400,3 +400,68 @@ fn a_conversation_that_a_timeout_ended_is_kept_as_long_as_any_ended_one() {
     assert_eq!(stage.pass(61), []);
     assert!(stage.monitor.is_empty());
 }
+
+#[test]
+fn the_cancel_protocol_runs_within_the_conversation_that_it_cancels() {
+    let cancel = |words| say_in("fipa-cancel", words);
+    for mut stage in [
+        Stage::observer(),
+        Stage::new(Monitor::agent(library(), "ann")),
+        Stage::new(Monitor::agent(library(), "ben")),
+    ] {
+        stage.right(request("request ann>ben"));
+        stage.right(request("agree ben>ann"));
+        stage.wrong(cancel("cancel ben>ann"));
+        assert_eq!(stage.right(cancel("cancel ann>ben")), "cancelling");
+        assert_eq!(stage.right(cancel("failure ben>ann")), "agreed");
+        assert_eq!(stage.right(cancel("cancel ann>ben")), "cancelling");
+        assert_eq!(stage.right(cancel("inform ben>ann")), "cancelled");
+        assert_eq!(stage.monitor.len(), 1, "it is the same conversation");
+        // It is also a protocol of its own, in a conversation of its own.
+        let own = |words| cancel(words).conversation_id("d");
+        assert_eq!(stage.right(own("cancel ann>ben")), "cancelling");
+        assert_eq!(stage.right(own("inform ben>ann")), "cancelled");
+    }
+    // A protocol that cannot be canceled.
+    let mut stage = Stage::observer();
+    stage.right(say_in("fipa-auction-english", "inform ann>ben"));
+    stage.wrong(cancel("cancel ann>ben"));
+}
+
+#[test]
+fn a_participant_may_join_a_finished_conversation_of_its_initiator() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("inform ben>ann"));
+    // The initiator asks another agent.
+    let Verdict::Accepted(accepted) = stage.check(&request("request ann>cid")) else {
+        panic!("it is accepted");
+    };
+    assert!(accepted.opened && !accepted.complete);
+    stage.right(request("agree cid>ann"));
+    assert_eq!(stage.right(request("inform cid>ann")), "done");
+    assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
+    assert_eq!(stage.wrong(request("request ann>ben")).kind, Kind::Ended);
+    assert_eq!(stage.monitor.len(), 1);
+    // Another agent that uses the identifier begins another conversation.
+    stage.right(request("request dan>ben"));
+    assert_eq!(stage.right(request("agree ben>dan")), "agreed");
+    assert_eq!(stage.monitor.len(), 2);
+}
+
+#[test]
+fn a_monitor_of_one_conversation_refuses_protocols_that_cannot_run_within_it() {
+    let proxy = |words| say_in("fipa-brokering", words);
+    let query = || say_in("fipa-query", "query-ref ben>cid");
+    let agent = || Monitor::agent(library(), "ben");
+    let mut stage = Stage::new(agent().with_one_conversation());
+    stage.right(proxy("proxy ann>ben"));
+    assert_eq!(stage.wrong(query()).kind, Kind::WrongProtocol);
+    stage.right(proxy("agree ben>ann"));
+    stage.right(query());
+    // By default, the agent begins another conversation with the same identifier.
+    let mut stage = Stage::new(agent());
+    stage.right(proxy("proxy ann>ben"));
+    stage.right(query());
+    assert_eq!(stage.monitor.len(), 2);
+}

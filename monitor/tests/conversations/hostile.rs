@@ -136,6 +136,30 @@ fn a_policy_refuses_messages_without_a_conversation() {
 }
 
 #[test]
+fn a_message_of_a_conversation_that_may_have_begun_is_not_unsolicited() {
+    let answer = || request("inform ann>ben").conversation_id("d");
+    let unknown = |stage: &mut Stage| {
+        let verdict = stage.check(&answer());
+        assert!(matches!(verdict, Verdict::Unchecked(_)), "{verdict:?}");
+    };
+    // The agent continues conversations of an earlier registration, or a `reply-to` names it.
+    let mut stage = enforced(Policy::strict());
+    stage.monitor.set_history(History::Unknown);
+    unknown(&mut stage);
+    let mut stage = enforced(Policy::strict());
+    stage.monitor.expect("d");
+    unknown(&mut stage);
+    let other = request("inform ann>ben").conversation_id("e");
+    assert_eq!(stage.wrong(other).kind, Kind::Unsolicited);
+    // The monitor has removed the conversation after its idle time.
+    let mut stage = enforced(Policy::strict());
+    stage.right(request("request ben>ann").conversation_id("d"));
+    stage.pass(100_000);
+    assert!(stage.monitor.is_empty());
+    unknown(&mut stage);
+}
+
+#[test]
 fn an_impossible_message_is_a_violation_whatever_came_before() {
     let mut stage = Stage::new(Monitor::agent(library(), "ben").with_history(History::Unknown));
     for header in [

@@ -347,3 +347,14 @@ fn the_copies_of_a_multicast_are_one_message() {
     let alone = own("query-if ann>eve").copy_for("eve");
     assert_eq!(stage.wrong(alone).kind, Kind::WrongReceiver);
 }
+
+#[test]
+fn a_message_that_was_sent_again_after_its_outcome_cannot_be_sent_a_third_time() {
+    let request = || request("request ann>ben").reply_with("w");
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(request());
+    stage.monitor.undelivered(&request(), "ben", stage.now);
+    stage.right(request());
+    stage.right(say_in("fipa-request", "agree ben>ann").in_reply_to("w"));
+    assert_eq!(stage.wrong(request()).kind, Kind::Repeated);
+}

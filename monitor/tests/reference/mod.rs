@@ -470,7 +470,9 @@ impl<'l> Conversation<'l> {
         now: u64,
     ) -> Result<ReferenceVerdict, (&'static str, bool)> {
         let name = match &words.protocol {
-            Some(name) if !self.machine.is_called(name) => name.clone(),
+            Some(name) if !self.machine.is_called(name) && !self.is_canceled(library, words) => {
+                name.clone()
+            }
             _ => {
                 let verdict = self.check(words, now);
                 let verdict = verdict.or_else(|wrong| self.elsewhere(words, wrong, now));
@@ -482,6 +484,20 @@ impl<'l> Conversation<'l> {
             self.touched = now;
         }
         verdict.map_err(|wrong| (wrong, false))
+    }
+
+    /// Whether a message of the cancel protocol belongs to this conversation, which has another one.
+    fn is_canceled(&self, library: &Library, words: &Words) -> bool {
+        let Some(name) = &words.protocol else {
+            return false;
+        };
+        let all = || std::iter::once(self).chain(&self.inner);
+        ["cancel", "inform", "failure", "not-understood"].contains(&words.act)
+            && library
+                .find(name)
+                .is_some_and(|it| it.name() == "fipa-cancel")
+            && !all().any(|it| it.may_begin(library, name, words.from))
+            && !self.inner.iter().any(|it| it.machine.is_called(name))
     }
 
     fn check_inner(

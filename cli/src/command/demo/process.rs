@@ -7,6 +7,7 @@
 use std::io::Write;
 use std::time::{Duration, Instant};
 
+use fipa::monitor::Library;
 use fipa::watch::{WatchOptions, Watcher};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, ErrorChain, Gateway, Incoming, Performative, Reach,
@@ -15,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 
-use crate::command::watch::checker::{CheckResult, Checker};
+use crate::command::watch::checker::{CheckResult, Checker, Letter};
 use crate::output;
 
 /// The protocol of messages that are sent only to measure their time.
@@ -129,7 +130,7 @@ pub(super) async fn gateway(config: &Config) -> Result<(), String> {
 pub(super) async fn watcher(config: &Config) -> Result<(), String> {
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let mut watcher = watcher.map_err(|error| ErrorChain(&error).to_string())?;
-    let mut checker = Checker::new(None).map_err(|_| "cannot read the protocols")?;
+    let mut checker = Checker::new(Library::standard());
     emit(&Event::Ready {
         locations: Vec::new(),
     });
@@ -146,7 +147,7 @@ pub(super) async fn watcher(config: &Config) -> Result<(), String> {
         let fipa::watch::Event::Letter(passage) = seen else {
             continue;
         };
-        match checker.check(&passage) {
+        match checker.check(Letter::from(&*passage)) {
             CheckResult::Accepted { .. } => accepted += 1,
             CheckResult::Violation(violation) => emit(&Event::Violation {
                 sender: violation.sender.clone(),

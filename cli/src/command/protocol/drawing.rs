@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use fipa::monitor::{Machine, State};
 use fipa_acl::escape;
 
-use super::{act, role, within};
+use super::{act, defaults, role, within};
 
 const MARGIN: usize = 24;
 const ROW: usize = 22;
@@ -34,7 +34,8 @@ struct Row {
 }
 
 struct Placed<'m> {
-    state: &'m State,
+    name: &'m str,
+    is_final: bool,
     rows: Vec<Row>,
     top: usize,
 }
@@ -49,15 +50,16 @@ struct Line {
     color: usize,
 }
 
-pub(super) fn svg(machine: &Machine) -> String {
+/// Draws a protocol, with the transitions that every protocol has if `with_defaults` is set.
+pub(super) fn svg(machine: &Machine, with_defaults: bool) -> String {
     let title = match machine.title() {
         Some(title) => format!("{}: {title}", machine.name()),
         None => machine.name().to_owned(),
     };
-    let placed = placed(machine);
+    let placed = placed(machine, with_defaults);
     let texts = placed.iter().flat_map(|one| {
         let rows = one.rows.iter().map(|row| row.text.chars().count());
-        rows.chain([one.state.id().chars().count() + 4])
+        rows.chain([one.name.chars().count() + 4])
     });
     let width = texts.max().unwrap_or(0) * CHAR + 3 * MARGIN;
     let lines = lines(&placed);
@@ -87,8 +89,9 @@ pub(super) fn svg(machine: &Machine) -> String {
     for line in &lines {
         line_to(&mut out, line, &placed, MARGIN * 2 + width);
     }
-    for one in &placed {
-        let initial = one.state.id() == machine.initial().id();
+    let own = machine.states().len();
+    for (number, one) in placed.iter().enumerate() {
+        let initial = number < own && one.name == machine.initial().id();
         state(&mut out, one, width, initial);
         for (number, row) in one.rows.iter().enumerate() {
             let y = one.top + HEAD + number * ROW;
@@ -103,17 +106,38 @@ fn height(placed: &Placed<'_>) -> usize {
     HEAD + placed.rows.len() * ROW + if placed.rows.is_empty() { 0 } else { 6 }
 }
 
-fn placed(machine: &Machine) -> Vec<Placed<'_>> {
+fn placed(machine: &Machine, with_defaults: bool) -> Vec<Placed<'_>> {
+    let own = machine.states().iter().map(|state| Placed {
+        name: state.id(),
+        is_final: state.is_final(),
+        rows: rows(machine, state),
+        top: 0,
+    });
+    let mut all: Vec<Placed<'_>> = own.collect();
+    if with_defaults {
+        let first = all.len();
+        let defaults = defaults::of(machine);
+        let number = |name| defaults.iter().position(|state| state.name == name);
+        for state in &defaults {
+            let rows = state.steps.iter().map(|step| Row {
+                text: step.label.clone(),
+                color: "#555555",
+                dashed: false,
+                // The state before is one of the protocol.
+                target: step.target.map_or(Some(0), number).map(|at| first + at),
+            });
+            all.push(Placed {
+                name: state.name,
+                is_final: state.is_final,
+                rows: rows.collect(),
+                top: 0,
+            });
+        }
+    }
     let mut top = MARGIN + 56;
-    let mut all = Vec::new();
-    for state in machine.states() {
-        let one = Placed {
-            state,
-            rows: rows(machine, state),
-            top,
-        };
-        top += height(&one) + GAP;
-        all.push(one);
+    for one in &mut all {
+        one.top = top;
+        top += height(one) + GAP;
     }
     all
 }
@@ -254,7 +278,7 @@ fn roles(out: &mut String, machine: &Machine) {
 
 fn state(out: &mut String, placed: &Placed<'_>, width: usize, initial: bool) {
     let (x, top, height) = (2 * MARGIN, placed.top, height(placed));
-    let fill = if placed.state.is_final() {
+    let fill = if placed.is_final {
         "#eef4ea"
     } else {
         "#f4f6fa"
@@ -264,7 +288,7 @@ fn state(out: &mut String, placed: &Placed<'_>, width: usize, initial: bool) {
         "<rect x=\"{x}\" y=\"{top}\" width=\"{width}\" height=\"{height}\" rx=\"8\" \
          fill=\"{fill}\" stroke=\"#333333\"/>"
     );
-    if placed.state.is_final() {
+    if placed.is_final {
         let _ = writeln!(
             out,
             "<rect x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\" rx=\"6\" fill=\"none\" \
@@ -292,7 +316,7 @@ fn state(out: &mut String, placed: &Placed<'_>, width: usize, initial: bool) {
         "<text x=\"{}\" y=\"{}\" font-weight=\"bold\">{}</text>",
         x + 12,
         top + HEAD / 2 + 5,
-        escaped(placed.state.id())
+        escaped(placed.name)
     );
 }
 

@@ -5,9 +5,10 @@ use std::fmt::Write as _;
 use fipa::monitor::Machine;
 use fipa_acl::escape;
 
-use super::{act, role, within};
+use super::{act, defaults, role, within};
 
-pub(super) fn diagram(machine: &Machine) -> String {
+/// Draws a protocol, with the transitions that every protocol has if `with_defaults` is set.
+pub(super) fn diagram(machine: &Machine, with_defaults: bool) -> String {
     let mut out = "stateDiagram-v2\n".to_owned();
     let number = |id: &str| machine.states().iter().position(|state| state.id() == id);
     // Writing to a string cannot fail.
@@ -47,6 +48,23 @@ pub(super) fn diagram(machine: &Machine) -> String {
         }
         if state.is_final() {
             let _ = writeln!(out, "    s{at} --> [*]");
+        }
+    }
+    if with_defaults {
+        let all = defaults::of(machine);
+        let number = |name: &str| all.iter().position(|state| state.name == name);
+        for (at, state) in all.iter().enumerate() {
+            let _ = writeln!(out, "    state \"{}\" as d{at}", escaped(state.name));
+        }
+        for (at, state) in all.iter().enumerate() {
+            for step in &state.steps {
+                // The state before is one of the protocol.
+                let target = step.target.map_or(Some(0), number).unwrap_or(at);
+                let _ = writeln!(out, "    d{at} --> d{target} : {}", escaped(&step.label));
+            }
+            if state.is_final {
+                let _ = writeln!(out, "    d{at} --> [*]");
+            }
         }
     }
     out

@@ -1,6 +1,9 @@
 //! Remedies for messages that were not delivered.
 
-use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_pattern};
+use fipa::monitor::ViolationKind;
+use fipa::{
+    Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, SendError, is_pattern,
+};
 
 use crate::report::Failure;
 
@@ -24,6 +27,38 @@ pub(super) fn failures(deliveries: &Deliveries, agent: &Agent, config: &Config) 
         Failure::failed(format!("not delivered: {reason}"), receivers(&names), help)
     };
     reasons.into_iter().map(failure).collect()
+}
+
+/// The remedy for a message that was not sent at all.
+pub(super) fn not_sent(error: &SendError) -> String {
+    let SendError::Violation(violation) = error else {
+        return "`fipa send --help` describes the parameters of a message".to_owned();
+    };
+    let protocol = &violation.protocol;
+    match violation.kind {
+        ViolationKind::NoConversation => {
+            "give --conversation-id; or list the protocol in monitor.exempt".to_owned()
+        }
+        ViolationKind::Misspelled => {
+            "`fipa protocol list` lists the protocols; correct --protocol, or list the name in \
+             monitor.exempt"
+                .to_owned()
+        }
+        ViolationKind::NotOpened => format!(
+            "begin the conversation with a message that `fipa protocol show {protocol:?}` lists \
+             for the initial state; give --from if an earlier agent of this name began it"
+        ),
+        ViolationKind::Repeated | ViolationKind::Ended => {
+            "give a new --conversation-id to begin another conversation".to_owned()
+        }
+        ViolationKind::TooLarge | ViolationKind::TooMany => {
+            "use fewer receivers and shorter names and identifiers".to_owned()
+        }
+        _ => format!(
+            "`fipa protocol show {protocol:?}` shows the messages that each state allows; \
+             monitor.check=warn sends the message nevertheless"
+        ),
+    }
 }
 
 /// The quoted names of receivers.

@@ -1,11 +1,13 @@
 //! Checks letters against the protocols of their conversations.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use fipa::Outcome;
 use fipa::watch::{Fate, Passage};
+use fipa::{Message, Outcome};
 use fipa_monitor::{Event, Header, Library, LibraryError, Monitor, Unchecked, Verdict, Violation};
 
 use crate::report::Failure;
@@ -72,35 +74,74 @@ impl Overdue {
 /// Maximum size of a protocol file, in bytes.
 const MAX_FILE: u64 = 1 << 20;
 
-impl Checker {
-    /// A checker with the protocols of the standards and those in this directory.
-    pub(in crate::command) fn new(directory: Option<&Path>) -> Result<Self, Failure> {
-        let mut library = Library::standard();
-        if let Some(directory) = directory {
-            let mut files = protocol_files(directory)?;
-            files.sort();
-            for file in files {
-                read(&mut library, &file)?;
-            }
+/// The data of a letter that its check needs.
+pub(in crate::command) struct Letter<'a> {
+    pub(in crate::command) message: Option<&'a Message>,
+    pub(in crate::command) receiver: &'a str,
+    pub(in crate::command) at: SystemTime,
+    /// Whether a message transport service wrote it.
+    pub(in crate::command) from_service: bool,
+    pub(in crate::command) undelivered: bool,
+}
+
+impl<'a> From<&'a Passage> for Letter<'a> {
+    fn from(passage: &'a Passage) -> Self {
+        Self {
+            message: passage.message.as_ref(),
+            receiver: &passage.receiver,
+            at: passage.at,
+            from_service: passage.from_service,
+            undelivered: matches!(passage.fate, Fate::Settled(Outcome::Failed { .. })),
         }
-        Ok(Self {
+    }
+}
+
+/// Returns the protocols of the standards, of the configuration, and in this directory. Later ones
+/// replace earlier ones of the same name.
+pub(in crate::command) fn protocols(
+    configured: &[String],
+    directory: Option<&Path>,
+) -> Result<Library, Failure> {
+    let mut library = Library::standard();
+    for file in configured {
+        let remedy = "fix the file, or remove it from monitor.protocols";
+        read(&mut library, Path::new(file), remedy)?;
+    }
+    if let Some(directory) = directory {
+        let mut files = protocol_files(directory)?;
+        files.sort();
+        for file in files {
+            read(
+                &mut library,
+                &file,
+                "fix the file, or remove it from the directory",
+            )?;
+        }
+    }
+    Ok(library)
+}
+
+impl Checker {
+    /// Creates a checker with these protocols.
+    pub(in crate::command) fn new(library: Library) -> Self {
+        Self {
             monitor: Monitor::observer(Arc::new(library)),
-        })
+        }
     }
 
-    pub(in crate::command) fn check(&mut self, passage: &Passage) -> CheckResult {
-        let Some(message) = &passage.message else {
+    pub(in crate::command) fn check(&mut self, letter: Letter<'_>) -> CheckResult {
+        let Some(message) = letter.message else {
             return CheckResult::Excluded("the message cannot be decoded");
         };
-        if passage.from_service {
+        if letter.from_service {
             return CheckResult::Excluded("sent by a message transport service");
         }
-        if let Fate::Settled(Outcome::Failed { .. }) = passage.fate {
+        if letter.undelivered {
             return CheckResult::Excluded("not delivered");
         }
         // A letter has exactly one receiver, a message can have several.
-        let header = Header::from(message).copy_for(&*passage.receiver);
-        match self.monitor.check(&header, passage.at) {
+        let header = Header::from(message).copy_for(letter.receiver);
+        match self.monitor.check(&header, letter.at) {
             Verdict::Accepted(accepted) => CheckResult::Accepted {
                 protocol: accepted.protocol.to_owned(),
                 state: accepted.state.to_owned(),
@@ -113,6 +154,11 @@ impl Checker {
             Verdict::Unchecked(why) => CheckResult::Unchecked(why),
             _ => CheckResult::Excluded("the verdict is unknown"),
         }
+    }
+
+    /// Handles timeouts up to a time, without reporting overdue messages.
+    pub(in crate::command) fn pass(&mut self, now: SystemTime) {
+        drop(self.handle_timeout(now));
     }
 
     /// Returns the messages that have become overdue by `now`.
@@ -145,15 +191,17 @@ fn protocol_files(directory: &Path) -> Result<Vec<std::path::PathBuf>, Failure> 
         Failure::wrong_usage(
             format!("cannot read the protocol directory: {error}"),
             directory.display().to_string(),
-            "give a directory with SCXML files (*.scxml or *.xml)",
+            "give a directory with SCXML files (*.scxml, *.xml, or without an extension)",
         )
     };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(directory).map_err(failed)? {
         let path = entry.map_err(failed)?.path();
-        let is_protocol = path
-            .extension()
-            .is_some_and(|extension| extension == "scxml" || extension == "xml");
+        let is_protocol = match path.extension() {
+            Some(extension) => extension == "scxml" || extension == "xml",
+            // The files of fipa_acl have no extension.
+            None => is_xml(&path),
+        };
         if is_protocol {
             files.push(path);
         }
@@ -161,15 +209,21 @@ fn protocol_files(directory: &Path) -> Result<Vec<std::path::PathBuf>, Failure> 
     Ok(files)
 }
 
-fn read(library: &mut Library, file: &Path) -> Result<(), Failure> {
+/// Whether a file begins like XML.
+fn is_xml(file: &Path) -> bool {
+    let mut beginning = [0; 64];
+    let read = File::open(file).and_then(|mut file| match file.metadata()?.is_file() {
+        true => file.read(&mut beginning),
+        false => Ok(0),
+    });
+    let beginning = beginning.get(..read.unwrap_or(0)).unwrap_or_default();
+    let text = beginning.strip_prefix(b"\xef\xbb\xbf").unwrap_or(beginning);
+    text.trim_ascii_start().starts_with(b"<")
+}
+
+fn read(library: &mut Library, file: &Path, remedy: &str) -> Result<(), Failure> {
     let name = file.display().to_string();
-    let failed = |problem: String| {
-        Failure::wrong_usage(
-            problem,
-            name.clone(),
-            "fix the file, or remove it from the directory",
-        )
-    };
+    let failed = |problem: String| Failure::wrong_usage(problem, name.clone(), remedy);
     let length = std::fs::metadata(file)
         .map_err(|error| failed(error.to_string()))?
         .len();

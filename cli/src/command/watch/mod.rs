@@ -5,6 +5,7 @@ mod conversations;
 mod filter;
 mod json;
 mod mermaid;
+mod recorder;
 mod sequence;
 mod tally;
 mod text;
@@ -18,9 +19,10 @@ use fipa::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::{Config, Matcher, Performative};
 use tokio::time::Instant;
 
-use self::checker::{CheckResult, Checker};
+use self::checker::{CheckResult, Checker, Letter};
 use self::conversations::Conversations;
 use self::filter::Filter;
+use self::recorder::Recorder;
 use self::tally::Tally;
 use self::text::{Look, TextOutput};
 use crate::membership::{self, Stop};
@@ -47,6 +49,7 @@ Examples:
   fipa watch --agent 'arm_.*' --protocol fipa-contract-net
   fipa watch --violations --protocols ./protocols
   fipa watch --sequence                          draws conversations as sequence diagrams
+  fipa watch --record letters.rec                 for `fipa protocol replay letters.rec`
   fipa watch --conversation c1 --mermaid c1.mmd  writes a diagram for documents at the end
   fipa watch --json | jq -r 'select(.verdict.verdict == \"violation\") | .verdict.text'
 
@@ -97,7 +100,9 @@ pub(crate) struct Arguments {
           require_equals = true, value_parser = bytes)]
     content: Option<usize>,
 
-    /// Directory with SCXML files of protocols in addition to those of the FIPA standards
+    /// Directory with SCXML files of protocols (*.scxml, *.xml, or without an extension)
+    ///
+    /// They are added to those of the FIPA standards and of monitor.protocols.
     #[arg(long, value_name = "DIR")]
     protocols: Option<PathBuf>,
 
@@ -108,6 +113,13 @@ pub(crate) struct Arguments {
     /// Write the conversations as a Mermaid sequence diagram to this file at the end
     #[arg(long, value_name = "FILE")]
     mermaid: Option<PathBuf>,
+
+    /// Write all letters with their times to this file, for `fipa protocol replay`
+    ///
+    /// Filters do not apply. The file is replaced; it has no content of messages. The page
+    /// docs/protocols.md describes its format.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
 
     /// End after this number of shown letters
     #[arg(long, value_name = "N")]
@@ -129,15 +141,24 @@ fn bytes(text: &str) -> Result<usize, String> {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    let checker = Checker::new(arguments.protocols.as_deref())?;
+    let directory = arguments.protocols.as_deref();
+    let library = checker::protocols(&config.monitor.protocols, directory)?;
+    let checker = Checker::new(library);
     if let Some(file) = &arguments.mermaid {
         // An unwritable file is reported at the start, not at the end.
         mermaid::write(file, "sequenceDiagram\n")?;
     }
-    options::block_on(watch(&arguments, checker, &config))?
+    let recorder = arguments.record.as_deref().map(Recorder::create);
+    let recorder = recorder.transpose()?;
+    options::block_on(watch(&arguments, checker, recorder, &config))?
 }
 
-async fn watch(arguments: &Arguments, checker: Checker, config: &Config) -> Result<(), Failure> {
+async fn watch(
+    arguments: &Arguments,
+    checker: Checker,
+    recorder: Option<Recorder>,
+    config: &Config,
+) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let content = arguments.content.unwrap_or(0);
     let watcher = Watcher::open(config, WatchOptions { content }).await;
@@ -151,6 +172,7 @@ async fn watch(arguments: &Arguments, checker: Checker, config: &Config) -> Resu
             violations: arguments.violations,
         },
         checker,
+        recorder,
         tally: Tally::default(),
         conversations: (arguments.sequence || arguments.mermaid.is_some())
             .then(Conversations::default),
@@ -215,6 +237,7 @@ async fn at(end: Option<Instant>) {
 struct Display<'a> {
     filter: Filter<'a>,
     checker: Checker,
+    recorder: Option<Recorder>,
     tally: Tally,
     conversations: Option<Conversations>,
     format: Format,
@@ -288,7 +311,10 @@ impl Display<'_> {
     fn letter(&mut self, passage: &Passage) -> Result<(), Failure> {
         // Every letter is checked, whether shown or not: the state of a conversation depends on all its
         // letters.
-        let checked = self.checker.check(passage);
+        let checked = self.checker.check(Letter::from(passage));
+        if let Some(recorder) = &mut self.recorder {
+            recorder.add(passage)?;
+        }
         self.tally.letter(passage, &checked);
         if !self.filter.takes(passage, &checked) {
             return Ok(());
@@ -308,6 +334,9 @@ impl Display<'_> {
 
     /// Prints overdue messages and the diagrams of idle conversations.
     fn handle_timeout(&mut self) -> Result<(), Failure> {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.flush()?;
+        }
         let now = SystemTime::now() - OBSERVATION_DELAY;
         for event in self.checker.handle_timeout(now) {
             if self
@@ -337,6 +366,9 @@ impl Display<'_> {
     }
 
     fn end(mut self, mermaid: Option<&std::path::Path>) -> Result<(), Failure> {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.flush()?;
+        }
         if let (Format::Sequence(look), Some(conversations)) =
             (&self.format, &mut self.conversations)
         {
