@@ -51,6 +51,8 @@ enum Attack {
     Datagrams,
     /// A UDP connection.
     Udp,
+    /// A UDT connection of a legacy peer.
+    Udt,
     /// The start of a TLS handshake.
     Handshake,
     /// Frames over TLS, as a trusted peer.
@@ -64,7 +66,7 @@ enum Attack {
 }
 
 use Attack::*;
-const CLEAR: [Attack; 5] = [Frames, LegacyPeer, Http, Datagrams, Udp];
+const CLEAR: [Attack; 6] = [Frames, LegacyPeer, Http, Datagrams, Udp, Udt];
 const SECURED: [Attack; 8] = [
     Frames,
     LegacyPeer,
@@ -99,6 +101,8 @@ struct Target {
     tcp: SocketAddr,
     datagrams: SocketAddr,
     http: SocketAddr,
+    /// Without keys only: peers over UDT prove nothing.
+    udt: Option<SocketAddr>,
     tls: Option<Arc<rustls::ClientConfig>>,
     quic: Option<quinn::ClientConfig>,
     receivers: Vec<String>,
@@ -142,6 +146,7 @@ impl Setup {
             attacks: if secured { &SECURED } else { &CLEAR },
             tcp: pair.gateway.at("tcp"),
             http: pair.gateway.at("http"),
+            udt: (!secured).then(|| pair.gateway.at("udt")),
             datagrams: pair.gateway.at(if secured { "quic" } else { "udp" }),
             handshakes: match (&tls, &quic) {
                 (Some(tls), Some(quic)) => handshakes(tls, quic),
@@ -229,6 +234,7 @@ impl Target {
                 Some(datagram::raw(self.datagrams, script).await)
             }
             Udp => datagram::udp(self.datagrams, &mut writer).await,
+            Udt => datagram::udt(self.udt.unwrap(), &mut writer).await,
             Handshake => {
                 let script = writer.recorded(&self.handshakes[..1]);
                 Some(stream::plain(self.tcp, script).await)
