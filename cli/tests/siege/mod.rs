@@ -157,6 +157,8 @@ impl Gateway {
         let found = locations.find_map(|it| it.strip_prefix(kind)?.strip_prefix("://"));
         // An address of HTTP has a path.
         let address = found.unwrap().trim_end_matches("/acc");
+        // That of a legacy peer has a signature.
+        let address = address.split(';').next().unwrap();
         address.parse().unwrap()
     }
 
