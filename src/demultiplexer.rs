@@ -9,7 +9,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
 use fipa_acl::{Message, Performative};
-use fipa_sds::Entry;
+use fipa_sds::{Entry, Reach, Role};
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
@@ -411,9 +411,13 @@ impl Admitted {
         };
         let is_own = incoming.via.is_none();
         let agent = incoming.sender;
+        // The gateway of this host hands over the letters of legacy peers in its own name.
+        let is_of_gateway =
+            registered.is_some_and(|it| it.role == Role::Gateway && it.reach == Reach::Local);
         if let Some(party) = parties.iter().find(|party| *party.name == *sender) {
             return match registered {
                 _ if is_own => true,
+                Some(_) if is_of_gateway && !party.agent.is_known() => true,
                 Some(registered) => *registered.name == *sender,
                 None => party.agent == agent,
             };
@@ -426,7 +430,8 @@ impl Admitted {
         reports
             && (is_own
                 || parties.iter().any(|party| match agent.is_known() {
-                    true => party.mts == agent,
+                    true if party.agent.is_known() => party.mts == agent,
+                    true => is_of_gateway,
                     false => !party.agent.is_known(),
                 }))
     }
@@ -479,6 +484,43 @@ mod tests {
         let arm = Party::new("arm", Some(&entry("arm", ARM)));
         let key = demultiplexer.begin("c", Admitted::Parties(vec![arm]));
         (demultiplexer, key)
+    }
+
+    /// The gateway of the host is the sender of the stream in which their letters arrive.
+    #[test]
+    fn messages_of_a_legacy_peer_belong_to_their_conversation() {
+        let demultiplexer = Demultiplexer::default();
+        let echo = Party::new("echo@jade", None);
+        let key = demultiplexer.begin("c", Admitted::Parties(vec![echo]));
+        let mut state = demultiplexer.state.lock();
+        let (gateway, mallory) = (Incarnation::from_u64(6), entry("mallory", MALLORY));
+        let relay = Entry {
+            role: Role::Gateway,
+            ..Entry::clone(&entry("gateway", gateway))
+        };
+        let elsewhere = Entry {
+            reach: Reach::Remote { gateway },
+            ..relay.clone()
+        };
+        for (registered, from, sender, act, belongs) in [
+            (&relay, gateway, "echo@jade", Performative::Inform, true),
+            (&relay, gateway, "ams@jade", Performative::Failure, true),
+            (&relay, gateway, "other@jade", Performative::Inform, false),
+            (&*mallory, MALLORY, "echo@jade", Performative::Inform, false),
+            (&*mallory, MALLORY, "ams@jade", Performative::Failure, false),
+            (
+                &elsewhere,
+                gateway,
+                "echo@jade",
+                Performative::Inform,
+                false,
+            ),
+        ] {
+            state.put(message(sender, from, act), Some(registered));
+            let conversation = state.conversation(&key).unwrap();
+            let found = conversation.queue.pop_front().is_some();
+            assert_eq!(found, belongs, "{sender} by {}", registered.name);
+        }
     }
 
     #[test]

@@ -159,7 +159,7 @@ impl Gateway {
             Arc::clone(&gateway.neighbours),
         );
         gateway.tasks.push(tokio::spawn(follow));
-        gateway.open_for_letters(config, known)?;
+        gateway.open_for_letters(config, known, contacts)?;
         #[cfg(feature = "secure")]
         gateway
             .tasks
@@ -173,6 +173,7 @@ impl Gateway {
         &mut self,
         config: &Config,
         known: Arc<MergedDirectory>,
+        contacts: Arc<KnownPeers>,
     ) -> Result<(), OpenError> {
         let means = self.means()?;
         let gateway_agent = GatewayAgent {
@@ -181,6 +182,7 @@ impl Gateway {
             neighbours: Arc::clone(&self.neighbours),
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
+            contacts,
             notices: Mutex::default(),
             questions: Mutex::default(),
         };
@@ -532,18 +534,28 @@ struct KnownPeers {
     network: Mutex<Option<Arc<dyn Network>>>,
 }
 
+impl KnownPeers {
+    /// Records an agent of another host, and publishes it on this host.
+    fn record(
+        &self,
+        name: &str,
+        agent: Incarnation,
+        location: Location,
+    ) -> Result<(), fipa_sds::EntryError> {
+        let is_new = self
+            .directory
+            .heard(Instant::now(), name, agent, location)?;
+        if is_new && let Some(publisher) = &*self.publisher.lock() {
+            publisher.publish();
+        }
+        Ok(())
+    }
+}
+
 impl Contacts for KnownPeers {
     fn heard(&self, name: &str, agent: Incarnation, location: Location) {
-        match self.directory.heard(Instant::now(), name, agent, location) {
-            Ok(true) => {
-                if let Some(publisher) = &*self.publisher.lock() {
-                    publisher.publish();
-                }
-            }
-            Ok(false) => {}
-            Err(error) => {
-                tracing::info!(error = %ErrorChain(&error), "cannot record the sender of a letter")
-            }
+        if let Err(error) = self.record(name, agent, location) {
+            tracing::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
         }
     }
 

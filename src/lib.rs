@@ -103,6 +103,7 @@ mod checks;
 mod checks;
 mod coalition;
 pub mod config;
+pub mod contact;
 mod delivery;
 #[cfg(feature = "monitor")]
 mod demultiplexer;

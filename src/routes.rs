@@ -14,7 +14,7 @@ use fipa_sds::{Directory, Entry, Query, Role};
 use fipa_transport::{Incarnation, Location};
 use serde::{Deserialize, Serialize};
 
-use crate::{Agent, Deliveries, ReceiveError, SendError};
+use crate::{Agent, Deliveries, Message, ReceiveError, SendError};
 
 /// The ontology of a request for routes.
 pub const ONTOLOGY: &str = "fipa-mts-routes";
@@ -111,16 +111,33 @@ pub async fn of_gateway(
     receivers: Option<&str>,
     patience: Duration,
 ) -> Result<Report, AskError> {
+    let request = (ONTOLOGY, receivers.map(str::to_owned));
+    let answer = ask(agent, gateway, request, patience).await?;
+    let content = answer.content().map(|bytes| &bytes[..]).unwrap_or_default();
+    if *answer.performative() != Performative::Inform {
+        let text = String::from_utf8_lossy(content).into_owned();
+        return Err(AskError::NotUnderstood(text));
+    }
+    serde_json::from_slice(content).map_err(|error| AskError::NotUnderstood(error.to_string()))
+}
+
+/// Sends a request with this ontology and content to the gateway, and returns the answer.
+pub(crate) async fn ask(
+    agent: &Agent,
+    gateway: &Entry,
+    (ontology, content): (&str, Option<String>),
+    patience: Duration,
+) -> Result<Message, AskError> {
     let reference = Incarnation::random().to_string();
     let receiver =
         AgentId::new(&*gateway.name).map_err(|error| AskError::NotUnderstood(error.to_string()))?;
     let mut request = agent
         .message(Performative::Request)
         .receiver(receiver)
-        .ontology(ONTOLOGY)
+        .ontology(ontology)
         .reply_with(reference.as_str());
-    if let Some(receivers) = receivers {
-        request = request.content(receivers.to_owned());
+    if let Some(content) = content {
+        request = request.content(content);
     }
     let deliveries = agent.send_within(request.build()?, patience).await?;
     if !deliveries.all_succeeded() {
@@ -135,13 +152,7 @@ pub async fn of_gateway(
         }
     };
     let answer = tokio::time::timeout(patience, answer);
-    let answer = answer.await.map_err(|_| AskError::Silence(patience))??;
-    let content = answer.content().map(|bytes| &bytes[..]).unwrap_or_default();
-    if *answer.performative() != Performative::Inform {
-        let text = String::from_utf8_lossy(content).into_owned();
-        return Err(AskError::NotUnderstood(text));
-    }
-    serde_json::from_slice(content).map_err(|error| AskError::NotUnderstood(error.to_string()))
+    Ok(answer.await.map_err(|_| AskError::Silence(patience))??)
 }
 
 impl From<fipa_mts::core::PeerState> for StaticPeer {

@@ -21,6 +21,17 @@ pub enum BenchError {
     /// An encoding failed on the message of the paper.
     #[error("cannot measure the encodings: {0}")]
     Encoding(String),
+    /// An agent of another platform does not answer as expected.
+    #[error(
+        "cannot measure conversations with {}: {what}",
+        fipa_acl::escape(agent)
+    )]
+    Peer {
+        /// The name of the agent.
+        agent: String,
+        /// The cause.
+        what: String,
+    },
     /// A diagram could not be drawn.
     #[error("cannot draw the diagram: {0}")]
     Draw(String),

@@ -9,6 +9,7 @@
 //!   process in it.
 //! * [`Baseline`] is an earlier result, and [`Changes`] are the differences from it.
 //! * [`Paper`] repeats the evaluation of the C++ libraries: lengths and times of all encodings.
+//! * [`Peers`] measures conversations with an agent of JADE, beside those of another JADE platform.
 //! * [`Machine`] describes the machine that was measured.
 //!
 //! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
@@ -23,6 +24,7 @@ mod measure;
 mod paper;
 mod part;
 mod path;
+mod peers;
 mod plot;
 mod report;
 mod stage;
@@ -34,3 +36,4 @@ pub use machine::Machine;
 pub use measure::Effort;
 pub use paper::Paper;
 pub use part::play;
+pub use peers::{Conversations, Peers, PeersReport};

@@ -3,11 +3,12 @@
 
 use std::io::{self, IsTerminal};
 use std::pin::pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::{
-    Agent, Config, Domain, DomainDirError, ErrorChain, ListenError, OpenError, RegisterError,
-    RegisterOptions,
+    Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, ListenError, OpenError,
+    Reach, RegisterError, RegisterOptions, Role, contact,
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
@@ -213,4 +214,55 @@ pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) 
             "`fipa agents` lists the registered agents; stop those that are not needed",
         ),
     }
+}
+
+/// Maximum time for the gateway's answer to an introduction.
+const INTRODUCTION_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Parses the address of an agent of another platform.
+pub(crate) fn address(text: &str) -> Result<String, contact::AddressError> {
+    contact::location(text).map(|_| text.to_owned())
+}
+
+/// Adds addresses to the identifier of an agent of another platform, and introduces the agent to the
+/// gateway of this host. Does nothing without addresses.
+pub(crate) async fn introduce(
+    agent: &Agent,
+    mut id: AgentId,
+    addresses: &[String],
+) -> Result<AgentId, Failure> {
+    if addresses.is_empty() {
+        return Ok(id);
+    }
+    let failed = |what: String| {
+        Failure::failed(
+            what,
+            addresses.join(", "),
+            "check the address, and that `fipa up` runs with the transport in mts.transports",
+        )
+    };
+    for address in addresses {
+        let with = id.with_address(address);
+        id = with.map_err(|error| failed(error.to_string()))?;
+    }
+    let gateway = gateway(agent.domain()).ok_or_else(no_gateway)?;
+    contact::introduce(agent, &gateway, &id, INTRODUCTION_TIMEOUT)
+        .await
+        .map_err(|error| failed(ErrorChain(&error).to_string()))?;
+    Ok(id)
+}
+
+/// Returns the gateway of this host, if one is running.
+pub(crate) fn gateway(domain: &Domain) -> Option<Arc<Entry>> {
+    let entries = domain.directory().entries();
+    let is_own = |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
+    entries.iter().find(is_own).cloned()
+}
+
+pub(crate) fn no_gateway() -> Failure {
+    Failure::failed(
+        "no gateway is running on this host, and only gateways reach other platforms",
+        "this host",
+        "start one with the transport http in mts.transports: `fipa up`",
+    )
 }

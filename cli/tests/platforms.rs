@@ -299,3 +299,52 @@ fn a_letter_is_sent_to_a_platform_and_its_reply_or_failure_is_received() {
         .failed_json();
     assert_eq!(json["deliveries"][0]["outcome"], "failed");
 }
+
+#[test]
+fn an_agent_that_no_directory_lists_is_reached_at_a_stated_address() {
+    let host = Host::new();
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    let (_gateway, http) = gateway(&host, &[]);
+    let address = format!("http://{here}/acc");
+    let send = |to: &'static str, address: &str, more: &[&'static str]| {
+        let mut arguments = vec!["send", "--to", to, "--content", "hello jade", "--json"];
+        arguments.extend(["--from", "rusty@rustap", "--address", address]);
+        arguments.extend(more);
+        arguments.into_iter().map(str::to_owned).collect::<Vec<_>>()
+    };
+    let run = |arguments: Vec<String>| {
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        host.run(&arguments)
+    };
+    let reply = at(
+        REPLIES[0],
+        &[("127.0.0.1:7778", &here), ("127.0.0.1:9901", &http)],
+    );
+    let sent = answers_with(&platform, reply, http.clone());
+    let waiting = ["--wait", "--timeout", "60s", "--deadline", "60s"];
+    let conversation = ["--conversation-id", "conv-1", "--reply-with", "rw-1"];
+    let json = run(send(
+        "echo@jadetest",
+        &address,
+        &[waiting.as_slice(), &conversation].concat(),
+    ));
+    let json = json.done_json();
+    assert_eq!(json["deliveries"][0]["via"], "http");
+    assert_eq!(json["reply"]["content"], "hello jade");
+    let sent = sent.join().unwrap();
+    assert_eq!(sent.receivers()[0].name(), "echo@jadetest");
+    assert_eq!(sent.receivers()[0].addresses(), [address.as_str()]);
+
+    // The name of an agent that the directory lists cannot be taken by an address.
+    let _arm = host.echo("arm_1");
+    let error = run(send("arm_1", &address, &[])).failed(1);
+    let why = "the directory lists another agent of this name";
+    assert!(error.contains(why), "{error}");
+    let udt = "udt://127.0.0.1:9;fipa-services";
+    let error = run(send("echo@else", udt, &[])).failed(1);
+    assert!(error.contains("the gateway does not use udt"), "{error}");
+    // An address of this project's own protocol.
+    let error = run(send("echo@else", "tcp://127.0.0.1:9", &[])).failed(2);
+    assert!(error.contains("is no address of a legacy peer"), "{error}");
+}

@@ -11,8 +11,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, StaticDirectory};
 use fipa_transport::{
-    AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, TransportError,
-    TransportErrorKind,
+    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome,
+    TransportError, TransportErrorKind,
 };
 
 const ROVER: Incarnation = Incarnation::from_u64(0xb);
@@ -184,6 +184,51 @@ fn a_service_of_this_project_is_not_reached_in_the_dialect_of_legacy_peers() {
     let mut bench = Bench::new(&[known, "tcp://10.0.0.4:6789;fipa-services"]);
     bench.send(0);
     assert_eq!(bench.dispatched().1, "tcp://10.0.0.4:6789;fipa-services");
+}
+
+/// A legacy peer would take a copy for a new letter.
+#[test]
+fn a_letter_that_a_lost_gateway_may_have_sent_is_not_sent_by_another() {
+    let gateways = [
+        "shm://000000000000000a#000000000000000a",
+        "shm://000000000000000b#000000000000000b",
+    ];
+    let lost = || TransportError::new(TransportErrorKind::Broken, "the gateway is gone");
+    // It ended before it answered.
+    let mut bench = Bench::new(&gateways);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    let unconfirmed = Conclusion::Unconfirmed(lost());
+    bench
+        .core
+        .handle_conclusion(bench.at(1), attempt, unconfirmed);
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Unconfirmed);
+    assert!(!bench.core.has_open_letters());
+
+    // It took the letter, and its successor does not have it.
+    let mut bench = Bench::new(&gateways);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    let custody = Conclusion::Answered(Answer::Custody);
+    bench.core.handle_conclusion(bench.at(1), attempt, custody);
+    bench.core.handle_timeout(bench.at(1100));
+    let (question, _) = bench.dispatched();
+    let denied = Conclusion::Answered(Answer::Returned { uncertain: true });
+    bench
+        .core
+        .handle_conclusion(bench.at(1101), question, denied);
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Unconfirmed);
+
+    // It never got the letter.
+    let mut bench = Bench::new(&gateways);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench
+        .core
+        .handle_conclusion(bench.at(1), attempt, Conclusion::NotSent(lost()));
+    assert_eq!(bench.dispatched().1, gateways[1]);
 }
 
 const LEGACY: &str = "tcp://10.0.0.3:6789;fipa-services";

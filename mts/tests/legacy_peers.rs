@@ -304,15 +304,9 @@ fn the_sender_of_a_recorded_letter_becomes_a_contact_at_its_stated_address() {
     assert_eq!(heard(&mut core), known(at));
 }
 
-#[test]
-fn agents_become_known_by_letters_at_a_limited_rate() {
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
-    };
-    let mut core = Core::new(config, host_of("echo").view());
-    let then = now();
-    for number in 0..200 {
+/// Handles a letter of each of these agents of one address.
+fn written_by(core: &mut Core, then: Now, agents: std::ops::Range<u32>) {
+    for number in agents {
         let name = format!("agent-{number}");
         let sender = AgentId::new(name).unwrap();
         let sender = sender.with_address("tcp://127.0.0.1:9").unwrap();
@@ -322,9 +316,29 @@ fn agents_become_known_by_letters_at_a_limited_rate() {
             .build()
             .unwrap();
         let letter = letter_for(&message, then.utc).unwrap();
-        let unframed = read(&core, letter, Kind::Tcp, HERE);
+        let unframed = read(core, letter, Kind::Tcp, HERE);
         core.handle_unframed(then, Duration::from_secs(5), unframed);
     }
+}
+
+#[test]
+fn agents_become_known_by_letters_at_a_limited_rate() {
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+    };
+    let mut core = Core::new(config, host_of("echo").view());
+    let then = now();
+    // The agents of a platform begin together.
+    written_by(&mut core, then, 0..100);
+    assert_eq!(heard(&mut core).len(), 100);
+    written_by(&mut core, then, 100..300);
+    assert_eq!(heard(&mut core).len(), 28);
+    let later = Now {
+        instant: then.instant + Duration::from_secs(1),
+        ..then
+    };
+    written_by(&mut core, later, 300..400);
     assert_eq!(heard(&mut core).len(), 20);
 }
 

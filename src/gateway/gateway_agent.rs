@@ -4,8 +4,8 @@
 //! The ontology of a letter selects its handler. A request with an unknown ontology is answered
 //! with `not-understood`.
 
-use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::collections::{BTreeSet, HashMap};
 use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -13,13 +13,15 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query};
+use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 
+use super::KnownPeers;
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::neighbours::Neighbours;
 use super::presence::Questions;
+use crate::contact;
 use crate::presence;
 use crate::routes;
 use crate::service::Service;
@@ -37,6 +39,7 @@ pub(crate) struct GatewayAgent {
     pub(crate) neighbours: Arc<Neighbours>,
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
+    pub(super) contacts: Arc<KnownPeers>,
     /// Time of the last logged notice of each gateway.
     pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
     /// The questions of agents of this host about agents of other hosts.
@@ -99,10 +102,52 @@ impl GatewayAgent {
                 });
             }
             Some(routes::ONTOLOGY) => self.answer_routes(message, sender),
+            Some(contact::ONTOLOGY) => {
+                let content = message.content().map(|content| &content[..]);
+                let introduced = match received.remote {
+                    true => {
+                        Err("only agents of the gateway's host may introduce others".to_owned())
+                    }
+                    false => self.introduce(content.unwrap_or_default()),
+                };
+                match introduced {
+                    Ok(()) => self.answer(message, sender, Performative::Inform, |answer| answer),
+                    Err(reason) => {
+                        self.answer(message, sender, Performative::Refuse, |answer| {
+                            answer.content(reason)
+                        });
+                    }
+                }
+            }
             _ => self.answer(message, sender, Performative::NotUnderstood, |answer| {
                 answer.content("the gateway does not support this ontology")
             }),
         }
+    }
+
+    /// Records an agent of another platform at the first of its stated locations for which this gateway
+    /// has a transport. Returns the reason if it does not.
+    fn introduce(&self, content: &[u8]) -> Result<(), String> {
+        let (name, locations) = contact::read(content)?;
+        let mut used = locations.iter();
+        let Some(location) = used.find(|it| self.service.uses(it.kind())) else {
+            let kinds: BTreeSet<_> = locations.iter().map(|it| it.kind().name()).collect();
+            let kinds: Vec<_> = kinds.into_iter().collect();
+            return Err(format!(
+                "the gateway does not use {}; list it in mts.transports",
+                kinds.join(" or ")
+            ));
+        };
+        if let Some(known) = self.view.lookup(&name)
+            && !known.locations.contains(location)
+            && (known.source != Source::Contact || known.incarnation.is_known())
+        {
+            return Err("the directory lists another agent of this name".to_owned());
+        }
+        let recorded = self
+            .contacts
+            .record(&name, Incarnation::UNKNOWN, location.clone());
+        recorded.map_err(|error| ErrorChain(&error).to_string())
     }
 
     /// Logs a notice about a name that another gateway sent to the operator of this one. At most

@@ -14,7 +14,7 @@ use fipa_platform::{
     Ams, Answer, ApDescription, Asker, Df, Now, Platform, Resident, SubscriptionId,
 };
 use fipa_sds::{Directory, Entry, MergedDirectory, Reach, RegisterError, Registration, Role};
-use fipa_transport::{Incarnation, Location, Principal, Signature};
+use fipa_transport::{Incarnation, Location, Principal};
 use tokio::task::{JoinHandle, JoinSet};
 
 use super::neighbours::Neighbours;
@@ -90,7 +90,7 @@ impl PlatformAgents {
             self.platform(&entry, received),
         );
         asker.is_proved = is_proved;
-        let is_jade = |location: &Location| location.signature() == Signature::JadeProxy;
+        let is_jade = |location: &Location| location.signature().is_jade();
         if entry.locations.iter().any(is_jade) {
             asker.dialect = Dialect::Jade;
         }

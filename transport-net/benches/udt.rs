@@ -1,5 +1,9 @@
-//! Throughput of letters over UDT, beside libudt to libudt in the same run: letters to libudt, and
-//! from libudt. Needs `libudt-dev` and `g++`.
+//! Letters over UDT beside libudt to libudt in the same run: throughput and processor time of letters
+//! of 1 MB to libudt and from libudt, and round trips of letters of 1 KB. Needs `libudt-dev` and
+//! `g++`.
+//!
+//! Each figure of this side is divided by that of libudt in the same round. The last lines are the
+//! medians over the rounds; `FIPA_UDT_ROUNDS` is their number.
 //!
 //! `cargo bench -p fipa-transport-net --features udt --bench udt`
 #![allow(
@@ -27,27 +31,52 @@ use parking_lot::{Condvar, Mutex};
 
 const LEN: usize = 1_000_000;
 const COUNT: u64 = 200;
-const ROUNDS: usize = 3;
+
+/// Content of a letter whose round trip is measured, and their number.
+const SHORT: usize = 1024;
+const TRIPS: usize = 2000;
+
+const ROUNDS: u64 = 5;
 
 /// Counts letters and conclusions.
 #[derive(Default)]
 struct Counter {
-    count: Mutex<u64>,
+    counts: Mutex<Counts>,
     changed: Condvar,
 }
 
+#[derive(Default)]
+struct Counts {
+    /// Letters and conclusions.
+    all: u64,
+    /// Letters that [`Counter::wait_for_arrival`] has not taken.
+    arrived: u64,
+}
+
 impl Counter {
-    fn add(&self) {
-        *self.count.lock() += 1;
+    fn add(&self, arrived: u64) {
+        let mut counts = self.counts.lock();
+        counts.all += 1;
+        counts.arrived += arrived;
+        drop(counts);
         self.changed.notify_all();
     }
 
+    /// Waits for this number of letters and conclusions, and starts at zero again.
     fn wait_for(&self, count: u64) {
-        let mut now = self.count.lock();
-        while *now < count {
-            self.changed.wait(&mut now);
+        let mut counts = self.counts.lock();
+        while counts.all < count {
+            self.changed.wait(&mut counts);
         }
-        *now = 0;
+        *counts = Counts::default();
+    }
+
+    fn wait_for_arrival(&self) {
+        let mut counts = self.counts.lock();
+        while counts.arrived == 0 {
+            self.changed.wait(&mut counts);
+        }
+        counts.arrived -= 1;
     }
 }
 
@@ -57,12 +86,12 @@ impl Sink for Counter {
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {
-        self.add();
+        self.add(1);
     }
 
     fn concluded(&self, _: AttemptId, conclusion: Conclusion) {
         assert_eq!(conclusion, Conclusion::Handed);
-        self.add();
+        self.add(0);
     }
 }
 
@@ -106,6 +135,18 @@ impl Peer {
         (words.next().unwrap(), words.next().unwrap())
     }
 
+    /// Returns the median of the round trips in microseconds, to the echo at this port.
+    fn pings(mut self, port: u16, letter: &[u8]) -> f64 {
+        let stdin = self.child.stdin.as_mut().unwrap();
+        let len = u32::try_from(letter.len()).unwrap();
+        stdin.write_all(&u32::from(port).to_le_bytes()).unwrap();
+        stdin.write_all(&len.to_le_bytes()).unwrap();
+        stdin.write_all(letter).unwrap();
+        let mut line = String::new();
+        self.stdout.read_line(&mut line).unwrap();
+        line.trim().parse().unwrap()
+    }
+
     /// Returns the processor time of the process so far, in seconds.
     fn processor(&self) -> f64 {
         processor(&self.child.id().to_string())
@@ -139,11 +180,11 @@ fn build() -> PathBuf {
     program
 }
 
-fn message() -> Message {
+fn message(len: usize) -> Message {
     let built = Message::builder(Performative::Inform)
         .sender(AgentId::new("rover").unwrap())
         .receiver(AgentId::new("arm").unwrap())
-        .content("x".repeat(LEN))
+        .content("x".repeat(len))
         .build();
     built.unwrap()
 }
@@ -163,19 +204,19 @@ fn envelope() -> Envelope {
     }
 }
 
-fn legacy_letter() -> Vec<u8> {
+fn legacy_letter(len: usize) -> Vec<u8> {
     let (representation, dialect) = (Representation::BitEfficient, Dialect::FipaServices);
     let mut envelope = envelope();
     envelope.base.date = Some("20261120T112644481".parse().unwrap());
     let envelope = envelope.encode(representation, dialect).unwrap();
-    let message = message().encode(representation, dialect).unwrap();
+    let message = message(len).encode(representation, dialect).unwrap();
     [&envelope[..], &message].concat()
 }
 
-fn parcel() -> Parcel {
+fn parcel(len: usize) -> Parcel {
     let letter = Letter::new(
         envelope().encode_standard().unwrap(),
-        message().to_payload(),
+        message(len).to_payload(),
     );
     Parcel {
         receiver: "arm".into(),
@@ -191,9 +232,120 @@ fn parcel() -> Parcel {
     }
 }
 
-fn show(what: &str, seconds: f64, sender: f64, receiver: f64) {
-    let rate = COUNT as f64 * LEN as f64 / seconds / 1e6;
-    println!("{what}: {rate:.0} MB/s, processor {sender:.2} s + {receiver:.2} s");
+/// The result of a flood.
+#[derive(Clone, Copy)]
+struct Flood {
+    seconds: f64,
+    /// Processor time of the sender and of the receiver, in seconds.
+    sender: f64,
+    receiver: f64,
+}
+
+impl Flood {
+    fn show(&self, what: &str) {
+        let rate = COUNT as f64 * LEN as f64 / self.seconds / 1e6;
+        println!(
+            "  {what}: {rate:.0} MB/s, processor {:.2} s + {:.2} s",
+            self.sender, self.receiver
+        );
+    }
+}
+
+/// The endpoint of this side, and what is sent.
+struct Side {
+    transport: UdtTransport,
+    sink: Arc<Counter>,
+    port: String,
+    program: PathBuf,
+}
+
+impl Side {
+    fn peer(&self, arguments: &[&str]) -> Peer {
+        Peer::start(&self.program, arguments)
+    }
+
+    fn libudt_to_libudt(&self) -> Flood {
+        let receiver = self.peer(&["discard", "127.0.0.1", "0"]);
+        let count = COUNT.to_string();
+        let sender = self.peer(&["flood", "127.0.0.1", receiver.port(), &count]);
+        let (seconds, sender) = sender.floods(&legacy_letter(LEN));
+        Flood {
+            seconds,
+            sender,
+            receiver: receiver.processor(),
+        }
+    }
+
+    fn this_to_libudt(&self) -> Flood {
+        let receiver = self.peer(&["discard", "127.0.0.1", "0"]);
+        let to = location(receiver.port());
+        let parcel = parcel(LEN);
+        let (begun, before) = (Instant::now(), processor("self"));
+        for attempt in 0..COUNT {
+            self.dispatch(attempt, &to, &parcel);
+        }
+        self.sink.wait_for(COUNT);
+        Flood {
+            seconds: begun.elapsed().as_secs_f64(),
+            sender: processor("self") - before,
+            receiver: receiver.processor(),
+        }
+    }
+
+    fn libudt_to_this(&self) -> Flood {
+        let before = processor("self");
+        let sender = self.peer(&["flood", "127.0.0.1", &self.port, &COUNT.to_string()]);
+        let (seconds, sender) = sender.floods(&legacy_letter(LEN));
+        self.sink.wait_for(COUNT);
+        Flood {
+            seconds,
+            sender,
+            receiver: processor("self") - before,
+        }
+    }
+
+    /// Returns the median round trip between two processes of libudt, in microseconds.
+    fn trips_of_libudt(&self) -> f64 {
+        let ping = self.peer(&["ping", "127.0.0.1", "0", &TRIPS.to_string()]);
+        let echo = self.peer(&["echo", "127.0.0.1", "0", ping.port()]);
+        let port = echo.port().parse().unwrap();
+        ping.pings(port, &legacy_letter(SHORT))
+    }
+
+    /// Returns the median round trip from this side to libudt, in microseconds: until the letter of
+    /// the echo has arrived over its own connection.
+    fn trips_of_this(&self) -> f64 {
+        let echo = self.peer(&["echo", "127.0.0.1", "0", &self.port]);
+        let (to, parcel) = (location(echo.port()), parcel(SHORT));
+        let trips = (0..=TRIPS as u64).map(|attempt| {
+            let begun = Instant::now();
+            self.dispatch(attempt, &to, &parcel);
+            self.sink.wait_for_arrival();
+            begun.elapsed().as_secs_f64() * 1e6
+        });
+        let mut trips: Vec<f64> = trips.skip(1).collect();
+        self.sink.wait_for(2 * (TRIPS as u64 + 1));
+        median(&mut trips)
+    }
+
+    fn dispatch(&self, attempt: u64, to: &Location, parcel: &Parcel) {
+        while let Err(error) = self
+            .transport
+            .dispatch(AttemptId(attempt), to, parcel.clone())
+        {
+            assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+fn location(port: &str) -> Location {
+    Location::new(Kind::Udt, &format!("127.0.0.1:{port}")).unwrap()
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }
 
 fn main() {
@@ -218,49 +370,48 @@ fn main() {
     let transport = UdtTransport::new(config, runtime.handle().clone());
     let sink = Arc::new(Counter::default());
     let here = transport.listen(sink.clone()).unwrap();
-    let (_, here) = here[0].address().rsplit_once(':').unwrap();
-    let (letter, parcel) = (legacy_letter(), parcel());
-    let count = COUNT.to_string();
-    for round in 1..=ROUNDS {
-        println!("round {round}: {COUNT} letters of {LEN} bytes");
-        let receiver = Peer::start(&program, &["discard", "127.0.0.1", "0"]);
-        let sender = Peer::start(&program, &["flood", "127.0.0.1", receiver.port(), &count]);
-        let (seconds, processor_time) = sender.floods(&letter);
-        show(
-            "libudt to libudt",
-            seconds,
-            processor_time,
-            receiver.processor(),
-        );
-
-        let receiver = Peer::start(&program, &["discard", "127.0.0.1", "0"]);
-        let address = format!("127.0.0.1:{}", receiver.port());
-        let to = Location::new(Kind::Udt, &address).unwrap();
-        let (begun, before) = (Instant::now(), processor("self"));
-        for attempt in 0..COUNT {
-            while let Err(error) = transport.dispatch(AttemptId(attempt), &to, parcel.clone()) {
-                assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
-                std::thread::sleep(Duration::from_millis(1));
-            }
+    let port = here[0].address().rsplit_once(':').unwrap().1.to_owned();
+    let side = Side {
+        transport,
+        sink,
+        port,
+        program,
+    };
+    let rounds = std::env::var("FIPA_UDT_ROUNDS").ok();
+    let rounds = rounds.map_or(ROUNDS, |text| text.parse().unwrap());
+    let names = [
+        "throughput to libudt",
+        "throughput from libudt",
+        "processor of the sender",
+        "processor of the receiver",
+        "round trip",
+    ];
+    let mut ratios: [Vec<f64>; 5] = Default::default();
+    for round in 1..=rounds {
+        println!("round {round}: {COUNT} letters of {LEN} bytes, {TRIPS} round trips of {SHORT}");
+        let limit = side.libudt_to_libudt();
+        limit.show("libudt to libudt");
+        let out = side.this_to_libudt();
+        out.show("this to libudt");
+        let back = side.libudt_to_this();
+        back.show("libudt to this");
+        let (theirs, ours) = (side.trips_of_libudt(), side.trips_of_this());
+        println!("  round trip: libudt {theirs:.0} µs, this {ours:.0} µs");
+        let now = [
+            limit.seconds / out.seconds,
+            limit.seconds / back.seconds,
+            out.sender / limit.sender,
+            back.receiver / limit.receiver,
+            ours / theirs,
+        ];
+        for (kept, now) in ratios.iter_mut().zip(now) {
+            kept.push(now);
         }
-        sink.wait_for(COUNT);
-        let seconds = begun.elapsed().as_secs_f64();
-        show(
-            "this to libudt",
-            seconds,
-            processor("self") - before,
-            receiver.processor(),
-        );
-
-        let before = processor("self");
-        let sender = Peer::start(&program, &["flood", "127.0.0.1", here, &count]);
-        let (seconds, processor_time) = sender.floods(&letter);
-        sink.wait_for(COUNT);
-        show(
-            "libudt to this",
-            seconds,
-            processor_time,
-            processor("self") - before,
-        );
+    }
+    println!("median of {rounds} rounds, as a ratio to libudt (smallest to largest)");
+    for (name, ratios) in names.iter().zip(&mut ratios) {
+        let median = median(ratios);
+        let (least, most) = (ratios[0], ratios[ratios.len() - 1]);
+        println!("  {name}: {median:.2} ({least:.2} to {most:.2})");
     }
 }

@@ -102,11 +102,30 @@ pub enum Signature {
     /// An XML envelope and a string message, whose delivery is not confirmed: JADE. Over TCP, its
     /// proxy agent reads one letter per connection.
     JadeProxy,
+    /// The same with an XML message, over HTTP, to a platform with JADE's codec for XML.
+    JadeXml,
+    /// The same with a bit-efficient message, over HTTP, to a platform with JADE's codec for it.
+    JadeBitEfficient,
 }
 
 impl Signature {
     /// All signatures.
-    pub const ALL: [Self; 3] = [Self::Frames, Self::FipaServices, Self::JadeProxy];
+    pub const ALL: [Self; 5] = [
+        Self::Frames,
+        Self::FipaServices,
+        Self::JadeProxy,
+        Self::JadeXml,
+        Self::JadeBitEfficient,
+    ];
+
+    /// Whether the peer is JADE.
+    #[must_use]
+    pub const fn is_jade(self) -> bool {
+        matches!(
+            self,
+            Self::JadeProxy | Self::JadeXml | Self::JadeBitEfficient
+        )
+    }
 
     /// Name of this signature in a [`Location`]. The name of frames is omitted there.
     #[must_use]
@@ -115,6 +134,8 @@ impl Signature {
             Self::Frames => "fipa",
             Self::FipaServices => "fipa-services",
             Self::JadeProxy => "jade",
+            Self::JadeXml => "jade-xml",
+            Self::JadeBitEfficient => "jade-bit-efficient",
         }
     }
 
@@ -124,7 +145,7 @@ impl Signature {
     pub const fn signature_type(self) -> &'static str {
         match self {
             Self::Frames | Self::FipaServices => "fipa::services::transports::MessageTransport",
-            Self::JadeProxy => "JadeProxyAgent",
+            Self::JadeProxy | Self::JadeXml | Self::JadeBitEfficient => "JadeProxyAgent",
         }
     }
 
@@ -159,8 +180,8 @@ impl FromStr for Signature {
 /// service.
 ///
 /// Written `kind://address`, then `;signature` unless the protocol is frames (it may be omitted for
-/// `udt`, over which only fipa_services is supported, and is omitted for `http`, over which only JADE
-/// is), then `#incarnation` if known: `tcp://10.0.0.2:7788#00abcdef01234567`,
+/// `udt`, over which only fipa_services is supported, and for `http`, over which only JADE is:
+/// without it, messages to JADE are strings), then `#incarnation` if known: `tcp://10.0.0.2:7788#00abcdef01234567`,
 /// `tcp://10.0.0.3:6789;fipa-services`, `tcp://10.0.0.4:6789;jade`, `http://10.0.0.4:7778/acc`. The transport defines the meaning of `address`. Ports are reused, so
 /// a transport that finds another incarnation than the known one at a location reports that no
 /// receiver was reached.
@@ -218,13 +239,14 @@ impl Location {
     /// Sets the signature.
     ///
     /// # Errors
-    /// Returns an error if this kind of transport does not support it: TCP supports every
-    /// signature, UDT only that of fipa_services, HTTP only that of JADE, and all others only frames.
+    /// Returns an error if this kind of transport does not support it: UDT supports only that of
+    /// fipa_services, HTTP those of JADE, TCP all but the latter's encodings, and all others only
+    /// frames.
     pub fn with_signature(mut self, signature: Signature) -> Result<Self, LocationError> {
         let is_spoken = match self.kind {
-            Kind::Tcp => true,
+            Kind::Tcp => !matches!(signature, Signature::JadeXml | Signature::JadeBitEfficient),
             Kind::Udt => signature == Signature::FipaServices,
-            Kind::Http => signature == Signature::JadeProxy,
+            Kind::Http => signature.is_jade(),
             _ => signature == Signature::Frames,
         };
         if !is_spoken {
@@ -272,7 +294,11 @@ impl Location {
 impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}://{}", self.kind, self.address)?;
-        if self.signature != Signature::Frames && self.kind != Kind::Http {
+        let is_default = match self.kind {
+            Kind::Http => self.signature == Signature::JadeProxy,
+            _ => self.signature == Signature::Frames,
+        };
+        if !is_default {
             write!(f, ";{}", self.signature)?;
         }
         if self.incarnation.is_known() {
@@ -305,7 +331,9 @@ pub enum LocationError {
     #[error("the address contains white space, control or format characters, '#' or ';': {0:?}")]
     AddressCharacters(String),
     /// The text after `;` is not a signature.
-    #[error("unknown signature after ';' (known: fipa-services, jade, fipa): {0:?}")]
+    #[error(
+        "unknown signature after ';' (known: fipa-services, jade, jade-xml, jade-bit-efficient, fipa): {0:?}"
+    )]
     UnknownSignature(String),
     /// This kind of transport does not support this signature.
     #[error("the transport {1} does not support the signature {0}")]
@@ -410,6 +438,13 @@ mod tests {
         for refused in [Signature::Frames, Signature::FipaServices] {
             let refused = http.clone().with_signature(refused);
             assert!(matches!(refused, Err(LocationError::NotOverKind(..))));
+        }
+        for signature in [Signature::JadeXml, Signature::JadeBitEfficient] {
+            let encoded = http.clone().with_signature(signature).unwrap();
+            assert_eq!(encoded.to_string(), format!("{http};{signature}"));
+            assert_eq!(encoded.to_string().parse(), Ok(encoded.clone()));
+            let tcp = Location::new(Kind::Tcp, "10.0.0.4:6789").unwrap();
+            assert!(tcp.with_signature(signature).is_err());
         }
         let tcp: Location = "tcp://10.0.0.4:6789;jade".parse().unwrap();
         assert_eq!(tcp.authority(), "10.0.0.4:6789");

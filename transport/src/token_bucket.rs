@@ -31,7 +31,13 @@ impl TokenBucket {
 
     /// Takes `amount` tokens if there are as many. Returns whether it did.
     pub fn take(&mut self, amount: f64, per_second: f64, now: Instant) -> bool {
-        self.refill(per_second, now);
+        self.take_of(amount, per_second, per_second, now)
+    }
+
+    /// Like [`take`](Self::take), from a bucket that holds at most `burst` tokens. It begins with the
+    /// number of its creation.
+    pub fn take_of(&mut self, amount: f64, per_second: f64, burst: f64, now: Instant) -> bool {
+        self.refill(per_second, burst, now);
         let enough = self.left >= amount;
         if enough {
             self.left -= amount;
@@ -42,14 +48,14 @@ impl TokenBucket {
     /// Takes `amount` tokens for something that has already happened. If the bucket is negative then,
     /// returns the time until it no longer is, limited to one second.
     pub fn spend(&mut self, amount: f64, per_second: f64, now: Instant) -> Option<Duration> {
-        self.refill(per_second, now);
+        self.refill(per_second, per_second, now);
         self.left = (self.left - amount).max(-per_second);
         (self.left < 0.0).then(|| Duration::from_secs_f64(-self.left / per_second))
     }
 
-    fn refill(&mut self, per_second: f64, now: Instant) {
+    fn refill(&mut self, per_second: f64, most: f64, now: Instant) {
         let since = now.saturating_duration_since(self.at).as_secs_f64();
-        self.left = (self.left + since * per_second).min(per_second);
+        self.left = (self.left + since * per_second).min(most);
         self.at = self.at.max(now);
     }
 }
@@ -68,6 +74,23 @@ mod tests {
         assert!(!allowance.take(1.0, 2.0, now));
         assert!(allowance.take(1.0, 2.0, now + SECOND / 2));
         assert!(!allowance.take(1.0, 2.0, now + SECOND / 2));
+    }
+
+    #[test]
+    fn a_burst_may_be_larger_than_the_rate() {
+        let now = Instant::now();
+        let mut allowance = TokenBucket::new(3.0, now);
+        let mut take = |now| allowance.take_of(1.0, 1.0, 3.0, now);
+        assert_eq!(
+            [take(now), take(now), take(now), take(now)],
+            [true, true, true, false]
+        );
+        assert_eq!([take(now + SECOND), take(now + SECOND)], [true, false]);
+        let full = now + 10 * SECOND;
+        assert_eq!(
+            [take(full), take(full), take(full), take(full)],
+            [true, true, true, false]
+        );
     }
 
     #[test]

@@ -23,6 +23,7 @@ Examples:
   fipa ams
   fipa ams --state active
   fipa ams --ams ams@crex-mts --json
+  fipa ams --ams ams@jade --address http://10.0.0.7:7778/acc    of a JADE platform
 
 JSON:
   { \"ams\": name, \"platform\": { \"name\", \"services\": { transport: [address] } },
@@ -31,6 +32,10 @@ pub(crate) struct Arguments {
     /// Name of the agent management system [default: that of this host]
     #[arg(long, value_name = "NAME")]
     ams: Option<AgentId>,
+
+    /// Address of the agent management system, if it is not in the directory; repeatable
+    #[arg(long, value_name = "ADDRESS", requires = "ams", value_parser = membership::address)]
+    address: Vec<String>,
 
     /// Only the agent with this name
     #[arg(long, value_name = "NAME")]
@@ -66,7 +71,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let asked = async {
             let agent = asking(&domain, "ams", &config).await?;
             let ams = match arguments.ams {
-                Some(ams) => agent.ams_of(ams),
+                Some(ams) => {
+                    let ams = membership::introduce(&agent, ams, &arguments.address).await?;
+                    agent.ams_of(ams)
+                }
                 None => agent.ams().map_err(|error| failed(&error, &config))?,
             };
             let platform = ams.description().await;

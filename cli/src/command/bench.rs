@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
-use fipa::ErrorChain;
+use fipa::{AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
 use fipa_bench::{
-    Baseline, BenchError, Comparison, Effort, Machine, Measurement, Paper, Program, Selection,
+    Baseline, BenchError, Comparison, Effort, Machine, Measurement, Paper, Peers, Program,
+    Selection,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -34,7 +35,8 @@ Examples:
   fipa bench --svg latency.svg
   fipa bench --json > before.json; fipa bench --baseline before.json
   fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
-  fipa bench paper --dir docs")]
+  fipa bench paper --dir docs
+  fipa bench peers --jade http://127.0.0.1:7777/acc --jade-asker http://127.0.0.1:7776/acc")]
 pub(crate) struct Arguments {
     /// Part to measure [default: shm and net]
     #[arg(value_enum)]
@@ -69,6 +71,24 @@ pub(crate) struct Arguments {
     /// Also measure zenoh in the same rounds, with this program (see comparison/zenoh)
     #[arg(long, value_name = "PROGRAM")]
     zenoh: Option<PathBuf>,
+    /// Address of a JADE platform with the agent of --echo; for `peers`
+    ///
+    /// `peers` measures conversations of 100 bytes in a row with that agent, through the gateway of this
+    /// host (`fipa up` with the transport http). comparison/jade has the agents for JADE.
+    #[arg(long, value_name = "ADDRESS", value_parser = membership::address)]
+    jade: Option<String>,
+    /// Address of a second JADE platform, whose agent --asker asks the same agent in turn
+    #[arg(long, value_name = "ADDRESS", requires = "jade", value_parser = membership::address)]
+    jade_asker: Option<String>,
+    /// Name of the echo agent of JADE
+    #[arg(long, value_name = "NAME", default_value = "echo@jade")]
+    echo: AgentId,
+    /// Name of the asking agent of JADE
+    #[arg(long, value_name = "NAME", default_value = "ask@asker")]
+    asker: AgentId,
+    /// Number of conversations of `peers`
+    #[arg(long, value_name = "N", default_value_t = Peers::CONVERSATIONS)]
+    conversations: usize,
     /// Run as a process of a measurement
     #[arg(long, hide = true)]
     part: Option<String>,
@@ -85,6 +105,8 @@ enum What {
     Net,
     /// Encodings, as in the paper about the C++ libraries; writes tables and drawings
     Paper,
+    /// Conversations with an agent of a JADE platform, beside those of another JADE platform
+    Peers,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -96,8 +118,24 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             Failure::failed(error.to_string(), "a process of fipa bench", advice)
         });
     }
-    if arguments.what == Some(What::Paper) {
-        return measure_paper(&arguments);
+    match (arguments.what, &arguments.jade) {
+        (Some(What::Paper), _) => return measure_paper(&arguments),
+        (Some(What::Peers), Some(jade)) => return measure_peers(&arguments, jade, &config),
+        (Some(What::Peers), None) => {
+            return Err(Failure::wrong_usage(
+                "`fipa bench peers` needs the address of a JADE platform",
+                "--jade",
+                "add --jade http://HOST:PORT/acc, as JADE prints it",
+            ));
+        }
+        (_, Some(_)) => {
+            return Err(Failure::wrong_usage(
+                "--jade is only for `fipa bench peers`",
+                "--jade",
+                "omit --jade, or measure `peers`",
+            ));
+        }
+        _ => {}
     }
     if arguments.dir.is_some() {
         return Err(Failure::wrong_usage(
@@ -162,6 +200,44 @@ async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {
     let measured = measured.await;
     progress.finish_and_clear();
     measured.map_err(failed)
+}
+
+/// Measures conversations with an agent of a JADE platform.
+fn measure_peers(arguments: &Arguments, jade: &str, config: &Config) -> Result<(), Failure> {
+    let at = |id: &AgentId, address: &str| {
+        let id = id.clone().with_address(address);
+        id.map_err(|error| {
+            Failure::wrong_usage(error.to_string(), address.to_owned(), "change the address")
+        })
+    };
+    let mut peers = Peers::new(at(&arguments.echo, jade)?);
+    peers.conversations = arguments.conversations;
+    if let Some(address) = &arguments.jade_asker {
+        peers.asker = Some(at(&arguments.asker, address)?);
+    }
+    let report = membership::run(async {
+        observe().await;
+        let domain = membership::join(config).await?;
+        let name = format!("fipa-bench-{}", Incarnation::random());
+        let options = RegisterOptions::default();
+        let agent = membership::register(&domain, &name, options, config).await?;
+        let gateway = membership::gateway(&domain).ok_or_else(membership::no_gateway)?;
+        let progress = progress(Peers::STEPS);
+        let report = peers.measure(&agent, &gateway, |step| advance(&progress, step));
+        let report = report.await;
+        progress.finish_and_clear();
+        drop(agent);
+        domain.close().await;
+        report.map_err(failed)
+    })?;
+    match arguments.json {
+        true => output::json(&report)?,
+        false => output::text(&report.to_text())?,
+    }
+    match report.is_complete() {
+        true => Ok(()),
+        false => Err(Failure::already_reported()),
+    }
 }
 
 /// Repeats the evaluation of the paper.
@@ -234,6 +310,9 @@ fn failed(error: BenchError) -> Failure {
         BenchError::Prepare(_) => "check that this user can write to $TMPDIR",
         BenchError::NothingMeasured(_) => {
             "check mts.transports (`fipa config show`), and run the command with -v for the logs"
+        }
+        BenchError::Peer { .. } => {
+            "check that JADE runs with the agents of comparison/jade, and the gateway with http"
         }
         BenchError::Read { .. } => "check the name of the file",
         BenchError::Baseline { .. } => "make a baseline with `fipa bench --json > FILE`",

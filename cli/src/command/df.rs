@@ -24,6 +24,7 @@ Examples:
   fipa df register crane lifting
   fipa df search --type lifting
   fipa df search --df df@crex-mts --json
+  fipa df search --df df@jade --address http://10.0.0.7:7778/acc    at a JADE platform
   fipa df watch --type lifting")]
 pub(crate) struct Arguments {
     #[command(subcommand)]
@@ -96,6 +97,10 @@ struct Server {
     /// Name of the directory facilitator [default: that of this host]
     #[arg(long, value_name = "NAME")]
     df: Option<AgentId>,
+
+    /// Address of the directory facilitator, if it is not in the directory; repeatable
+    #[arg(long, value_name = "ADDRESS", requires = "df", value_parser = membership::address)]
+    address: Vec<String>,
 }
 
 #[derive(Debug, Args)]
@@ -151,9 +156,12 @@ impl Template {
 }
 
 impl Server {
-    fn of<'a>(&self, agent: &'a Agent, config: &Config) -> Result<Df<'a>, Failure> {
+    async fn of<'a>(&self, agent: &'a Agent, config: &Config) -> Result<Df<'a>, Failure> {
         match &self.df {
-            Some(df) => Ok(agent.df_of(df.clone())),
+            Some(df) => {
+                let df = membership::introduce(agent, df.clone(), &self.address).await?;
+                Ok(agent.df_of(df))
+            }
             None => agent.df().map_err(|error| failed(&error, config)),
         }
     }
@@ -231,7 +239,7 @@ async fn register(
     let done = async {
         let agent =
             membership::register(&domain, name.name(), RegisterOptions::default(), config).await?;
-        let df = server.of(&agent, config)?;
+        let df = server.of(&agent, config).await?;
         let service_type = service.service_type.clone().unwrap_or_default();
         let registered = df.register_service(service).await;
         let registered = registered.map_err(|error| failed(&error, config))?;
@@ -293,7 +301,7 @@ fn search(
         let domain = membership::join(config).await?;
         let found = async {
             let agent = asking(&domain, "df", config).await?;
-            let df = server.of(&agent, config)?;
+            let df = server.of(&agent, config).await?;
             let found = df.search(&template.description()).await;
             let found = found.map_err(|error| failed(&error, config))?;
             Ok((df.id().clone(), found))
@@ -383,7 +391,7 @@ async fn watch(
     let domain = membership::join(config).await?;
     let done = async {
         let agent = asking(&domain, "df", config).await?;
-        let df = server.of(&agent, config)?;
+        let df = server.of(&agent, config).await?;
         let notifications = df.subscribe(&template.description()).await;
         let mut notifications = notifications.map_err(|error| failed(&error, config))?;
         let name = df.id().name();

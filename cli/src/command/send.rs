@@ -49,6 +49,7 @@ Examples:
   fipa send --to arm_1 --performative request --content '(lift sample-3)' --wait
   fipa send --to 'arm_.*' --content stop               to all agents whose names match
   fipa send --to camera --content-file picture.raw --deadline 30s
+  fipa send --to echo@jade --address http://10.0.0.7:7778/acc --wait    an agent of another platform
   head -c 4096 /dev/urandom | fipa send --to camera --content-file - --json
   fipa send --to camera --content x --rate 10 --count 100
   fipa send --to 'arm_.*' -p cfp --protocol fipa-contract-net --content '(carry crate)' \\
@@ -73,6 +74,10 @@ pub(crate) struct Arguments {
     /// Name of the receiver, or a pattern such as 'arm_.*'; repeatable
     #[arg(long, required = true, value_name = "NAME", add = complete::agents())]
     to: Vec<AgentId>,
+
+    /// Address of the receiver, an agent of another platform that is not in the directory; repeatable
+    #[arg(long, value_name = "ADDRESS", value_parser = membership::address)]
+    address: Vec<String>,
 
     /// Name of the sending agent [default: a random, unused name]
     #[arg(long, value_name = "NAME")]
@@ -173,6 +178,13 @@ struct Parameters {
 
 pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
+    if !arguments.address.is_empty() && arguments.to.len() != 1 {
+        return Err(Failure::wrong_usage(
+            "--address is the address of one receiver",
+            "--address",
+            "give --to once, and send to the other receivers by another command",
+        ));
+    }
     // Read before the domain is joined: input from a terminal can take long.
     let content = match (arguments.content.take(), &arguments.content_file) {
         (Some(text), _) => Some(text.into_bytes()),
@@ -185,7 +197,13 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
     membership::run(async {
         let domain = membership::join(&config).await?;
         let agent = register(&domain, &arguments, &config).await?;
-        let done = converse(&agent, &arguments, content, &config).await;
+        let done = match located(&agent, &arguments).await {
+            Ok(to) => {
+                arguments.to = to;
+                converse(&agent, &arguments, content, &config).await
+            }
+            Err(failure) => Err(failure),
+        };
         drop(agent);
         domain.close().await;
         done
@@ -220,6 +238,17 @@ fn not_sent(error: &fipa::SendError) -> Failure {
         "this process",
         advice::not_sent(error),
     )
+}
+
+/// Returns the receivers, with their address if one is given.
+async fn located(agent: &Agent, arguments: &Arguments) -> Result<Vec<AgentId>, Failure> {
+    match arguments.to.as_slice() {
+        [to] => {
+            let to = membership::introduce(agent, to.clone(), &arguments.address).await?;
+            Ok(vec![to])
+        }
+        several => Ok(several.to_vec()),
+    }
 }
 
 /// Sends the message, waits for the replies if requested, and prints the outcomes and the replies.

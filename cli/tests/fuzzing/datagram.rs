@@ -1,4 +1,4 @@
-//! Datagrams of the UDP transport and of QUIC.
+//! Datagrams of the UDP transport, of QUIC and of UDT.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -121,6 +121,83 @@ pub(crate) async fn udp(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> 
         sleep(pause).await;
     }
     Some(sent)
+}
+
+/// A packet of UDT to this socket: two words of its own, and the contents.
+fn udt_packet(first: u32, second: u32, to: u32, contents: &[u8]) -> Vec<u8> {
+    let header = [first, second, 0, to];
+    let header: Vec<u8> = header.into_iter().flat_map(u32::to_be_bytes).collect();
+    [&header, contents].concat()
+}
+
+/// The sequence number of the first packet of a UDT connection.
+const UDT_INITIAL: u32 = 7;
+
+/// Returns a handshake of UDT with this request and cookie.
+fn udt_handshake(request: i32, socket: u32, cookie: u32) -> Vec<u8> {
+    let (version, datagrams, max_packet, window) = (4, 2, 1500, 8192);
+    let words = [
+        [version, datagrams, UDT_INITIAL, max_packet],
+        [window, request.cast_unsigned(), socket, cookie],
+        [u32::from_le_bytes([127, 0, 0, 1]), 0, 0, 0],
+    ];
+    let contents = words.concat().into_iter().flat_map(u32::to_be_bytes);
+    udt_packet(1 << 31, 0, 0, &contents.collect::<Vec<u8>>())
+}
+
+/// Opens a UDT connection and sends letters and control packets with mutations. Returns the number
+/// of bytes sent, or `None` if the handshake failed.
+pub(crate) async fn udt(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> {
+    const COOKIE: std::ops::Range<usize> = 44..48;
+    const SOCKET: std::ops::Range<usize> = 40..44;
+    let socket = socket(to).await;
+    let id = writer.random.u32(1..1 << 30);
+    let mut answer = [0; 2048];
+    let mut asked = async |request: Vec<Vec<u8>>, field: std::ops::Range<usize>| {
+        for packet in &request {
+            socket.send(packet).await.ok()?;
+        }
+        let answered = timeout(PATIENCE, socket.recv(&mut answer)).await;
+        let len = answered.ok()?.ok()?;
+        let word = answer[..len].get(field)?;
+        Some(u32::from_be_bytes(word.try_into().ok()?))
+    };
+    let cookie = asked(vec![udt_handshake(1, id, 0)], COOKIE).await?;
+    let mut again = vec![udt_handshake(-1, id, cookie)];
+    if writer.random.u8(..4) == 0 {
+        mutate(writer.random, &mut again);
+    }
+    let peer = asked(again, SOCKET).await?;
+    let packets = writer.udt(peer, UDT_INITIAL);
+    let script = writer.recorded(&packets);
+    let mut sent = 0;
+    for (mut piece, pause) in script.pieces {
+        piece.truncate(60_000);
+        if socket.send(&piece).await.is_ok() {
+            sent += piece.len() as u64;
+        }
+        sleep(pause).await;
+    }
+    Some(sent)
+}
+
+/// Returns a packet of UDT with a part of a message.
+pub(crate) fn udt_data(
+    peer: u32,
+    sequence: u32,
+    (begins, ends): (bool, bool),
+    message: u32,
+    part: &[u8],
+) -> Vec<u8> {
+    let position = u32::from(begins) << 31 | u32::from(ends) << 30;
+    udt_packet(sequence, position | 1 << 29 | message, peer, part)
+}
+
+/// Returns a packet of UDT that controls the connection.
+pub(crate) fn udt_control(peer: u32, kind: u32, number: u32, words: &[u32]) -> Vec<u8> {
+    let contents = words.iter().copied().flat_map(u32::to_be_bytes);
+    let contents: Vec<u8> = contents.collect();
+    udt_packet(1 << 31 | kind << 16, number, peer, &contents)
 }
 
 /// Returns the first datagram of a QUIC connection with this configuration.

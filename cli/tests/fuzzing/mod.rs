@@ -122,6 +122,36 @@ impl Writer<'_> {
         self.script(pieces)
     }
 
+    /// Returns the packets of a UDT connection whose first packet has this number: letters of a
+    /// legacy peer, with other packets between them.
+    pub(crate) fn udt(&mut self, peer: u32, first: u32) -> Vec<Vec<u8>> {
+        let (mut packets, mut sequence) = (Vec::new(), first);
+        for message in 1..=self.random.u32(1..4) {
+            let letter = LEGACY_PEERS[self.random.usize(..LEGACY_PEERS.len())];
+            // libudt fills its packets; other lengths are legal.
+            let parts = letter.chunks(if self.random.bool() { 1456 } else { 100 });
+            let count = parts.len();
+            for (number, part) in parts.enumerate() {
+                let position = (number == 0, number + 1 == count);
+                packets.push(datagram::udt_data(peer, sequence, position, message, part));
+                sequence += 1;
+                if self.random.u8(..4) == 0 {
+                    // Each kind with the words that it may have, and kinds that do not exist.
+                    let kind = self.random.u32(..9);
+                    let number = self.counted() as u32;
+                    let words: Vec<u32> = (0..self.random.usize(..7))
+                        .map(|_| match self.random.bool() {
+                            true => sequence.wrapping_add(self.random.u32(..20)),
+                            false => self.edge() as u32,
+                        })
+                        .collect();
+                    packets.push(datagram::udt_control(peer, kind, number, &words));
+                }
+            }
+        }
+        packets
+    }
+
     /// Returns these recorded pieces, with mutations.
     pub(crate) fn recorded(&mut self, pieces: &[Vec<u8>]) -> Script {
         self.script(pieces.to_vec())

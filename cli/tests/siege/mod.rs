@@ -141,7 +141,8 @@ impl Gateway {
 
     /// Returns the `discovery.static` setting with the locations of this gateway.
     pub(crate) fn known_as(&self, name: &str) -> String {
-        let is_other = |it: &&String| it.starts_with("shm") || it.starts_with("http");
+        let others = ["shm", "http", "udt"];
+        let is_other = |it: &&String| others.iter().any(|other| it.starts_with(other));
         let network = self.locations.iter().filter(|it| !is_other(it));
         let locations: Vec<String> = network.map(|location| format!("{location:?}")).collect();
         format!(
@@ -156,6 +157,8 @@ impl Gateway {
         let found = locations.find_map(|it| it.strip_prefix(kind)?.strip_prefix("://"));
         // An address of HTTP has a path.
         let address = found.unwrap().trim_end_matches("/acc");
+        // That of a legacy peer has a signature.
+        let address = address.split(';').next().unwrap();
         address.parse().unwrap()
     }
 
@@ -229,7 +232,10 @@ impl Pair {
                     format!("security.keys={}", place.join(name).display()),
                     "mts.transports=shm,quic,tcp,http".to_owned(),
                 ]),
-                false => settings.push("mts.transports=shm,udp,tcp,http".to_owned()),
+                false => settings.extend([
+                    "mts.transports=shm,udp,tcp,http,udt".to_owned(),
+                    "transport.udt.listen=127.0.0.1:0".to_owned(),
+                ]),
             }
             settings
         };

@@ -254,7 +254,7 @@ fn stated_entry(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> 
 fn dialect_of(entry: &Entry) -> Dialect {
     match entry.locations.first().map(Location::signature) {
         Some(Signature::FipaServices) => Dialect::FipaServices,
-        Some(Signature::JadeProxy) => Dialect::Jade,
+        Some(signature) if signature.is_jade() => Dialect::Jade,
         _ => Dialect::Standard,
     }
 }

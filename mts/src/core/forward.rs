@@ -15,7 +15,7 @@ use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::link_of;
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
-use super::limits::SenderLimit;
+use super::limits::{Rate, SenderLimit};
 use super::{Core, MAX_DEADLINE, News, Now, own_lane, work};
 use crate::gate::{self, Link};
 use smallvec::smallvec;
@@ -129,9 +129,14 @@ fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(Str
 }
 
 /// Limits the rate at which agents of legacy peers become known by their letters: each is published
-/// to the processes of the host.
+/// to the processes of the host. The agents of a platform have one address and may begin together,
+/// so a burst is larger than the rate.
 pub(super) fn contact_limit() -> SenderLimit {
-    SenderLimit::new(2.0, 20.0, 50.0)
+    SenderLimit::new(
+        Rate::of(2.0),
+        Rate::with_burst(20.0, 128.0),
+        Rate::with_burst(50.0, 256.0),
+    )
 }
 
 impl Core {

@@ -17,8 +17,6 @@ const PER_SENDER: f64 = 20.0;
 const PER_ADDRESS: f64 = 100.0;
 /// Maximum number of failure messages per second to all senders.
 const IN_ALL: f64 = 400.0;
-/// Time after which a token bucket is full again, so that it can be dropped.
-const MEMORY: Duration = Duration::from_secs(1);
 /// Maximum number of addresses with a byte credit.
 const MAX_CREDIT_ADDRESSES: usize = 4096;
 /// Time for which a credit is kept when another address needs the space. Longer than the deadline
@@ -35,26 +33,66 @@ const LOG_EVERY: Duration = Duration::from_secs(1);
 /// The address from which a letter came, if known, and the name of its sender.
 type Sender = (Option<IpAddr>, String);
 
+/// A rate of actions, and the number that may follow each other at once.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rate {
+    per_second: f64,
+    burst: f64,
+}
+
+impl Rate {
+    /// A rate whose burst is the number of one second.
+    pub(super) const fn of(per_second: f64) -> Self {
+        Self::with_burst(per_second, per_second)
+    }
+
+    pub(super) const fn with_burst(per_second: f64, burst: f64) -> Self {
+        Self { per_second, burst }
+    }
+
+    fn full(self, now: Instant) -> TokenBucket {
+        TokenBucket::new(self.burst, now)
+    }
+
+    fn take(self, bucket: &mut TokenBucket, now: Instant) -> bool {
+        bucket.take_of(1.0, self.per_second, self.burst, now)
+    }
+
+    /// A full token bucket from which one token was taken.
+    fn less_one(self, now: Instant) -> TokenBucket {
+        let mut bucket = self.full(now);
+        self.take(&mut bucket, now);
+        bucket
+    }
+
+    /// Time after which a token bucket is full again, so that it can be dropped.
+    fn memory(self) -> Duration {
+        Duration::from_secs_f64(self.burst / self.per_second)
+    }
+}
+
 /// Limits actions for senders: per sender, per address, and in total. A request that exceeds one
 /// rate does not use up the others.
 #[derive(Debug)]
 pub(super) struct SenderLimit {
-    per_sender: f64,
-    per_address: f64,
-    in_all: f64,
+    per_sender: Rate,
+    per_address: Rate,
+    in_all: Rate,
+    /// Time after which the token buckets of a sender and of an address are full again.
+    memory: Duration,
     all: Option<TokenBucket>,
     addresses: Map<IpAddr, TokenBucket>,
     senders: Map<Sender, TokenBucket>,
 }
 
 impl SenderLimit {
-    /// Maximum number of senders, and of addresses. Only granted requests create entries: at most
-    /// twice `in_all` within `MEMORY`.
+    /// Maximum number of senders, and of addresses. Only granted requests create entries: within
+    /// `memory`, at most a burst and the rate of `in_all`, which is less.
     const MAX_ENTRIES: usize = 1024;
 
-    /// Creates a limit with these rates per second.
-    pub(super) fn new(per_sender: f64, per_address: f64, in_all: f64) -> Self {
+    pub(super) fn new(per_sender: Rate, per_address: Rate, in_all: Rate) -> Self {
         Self {
+            memory: per_sender.memory().max(per_address.memory()),
             per_sender,
             per_address,
             in_all,
@@ -67,7 +105,8 @@ impl SenderLimit {
     /// Takes a token; returns whether the action is allowed.
     pub(super) fn take(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
         if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
-            let is_recent = |it: &TokenBucket| now.saturating_duration_since(it.asked()) < MEMORY;
+            let memory = self.memory;
+            let is_recent = |it: &TokenBucket| now.saturating_duration_since(it.asked()) < memory;
             self.senders.retain(|_, allowance| is_recent(allowance));
             self.addresses.retain(|_, allowance| is_recent(allowance));
             if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
@@ -79,27 +118,27 @@ impl SenderLimit {
         // The narrowest first, because a refused request must not use up the wider rates. If the
         // widest refuses, nothing is stored.
         if let Some(known) = self.senders.get_mut(&sender)
-            && !known.take(1.0, self.per_sender, now)
+            && !self.per_sender.take(known, now)
         {
             return false;
         }
         if let Some(known) = address.and_then(|address| self.addresses.get_mut(&address))
-            && !known.take(1.0, self.per_address, now)
+            && !self.per_address.take(known, now)
         {
             return false;
         }
         let in_all = self.in_all;
-        let all = self
-            .all
-            .get_or_insert_with(|| TokenBucket::new(in_all, now));
-        if !all.take(1.0, in_all, now) {
+        if !in_all.take(self.all.get_or_insert_with(|| in_all.full(now)), now) {
             return false;
         }
-        let per_sender = || less_one(self.per_sender, now);
-        self.senders.entry(sender).or_insert_with(per_sender);
+        let less_one = |rate: Rate| move || rate.less_one(now);
+        self.senders
+            .entry(sender)
+            .or_insert_with(less_one(self.per_sender));
         if let Some(address) = address {
-            let per_address = || less_one(self.per_address, now);
-            self.addresses.entry(address).or_insert_with(per_address);
+            self.addresses
+                .entry(address)
+                .or_insert_with(less_one(self.per_address));
         }
         true
     }
@@ -127,7 +166,11 @@ pub(super) struct FailureLimit {
 impl Default for FailureLimit {
     fn default() -> Self {
         Self {
-            limit: SenderLimit::new(PER_SENDER, PER_ADDRESS, IN_ALL),
+            limit: SenderLimit::new(
+                Rate::of(PER_SENDER),
+                Rate::of(PER_ADDRESS),
+                Rate::of(IN_ALL),
+            ),
             credits: Map::default(),
             left_out: 0,
             log_at: None,
@@ -239,13 +282,6 @@ fn host(address: IpAddr) -> IpAddr {
     }
 }
 
-/// A full token bucket from which one token was taken.
-fn less_one(per_second: f64, now: Instant) -> TokenBucket {
-    let mut allowance = TokenBucket::new(per_second, now);
-    allowance.take(1.0, per_second, now);
-    allowance
-}
-
 #[cfg(test)]
 mod tests {
     use std::net::{Ipv4Addr, Ipv6Addr};
@@ -265,7 +301,7 @@ mod tests {
         assert!(limit.allows(now, address(2), "loud"));
         assert_eq!(limit.left_out, 980);
         // A second later everything is allowed again.
-        assert!(limit.allows(now + MEMORY, address(1), "loud"));
+        assert!(limit.allows(now + Duration::from_secs(1), address(1), "loud"));
     }
 
     #[test]

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::escape;
-use fipa_transport::{Conclusion, Location, TransportError, TransportErrorKind};
+use fipa_transport::{Conclusion, Location, Signature, TransportError, TransportErrorKind};
 use socket2::SockRef;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
@@ -92,7 +92,8 @@ impl HttpSender {
             let detail = "no boundary is absent from the letter";
             return Err(not_sent(TransportErrorKind::Inexpressible, &detail));
         };
-        let charset = (!message.is_ascii()).then_some("UTF-8");
+        let is_text = signature != Signature::JadeBitEfficient;
+        let charset = (is_text && !message.is_ascii()).then_some("UTF-8");
         let payload = (message.len(), charset);
         let (head, end) = request::write(&url, &boundary, &envelope, payload, true);
         if let Err(abandoned) = progress.begin() {

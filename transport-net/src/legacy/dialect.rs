@@ -1,7 +1,8 @@
 //! Translation of letters for legacy peers.
 //!
 //! fipa_services gets a bit-efficient envelope and message in its dialect. JADE's proxy agent gets
-//! an XML envelope with the length of the payload, and a string message. Both get the letter with
+//! an XML envelope with the length of the payload, and a string message, or one in the encoding that the
+//! signature names. Both get the letter with
 //! only the receiver it is delivered to.
 
 use bytes::Bytes;
@@ -59,17 +60,27 @@ pub(crate) fn translate(
             let envelope = addressed(envelope, to, AclRepresentation::BitEfficient, length);
             Ok([envelope.encode(representation, dialect)?, message])
         }
-        Signature::JadeProxy => {
+        Signature::JadeProxy | Signature::JadeXml | Signature::JadeBitEfficient => {
+            let (representation, named) = match signature {
+                Signature::JadeXml => (Representation::Xml, AclRepresentation::Xml),
+                Signature::JadeBitEfficient => (
+                    Representation::BitEfficient,
+                    AclRepresentation::BitEfficient,
+                ),
+                _ => (Representation::String, AclRepresentation::String),
+            };
             if message.sender().is_none() {
                 return Err(TranslateError::NoSender);
             }
             let message = with_address(message, here);
-            let message = message.encode(Representation::String, Dialect::Jade)?;
+            let message = message.encode(representation, Dialect::Jade)?;
             // JADE counts characters, in US-ASCII unless the envelope names another encoding.
-            let text = std::str::from_utf8(&message).ok();
+            let is_text = representation != Representation::BitEfficient;
+            let text = std::str::from_utf8(&message).ok().filter(|_| is_text);
             let length = text.map_or(message.len(), |text| text.chars().count()) as u64;
-            let mut envelope = addressed(envelope, to, AclRepresentation::String, length);
-            envelope.base.payload_encoding = (!message.is_ascii()).then(|| "UTF-8".to_owned());
+            let mut envelope = addressed(envelope, to, named, length);
+            let names_charset = is_text && !message.is_ascii();
+            envelope.base.payload_encoding = names_charset.then(|| "UTF-8".to_owned());
             if let (Some(from), Some(here)) = (&mut envelope.base.from, here) {
                 add_address(from, here);
             }
@@ -268,6 +279,41 @@ mod tests {
             assert_eq!(said.content().unwrap(), content);
             assert_eq!(said.conversation_id(), Some("c-1"));
         }
+    }
+
+    #[test]
+    fn jade_gets_messages_in_the_encoding_of_the_signature() {
+        for (signature, representation) in [
+            (Signature::JadeXml, AclRepresentation::Xml),
+            (Signature::JadeBitEfficient, AclRepresentation::BitEfficient),
+        ] {
+            for content in ["hello", "(a \"b\")", "grüß dich"] {
+                let here = Some("http://10.0.0.1:7778/acc");
+                let [envelope, bytes] =
+                    translate(&letter(content), "arm", signature, here).unwrap();
+                assert!(envelope.starts_with(b"<?xml"));
+                let (read, _) = Envelope::decode(&envelope).unwrap();
+                let effective = read.effective();
+                assert_eq!(effective.acl_representation, Some(representation.clone()));
+                let said = Message::decode(&bytes.clone().into()).unwrap();
+                assert_eq!(said.content().unwrap(), content);
+                assert_eq!(said.sender().unwrap().addresses(), [here.unwrap()]);
+                let is_text = signature == Signature::JadeXml;
+                let named = effective.payload_encoding.is_some();
+                assert_eq!(named, is_text && !content.is_ascii());
+                let length = match is_text {
+                    true => String::from_utf8(bytes.to_vec()).unwrap().chars().count(),
+                    false => bytes.len(),
+                };
+                assert_eq!(effective.payload_length, Some(length as u64));
+            }
+        }
+        // JADE's reader of XML inserts blanks at escaped characters.
+        let escaped = letter("a < b");
+        let refused = translate(&escaped, "arm", Signature::JadeXml, None);
+        let fault = refused.unwrap_err().fault();
+        assert_eq!(fault, TransportErrorKind::Inexpressible);
+        assert!(translate(&escaped, "arm", Signature::JadeBitEfficient, None).is_ok());
     }
 
     #[test]

@@ -12,18 +12,26 @@
 //   peer flood ADDRESS PORT COUNT
 //     Sends the message from its standard input COUNT times. Prints "ready" when connected, then the
 //     seconds until all were acknowledged, and the seconds of the processor.
+//   peer echo ADDRESS PORT BACK
+//     Prints "ready PORT", and sends each message back over a connection of its own to the port BACK.
+//   peer ping ADDRESS PORT COUNT
+//     Prints "ready PORT". Reads the port of an echo (4 bytes, little-endian) and a message from its
+//     standard input, sends the message COUNT times, each after the reply to the one before, and prints
+//     the median of the round trips in microseconds.
 //
 // On the standard streams, a message is its length (4 bytes, little-endian) and its bytes.
 
 #include <arpa/inet.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <ctime>
 #include <mutex>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -86,7 +94,8 @@ void receive(UDTSOCKET peer) {
     }
 }
 
-int serve(const char* ip, const char* port) {
+// Prints "ready PORT".
+UDTSOCKET listening(const char* ip, const char* port) {
     const UDTSOCKET server = UDT::socket(AF_INET, SOCK_DGRAM, 0);
     sockaddr_in here = address(ip, port);
     if (UDT::bind(server, reinterpret_cast<sockaddr*>(&here), sizeof here) == UDT::ERROR) {
@@ -101,14 +110,23 @@ int serve(const char* ip, const char* port) {
     }
     std::printf("ready %d\n", ntohs(here.sin_port));
     std::fflush(stdout);
+    return server;
+}
+
+UDTSOCKET accepted(UDTSOCKET server) {
+    sockaddr_in from{};
+    int size = sizeof from;
+    const UDTSOCKET peer = UDT::accept(server, reinterpret_cast<sockaddr*>(&from), &size);
+    if (peer == UDT::INVALID_SOCK) {
+        fail("accept");
+    }
+    return peer;
+}
+
+int serve(const char* ip, const char* port) {
+    const UDTSOCKET server = listening(ip, port);
     for (;;) {
-        sockaddr_in from{};
-        int size = sizeof from;
-        const UDTSOCKET peer = UDT::accept(server, reinterpret_cast<sockaddr*>(&from), &size);
-        if (peer == UDT::INVALID_SOCK) {
-            fail("accept");
-        }
-        std::thread(receive, peer).detach();
+        std::thread(receive, accepted(server)).detach();
     }
 }
 
@@ -118,6 +136,10 @@ UDTSOCKET connected(const char* ip, const char* port) {
     if (UDT::connect(peer, reinterpret_cast<const sockaddr*>(&there), sizeof there) == UDT::ERROR) {
         fail("connect");
     }
+    return peer;
+}
+
+UDTSOCKET announced(UDTSOCKET peer) {
     std::printf("ready\n");
     std::fflush(stdout);
     return peer;
@@ -148,7 +170,7 @@ double seconds(clockid_t clock) {
 }
 
 int flood(const char* ip, const char* port, long count) {
-    const UDTSOCKET peer = connected(ip, port);
+    const UDTSOCKET peer = announced(connected(ip, port));
     std::vector<char> buffer(most);
     const uint32_t length = next(buffer);
     const double begun = seconds(CLOCK_MONOTONIC);
@@ -163,8 +185,53 @@ int flood(const char* ip, const char* port, long count) {
     return 0;
 }
 
+int echo(const char* ip, const char* port, const char* back) {
+    const UDTSOCKET in = accepted(listening(ip, port));
+    const UDTSOCKET out = connected(ip, back);
+    std::vector<char> buffer(most);
+    for (;;) {
+        const int length = UDT::recvmsg(in, buffer.data(), most);
+        if (length == UDT::ERROR) {
+            return 0;
+        }
+        send_one(out, buffer, static_cast<uint32_t>(length));
+    }
+}
+
+int ping(const char* ip, const char* port, long count) {
+    const UDTSOCKET server = listening(ip, port);
+    unsigned char there[4];
+    if (!read_exactly(reinterpret_cast<char*>(there), sizeof there)) {
+        return 2;
+    }
+    const UDTSOCKET out = connected(ip, std::to_string(there[0] | there[1] << 8).c_str());
+    std::vector<char> buffer(most);
+    std::vector<char> reply(most);
+    const uint32_t length = next(buffer);
+    send_one(out, buffer, length);
+    const UDTSOCKET in = accepted(server);
+    std::vector<double> trips;
+    for (long sent = 0; sent <= count; ++sent) {
+        const double begun = seconds(CLOCK_MONOTONIC);
+        if (sent > 0) {
+            send_one(out, buffer, length);
+        }
+        if (UDT::recvmsg(in, reply.data(), most) != static_cast<int>(length)) {
+            fail("recvmsg");
+        }
+        // The first message also waits for the connection of the echo.
+        if (sent > 0) {
+            trips.push_back(seconds(CLOCK_MONOTONIC) - begun);
+        }
+    }
+    std::sort(trips.begin(), trips.end());
+    std::printf("%f\n", trips[trips.size() / 2] * 1e6);
+    std::fflush(stdout);
+    return 0;
+}
+
 int send(const char* ip, const char* port) {
-    const UDTSOCKET peer = connected(ip, port);
+    const UDTSOCKET peer = announced(connected(ip, port));
     std::vector<char> buffer(most);
     while (const uint32_t length = next(buffer)) {
         send_one(peer, buffer, length);
@@ -188,8 +255,11 @@ int main(int argc, char** argv) {
         budget = argc > 4 ? std::atol(argv[4]) : -1;
         return serve(argv[2], argv[3]);
     }
-    const bool floods = std::strcmp(argv[1], "flood") == 0 && argc > 4;
-    const int code = floods ? flood(argv[2], argv[3], std::atol(argv[4])) : send(argv[2], argv[3]);
+    const auto is = [&](const char* what) { return argc > 4 && std::strcmp(argv[1], what) == 0; };
+    const int code = is("flood")  ? flood(argv[2], argv[3], std::atol(argv[4]))
+                     : is("echo") ? echo(argv[2], argv[3], argv[4])
+                     : is("ping") ? ping(argv[2], argv[3], std::atol(argv[4]))
+                                  : send(argv[2], argv[3]);
     UDT::cleanup();
     return code;
 }

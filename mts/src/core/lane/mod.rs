@@ -342,6 +342,12 @@ impl Lane {
                 }
                 break;
             };
+            if self.letters[index].progress.uncertain && !entry.incarnation.is_known() {
+                // An earlier gateway may have sent it, and a legacy peer would take a copy for a new
+                // letter.
+                self.fail(now, index, FailureReason::Unconfirmed, table);
+                continue;
+            }
             match table.choose(now, &entry, &self.letters[index].progress.tried) {
                 Some(route) if self.under_way == 0 || self.route.as_ref() == Some(&route) => {
                     self.dispatch(now, index, route, table);
