@@ -28,6 +28,15 @@ pub struct Agent {
 pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
+    #[cfg(feature = "actions")]
+    pub(crate) actions: crate::action_table::ActionTable,
+}
+
+#[cfg(feature = "actions")]
+impl Drop for AgentCore {
+    fn drop(&mut self) {
+        self.actions.close();
+    }
 }
 
 #[cfg(feature = "monitor")]
@@ -99,6 +108,8 @@ impl Domain {
                     core: Arc::new(AgentCore {
                         endpoint: Endpoint::new(self.clone(), id, name, incarnation),
                         demultiplexer: Demultiplexer::default(),
+                        #[cfg(feature = "actions")]
+                        actions: crate::action_table::ActionTable::default(),
                     }),
                     registered: true,
                 })

@@ -3,6 +3,8 @@
 //! A background thread receives and acknowledges letters while the application does other work. It
 //! sleeps when it has nothing to do.
 
+#[cfg(feature = "actions")]
+pub mod actions;
 #[cfg(feature = "monitor")]
 mod platform;
 #[cfg(feature = "monitor")]

@@ -33,10 +33,15 @@
 //! * [`keys`] (feature `secure`) manages the keys of this host and the certificates of its peers.
 //! * [`platform`] (feature `monitor`) registers and finds services with the directory facilitator of a
 //!   gateway, and lists agents with its agent management system.
+//! * [`actions`] (feature `actions`) are actions that robots offer and other agents invoke.
 //! * [`Gateway`] (feature `net`) is the gateway that `fipa up` runs; robot processes do not need it.
 //!
 //! Not in this crate: delivery (`fipa-mts`), the transports, and terminal output (`fipa-cli`).
 //!
+#![cfg_attr(
+    not(feature = "actions"),
+    doc = "[`actions`]: https://docs.rs/fipa/latest/fipa/actions/index.html"
+)]
 #![cfg_attr(
     not(feature = "net"),
     doc = "[`Gateway`]: https://docs.rs/fipa/latest/fipa/struct.Gateway.html"
@@ -48,6 +53,10 @@
 
 mod access;
 mod access_gate;
+#[cfg(feature = "actions")]
+mod action_table;
+#[cfg(feature = "actions")]
+pub mod actions;
 mod agent;
 mod background;
 pub mod blocking;
