@@ -1,7 +1,8 @@
 //! A child process: a robot that offers an action and never ends it by itself, or a client that invokes an
 //! action of the rover.
 
-use std::process::Command;
+use std::io::{BufRead as _, BufReader};
+use std::process::Stdio;
 
 use fipa::actions::{Action, Execution, Orphans};
 use fipa::config::Sources;
@@ -14,9 +15,16 @@ const ROLE: &str = "FIPA_ACTIONS_ROLE";
 
 /// Starts a process with this role and waits until it is ready.
 pub(crate) fn start(role: &str, set: &[String]) -> ChildGuard {
-    let mut command: Command = ignored_test("process_entry");
+    let mut command = ignored_test("process_entry");
     command.env(ROLE, format!("{role} {}", set.join(" ")));
-    ChildGuard::until_ready(&mut command).0
+    let mut child = ChildGuard::start(command.stdout(Stdio::piped()));
+    let mut lines = BufReader::new(child.child().stdout.take().unwrap()).lines();
+    // The test harness prints lines of its own.
+    let ready = lines.find(|line| line.as_ref().is_ok_and(|line| line.ends_with("ready")));
+    assert!(ready.is_some(), "the process has ended before it was ready");
+    // A closed pipe would end it.
+    std::thread::spawn(move || lines.for_each(drop));
+    child
 }
 
 /// Runs the role of the environment, if there is one.

@@ -1,5 +1,6 @@
 //! `fipa actions`: lists the actions of robots, and the goals that they run.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
@@ -11,6 +12,7 @@ use fipa::protocol::DialogueError;
 use fipa::{Agent, AgentId, Config, Reach, Role};
 use fipa_acl::escape;
 use serde_json::{Value, json};
+use tokio::task::JoinSet;
 
 use super::df::asking;
 use crate::membership;
@@ -59,7 +61,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let found = membership::run(async {
         let domain = membership::join(&config).await?;
         let found = async {
-            let agent = asking(&domain, "actions", &config).await?;
+            let agent = Arc::new(asking(&domain, "actions", &config).await?);
             match &arguments.robot {
                 Some(robot) => {
                     let listed = list(&agent, robot, arguments.goals).await;
@@ -114,9 +116,8 @@ async fn list(agent: &Agent, robot: &AgentId, goals: bool) -> Result<Listed, Act
     }
 }
 
-/// Asks all agents of this host. Those that do not answer in time offer no actions.
-async fn all(agent: &Agent, goals: bool) -> Vec<(String, Listed)> {
-    const PATIENCE: Duration = Duration::from_secs(1);
+/// Asks all agents of this host at the same time. Those that do not answer in time offer no actions.
+async fn all(agent: &Arc<Agent>, goals: bool) -> Vec<(String, Listed)> {
     let directory = agent.domain().directory();
     directory.refresh();
     let entries = directory.entries();
@@ -124,20 +125,27 @@ async fn all(agent: &Agent, goals: bool) -> Vec<(String, Listed)> {
         entry.role == Role::Agent
             && entry.reach == Reach::Local
             && !entry.is_platform_agent()
-            && entry.name != *agent.name()
+            && *entry.name != *agent.name()
     });
-    let mut found = Vec::new();
+    let mut asked = JoinSet::new();
     for name in names.map(|entry| entry.name.to_string()) {
         let Ok(robot) = AgentId::new(&*name) else {
             continue;
         };
-        let listed = tokio::time::timeout(PATIENCE, list(agent, &robot, goals)).await;
-        match listed {
-            Ok(Ok(listed)) => found.push((name, listed)),
-            Ok(Err(error)) => tracing::debug!(agent = %escape(&name), %error, "no actions"),
-            Err(_) => tracing::debug!(agent = %escape(&name), "no answer"),
+        let agent = Arc::clone(agent);
+        asked.spawn(async move { (name, list(&agent, &robot, goals).await) });
+    }
+    let mut found = Vec::new();
+    while let Some(answered) = asked.join_next().await {
+        match answered {
+            Ok((name, Ok(listed))) => found.push((name, listed)),
+            Ok((name, Err(error))) => {
+                tracing::debug!(agent = %escape(&name), %error, "the agent lists no actions");
+            }
+            Err(error) => tracing::debug!(%error, "a question has ended"),
         }
     }
+    found.sort_by(|(one, _), (other, _)| one.cmp(other));
     found
 }
 
@@ -247,7 +255,7 @@ fn goals(robot: &str, all: &[GoalStatus]) -> String {
 }
 
 /// The progress of a goal in one line.
-pub(super) fn progress(goal: &GoalStatus) -> String {
+fn progress(goal: &GoalStatus) -> String {
     let Some(progress) = &goal.progress else {
         return "-".to_owned();
     };
@@ -290,7 +298,7 @@ fn description(action: &ActionDescription) -> Value {
 }
 
 /// The status of a goal as JSON.
-pub(super) fn status(goal: &GoalStatus) -> Value {
+fn status(goal: &GoalStatus) -> Value {
     let progress = goal.progress.as_ref();
     json!({
         "goal": goal.goal,

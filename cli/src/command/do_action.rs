@@ -15,7 +15,7 @@ use fipa_content::{Arguments as TermArguments, FunctionalTerm, Number, Parameter
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
-use super::actions::{failed, progress};
+use super::actions::failed;
 use super::df::asking;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
@@ -27,7 +27,7 @@ const STOP: Duration = Duration::from_secs(15);
 
 /// Let a robot perform an action
 ///
-/// Sends a goal, shows its progress, and prints the result. Ctrl-C cancels the goal and waits until the
+/// Sends a goal, shows its progress on a terminal, and prints the result. Ctrl-C cancels the goal and waits until the
 /// robot has stopped; a second Ctrl-C ends the command at once, and the robot then cancels the goal by
 /// itself.
 #[derive(Debug, Args)]
@@ -190,7 +190,7 @@ fn cancelled(arguments: &Arguments, when: &str) -> Failure {
     )
 }
 
-/// The progress as it is shown: a bar, lines, or JSON.
+/// The progress as it is shown: a bar on a terminal, or JSON.
 struct Shown {
     bar: Option<ProgressBar>,
     as_json: bool,
@@ -229,11 +229,7 @@ impl Shown {
             return output::json_line(&event);
         }
         let Some(bar) = &self.bar else {
-            let line = match &status.progress {
-                Some(_) => progress(status),
-                None => status.state.as_str().to_owned(),
-            };
-            return output::text(&format!("{line}\n"));
+            return Ok(());
         };
         #[expect(
             clippy::cast_possible_truncation,
