@@ -60,7 +60,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
 }
 
 /// Offers the actions of the robot.
-fn offer(crex: &Agent) -> Result<[Offer; 3], Box<dyn std::error::Error>> {
+pub(crate) fn offer(crex: &Agent) -> Result<[Offer; 3], Box<dyn std::error::Error>> {
     let dock = Action::new("dock")
         .described("Drives to a charger and docks")
         .parameter::<Pose>("target", "m, rad; frame crex/base")
@@ -104,7 +104,8 @@ async fn work(run: &Execution, seconds: f64) -> Result<(), String> {
     Ok(())
 }
 
-async fn client(crex: &Robot<'_>) -> Result<(), ActionError> {
+/// Uses the actions of the robot.
+pub(crate) async fn client(crex: &Robot<'_>) -> Result<(), ActionError> {
     for action in crex.actions().await? {
         print(&format!(
             "crex offers {}, result {}",

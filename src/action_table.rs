@@ -20,6 +20,9 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::AbortHandle;
 
+/// Maximum number of subscriptions of one client.
+const MAX_SUBSCRIPTIONS: usize = 256;
+
 /// The result of a goal.
 pub(crate) type Outcome = Result<Option<Term<'static>>, Failure>;
 
@@ -50,6 +53,8 @@ struct State {
     watched: HashMap<u64, watch::Sender<GoalStatus>>,
     /// Number of changes of the status of goals.
     changes: watch::Sender<u64>,
+    /// Number of subscriptions, by client.
+    subscriptions: HashMap<String, usize>,
     /// The servers of the agent, as soon as it offers an action.
     servers: Vec<Box<dyn Any + Send>>,
     timers: Option<AbortHandle>,
@@ -71,6 +76,7 @@ impl Default for State {
             conversation: 0,
             watched: HashMap::new(),
             changes: watch::Sender::new(0),
+            subscriptions: HashMap::new(),
             servers: Vec::new(),
             timers: None,
         }
@@ -121,7 +127,39 @@ impl Drop for Conversation {
     }
 }
 
+/// A subscription of a client, which counts until it is dropped.
+pub(crate) struct Subscribed {
+    table: ActionTable,
+    client: String,
+}
+
+impl Drop for Subscribed {
+    fn drop(&mut self) {
+        let mut state = self.table.0.state.lock();
+        if let Some(count) = state.subscriptions.get_mut(&self.client) {
+            *count -= 1;
+            if *count == 0 {
+                state.subscriptions.remove(&self.client);
+            }
+        }
+    }
+}
+
 impl ActionTable {
+    /// Counts a subscription. Returns `None` if the client has too many.
+    pub(crate) fn subscribe(&self, client: &str) -> Option<Subscribed> {
+        let mut state = self.0.state.lock();
+        let count = state.subscriptions.entry(client.to_owned()).or_default();
+        if *count >= MAX_SUBSCRIPTIONS {
+            return None;
+        }
+        *count += 1;
+        Some(Subscribed {
+            table: self.clone(),
+            client: client.to_owned(),
+        })
+    }
+
     /// Adds an action. Returns whether the agent has no servers yet.
     pub(crate) fn offer(
         &self,

@@ -25,7 +25,7 @@ const MAX_TEXT: usize = 1_024;
 pub struct Limits {
     /// Maximum number of goals that run or wait.
     pub goals: usize,
-    /// The same for one client.
+    /// The same for one client, and for its conversations about them.
     pub goals_of_client: usize,
     /// Maximum number of ended goals that are stored.
     pub ended: usize,
@@ -236,6 +236,8 @@ struct Offer {
 #[derive(Debug, Default)]
 struct Client {
     open: usize,
+    /// Number of conversations about its goals.
+    conversations: usize,
     bytes: usize,
     waiting: usize,
     ended: VecDeque<u64>,
@@ -403,7 +405,8 @@ impl Executor {
             }
         }
         let known = self.clients.get(&client);
-        let (open, waiting) = known.map_or((0, 0), |known| (known.open, known.waiting));
+        let (open, waiting) =
+            known.map_or((0, 0), |it| (it.open.max(it.conversations), it.waiting));
         let limits = &self.limits;
         // The arguments of running goals belong to their handlers.
         let stored = if is_free { 0 } else { size };
@@ -436,6 +439,7 @@ impl Executor {
         self.conversations.insert(conversation, number);
         let counted = self.clients.entry(Arc::clone(&client)).or_default();
         counted.open += 1;
+        counted.conversations += 1;
         counted.bytes += stored;
         counted.waiting += stored;
         self.bytes += stored;
@@ -489,9 +493,13 @@ impl Executor {
                 Ok(false)
             }
             state => {
-                if record.conversations.len() >= MAX_CONVERSATIONS {
+                let client = self.clients.entry(Arc::clone(&record.client)).or_default();
+                if record.conversations.len() >= MAX_CONVERSATIONS
+                    || client.conversations >= self.limits.goals_of_client
+                {
                     return Err(Refusal::TooManyGoals);
                 }
+                client.conversations += 1;
                 let waits = *state == State::Waiting;
                 record.conversations.push(conversation);
                 self.conversations.insert(conversation, goal);
@@ -517,6 +525,9 @@ impl Executor {
             return;
         };
         record.conversations.retain(|known| *known != conversation);
+        if let Some(client) = self.clients.get_mut(&record.client) {
+            client.conversations = client.conversations.saturating_sub(1);
+        }
         let offer = self.offers.get(&record.action);
         let orphans = offer.map_or(Orphans::Cancel, |offer| offer.options.orphans);
         if record.conversations.is_empty() && orphans == Orphans::Cancel {
@@ -752,7 +763,9 @@ impl Executor {
         let Some(record) = self.goals.get_mut(&goal) else {
             return;
         };
-        for conversation in std::mem::take(&mut record.conversations) {
+        let conversations = std::mem::take(&mut record.conversations);
+        let told = conversations.len();
+        for conversation in conversations {
             self.conversations.remove(&conversation);
             let outcome = outcome.clone();
             self.outputs.push_back(Output::Finish {
@@ -770,6 +783,7 @@ impl Executor {
         };
         let client = self.clients.entry(Arc::clone(&record.client)).or_default();
         client.open = client.open.saturating_sub(1);
+        client.conversations = client.conversations.saturating_sub(told);
         client.bytes -= waited;
         client.waiting -= waited;
         self.bytes -= waited;

@@ -353,6 +353,34 @@ fn descriptions_that_cannot_be_met_are_not_offered() {
     assert_eq!(refused, Err(OfferRefused::Default("speed".to_owned())));
 }
 
+#[test]
+fn a_client_that_repeats_its_goals_takes_no_more_conversations_than_goals() {
+    let limits = Limits {
+        goals_of_client: 5,
+        ..Limits::default()
+    };
+    let mut executor = Executor::new(limits);
+    let options = OfferOptions {
+        concurrency: 10,
+        ..OfferOptions::default()
+    };
+    let drive = action("drive", Policy::Reject);
+    executor.offer(drive, options).unwrap();
+    let mut accepted = 0;
+    for conversation in 0..20 {
+        let id = (conversation / 3).to_string();
+        let request = executor.request(0, conversation, "rover", &id, goal(""));
+        accepted += u32::from(request.is_ok());
+    }
+    assert_eq!(accepted, 5);
+    let other = executor.request(0, 50, "arm", "a", goal(""));
+    assert_eq!(other, Ok(false));
+    // A conversation that ends makes room for another one.
+    executor.gone(1, 0);
+    let again = executor.request(1, 60, "rover", "0", goal(""));
+    assert_eq!(again, Ok(false));
+}
+
 /// A client with many names, ids and large values stays within the bounds, and does not evict the goals
 /// of another client.
 #[test]

@@ -5,7 +5,7 @@
 use fipa_acl::AgentId;
 use fipa_actions::{
     ActionDescription, Answer, Ask, Executor, Failure, Goal, GoalState, Json, Language, Limits,
-    OfferOptions, Output, ParameterDescription, Policy, Progress, Refusal, Sl, Type, language,
+    OfferOptions, ParameterDescription, Policy, Progress, Refusal, Sl, Type, language,
 };
 use fipa_content::Term;
 
@@ -109,7 +109,7 @@ fn status() -> Vec<fipa_actions::GoalStatus> {
     executor.progress(5, numbers[0], Progress::fraction(0.5).note("half"));
     executor.progress(5, numbers[0], Progress::default());
     executor.cancel(6, 3);
-    while executor.poll_output() != None::<Output> {}
+    while executor.poll_output().is_some() {}
     let all = numbers
         .iter()
         .map(|number| executor.status_of(9, *number).unwrap());

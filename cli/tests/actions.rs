@@ -2,6 +2,7 @@
 //! its own.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![expect(clippy::print_stdout, reason = "the parent process reads it")]
 
 mod common;
 

@@ -217,9 +217,12 @@ impl Side {
             Ok(_) => return self.refuse_unread(Refusal::Malformed("the content language".into())),
             Err(reason) => return self.refuse_unread(reason),
         };
+        let Some(_subscribed) = self.table.subscribe(&self.client) else {
+            return self.refuse(&ask, Refusal::TooManyGoals);
+        };
         match &ask {
             Ask::StatusOf(id) => match self.table.watch(&self.client, id) {
-                None => return self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
+                None => self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
                 Some(mut status) => {
                     if task.agree("").await.is_err() {
                         return Reply::Nothing;

@@ -2,6 +2,9 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+#[path = "../../examples/actions.rs"]
+#[allow(dead_code, reason = "the test has a domain of its own")]
+mod example;
 mod process;
 #[path = "../support/mod.rs"]
 mod support;
@@ -15,7 +18,7 @@ use fipa::actions::{
     Policy, Progress, Refusal, Type,
 };
 use fipa::protocol::DialogueError;
-use fipa::{AgentId, Domain, Performative};
+use fipa::{AgentId, Domain, FailureReason, Performative};
 use fipa_testbed::until_async;
 use process::{endless, forever};
 use serde::{Deserialize, Serialize};
@@ -453,6 +456,58 @@ async fn the_goal_of_a_killed_client_is_cancelled_unless_the_action_says_otherwi
     assert_eq!(stopped.available_permits(), 0);
     offers.clear();
     until_async("the orphan stops", || stopped.available_permits() == 1).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn access_rules_can_name_actions() {
+    let host = host();
+    let lax = Domain::open(&load(host.clone())).await.unwrap();
+    let rules = "access.deny={ \"rover\" = [\"crex action=drive\"] }".to_owned();
+    let strict = load(host.into_iter().chain([rules]));
+    let strict = Domain::open(&strict).await.unwrap();
+    let robot = strict.register("crex").await.unwrap();
+    let runs = Arc::new(AtomicUsize::new(0));
+    let mut offers = Vec::new();
+    for name in ["drive", "stop"] {
+        let runs = Arc::clone(&runs);
+        let offered = robot.offer(Action::new(name), move |(): (), _: Execution| {
+            runs.fetch_add(1, Ordering::Relaxed);
+            async { Ok::<(), String>(()) }
+        });
+        offers.push(offered.unwrap());
+    }
+    let (rover, arm) = (
+        lax.register("rover").await.unwrap(),
+        lax.register("arm").await.unwrap(),
+    );
+    for from in [rover.robot(crex()), rover.robot(crex()).in_json()] {
+        let denied = from.invoke("drive", &()).await;
+        assert!(
+            matches!(
+                denied,
+                Err(ActionError::Dialogue(DialogueError::NotDelivered {
+                    reason: FailureReason::Refused,
+                    ..
+                }))
+            ),
+            "{denied:?}"
+        );
+        let stop = from.invoke("stop", &()).await.unwrap();
+        stop.result::<()>().await.unwrap();
+    }
+    let other = arm.robot(crex()).invoke("drive", &()).await.unwrap();
+    other.result::<()>().await.unwrap();
+    assert_eq!(runs.load(Ordering::Relaxed), 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_example_works() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let offers = example::offer(&robot).unwrap();
+    assert_eq!(offers.len(), 3);
+    let rover = there.register("rover").await.unwrap();
+    example::client(&rover.robot(crex())).await.unwrap();
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! A child process: a robot that offers an action and never ends it by itself, or a client that invokes an
 //! action of the rover.
 
+#![expect(clippy::print_stdout, reason = "the parent process reads it")]
+
 use std::io::{BufRead as _, BufReader};
 use std::process::Stdio;
 
