@@ -1,5 +1,5 @@
-//! The rules of `[access]`, which decide about letters by their sender, receiver, performative and
-//! protocol, and the rate limit of senders.
+//! The rules of `[access]`, which decide about letters by their sender, receiver, performative,
+//! protocol, ontology and action, and the rate limit of senders.
 //!
 //! A deny rule takes precedence over all allow rules. If there are allow rules, a letter that
 //! matches none of them is refused. This module does no I/O: it takes the facts of a letter and
@@ -30,6 +30,9 @@ pub(crate) struct LetterFacts<'a> {
     pub(crate) receiver: &'a str,
     pub(crate) performative: &'a str,
     pub(crate) protocol: Option<&'a str>,
+    pub(crate) ontology: Option<&'a str>,
+    /// The action of a goal for a robot.
+    pub(crate) action: Option<&'a str>,
 }
 
 /// The reason why a letter is refused.
@@ -90,6 +93,10 @@ struct Rule {
     performatives: Vec<String>,
     /// The protocols to which the rule applies; if empty, all.
     protocols: Vec<String>,
+    /// The ontologies to which the rule applies; if empty, all.
+    ontologies: Vec<String>,
+    /// The actions to which the rule applies; if empty, all letters.
+    actions: Vec<String>,
 }
 
 /// The rate of one sender.
@@ -119,6 +126,13 @@ impl Access {
             rate: (rate > 0).then_some(rate as f64),
             senders: Senders::default(),
         }))
+    }
+
+    /// Whether a rule names an action.
+    #[cfg(feature = "actions")]
+    pub(crate) fn names_actions(&self) -> bool {
+        let mut rules = self.deny.iter().chain(&self.allow);
+        rules.any(|rule| !rule.actions.is_empty())
     }
 
     /// Checks a letter against the rules.
@@ -239,7 +253,7 @@ fn is_over(since: Instant, now: Instant) -> bool {
 }
 
 impl Rule {
-    /// Parses `RECEIVER [performative=NAME,…] [protocol=NAME,…]`.
+    /// Parses `RECEIVER [performative=NAME,…] [protocol=NAME,…] [ontology=NAME,…] [action=NAME,…]`.
     fn parse(sender: &str, receiver: &str) -> Result<Self, RuleError> {
         let matcher = |text: &str| {
             Matcher::parse(text).map_err(|error| {
@@ -260,11 +274,19 @@ impl Rule {
             receiver: matcher(name)?,
             performatives: Vec::new(),
             protocols: Vec::new(),
+            ontologies: Vec::new(),
+            actions: Vec::new(),
         };
         for word in words {
             let (list, names) = match word.split_once('=') {
                 Some(("performative", names)) => (&mut rule.performatives, names),
                 Some(("protocol", names)) => (&mut rule.protocols, names),
+                Some(("ontology", names)) => (&mut rule.ontologies, names),
+                Some(("action", names)) if cfg!(feature = "actions") => (&mut rule.actions, names),
+                Some(("action", _)) => {
+                    let problem = "names an action, which needs the feature `actions`";
+                    return Err(RuleError(problem.to_owned()));
+                }
                 _ => return Err(RuleError(format!("has {word:?} behind a receiver"))),
             };
             list.extend(names.split(',').map(str::to_owned));
@@ -285,6 +307,11 @@ impl Rule {
             && self.receiver.matches(facts.receiver)
             && among(&self.performatives, Some(facts.performative))
             && among(&self.protocols, facts.protocol)
+            && among(&self.ontologies, facts.ontology)
+            && (self.actions.is_empty()
+                || facts
+                    .action
+                    .is_some_and(|action| self.actions.iter().any(|it| it == action)))
     }
 }
 
@@ -336,6 +363,8 @@ mod tests {
             receiver,
             performative: "inform",
             protocol: None,
+            ontology: None,
+            action: None,
         }
     }
 
@@ -365,6 +394,42 @@ mod tests {
             let facts = LetterFacts {
                 performative,
                 protocol,
+                ..facts("rover", "arm")
+            };
+            assert_eq!(access.judge(&facts).is_ok(), passes, "{facts:?}");
+        }
+    }
+
+    #[test]
+    fn a_rule_can_be_about_some_ontologies_only() {
+        let access = access(&[], &[(".*", &["arm ontology=fipa-robot-actions"])], 0);
+        for (ontology, passes) in [
+            (Some("fipa-robot-actions"), true),
+            (Some("other"), false),
+            (None, false),
+        ] {
+            let facts = LetterFacts {
+                ontology,
+                ..facts("rover", "arm")
+            };
+            assert_eq!(access.judge(&facts).is_ok(), passes, "{facts:?}");
+        }
+    }
+
+    #[cfg(feature = "actions")]
+    #[test]
+    fn a_rule_can_be_about_some_actions_only() {
+        let deny = ["arm action=lift,drop"];
+        let access = access(&[(".*", &deny)], &[], 0);
+        assert!(access.names_actions());
+        for (action, passes) in [
+            (Some("lift"), false),
+            (Some("drop"), false),
+            (Some("wave"), true),
+            (None, true),
+        ] {
+            let facts = LetterFacts {
+                action,
                 ..facts("rover", "arm")
             };
             assert_eq!(access.judge(&facts).is_ok(), passes, "{facts:?}");

@@ -20,6 +20,9 @@ const AUDIT: &str = "fipa::audit";
 pub(crate) struct RulesGate {
     access: Mutex<Access>,
     of: Of,
+    /// Whether a rule names an action, so that contents are read.
+    #[cfg(feature = "actions")]
+    names_actions: bool,
 }
 
 /// The owner of a gate.
@@ -36,6 +39,8 @@ pub(crate) enum Of {
 impl RulesGate {
     pub(crate) fn new(access: Access, of: Of) -> Self {
         Self {
+            #[cfg(feature = "actions")]
+            names_actions: access.names_actions(),
             access: Mutex::new(access),
             of,
         }
@@ -63,11 +68,16 @@ impl RulesGate {
         let performative = message.performative_name();
         let protocol = message.protocol();
         let protocol = protocol.as_ref().map(|text| text.as_str());
+        let ontology = message.ontology();
+        let ontology = ontology.as_ref().map(|text| text.as_str());
+        let action = self.action(&message);
         let facts = LetterFacts {
             sender,
             receiver,
             performative: &performative.as_str(),
             protocol: protocol.as_deref(),
+            ontology: ontology.as_deref(),
+            action: action.as_deref(),
         };
         let is_stamped = view.stamps().next().is_some();
         let judge = |gateway: Option<Arc<Entry>>| match gateway {
@@ -91,6 +101,28 @@ impl RulesGate {
                 None => Err(refusal.into()),
             }
         })
+    }
+
+    /// Returns the action of a goal for a robot, if a rule names actions. The content is read as the
+    /// robot reads it, so that no other notation evades a rule.
+    #[cfg(feature = "actions")]
+    fn action(&self, message: &MessageView<'_>) -> Option<String> {
+        if !self.names_actions {
+            return None;
+        }
+        let content = message.content();
+        let content = content.filter(|content| content.len() <= fipa_actions::MAX_CONTENT)?;
+        let language = message.language();
+        let language = language.as_ref().map(|text| text.as_str());
+        match fipa_actions::language(language.as_deref())?.read_ask(&content) {
+            Ok((_, fipa_actions::Ask::Goal(goal))) => Some(goal.action),
+            _ => None,
+        }
+    }
+
+    #[cfg(not(feature = "actions"))]
+    fn action(&self, _message: &MessageView<'_>) -> Option<String> {
+        None
     }
 
     /// Returns the entry of the gateway of this host if the directory shows the gateway at the

@@ -43,6 +43,15 @@ struct RegistrationGuard {
 pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
+    #[cfg(feature = "actions")]
+    pub(crate) actions: crate::action_table::ActionTable,
+}
+
+#[cfg(feature = "actions")]
+impl Drop for AgentCore {
+    fn drop(&mut self) {
+        self.actions.close();
+    }
 }
 
 #[cfg(feature = "monitor")]
@@ -113,6 +122,8 @@ impl Domain {
                 let core = Arc::new(AgentCore {
                     endpoint: Endpoint::new(self.clone(), id, name, incarnation),
                     demultiplexer: Demultiplexer::default(),
+                    #[cfg(feature = "actions")]
+                    actions: crate::action_table::ActionTable::default(),
                 });
                 let registration = Arc::new(RegistrationGuard {
                     core: Arc::clone(&core),

@@ -18,6 +18,8 @@
 //! The calls also work on a thread of a tokio runtime, for example in a function that asynchronous code
 //! calls. They block that thread; other tasks on it wait until the call returns.
 
+#[cfg(feature = "actions")]
+pub mod actions;
 #[cfg(feature = "monitor")]
 mod platform;
 #[cfg(feature = "monitor")]

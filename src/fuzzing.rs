@@ -63,6 +63,8 @@ impl Access {
             receiver,
             performative,
             protocol,
+            ontology: None,
+            action: None,
         };
         self.0.judge(&facts).is_ok()
     }

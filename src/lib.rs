@@ -58,6 +58,9 @@
 //! [`Agent::subscribe`] notify many agents. `monitor.check = "enforce"` checks all messages of a process
 //! against the protocols.
 //!
+//! [`Agent::offer`] (feature `actions`) offers an action of a robot, and [`Agent::robot`] lists and invokes
+//! those of another ([`actions`]).
+//!
 //! # Find
 //!
 //! [`Domain::agents`] and [`Domain::agents_of_type`] list the agents, [`Domain::changes`] is a stream of
@@ -83,6 +86,10 @@
 //! other crates: delivery, transports and protocols.
 //!
 #![cfg_attr(
+    not(feature = "actions"),
+    doc = "[`actions`]: https://docs.rs/fipa/latest/fipa/actions/index.html"
+)]
+#![cfg_attr(
     not(feature = "net"),
     doc = "[`Gateway`]: https://docs.rs/fipa/latest/fipa/struct.Gateway.html"
 )]
@@ -93,6 +100,10 @@
 
 mod access;
 mod access_gate;
+#[cfg(feature = "actions")]
+mod action_table;
+#[cfg(feature = "actions")]
+pub mod actions;
 mod agent;
 mod background;
 pub mod blocking;

@@ -17,6 +17,8 @@
 
 #[path = "../fuzz/src/access.rs"]
 mod access;
+#[path = "../fuzz/src/actions.rs"]
+mod actions;
 #[path = "../fuzz/src/config.rs"]
 mod config;
 #[path = "../fuzz/src/datagrams.rs"]
@@ -118,7 +120,7 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, config, datagrams, delivery, exchange, framed, host, http, mdns, platform,
+        access, actions, config, datagrams, delivery, exchange, framed, host, http, mdns, platform,
         recording, shm, texts, udt
     );
 

@@ -1,5 +1,6 @@
 //! The commands, one file each: its arguments with their help, and `run`.
 
+mod actions;
 mod agents;
 mod ams;
 #[cfg(feature = "bench")]
@@ -11,6 +12,7 @@ mod content;
 mod decode;
 mod demo;
 mod df;
+mod do_action;
 mod doctor;
 mod echo;
 mod encode;
@@ -45,6 +47,8 @@ pub(crate) enum Command {
     Coalition(coalition::Arguments),
     Df(df::Arguments),
     Ams(ams::Arguments),
+    Actions(actions::Arguments),
+    Do(do_action::Arguments),
     Routes(routes::Arguments),
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
@@ -75,6 +79,8 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Coalition(arguments) => coalition::run(arguments, global),
         Command::Df(arguments) => df::run(arguments, global),
         Command::Ams(arguments) => ams::run(arguments, global),
+        Command::Actions(arguments) => actions::run(arguments, global),
+        Command::Do(arguments) => do_action::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),

@@ -1,6 +1,7 @@
 //! Checks that several fuzz targets share.
 
 pub mod access;
+pub mod actions;
 pub mod config;
 pub mod datagrams;
 pub mod delivery;

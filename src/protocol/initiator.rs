@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 
+#[cfg(feature = "actions")]
+use super::dialogue::DialogueState;
 use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
 use super::reachability::Reachability;
 use super::receivers::single;
@@ -175,9 +177,17 @@ impl Request {
     /// # Errors
     /// If the other side refuses, fails, is gone, or does not answer in time.
     pub async fn result(mut self) -> Result<Message, DialogueError> {
+        self.finished().await
+    }
+
+    /// Waits for the result like [`result`](Self::result). Dropping the future loses no message.
+    pub(crate) async fn finished(&mut self) -> Result<Message, DialogueError> {
         self.agreed().await?;
         if let Some(early) = self.early.take() {
-            return Ok(early);
+            return match early.performative() {
+                Performative::Failure => Err(DialogueError::Failed(Box::new(early))),
+                _ => Ok(early),
+            };
         }
         let message = self.dialogue.receive(self.due).await?.message;
         match message.performative() {
@@ -193,5 +203,29 @@ impl Request {
     /// `patience`.
     pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
         self.dialogue.cancel(self.receivers, after(patience)).await
+    }
+
+    /// Cancels like [`cancel`](Self::cancel), and returns whether the other side has cancelled.
+    /// Otherwise the request has ended or goes on, and [`finished`](Self::finished) returns its result.
+    #[cfg(feature = "actions")]
+    pub(crate) async fn stop(&mut self, patience: Duration) -> Result<bool, DialogueError> {
+        if self.early.is_some() {
+            return Ok(false);
+        }
+        let due = after(patience);
+        let cancel = self.dialogue.agent().message(Performative::Cancel);
+        let cancel = cancel.receivers(self.receivers.clone());
+        only_delivered(&self.dialogue.send(cancel, due).await?)?;
+        let crossed = match self.dialogue.receive(due).await {
+            Ok(answer) if answer.meaning.state == DialogueState::Cancelled => return Ok(true),
+            // The other side does not cancel.
+            Ok(answer) if !answer.meaning.over => return Ok(false),
+            Ok(answer) => answer.message,
+            // The result crossed the cancel.
+            Err(DialogueError::Cancelled(message)) => *message,
+            Err(error) => return Err(error),
+        };
+        self.early = Some(crossed);
+        Ok(false)
     }
 }

@@ -69,6 +69,8 @@ pub use proxied::Proxied;
 pub use publisher::Publisher;
 pub use reachability::{Reachability, Unreachable};
 pub use serving::Server;
+#[cfg(feature = "actions")]
+pub(crate) use serving::serve_those;
 pub use subscription::Subscription;
 pub use watching::PartnerWatch;
 

@@ -447,6 +447,18 @@ impl Task {
         Ok(Reply::Nothing)
     }
 
+    /// Answers a cancel of the initiator with `failure`: the conversation goes on.
+    #[cfg(feature = "actions")]
+    pub(crate) async fn fail_cancel(
+        &mut self,
+        content: impl Into<Bytes>,
+    ) -> Result<(), DialogueError> {
+        self.send(Performative::Failure, content).await?;
+        // The result answers the request, not the cancel.
+        self.last = self.first.clone();
+        Ok(())
+    }
+
     /// Sends the last message of the participant.
     ///
     /// # Errors

@@ -52,16 +52,31 @@ impl Agent {
         F: Future<Output = Result<Reply, E>> + Send + 'static,
         E: Display + Send + 'static,
     {
-        let opens = opening(&self.core, protocol, |_| true)?;
-        let runtime = Handle::try_current().map_err(|_| DialogueError::NoRuntime)?;
-        let running = Arc::new(AtomicUsize::new(0));
-        let queue = ServedQueue::new(&self.core, opens);
-        let run = run(queue, handler, Arc::clone(&running));
-        Ok(Server {
-            task: runtime.spawn(run),
-            running,
-        })
+        serve_those(&self.core, protocol, |_| true, handler)
     }
+}
+
+/// Serves the conversations of a protocol whose first message meets a condition; see [`Agent::serve`].
+pub(crate) fn serve_those<H, F, E>(
+    core: &Arc<AgentCore>,
+    protocol: &str,
+    also: impl Fn(&Message) -> bool + Send + Sync + 'static,
+    handler: H,
+) -> Result<Server, DialogueError>
+where
+    H: Fn(Task) -> F + Send + Sync + 'static,
+    F: Future<Output = Result<Reply, E>> + Send + 'static,
+    E: Display + Send + 'static,
+{
+    let opens = opening(core, protocol, also)?;
+    let runtime = Handle::try_current().map_err(|_| DialogueError::NoRuntime)?;
+    let running = Arc::new(AtomicUsize::new(0));
+    let queue = ServedQueue::new(core, opens);
+    let run = run(queue, handler, Arc::clone(&running));
+    Ok(Server {
+        task: runtime.spawn(run),
+        running,
+    })
 }
 
 /// A running server; see [`Agent::serve`]. Dropping it ends the acceptance of further conversations.

@@ -235,6 +235,7 @@ impl PartnerWatch {
                 let AgentCore {
                     endpoint,
                     demultiplexer,
+                    ..
                 } = &*self.core;
                 demultiplexer.now_of(endpoint, &questions.key)
             }

@@ -1,0 +1,257 @@
+//! The ontology in JSON (RFC 8259).
+
+use std::borrow::Cow;
+
+use fipa_acl::AgentId;
+use fipa_content::{Arguments, FunctionalTerm, Number, Parameter, Term};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use crate::description::ActionDescription;
+use crate::language::{Language, LanguageError};
+use crate::message::{Answer, Ask, Failure, Goal, GoalStatus, Refusal};
+use crate::types::OBJECT;
+
+/// The key of the function symbol of an object.
+const SYMBOL: &str = "@";
+
+/// The key of arguments by position.
+const ARGUMENTS: &str = "@arguments";
+
+/// JSON: `json`.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Json;
+
+#[derive(Serialize, Deserialize)]
+struct JsonAsk {
+    agent: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    goal: Option<JsonGoal>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    query: Option<JsonQuery>,
+    /// The goal that a query for the status is about.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    of: Option<String>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct JsonGoal {
+    action: String,
+    #[serde(default)]
+    arguments: Map<String, Value>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    id: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    deadline: Option<u64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    fence: Option<String>,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum JsonQuery {
+    Actions,
+    Status,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum JsonAnswer {
+    Agreed(String),
+    Done,
+    Result(Value),
+    Refused(Refusal),
+    Failed(Failure),
+    Actions(Vec<ActionDescription>),
+    Status(Vec<GoalStatus>),
+}
+
+impl Language for Json {
+    fn name(&self) -> &'static str {
+        "json"
+    }
+
+    fn write_ask(&self, robot: &AgentId, ask: &Ask) -> Result<Vec<u8>, LanguageError> {
+        let mut json = JsonAsk {
+            agent: robot.name().to_owned(),
+            goal: None,
+            query: None,
+            of: None,
+        };
+        match ask {
+            Ask::Goal(goal) => {
+                json.goal = Some(JsonGoal {
+                    action: goal.action.clone(),
+                    arguments: object(&goal.arguments)?,
+                    id: goal.id.clone(),
+                    deadline: goal.deadline,
+                    fence: goal.fence.clone(),
+                });
+            }
+            Ask::Actions => json.query = Some(JsonQuery::Actions),
+            Ask::Status => json.query = Some(JsonQuery::Status),
+            Ask::StatusOf(id) => {
+                json.query = Some(JsonQuery::Status);
+                json.of = Some(id.clone());
+            }
+        }
+        Ok(serde_json::to_vec(&json)?)
+    }
+
+    fn read_ask(&self, bytes: &[u8]) -> Result<(String, Ask), LanguageError> {
+        let json: JsonAsk = serde_json::from_slice(bytes)?;
+        let ask = match (json.goal, json.query, json.of) {
+            (Some(goal), None, None) => Ask::Goal(Goal {
+                action: goal.action,
+                arguments: parameters(goal.arguments)?,
+                id: goal.id,
+                deadline: goal.deadline,
+                fence: goal.fence,
+            }),
+            (None, Some(JsonQuery::Actions), None) => Ask::Actions,
+            (None, Some(JsonQuery::Status), None) => Ask::Status,
+            (None, Some(JsonQuery::Status), Some(id)) => Ask::StatusOf(id),
+            _ => return Err(LanguageError::Form("either a goal or a query")),
+        };
+        Ok((json.agent, ask))
+    }
+
+    fn write_answer(
+        &self,
+        _robot: &AgentId,
+        _to: &Ask,
+        answer: &Answer,
+    ) -> Result<Vec<u8>, LanguageError> {
+        let json = match answer.clone() {
+            Answer::Agreed { queued } => {
+                JsonAnswer::Agreed(if queued { "queued" } else { "executing" }.to_owned())
+            }
+            Answer::Done(None) => JsonAnswer::Done,
+            Answer::Done(Some(value)) => JsonAnswer::Result(json(&value)?),
+            Answer::Refused(reason) => JsonAnswer::Refused(reason),
+            Answer::Failed(reason) => JsonAnswer::Failed(reason),
+            Answer::Actions(all) => JsonAnswer::Actions(all),
+            Answer::Status(all) => JsonAnswer::Status(all),
+        };
+        Ok(serde_json::to_vec(&json)?)
+    }
+
+    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<Answer, LanguageError> {
+        match (serde_json::from_slice(bytes)?, to) {
+            (JsonAnswer::Agreed(state), Ask::Goal(_)) => {
+                let queued = state == "queued";
+                Ok(Answer::Agreed { queued })
+            }
+            (JsonAnswer::Done, Ask::Goal(_)) => Ok(Answer::Done(None)),
+            (JsonAnswer::Result(value), Ask::Goal(_)) => Ok(Answer::Done(Some(term(value)?))),
+            (JsonAnswer::Actions(all), Ask::Actions) => Ok(Answer::Actions(all)),
+            (JsonAnswer::Status(all), Ask::Status | Ask::StatusOf(_)) => Ok(Answer::Status(all)),
+            _ => Err(LanguageError::Form("an answer to this message")),
+        }
+    }
+
+    fn read_rejection(&self, is_refusal: bool, bytes: &[u8]) -> Result<Answer, LanguageError> {
+        match (serde_json::from_slice(bytes)?, is_refusal) {
+            (JsonAnswer::Refused(reason), true) => Ok(Answer::Refused(reason)),
+            (JsonAnswer::Failed(reason), false) => Ok(Answer::Failed(reason)),
+            _ => Err(LanguageError::Form("a refusal or a failure")),
+        }
+    }
+}
+
+fn object(parameters: &[Parameter<'_>]) -> Result<Map<String, Value>, LanguageError> {
+    let parameters = parameters.iter();
+    let pairs = parameters.map(|it| match &*it.name {
+        SYMBOL | ARGUMENTS => Err(LanguageError::NoNotation("a parameter of this name")),
+        name => Ok((name.to_owned(), json(&it.value)?)),
+    });
+    pairs.collect()
+}
+
+/// Writes a term as JSON.
+fn json(term: &Term<'_>) -> Result<Value, LanguageError> {
+    Ok(match term {
+        Term::Boolean(truth) => Value::Bool(*truth),
+        Term::String(text) => Value::String(text.to_string()),
+        Term::DateTime(time) => Value::String(time.to_string()),
+        Term::Number(number) => {
+            let integer = number.is_integer();
+            let integer = integer.then(|| {
+                number
+                    .as_i64()
+                    .map(Value::from)
+                    .or(number.as_u64().map(Value::from))
+            });
+            let value = integer
+                .flatten()
+                .or_else(|| number.as_f64().map(Value::from));
+            value.ok_or(LanguageError::NoNotation("a number of this size"))?
+        }
+        Term::Sequence(elements) | Term::Set(elements) => {
+            Value::Array(elements.iter().map(json).collect::<Result<_, _>>()?)
+        }
+        Term::Functional(functional) => {
+            let mut object = match &functional.arguments {
+                Arguments::Parameters(parameters) => object(parameters)?,
+                Arguments::Terms(terms) if terms.is_empty() => Map::new(),
+                Arguments::Terms(terms) => {
+                    let terms = terms.iter().map(json).collect::<Result<_, _>>()?;
+                    Map::from_iter([(ARGUMENTS.to_owned(), Value::Array(terms))])
+                }
+            };
+            if functional.symbol != OBJECT {
+                let symbol = Value::String(functional.symbol.to_string());
+                object.insert(SYMBOL.to_owned(), symbol);
+            }
+            Value::Object(object)
+        }
+        _ => return Err(LanguageError::NoNotation("an expression of this kind")),
+    })
+}
+
+/// Reads a term from JSON. Objects without a symbol get that of the described type.
+fn term(value: Value) -> Result<Term<'static>, LanguageError> {
+    Ok(match value {
+        Value::Bool(truth) => Term::Boolean(truth),
+        Value::String(text) => Term::String(Cow::Owned(text)),
+        Value::Number(number) => {
+            let number = Number::new(number.to_string());
+            Term::Number(number.ok_or(LanguageError::Form("a number"))?)
+        }
+        Value::Array(elements) => {
+            Term::Sequence(elements.into_iter().map(term).collect::<Result<_, _>>()?)
+        }
+        Value::Object(mut object) => {
+            let symbol = match object.remove(SYMBOL) {
+                Some(Value::String(symbol)) => Cow::Owned(symbol),
+                Some(_) => return Err(LanguageError::Form("a symbol in \"@\"")),
+                None => Cow::Borrowed(OBJECT),
+            };
+            let arguments = match object.remove(ARGUMENTS) {
+                Some(Value::Array(terms)) if object.is_empty() => {
+                    let terms = terms.into_iter().map(term);
+                    Arguments::Terms(terms.collect::<Result<_, _>>()?)
+                }
+                Some(_) => return Err(LanguageError::Form("arguments in \"@arguments\"")),
+                None => match parameters(object)? {
+                    none if none.is_empty() => Arguments::Terms(Vec::new()),
+                    parameters => Arguments::Parameters(parameters),
+                },
+            };
+            Term::Functional(FunctionalTerm { symbol, arguments })
+        }
+        Value::Null => return Err(LanguageError::Form("a value in the place of null")),
+    })
+}
+
+/// Reads the members of an object. A member that is null is left out.
+fn parameters(object: Map<String, Value>) -> Result<Vec<Parameter<'static>>, LanguageError> {
+    let members = object.into_iter().filter(|(_, value)| !value.is_null());
+    let members = members.map(|(name, value)| {
+        Ok(Parameter {
+            name: Cow::Owned(name),
+            value: term(value)?,
+        })
+    });
+    members.collect()
+}

@@ -1,0 +1,232 @@
+//! The ontology in FIPA-SL.
+
+use std::borrow::Cow;
+
+use fipa_acl::AgentId;
+use fipa_content::{
+    ActionExpression, Arguments, Content, FunctionalTerm, Number, Parameter, Printer, Query,
+    ReadError, ReferentialOperator, Term, Wff,
+};
+
+use crate::language::{Language, LanguageError};
+use crate::message::{Answer, Ask, Goal, parameter};
+
+/// The predicate of offered actions: `(offers agent ?action)`.
+const OFFERS: &str = "offers";
+
+/// The predicate of goals: `(performs agent ?status)`, `(performs agent id ?status)`.
+const PERFORMS: &str = "performs";
+
+/// FIPA-SL, the language without which no agent is: `fipa-sl`.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Sl;
+
+impl Language for Sl {
+    fn name(&self) -> &'static str {
+        "fipa-sl"
+    }
+
+    fn write_ask(&self, robot: &AgentId, ask: &Ask) -> Result<Vec<u8>, LanguageError> {
+        let content = match ask {
+            Ask::Goal(goal) => action(robot, act(goal)).into(),
+            _ => query(robot, ask).content(),
+        };
+        Ok(Printer::new().print(&content)?)
+    }
+
+    fn read_ask(&self, bytes: &[u8]) -> Result<(String, Ask), LanguageError> {
+        let content = Content::parse(bytes)?;
+        if let Ok(ActionExpression::Action { agent, act }) = content.action() {
+            let agent = AgentId::try_from(agent).map_err(ReadError::from)?;
+            let goal = goal(act.clone().into_owned())?;
+            return Ok((agent.name().to_owned(), Ask::Goal(goal)));
+        }
+        asked(&Query::read(&content)?)
+    }
+
+    fn write_answer(
+        &self,
+        robot: &AgentId,
+        to: &Ask,
+        answer: &Answer,
+    ) -> Result<Vec<u8>, LanguageError> {
+        let reference = || action(robot, reference(to));
+        let content = match answer {
+            Answer::Agreed { queued } => {
+                let state = if *queued { "queued" } else { "executing" };
+                Content::of_refusal(reference(), Wff::Proposition(state.into()))
+            }
+            Answer::Done(None) => Wff::done(reference()).into(),
+            Answer::Done(Some(value)) => {
+                let of = Box::new(Term::from(reference()));
+                Wff::Result(of, Box::new(value.clone())).into()
+            }
+            Answer::Refused(reason) => Content::of_refusal(reference(), Wff::from_value(reason)?),
+            Answer::Failed(reason) => Content::of_refusal(reference(), Wff::from_value(reason)?),
+            Answer::Actions(all) => query(robot, to).answer_all(all)?,
+            Answer::Status(all) => query(robot, to).answer_all(all)?,
+        };
+        Ok(Printer::new().print(&content)?)
+    }
+
+    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<Answer, LanguageError> {
+        let content = Content::parse(bytes)?;
+        if let Ask::Goal(_) = to {
+            if let Ok((_, Wff::Proposition(state))) = content.refusal() {
+                let queued = state == "queued";
+                return Ok(Answer::Agreed { queued });
+            }
+            return match content.wff()? {
+                Wff::Done(..) => Ok(Answer::Done(None)),
+                Wff::Result(_, value) => Ok(Answer::Done(Some(Term::clone(value).into_owned()))),
+                _ => Err(LanguageError::Form("((done …)) or ((result …))")),
+            };
+        }
+        // Other robots may repeat the query in another notation, so it is not compared.
+        let Wff::Equal(_, value) = content.wff()? else {
+            return Err(LanguageError::Form("((= (all …) (set …)))"));
+        };
+        let read = |error| LanguageError::Read(ReadError::Value(error));
+        match to {
+            Ask::Actions => value.read().map(Answer::Actions).map_err(read),
+            _ => value.read().map(Answer::Status).map_err(read),
+        }
+    }
+
+    fn read_rejection(&self, is_refusal: bool, bytes: &[u8]) -> Result<Answer, LanguageError> {
+        let content = Content::parse(bytes)?;
+        let (_, reason) = content.refusal()?;
+        let read = |error| LanguageError::Read(ReadError::Value(error));
+        match is_refusal {
+            true => reason.read().map(Answer::Refused).map_err(read),
+            false => reason.read().map(Answer::Failed).map_err(read),
+        }
+    }
+}
+
+fn action(robot: &AgentId, act: Term<'static>) -> ActionExpression<'static> {
+    ActionExpression::Action {
+        agent: robot.into(),
+        act,
+    }
+}
+
+fn functional(symbol: &str, parameters: Vec<Parameter<'static>>) -> Term<'static> {
+    let arguments = match parameters.is_empty() {
+        true => Arguments::Terms(Vec::new()),
+        false => Arguments::Parameters(parameters),
+    };
+    Term::Functional(FunctionalTerm {
+        symbol: Cow::Owned(symbol.to_owned()),
+        arguments,
+    })
+}
+
+/// Returns the act of a goal.
+fn act(goal: &Goal) -> Term<'static> {
+    let mut parameters = goal.arguments.clone();
+    if let Some(id) = &goal.id {
+        parameters.push(parameter("goal", id.clone()));
+    }
+    if let Some(deadline) = goal.deadline {
+        parameters.push(parameter("deadline", Term::Number(Number::from(deadline))));
+    }
+    if let Some(fence) = &goal.fence {
+        parameters.push(parameter("fence", fence.clone()));
+    }
+    functional(&goal.action, parameters)
+}
+
+/// Returns the act that names the goal in answers.
+fn reference(ask: &Ask) -> Term<'static> {
+    match ask {
+        Ask::Goal(goal) => {
+            let id = goal.id.iter().map(|id| parameter("goal", id.clone()));
+            functional(&goal.action, id.collect())
+        }
+        Ask::Actions => functional(OFFERS, Vec::new()),
+        Ask::Status => functional(PERFORMS, Vec::new()),
+        Ask::StatusOf(id) => functional(PERFORMS, vec![parameter("goal", id.clone())]),
+    }
+}
+
+/// Reads the act of a goal.
+fn goal(act: Term<'static>) -> Result<Goal, LanguageError> {
+    let term = match act {
+        // An action without arguments may be a word.
+        Term::String(name) => return Ok(Goal::of(name, Vec::new())),
+        Term::Functional(term) => term,
+        _ => {
+            return Err(LanguageError::Form(
+                "(action agent (name :parameter value …))",
+            ));
+        }
+    };
+    let parameters = match term.arguments {
+        Arguments::Parameters(parameters) => parameters,
+        Arguments::Terms(terms) if terms.is_empty() => Vec::new(),
+        Arguments::Terms(_) => {
+            return Err(LanguageError::Form("an action with named arguments"));
+        }
+    };
+    let mut goal = Goal::of(term.symbol, Vec::with_capacity(parameters.len()));
+    for parameter in parameters {
+        match (&*parameter.name, parameter.value) {
+            ("goal", Term::String(id)) => goal.id = Some(id.into_owned()),
+            // An id of digits only is a number in SL.
+            ("goal", Term::Number(id)) => goal.id = Some(id.as_str().to_owned()),
+            ("deadline", Term::Number(time)) => {
+                let time = time
+                    .as_u64()
+                    .ok_or(LanguageError::Form("a deadline in ms"))?;
+                goal.deadline = Some(time);
+            }
+            ("fence", Term::String(fence)) => goal.fence = Some(fence.into_owned()),
+            ("goal" | "deadline" | "fence", _) => {
+                return Err(LanguageError::Form("a goal id, deadline or fence"));
+            }
+            (_, value) => {
+                let name = parameter.name;
+                goal.arguments.push(Parameter { name, value });
+            }
+        }
+    }
+    Ok(goal)
+}
+
+fn query(robot: &AgentId, ask: &Ask) -> Query {
+    let variable = Term::Variable(Cow::Borrowed("x"));
+    let robot = Term::from(robot);
+    let wff = match ask {
+        Ask::StatusOf(id) => Wff::predicate(PERFORMS, [robot, Term::from(id.clone()), variable]),
+        Ask::Status => Wff::predicate(PERFORMS, [robot, variable]),
+        _ => Wff::predicate(OFFERS, [robot, variable]),
+    };
+    Query::all(["x"], wff)
+}
+
+/// Reads a query: the name of the robot, and what is asked.
+fn asked(query: &Query) -> Result<(String, Ask), LanguageError> {
+    const FORM: LanguageError =
+        LanguageError::Form("(all ?x (offers agent ?x)) or (all ?x (performs agent ?x))");
+    let expression = query.expression();
+    let Wff::Predicate { symbol, arguments } = &expression.wff else {
+        return Err(FORM);
+    };
+    if expression.operator != ReferentialOperator::All {
+        return Err(FORM);
+    }
+    let (agent, ask) = match (&**symbol, &arguments[..]) {
+        (OFFERS, [agent, Term::Variable(_)]) => (agent, Ask::Actions),
+        (PERFORMS, [agent, Term::Variable(_)]) => (agent, Ask::Status),
+        (PERFORMS, [agent, Term::String(id), Term::Variable(_)]) => {
+            (agent, Ask::StatusOf(id.clone().into_owned()))
+        }
+        (PERFORMS, [agent, Term::Number(id), Term::Variable(_)]) => {
+            (agent, Ask::StatusOf(id.as_str().to_owned()))
+        }
+        _ => return Err(FORM),
+    };
+    let agent = AgentId::try_from(agent).map_err(ReadError::from)?;
+    Ok((agent.name().to_owned(), ask))
+}

@@ -1,0 +1,312 @@
+//! `fipa actions`: lists the actions of robots, and the goals that they run.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::Args;
+use comfy_table::{Table, presets};
+use fipa::actions::{
+    ActionDescription, ActionError, GoalStatus, ParameterDescription, Policy, Type,
+};
+use fipa::protocol::DialogueError;
+use fipa::{Agent, AgentId, Config, Reach, Role};
+use fipa_acl::escape;
+use serde_json::{Value, json};
+use tokio::task::JoinSet;
+
+use super::df::asking;
+use crate::membership;
+use crate::options::Global;
+use crate::output;
+use crate::report::Failure;
+
+/// List the actions that a robot offers, or the goals that it runs
+///
+/// Without a robot, all agents of this host are asked, and those that offer actions are listed.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa actions
+  fipa actions crex
+  fipa actions crex --goals
+  fipa actions crex --json
+
+JSON:
+  [ { \"robot\": name, \"actions\": [ { \"name\", \"description\", \"policy\", \"fenced\", \"result\": type,
+      \"parameters\": [ { \"name\", \"type\", \"unit\", \"min\", \"max\", \"default\": value in SL,
+      \"description\", \"optional\" } ] } ] } ]
+  with --goals: [ { \"robot\": name, \"goals\": [ { \"goal\", \"action\", \"client\", \"state\", \"age_ms\",
+      \"fraction\", \"note\" } ] } ]")]
+pub(crate) struct Arguments {
+    /// Name of the robot [default: all agents of this host]
+    robot: Option<AgentId>,
+
+    /// List the goals that run or wait
+    #[arg(long)]
+    goals: bool,
+
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The answer of one robot.
+enum Listed {
+    Actions(Vec<ActionDescription>),
+    Goals(Vec<GoalStatus>),
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    let found = membership::run(async {
+        let domain = membership::join(&config).await?;
+        let found = async {
+            let agent = Arc::new(asking(&domain, "actions", &config).await?);
+            match &arguments.robot {
+                Some(robot) => {
+                    let listed = list(&agent, robot, arguments.goals).await;
+                    let listed = listed.map_err(|error| failed(&error, robot, &config))?;
+                    Ok(vec![(robot.name().to_owned(), listed)])
+                }
+                None => Ok(all(&agent, arguments.goals).await),
+            }
+        };
+        let found = found.await;
+        domain.close().await;
+        found
+    })?;
+    if arguments.json {
+        let found = found.iter().map(|(robot, listed)| match listed {
+            Listed::Actions(all) => {
+                let all: Vec<Value> = all.iter().map(description).collect();
+                json!({ "robot": robot, "actions": all })
+            }
+            Listed::Goals(all) => {
+                let all: Vec<Value> = all.iter().map(status).collect();
+                json!({ "robot": robot, "goals": all })
+            }
+        });
+        return output::json(&found.collect::<Vec<_>>());
+    }
+    if found.is_empty() {
+        return output::text("no agent of this host offers actions\n");
+    }
+    let mut text = String::new();
+    for (robot, listed) in &found {
+        match listed {
+            Listed::Actions(all) if all.is_empty() => {
+                text.push_str(&format!("{} offers no actions\n", escape(robot)));
+            }
+            Listed::Actions(all) => {
+                for action in all {
+                    text.push_str(&described(robot, action));
+                }
+            }
+            Listed::Goals(all) => text.push_str(&goals(robot, all)),
+        }
+    }
+    output::text(&text)
+}
+
+async fn list(agent: &Agent, robot: &AgentId, goals: bool) -> Result<Listed, ActionError> {
+    let robot = agent.robot(robot.clone());
+    match goals {
+        true => robot.status().await.map(Listed::Goals),
+        false => robot.actions().await.map(Listed::Actions),
+    }
+}
+
+/// Asks all agents of this host at the same time. Those that do not answer in time offer no actions.
+async fn all(agent: &Arc<Agent>, goals: bool) -> Vec<(String, Listed)> {
+    let directory = agent.domain().directory();
+    directory.refresh();
+    let entries = directory.entries();
+    let names = entries.iter().filter(|entry| {
+        entry.role == Role::Agent
+            && entry.reach == Reach::Local
+            && !entry.is_platform_agent()
+            && *entry.name != *agent.name()
+    });
+    let mut asked = JoinSet::new();
+    for name in names.map(|entry| entry.name.to_string()) {
+        let Ok(robot) = AgentId::new(&*name) else {
+            continue;
+        };
+        let agent = Arc::clone(agent);
+        asked.spawn(async move { (name, list(&agent, &robot, goals).await) });
+    }
+    let mut found = Vec::new();
+    while let Some(answered) = asked.join_next().await {
+        match answered {
+            Ok((name, Ok(listed))) => found.push((name, listed)),
+            Ok((name, Err(error))) => {
+                tracing::debug!(agent = %escape(&name), %error, "the agent lists no actions");
+            }
+            Err(error) => tracing::debug!(%error, "a question has ended"),
+        }
+    }
+    found.sort_by(|(one, _), (other, _)| one.cmp(other));
+    found
+}
+
+/// The error report of a call about actions.
+pub(super) fn failed(error: &ActionError, robot: &AgentId, config: &Config) -> Failure {
+    let help = match error {
+        ActionError::Refused(_) => {
+            "`fipa actions ROBOT` shows the parameters, and --goals the goals that run"
+        }
+        ActionError::Failed(_) => {
+            "the robot reports the reason; send the goal again when it is gone"
+        }
+        ActionError::Dialogue(DialogueError::TimedOut | DialogueError::NotUnderstood(_)) => {
+            "the agent may offer no actions; `fipa actions` lists the agents that do"
+        }
+        _ => {
+            "check with `fipa agents` whether the agent is known, and with `fipa watch` its answers"
+        }
+    };
+    Failure::failed(
+        fipa::ErrorChain(error).to_string(),
+        format!("robot {}, domain {:?}", escape(robot.name()), config.domain),
+        help,
+    )
+}
+
+/// The lines of one action.
+fn described(robot: &str, action: &ActionDescription) -> String {
+    let mut text = format!("{} {}", escape(robot), escape(&action.name));
+    if let Some(words) = &action.description {
+        text.push_str(&format!(": {}", escape(words)));
+    }
+    text.push('\n');
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.add_rows(action.parameters.iter().map(parameter));
+    if action.result != Type::Nothing {
+        let result = escape(&action.result.to_string()).into_owned();
+        table.add_row(["result".to_owned(), result]);
+    }
+    table.add_row(["while it runs".to_owned(), policy(action.policy)]);
+    if action.fenced {
+        table.add_row(["needs".to_owned(), "the fence of a lock".to_owned()]);
+    }
+    for column in table.column_iter_mut() {
+        column.set_padding((2, 1));
+    }
+    text.push_str(&format!("{}\n", table.trim_fmt()));
+    text
+}
+
+fn policy(policy: Policy) -> String {
+    match policy {
+        Policy::Queue(longest) => format!("up to {longest} goals wait"),
+        Policy::Preempt => "a new goal takes its place".to_owned(),
+        _ => "a new goal is refused".to_owned(),
+    }
+}
+
+fn parameter(parameter: &ParameterDescription) -> [String; 3] {
+    let mut facts = Vec::new();
+    if let Some(unit) = &parameter.unit {
+        facts.push(escape(unit).into_owned());
+    }
+    if let Some(range) = &parameter.range {
+        facts.push(range.to_string());
+    }
+    if let Some(default) = &parameter.default {
+        facts.push(format!("default {}", escape(&default.to_string())));
+    }
+    if parameter.optional {
+        facts.push("optional".to_owned());
+    }
+    if let Some(words) = &parameter.description {
+        facts.push(escape(words).into_owned());
+    }
+    [
+        format!("{}=", escape(&parameter.name)),
+        escape(&parameter.value_type.to_string()).into_owned(),
+        facts.join("; "),
+    ]
+}
+
+fn goals(robot: &str, all: &[GoalStatus]) -> String {
+    if all.is_empty() {
+        return format!("{} runs no goals\n", escape(robot));
+    }
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_header([
+        "ROBOT", "GOAL", "ACTION", "CLIENT", "STATE", "AGE", "PROGRESS",
+    ]);
+    for column in table.column_iter_mut() {
+        column.set_padding((0, 2));
+    }
+    table.add_rows(all.iter().map(|goal| {
+        [
+            escape(robot).into_owned(),
+            escape(&goal.goal).into_owned(),
+            escape(&goal.action).into_owned(),
+            escape(&goal.client).into_owned(),
+            goal.state.as_str().to_owned(),
+            humantime::format_duration(Duration::from_millis(goal.age)).to_string(),
+            progress(goal),
+        ]
+    }));
+    format!("{}\n", table.trim_fmt())
+}
+
+/// The progress of a goal in one line.
+fn progress(goal: &GoalStatus) -> String {
+    let Some(progress) = &goal.progress else {
+        return "-".to_owned();
+    };
+    let part = progress
+        .fraction
+        .map(|part| format!("{:.0} %", part * 100.0));
+    let note = progress
+        .note
+        .as_deref()
+        .map(|note| escape(note).into_owned());
+    let parts: Vec<String> = part.into_iter().chain(note).collect();
+    parts.join(" ")
+}
+
+fn description(action: &ActionDescription) -> Value {
+    let parameters = action.parameters.iter().map(|parameter| {
+        json!({
+            "name": parameter.name,
+            "type": parameter.value_type.to_string(),
+            "unit": parameter.unit,
+            "min": parameter.range.and_then(|range| range.min),
+            "max": parameter.range.and_then(|range| range.max),
+            "default": parameter.default.as_ref().map(ToString::to_string),
+            "description": parameter.description,
+            "optional": parameter.optional,
+        })
+    });
+    json!({
+        "name": action.name,
+        "description": action.description,
+        "policy": match action.policy {
+            Policy::Queue(longest) => json!({ "queue": longest }),
+            Policy::Preempt => json!("preempt"),
+            _ => json!("reject"),
+        },
+        "fenced": action.fenced,
+        "result": action.result.to_string(),
+        "parameters": parameters.collect::<Vec<_>>(),
+    })
+}
+
+/// The status of a goal as JSON.
+fn status(goal: &GoalStatus) -> Value {
+    let progress = goal.progress.as_ref();
+    json!({
+        "goal": goal.goal,
+        "action": goal.action,
+        "client": goal.client,
+        "state": goal.state.as_str(),
+        "age_ms": goal.age,
+        "fraction": progress.and_then(|progress| progress.fraction),
+        "note": progress.and_then(|progress| progress.note.as_deref()),
+    })
+}

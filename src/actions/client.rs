@@ -1,0 +1,378 @@
+//! The client's side: the actions of a robot, goals and their handles.
+
+use std::fmt;
+use std::time::Duration;
+
+use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_actions::{
+    ActionDescription, Answer, Ask, Failure, Goal, GoalError, GoalStatus, Json, Language,
+    LanguageError, ONTOLOGY, Refusal, Sl, language,
+};
+use fipa_content::{DeserializeError, Term};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::agent::Agent;
+use crate::protocol::{DialogueError, Reachability, Request, Subscription};
+
+/// Time that a robot has beyond the deadline of a goal to stop and to report.
+const GRACE: Duration = Duration::from_secs(10);
+
+/// The error of a call about actions.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ActionError {
+    /// The robot refused. Holds the reason.
+    #[error("refused: {0}")]
+    Refused(Refusal),
+    /// The action failed. Holds the reason.
+    #[error("the action failed: {0}")]
+    Failed(Failure),
+    /// The conversation failed, for example because the robot is gone ([`DialogueError::Gone`]).
+    #[error(transparent)]
+    Dialogue(DialogueError),
+    /// The arguments cannot be a goal.
+    #[error(transparent)]
+    Goal(#[from] GoalError),
+    /// The result is not a value of the requested type.
+    #[error("the result is of another type")]
+    Result(#[from] DeserializeError),
+    /// A message cannot be written or read.
+    #[error(transparent)]
+    Language(#[from] LanguageError),
+}
+
+impl From<DialogueError> for ActionError {
+    fn from(error: DialogueError) -> Self {
+        let (message, is_refusal) = match &error {
+            DialogueError::Refused(message) => (message, true),
+            DialogueError::Failed(message) => (message, false),
+            _ => return Self::Dialogue(error),
+        };
+        let content = message.content().map_or(&[][..], |content| content);
+        let language = language(message.language());
+        let read = language.and_then(|it| it.read_rejection(is_refusal, content).ok());
+        match read {
+            Some(Answer::Refused(reason)) => Self::Refused(reason),
+            Some(Answer::Failed(reason)) => Self::Failed(reason),
+            _ => Self::Dialogue(error),
+        }
+    }
+}
+
+impl Agent {
+    /// Returns the robot with this identifier, whose actions this agent uses. See
+    /// [`actions`](crate::actions).
+    #[must_use]
+    pub fn robot(&self, robot: AgentId) -> Robot<'_> {
+        Robot {
+            agent: self,
+            robot,
+            language: &Sl,
+        }
+    }
+}
+
+/// A robot whose actions an agent uses; see [`Agent::robot`].
+#[derive(Debug, Clone)]
+pub struct Robot<'a> {
+    agent: &'a Agent,
+    robot: AgentId,
+    language: &'static dyn Language,
+}
+
+impl<'a> Robot<'a> {
+    /// Returns the identifier of the robot.
+    #[must_use]
+    pub fn id(&self) -> &AgentId {
+        &self.robot
+    }
+
+    /// Writes contents in JSON instead of FIPA-SL.
+    #[must_use]
+    pub fn in_json(self) -> Self {
+        Self {
+            language: &Json,
+            ..self
+        }
+    }
+
+    /// Returns the actions that the robot offers, by name.
+    ///
+    /// # Errors
+    /// If the robot is gone, refuses, or does not answer in time.
+    pub async fn actions(&self) -> Result<Vec<ActionDescription>, ActionError> {
+        match self.query(&Ask::Actions).await? {
+            Answer::Actions(all) => Ok(all),
+            _ => Err(LanguageError::Form("a list of actions").into()),
+        }
+    }
+
+    /// Returns the status of the goals that run or wait, of all clients, in the order of their arrival.
+    ///
+    /// # Errors
+    /// See [`actions`](Self::actions).
+    pub async fn status(&self) -> Result<Vec<GoalStatus>, ActionError> {
+        match self.query(&Ask::Status).await? {
+            Answer::Status(all) => Ok(all),
+            _ => Err(LanguageError::Form("a list of goals").into()),
+        }
+    }
+
+    /// Subscribes to the status of the goals that run or wait. The first notification has the present
+    /// ones.
+    ///
+    /// # Errors
+    /// See [`actions`](Self::actions).
+    pub async fn watch_status(&self) -> Result<StatusUpdates, ActionError> {
+        let ask = Ask::Status;
+        let message = self.message(Performative::Subscribe, &ask)?;
+        let subscription = self.agent.subscribe(message, self.patience()).await?;
+        Ok(StatusUpdates {
+            ask,
+            language: self.language,
+            subscription,
+        })
+    }
+
+    /// Creates a goal with an id of its own. `arguments` is a struct whose fields are the parameters, a
+    /// map, or `()`.
+    ///
+    /// # Errors
+    /// If the arguments have no named fields, or no notation.
+    pub fn goal(
+        &self,
+        action: impl Into<String>,
+        arguments: &(impl Serialize + ?Sized),
+    ) -> Result<Goal, GoalError> {
+        let mut goal = Goal::new(action, arguments)?;
+        goal.id = Some(self.agent.unique_id());
+        Ok(goal)
+    }
+
+    /// Sends a goal, and waits until the robot accepts it. `arguments` is a struct whose fields are the
+    /// parameters, a map, or `()`.
+    ///
+    /// # Errors
+    /// If the robot refuses ([`ActionError::Refused`]), is gone, or does not answer in time.
+    pub async fn invoke(
+        &self,
+        action: impl Into<String>,
+        arguments: &(impl Serialize + ?Sized),
+    ) -> Result<GoalHandle<'a>, ActionError> {
+        let goal = self.goal(action, arguments)?;
+        self.send(goal).await
+    }
+
+    /// Sends a goal like [`invoke`](Self::invoke), with its deadline, fence and id. A goal that was sent
+    /// before, under the same id, does not run again: the handle gets its outcome.
+    ///
+    /// # Errors
+    /// See [`invoke`](Self::invoke).
+    pub async fn send(&self, mut goal: Goal) -> Result<GoalHandle<'a>, ActionError> {
+        goal.id.get_or_insert_with(|| self.agent.unique_id());
+        let ask = Ask::Goal(goal.clone());
+        let message = self.message(Performative::Request, &ask)?;
+        let deadline = goal.deadline.map(Duration::from_millis);
+        let patience = deadline.and_then(|it| it.checked_add(GRACE + self.patience()));
+        let request = self
+            .agent
+            .request(message, patience.unwrap_or(Duration::MAX));
+        let mut request = request.await?;
+        match tokio::time::timeout(self.patience(), request.agreed()).await {
+            Ok(agreed) => agreed?,
+            Err(_) => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
+        };
+        Ok(GoalHandle {
+            robot: self.clone(),
+            goal,
+            ask,
+            request,
+        })
+    }
+
+    /// Returns the time for an answer: the deadlines of the message and of the answer.
+    fn patience(&self) -> Duration {
+        self.agent.domain().inner.deadline * 2
+    }
+
+    fn message(&self, act: Performative, ask: &Ask) -> Result<MessageBuilder, ActionError> {
+        let content = self.language.write_ask(&self.robot, ask)?;
+        let message = self.agent.message(act).receiver(self.robot.clone());
+        let message = message.ontology(ONTOLOGY).language(self.language.name());
+        Ok(message.content(content))
+    }
+
+    async fn query(&self, ask: &Ask) -> Result<Answer, ActionError> {
+        let message = self.message(Performative::QueryRef, ask)?;
+        let request = self.agent.query(message, self.patience()).await?;
+        let answer = request.result().await?;
+        read(self.language, ask, &answer)
+    }
+}
+
+fn read(
+    language: &'static dyn Language,
+    ask: &Ask,
+    message: &Message,
+) -> Result<Answer, ActionError> {
+    let content = message.content().map_or(&[][..], |content| content);
+    Ok(language.read_answer(ask, content)?)
+}
+
+/// A goal that the robot has accepted; see [`Robot::invoke`]. Dropping it does not cancel the goal; the
+/// further messages go to [`Agent::receive`].
+#[must_use = "result() returns the result"]
+pub struct GoalHandle<'a> {
+    robot: Robot<'a>,
+    goal: Goal,
+    ask: Ask,
+    request: Request,
+}
+
+impl GoalHandle<'_> {
+    /// Returns the goal with its id. After an unconfirmed outcome, [`Robot::send`] sends it again.
+    #[must_use]
+    pub fn goal(&self) -> &Goal {
+        &self.goal
+    }
+
+    /// Returns the id of the goal.
+    #[must_use]
+    pub fn id(&self) -> &str {
+        self.goal.id.as_deref().unwrap_or_default()
+    }
+
+    /// Returns a receiver of changes of the reachability of the robot.
+    #[must_use]
+    pub fn reachability(&self) -> Reachability {
+        self.request.reachability()
+    }
+
+    /// Subscribes to the progress of the goal. The handle can be used meanwhile.
+    ///
+    /// # Errors
+    /// If the robot is gone, refuses, or does not answer in time.
+    pub async fn progress(&self) -> Result<ProgressUpdates, ActionError> {
+        let ask = Ask::StatusOf(self.id().to_owned());
+        let robot = &self.robot;
+        let message = robot.message(Performative::Subscribe, &ask)?;
+        let subscription = robot.agent.subscribe(message, robot.patience()).await?;
+        Ok(ProgressUpdates {
+            ask,
+            language: robot.language,
+            patience: robot.patience(),
+            subscription: Some(subscription),
+        })
+    }
+
+    /// Waits for the result. `()` is the result of an action without one.
+    ///
+    /// # Errors
+    /// If the action fails ([`ActionError::Failed`]), the robot is gone, or the deadline of the goal has
+    /// passed without a word of the robot.
+    pub async fn result<R: DeserializeOwned>(mut self) -> Result<R, ActionError> {
+        let value = self.outcome().await?;
+        Ok(value.unwrap_or_else(|| Term::Sequence(Vec::new())).read()?)
+    }
+
+    /// Waits for the result as a term, `None` for an action without one. Dropping the future loses
+    /// nothing.
+    ///
+    /// # Errors
+    /// See [`result`](Self::result).
+    pub async fn outcome(&mut self) -> Result<Option<Term<'static>>, ActionError> {
+        let message = self.request.finished().await?;
+        match read(self.robot.language, &self.ask, &message)? {
+            Answer::Done(value) => Ok(value),
+            _ => Err(LanguageError::Form("a result").into()),
+        }
+    }
+
+    /// Cancels the goal, waits until the robot has stopped, and returns true. Returns false if the goal
+    /// has ended in the meantime or goes on; [`outcome`](Self::outcome) then returns its outcome.
+    ///
+    /// # Errors
+    /// If the robot is gone, or does not answer within `patience`.
+    pub async fn cancel(&mut self, patience: Duration) -> Result<bool, ActionError> {
+        Ok(self.request.stop(patience).await?)
+    }
+}
+
+impl fmt::Debug for GoalHandle<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("GoalHandle")
+            .field("goal", &self.goal)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The progress of a goal; see [`GoalHandle::progress`]. Dropping it does not cancel the subscription;
+/// further notifications go to [`Agent::receive`].
+#[derive(Debug)]
+#[must_use = "next() returns the progress"]
+pub struct ProgressUpdates {
+    ask: Ask,
+    language: &'static dyn Language,
+    patience: Duration,
+    /// `None` after the end of the goal.
+    subscription: Option<Subscription>,
+}
+
+impl ProgressUpdates {
+    /// Waits for the next status of the goal, without a time limit. Returns the status with the end of the
+    /// goal, and then `None`. Dropping the future loses no status.
+    ///
+    /// # Errors
+    /// If the robot is gone or ends the subscription.
+    pub async fn next(&mut self) -> Result<Option<GoalStatus>, ActionError> {
+        let Some(subscription) = &mut self.subscription else {
+            return Ok(None);
+        };
+        let message = subscription.next().await?;
+        let Answer::Status(mut all) = read(self.language, &self.ask, &message)? else {
+            return Err(LanguageError::Form("a status").into());
+        };
+        let status = all.pop();
+        if status.as_ref().is_none_or(|status| status.state.is_over())
+            && let Some(mut ended) = self.subscription.take()
+        {
+            // The robot ends the subscription.
+            let _ = tokio::time::timeout(self.patience, ended.next()).await;
+        }
+        Ok(status)
+    }
+}
+
+/// The status of all goals of a robot; see [`Robot::watch_status`]. Dropping it does not cancel the
+/// subscription; further notifications go to [`Agent::receive`].
+#[derive(Debug)]
+#[must_use = "next() returns the status"]
+pub struct StatusUpdates {
+    ask: Ask,
+    language: &'static dyn Language,
+    subscription: Subscription,
+}
+
+impl StatusUpdates {
+    /// Waits for the next change, without a time limit, and returns the goals that run or wait. There are
+    /// at most ten notifications per second. Dropping the future loses no notification.
+    ///
+    /// # Errors
+    /// If the robot is gone or ends the subscription.
+    pub async fn next(&mut self) -> Result<Vec<GoalStatus>, ActionError> {
+        let message = self.subscription.next().await?;
+        match read(self.language, &self.ask, &message)? {
+            Answer::Status(all) => Ok(all),
+            _ => Err(LanguageError::Form("a list of goals").into()),
+        }
+    }
+
+    /// Cancels the subscription.
+    ///
+    /// # Errors
+    /// If the robot does not confirm within `patience`.
+    pub async fn cancel(self, patience: Duration) -> Result<(), ActionError> {
+        Ok(self.subscription.cancel(patience).await?)
+    }
+}

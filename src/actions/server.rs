@@ -1,0 +1,293 @@
+//! The robot's side of conversations about actions.
+
+use std::any::Any;
+use std::convert::Infallible;
+use std::sync::Arc;
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_actions::{
+    Answer, Ask, Failure, Goal, Language, MAX_CONTENT, ONTOLOGY, Refusal, language,
+};
+
+use crate::action_table::ActionTable;
+use crate::agent::AgentCore;
+use crate::protocol::{DialogueError, Reply, Task, serve_those};
+
+/// Minimum time between two notifications of a subscription to all goals.
+const STATUS_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
+
+/// Starts the servers of an agent that offers its first action.
+pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
+    let is_about_actions = |message: &Message| message.ontology() == Some(ONTOLOGY);
+    let mut servers: Vec<Box<dyn Any + Send>> = Vec::new();
+    for (protocol, part) in [
+        ("fipa-request", Part::Goals),
+        ("fipa-query", Part::Queries),
+        ("fipa-subscribe", Part::Subscriptions),
+    ] {
+        let (table, id) = (core.actions.clone(), core.endpoint.id.clone());
+        let handler = move |task: Task| {
+            let side = Side::new(table.clone(), id.clone(), &task);
+            async move {
+                Ok::<_, Infallible>(match part {
+                    Part::Goals => side.perform(task).await,
+                    Part::Queries => side.answer(&task),
+                    Part::Subscriptions => side.notify(task).await,
+                })
+            }
+        };
+        let server = serve_those(core, protocol, is_about_actions, handler)?;
+        servers.push(Box::new(server));
+    }
+    core.actions.keep(servers);
+    Ok(())
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Part {
+    Goals,
+    Queries,
+    Subscriptions,
+}
+
+/// One conversation.
+struct Side {
+    table: ActionTable,
+    robot: AgentId,
+    client: String,
+    language: Option<&'static dyn Language>,
+    /// The conversation id, which is the id of a goal without one.
+    id: String,
+}
+
+impl Side {
+    fn new(table: ActionTable, robot: AgentId, task: &Task) -> Self {
+        let message = task.message();
+        let client = message.sender().map(AgentId::name).unwrap_or_default();
+        Self {
+            table,
+            robot,
+            client: client.to_owned(),
+            language: language(message.language()),
+            id: message.conversation_id().unwrap_or_default().to_owned(),
+        }
+    }
+
+    /// Reads the first message of the client.
+    fn ask(&self, task: &Task) -> Result<Ask, Refusal> {
+        let content = task.message().content().map_or(&[][..], |content| content);
+        if content.len() > MAX_CONTENT {
+            return Err(Refusal::TooLarge(MAX_CONTENT as u64));
+        }
+        let language = self.language.unwrap_or(&fipa_actions::Sl);
+        let (robot, ask) = language.read_ask(content).map_err(|error| {
+            let text = fipa_acl::ErrorChain(&error).to_string();
+            Refusal::Malformed(text.chars().take(200).collect())
+        })?;
+        if robot != self.robot.name() {
+            let robot = robot.chars().take(200).collect();
+            return Err(Refusal::NotThisAgent(robot));
+        }
+        Ok(ask)
+    }
+
+    fn write(&self, to: &Ask, answer: &Answer) -> Vec<u8> {
+        let language = self.language.unwrap_or(&fipa_actions::Sl);
+        let written = language.write_answer(&self.robot, to, answer);
+        written.unwrap_or_else(|error| {
+            let failure = Failure::Failed(format!("the answer has no notation: {error}"));
+            let written = language.write_answer(&self.robot, to, &Answer::Failed(failure));
+            written.unwrap_or_default()
+        })
+    }
+
+    fn refuse(&self, to: &Ask, reason: Refusal) -> Reply {
+        Reply::Refuse(self.write(to, &Answer::Refused(reason)).into())
+    }
+
+    fn refuse_unread(&self, reason: Refusal) -> Reply {
+        self.refuse(&Ask::Goal(Goal::of("unread", Vec::new())), reason)
+    }
+
+    /// Performs the action of a goal.
+    async fn perform(self, mut task: Task) -> Reply {
+        if self.language.is_none() {
+            return Reply::Refuse(
+                "unknown content language; the languages are fipa-sl and json".into(),
+            );
+        }
+        let mut goal = match self.ask(&task) {
+            Ok(Ask::Goal(goal)) => goal,
+            Ok(_) => return self.refuse_unread(Refusal::Malformed("a query in a request".into())),
+            Err(reason) => return self.refuse_unread(reason),
+        };
+        let id = goal.id.get_or_insert_with(|| self.id.clone()).clone();
+        let reference = Ask::Goal(Goal {
+            id: Some(id.clone()),
+            ..Goal::of(goal.action.clone(), Vec::new())
+        });
+        let mut accepted = match self.table.request(&self.client, &id, goal) {
+            Ok(accepted) => accepted,
+            Err(reason) => return self.refuse(&reference, reason),
+        };
+        let queued = accepted.queued;
+        let agreed = task
+            .agree(self.write(&reference, &Answer::Agreed { queued }))
+            .await;
+        if agreed.is_err() {
+            // Dropping the conversation cancels the goal: its client is gone.
+            return Reply::Nothing;
+        }
+        let mut cancelled = false;
+        let outcome = loop {
+            tokio::select! {
+                biased;
+                outcome = &mut accepted.outcome => break outcome.unwrap_or(Err(Failure::Withdrawn)),
+                received = task.cancelled() => match received {
+                    Ok(()) => {
+                        cancelled = true;
+                        accepted.conversation.cancel();
+                    }
+                    // A mistake of the client does not end its goal.
+                    Err(
+                        DialogueError::Unexpected(_)
+                        | DialogueError::Violation { .. }
+                        | DialogueError::Unchecked(_)
+                        | DialogueError::NotUnderstood(_)
+                        | DialogueError::Undelivered(_),
+                    ) => {}
+                    Err(_) => return Reply::Nothing,
+                },
+            }
+        };
+        let content = |answer: &Answer| self.write(&reference, answer).into();
+        match outcome {
+            Err(_) if cancelled => task.confirm_cancel().await.unwrap_or(Reply::Nothing),
+            Err(failure) => Reply::Failure(content(&Answer::Failed(failure))),
+            Ok(value) => {
+                let too_late = Answer::Failed(Failure::Failed("the action is done".to_owned()));
+                if cancelled
+                    && task
+                        .fail_cancel(self.write(&reference, &too_late))
+                        .await
+                        .is_err()
+                {
+                    return Reply::Nothing;
+                }
+                match self.language.unwrap_or(&fipa_actions::Sl).write_answer(
+                    &self.robot,
+                    &reference,
+                    &Answer::Done(value),
+                ) {
+                    Ok(content) => Reply::Inform(content.into()),
+                    Err(error) => {
+                        let failure = format!("the result has no notation: {error}");
+                        Reply::Failure(content(&Answer::Failed(Failure::Failed(failure))))
+                    }
+                }
+            }
+        }
+    }
+
+    /// Answers a query.
+    fn answer(self, task: &Task) -> Reply {
+        if *task.message().performative() != Performative::QueryRef || self.language.is_none() {
+            return self.refuse_unread(Refusal::Malformed("a query-ref in fipa-sl or json".into()));
+        }
+        let ask = match self.ask(task) {
+            Ok(ask) => ask,
+            Err(reason) => return self.refuse_unread(reason),
+        };
+        let answer = match &ask {
+            Ask::Actions => Answer::Actions(self.table.descriptions()),
+            Ask::Status => Answer::Status(self.table.status()),
+            Ask::StatusOf(id) => match self.table.status_of(&self.client, id) {
+                Some(status) => Answer::Status(vec![status]),
+                None => return self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
+            },
+            _ => return self.refuse_unread(Refusal::Malformed("a goal in a query".into())),
+        };
+        Reply::Inform(self.write(&ask, &answer).into())
+    }
+
+    /// Serves a subscription to the status of one goal, or of all.
+    async fn notify(self, mut task: Task) -> Reply {
+        let ask = match self.ask(&task) {
+            Ok(ask) if self.language.is_some() => ask,
+            Ok(_) => return self.refuse_unread(Refusal::Malformed("the content language".into())),
+            Err(reason) => return self.refuse_unread(reason),
+        };
+        let Some(_subscribed) = self.table.subscribe(&self.client) else {
+            return self.refuse(&ask, Refusal::TooManyGoals);
+        };
+        match &ask {
+            Ask::StatusOf(id) => match self.table.watch(&self.client, id) {
+                None => self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
+                Some(mut status) => {
+                    if task.agree("").await.is_err() {
+                        return Reply::Nothing;
+                    }
+                    loop {
+                        let now = status.borrow_and_update().clone();
+                        let is_over = now.state.is_over();
+                        let content = self.write(&ask, &Answer::Status(vec![now]));
+                        if task.inform(content).await.is_err() {
+                            return Reply::Nothing;
+                        }
+                        if is_over {
+                            let end = Answer::Failed(Failure::Failed("the goal has ended".into()));
+                            return Reply::Failure(self.write(&ask, &end).into());
+                        }
+                        tokio::select! {
+                            ended = ended(&mut task) => return ended,
+                            changed = status.changed() => if changed.is_err() {
+                                return Reply::Failure("the goal is not stored any more".into());
+                            },
+                        }
+                    }
+                }
+            },
+            Ask::Status => {
+                if task.agree("").await.is_err() {
+                    return Reply::Nothing;
+                }
+                let mut changes = self.table.changes();
+                loop {
+                    changes.mark_unchanged();
+                    let content = self.write(&ask, &Answer::Status(self.table.status()));
+                    if task.inform(content).await.is_err() {
+                        return Reply::Nothing;
+                    }
+                    let next = async {
+                        tokio::time::sleep(STATUS_INTERVAL).await;
+                        changes.changed().await
+                    };
+                    tokio::select! {
+                        ended = ended(&mut task) => return ended,
+                        changed = next => if changed.is_err() {
+                            return Reply::Failure("the agent has ended".into());
+                        },
+                    }
+                }
+            }
+            _ => self.refuse_unread(Refusal::Malformed("a subscription to the status".into())),
+        }
+    }
+}
+
+/// Waits until the subscriber cancels or is gone.
+async fn ended(task: &mut Task) -> Reply {
+    loop {
+        match task.cancelled().await {
+            Ok(()) => return task.confirm_cancel().await.unwrap_or(Reply::Nothing),
+            Err(
+                DialogueError::Unexpected(_)
+                | DialogueError::Violation { .. }
+                | DialogueError::Unchecked(_)
+                | DialogueError::NotUnderstood(_)
+                | DialogueError::Undelivered(_),
+            ) => {}
+            Err(_) => return Reply::Nothing,
+        }
+    }
+}

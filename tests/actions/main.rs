@@ -1,0 +1,552 @@
+//! Actions between agents: lists, goals, progress, cancels, refusals, and robots and clients that die.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+#[path = "../../examples/actions.rs"]
+#[allow(dead_code, reason = "the test has a domain of its own")]
+mod example;
+mod process;
+#[path = "../support/mod.rs"]
+mod support;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use fipa::actions::{
+    Action, ActionError, Execution, Failure, Goal, GoalState, OfferError, ParameterDescription,
+    Policy, Progress, Refusal, Type,
+};
+use fipa::protocol::DialogueError;
+use fipa::{AgentId, Domain, FailureReason, Performative};
+use fipa_testbed::until_async;
+use process::{endless, forever};
+use serde::{Deserialize, Serialize};
+use support::{config, load, mark, two};
+use tokio::sync::Semaphore;
+
+/// Time limit of all waits, which a passing test does not reach.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[test]
+#[ignore = "started by the other tests"]
+fn process_entry() {
+    process::run();
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename = "pose")]
+struct Pose {
+    x: f64,
+    y: f64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Dock {
+    target: Pose,
+    speed: Option<f64>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename = "docked")]
+struct Docked {
+    charge: f64,
+}
+
+fn dock() -> Action {
+    let speed = ParameterDescription::of::<f64>("speed").unit("m/s");
+    Action::new("dock")
+        .described("Docks")
+        .parameter::<Pose>("target", "m; frame crex/base")
+        .with(speed.range(0.0..=0.5).default(&0.25).unwrap())
+        .result::<Docked>()
+}
+
+fn target() -> Dock {
+    Dock {
+        target: Pose { x: 1.5, y: 0.2 },
+        speed: None,
+    }
+}
+
+/// Returns the settings of a host that no other test uses, for several processes.
+fn host() -> Vec<String> {
+    vec![
+        format!("domain=actions-{}", mark()),
+        "discovery.mdns=false".to_owned(),
+        "mts.deadline=30s".to_owned(),
+    ]
+}
+
+fn patient() -> fipa::Config {
+    config(&["mts.deadline=30s"])
+}
+
+fn crex() -> AgentId {
+    AgentId::new("crex").unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn actions_are_listed_invoked_with_progress_and_cancelled() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let step = Arc::new(Semaphore::new(0));
+    let steps = Arc::clone(&step);
+    let offered = robot.offer(dock(), move |goal: Dock, run: Execution| {
+        let steps = Arc::clone(&steps);
+        async move {
+            assert_eq!(goal.target, Pose { x: 1.5, y: 0.2 });
+            assert_eq!(goal.speed, Some(0.25), "the default");
+            for part in [0.25, 0.5] {
+                run.progress(Progress::fraction(part).note("near"));
+                steps.acquire().await.unwrap().forget();
+            }
+            Ok::<_, String>(Docked { charge: 0.8 })
+        }
+    });
+    let _offers = (
+        offered.unwrap(),
+        robot
+            .offer(endless("drive"), |(): (), run| forever(run))
+            .unwrap(),
+        robot
+            .offer(endless("blink"), |(): (), run| forever(run))
+            .unwrap(),
+    );
+
+    let rover = there.register("rover").await.unwrap();
+    for crex in [rover.robot(crex()), rover.robot(crex()).in_json()] {
+        let actions = crex.actions().await.unwrap();
+        let names: Vec<&str> = actions.iter().map(|it| &*it.name).collect();
+        assert_eq!(names, ["blink", "dock", "drive"]);
+        let [pose, speed] = &actions[1].parameters[..] else {
+            panic!("{actions:?}");
+        };
+        assert_eq!(pose.value_type.to_string(), "pose(x: number, y: number)");
+        assert_eq!(pose.unit.as_deref(), Some("m; frame crex/base"));
+        assert_eq!(speed.range.unwrap().max, Some(0.5));
+        assert_eq!(speed.default.as_ref().unwrap().to_string(), "0.25");
+        assert_eq!(actions[1].description.as_deref(), Some("Docks"));
+        assert!(matches!(&actions[1].result, Type::Structure { name, .. } if name == "docked"));
+
+        let goal = crex.invoke("dock", &target()).await.unwrap();
+        let mut progress = goal.progress().await.unwrap();
+        let mut parts = Vec::new();
+        let last = loop {
+            let status = progress.next().await.unwrap().unwrap();
+            if status.state.is_over() {
+                break status;
+            }
+            let Some(now) = status.progress else { continue };
+            assert_eq!(now.note.as_deref(), Some("near"));
+            let part = now.fraction.unwrap();
+            if parts.last() != Some(&part) {
+                parts.push(part);
+                step.add_permits(1);
+            }
+        };
+        assert_eq!(parts, [0.25, 0.5]);
+        assert_eq!(last.state, GoalState::Done);
+        assert_eq!(progress.next().await.unwrap(), None);
+        let docked: Docked = goal.result().await.unwrap();
+        assert_eq!(docked, Docked { charge: 0.8 });
+
+        let mut goal = crex.invoke("drive", &()).await.unwrap();
+        let running = crex.status().await.unwrap();
+        assert_eq!(running.len(), 1);
+        assert_eq!(
+            (&*running[0].action, &*running[0].client),
+            ("drive", "rover")
+        );
+        assert_eq!(running[0].goal, goal.id());
+        assert!(goal.cancel(PATIENCE).await.unwrap());
+        assert_eq!(crex.status().await.unwrap(), []);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn refusals_are_typed_and_wrong_goals_reach_no_handler() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let runs = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&runs);
+    let _offer = robot
+        .offer(dock(), move |_: Dock, _: Execution| {
+            counted.fetch_add(1, Ordering::Relaxed);
+            async { Ok::<_, String>(Docked { charge: 0.8 }) }
+        })
+        .unwrap();
+    // The handler takes fewer values than the description says.
+    let small = Action::new("count").parameter::<i64>("number", "");
+    let counted = Arc::clone(&runs);
+    #[derive(Serialize, Deserialize)]
+    struct Count {
+        number: u8,
+    }
+    let _count = robot
+        .offer(small, move |_: Count, _: Execution| {
+            counted.fetch_add(1, Ordering::Relaxed);
+            async { Ok::<(), String>(()) }
+        })
+        .unwrap();
+    let rover = there.register("rover").await.unwrap();
+    let wrong_target = |x: &str| format!("(dock :target (pose :x {x} :y 0.2))");
+    let text = |text: &str| text.to_owned();
+    for crex in [rover.robot(crex()), rover.robot(crex()).in_json()] {
+        for (goal, expected) in [
+            (
+                wrong_target("far"),
+                Refusal::WrongType(text("target.x"), text("number"), text("string")),
+            ),
+            (
+                text("(dock :target (pose :x 1))"),
+                Refusal::WrongType(text("target.y"), text("number"), text("nothing")),
+            ),
+            (text("(dock)"), Refusal::MissingParameter(text("target"))),
+            (
+                text("(dock :target (pose :x 1 :y 1) :speed 0.75)"),
+                Refusal::OutOfRange(text("speed"), text("0 to 0.5"), text("0.75")),
+            ),
+            (
+                text("(dock :target (pose :x 1 :y 1) :speed (quantity :value 1 :unit km/h))"),
+                Refusal::WrongUnit(text("speed"), text("m/s"), text("km/h")),
+            ),
+            (
+                text("(dock :target (pose :x 1 :y 1) :fence \"1.1@crane\")"),
+                Refusal::UncheckedFence,
+            ),
+            (text("(fly :height 3)"), Refusal::UnknownAction(text("fly"))),
+        ] {
+            let goal = parsed(&goal);
+            match crex.send(goal.clone()).await {
+                Err(ActionError::Refused(refusal)) => assert_eq!(refusal, expected, "{goal:?}"),
+                other => panic!("{goal:?}: {other:?}"),
+            }
+        }
+        match crex.invoke("count", &Count16 { number: 300 }).await {
+            Err(ActionError::Refused(Refusal::WrongType(parameter, ..))) => {
+                assert_eq!(parameter, "number");
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    // Contents that are no goals at all.
+    for (language, content) in [
+        ("fipa-sl", "((("),
+        ("json", "{"),
+        ("fipa-sl", ""),
+        ("klingon", "x"),
+    ] {
+        let request = rover
+            .message(Performative::Request)
+            .receiver(crex())
+            .ontology(fipa::actions::ONTOLOGY)
+            .language(language)
+            .content(content);
+        let request = rover.request(request, PATIENCE).await.unwrap();
+        let refused = request.result().await;
+        assert!(
+            matches!(refused, Err(DialogueError::Refused(_))),
+            "{refused:?}"
+        );
+    }
+    assert_eq!(runs.load(Ordering::Relaxed), 0);
+    rover
+        .robot(crex())
+        .invoke("count", &Count16 { number: 3 })
+        .await
+        .unwrap()
+        .result::<()>()
+        .await
+        .unwrap();
+    assert_eq!(runs.load(Ordering::Relaxed), 1);
+}
+
+#[derive(Serialize)]
+struct Count16 {
+    number: u16,
+}
+
+/// Reads a goal in SL, with its fence.
+fn parsed(act: &str) -> Goal {
+    let term = fipa::actions::Term::parse(act.as_bytes())
+        .unwrap()
+        .into_owned();
+    let term = term.as_functional().unwrap();
+    let mut goal = Goal::of(&*term.symbol, Vec::new());
+    for parameter in term.parameters() {
+        match &*parameter.name {
+            "fence" => goal.fence = parameter.value.as_str().map(str::to_owned),
+            _ => goal.arguments.push(parameter.clone()),
+        }
+    }
+    goal
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_goal_that_is_sent_again_runs_once() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let runs = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&runs);
+    let go = Arc::new(Semaphore::new(0));
+    let gate = Arc::clone(&go);
+    let _offer = robot
+        .offer(dock(), move |_: Dock, _: Execution| {
+            let (gate, counted) = (Arc::clone(&gate), Arc::clone(&counted));
+            async move {
+                let run = counted.fetch_add(1, Ordering::Relaxed);
+                gate.acquire().await.unwrap().forget();
+                Ok::<_, String>(Docked { charge: run as f64 })
+            }
+        })
+        .unwrap();
+    let rover = there.register("rover").await.unwrap();
+    let crex = rover.robot(crex());
+    let first = crex.invoke("dock", &target()).await.unwrap();
+    let goal = first.goal().clone();
+    let second = crex.send(goal.clone()).await.unwrap();
+    go.add_permits(1);
+    for handle in [first, second] {
+        let docked: Docked = handle.result().await.unwrap();
+        assert_eq!(docked.charge, 0.0);
+    }
+    let third = crex.send(goal.clone()).await.unwrap();
+    let docked: Docked = third.result().await.unwrap();
+    assert_eq!(docked.charge, 0.0);
+    assert_eq!(runs.load(Ordering::Relaxed), 1);
+    let other = Goal {
+        arguments: crex
+            .goal(
+                "dock",
+                &Dock {
+                    speed: Some(0.1),
+                    ..target()
+                },
+            )
+            .unwrap()
+            .arguments,
+        ..goal
+    };
+    let used = crex.send(other).await;
+    assert!(
+        matches!(used, Err(ActionError::Refused(Refusal::UsedId(_)))),
+        "{used:?}"
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn deadlines_policies_and_withdrawals_end_goals() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let drive = endless("drive").policy(Policy::Preempt);
+    let offer = robot.offer(drive, |(): (), run| forever(run)).unwrap();
+    let rover = there.register("rover").await.unwrap();
+    let crex = rover.robot(crex());
+    let mut goal = crex.goal("drive", &()).unwrap();
+    goal.deadline = Some(50);
+    let late = crex.send(goal).await.unwrap().result::<()>().await;
+    assert!(
+        matches!(late, Err(ActionError::Failed(Failure::DeadlinePassed))),
+        "{late:?}"
+    );
+
+    let first = crex.invoke("drive", &()).await.unwrap();
+    let second = crex.invoke("drive", &()).await.unwrap();
+    let preempted = first.result::<()>().await;
+    assert!(
+        matches!(preempted, Err(ActionError::Failed(Failure::Preempted))),
+        "{preempted:?}"
+    );
+    let mut updates = crex.watch_status().await.unwrap();
+    assert_eq!(updates.next().await.unwrap().len(), 1);
+    drop(offer);
+    let withdrawn = second.result::<()>().await;
+    assert!(
+        matches!(withdrawn, Err(ActionError::Failed(Failure::Withdrawn))),
+        "{withdrawn:?}"
+    );
+    while !updates.next().await.unwrap().is_empty() {}
+    updates.cancel(PATIENCE).await.unwrap();
+    assert_eq!(crex.actions().await.unwrap(), []);
+    let unknown = crex.invoke("drive", &()).await;
+    assert!(matches!(
+        unknown,
+        Err(ActionError::Refused(Refusal::UnknownAction(_)))
+    ));
+
+    // A handler that fails, and one that panics.
+    let _fails = robot
+        .offer(Action::new("fail"), |(): (), _: Execution| async {
+            Err::<(), _>("no power")
+        })
+        .unwrap();
+    let failed = crex.invoke("fail", &()).await.unwrap().result::<()>().await;
+    let power = Failure::Failed("no power".to_owned());
+    assert!(matches!(failed, Err(ActionError::Failed(failure)) if failure == power));
+    let undescribed = robot.offer(Action::new("turn"), |_: Dock, run| forever(run));
+    assert!(matches!(undescribed, Err(OfferError::Undescribed(name)) if name == "target"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_is_killed_ends_the_handle() {
+    let host = host();
+    let domain = Domain::open(&load(host.clone())).await.unwrap();
+    let mut robot = process::start("robot", &host);
+    let rover = domain.register("rover").await.unwrap();
+    let robot_id = AgentId::new("robot").unwrap();
+    let goal = rover.robot(robot_id).invoke("drive", &()).await.unwrap();
+    let mut progress = goal.progress().await.unwrap();
+    let first = progress.next().await.unwrap().unwrap();
+    assert_eq!(first.state, GoalState::Executing);
+    let waiting = tokio::spawn(async move {
+        loop {
+            if let Err(error) = progress.next().await {
+                return error;
+            }
+        }
+    });
+    robot.kill();
+    let is_gone = |error: &ActionError| matches!(error, ActionError::Dialogue(DialogueError::Gone { agent }) if agent == "robot");
+    let ended = tokio::time::timeout(PATIENCE, goal.result::<()>())
+        .await
+        .unwrap();
+    assert!(ended.as_ref().is_err_and(is_gone), "{ended:?}");
+    let ended = tokio::time::timeout(PATIENCE, waiting)
+        .await
+        .unwrap()
+        .unwrap();
+    assert!(is_gone(&ended), "{ended:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_goal_of_a_killed_client_is_cancelled_unless_the_action_says_otherwise() {
+    let host = host();
+    let domain = Domain::open(&load(host.clone())).await.unwrap();
+    let rover = domain.register("rover").await.unwrap();
+    let stopped = Arc::new(Semaphore::new(0));
+    let mut offers = Vec::new();
+    for name in ["drive", "orphan"] {
+        let stopped = Arc::clone(&stopped);
+        let offered = rover.offer(endless(name), move |(): (), run: Execution| {
+            let stopped = Arc::clone(&stopped);
+            async move {
+                let cause = run.stopped().await;
+                stopped.add_permits(1);
+                Err::<(), _>(format!("{cause:?}"))
+            }
+        });
+        offers.push(offered.unwrap());
+    }
+    let mut client = process::start("client", &host);
+    let observer = domain.register("observer").await.unwrap();
+    let robot = observer.robot(AgentId::new("rover").unwrap());
+    let mut updates = robot.watch_status().await.unwrap();
+    assert_eq!(updates.next().await.unwrap().len(), 2);
+    client.kill();
+    let cancelled = tokio::time::timeout(PATIENCE, stopped.acquire()).await;
+    cancelled.unwrap().unwrap().forget();
+    loop {
+        let running = updates.next().await.unwrap();
+        if running.len() == 1 {
+            assert_eq!(running[0].action, "orphan");
+            break;
+        }
+    }
+    assert_eq!(stopped.available_permits(), 0);
+    offers.clear();
+    until_async("the orphan stops", || stopped.available_permits() == 1).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn access_rules_can_name_actions() {
+    let host = host();
+    let lax = Domain::open(&load(host.clone())).await.unwrap();
+    let rules = "access.deny={ \"rover\" = [\"crex action=drive\"] }".to_owned();
+    let strict = load(host.into_iter().chain([rules]));
+    let strict = Domain::open(&strict).await.unwrap();
+    let robot = strict.register("crex").await.unwrap();
+    let runs = Arc::new(AtomicUsize::new(0));
+    let mut offers = Vec::new();
+    for name in ["drive", "stop"] {
+        let runs = Arc::clone(&runs);
+        let offered = robot.offer(Action::new(name), move |(): (), _: Execution| {
+            runs.fetch_add(1, Ordering::Relaxed);
+            async { Ok::<(), String>(()) }
+        });
+        offers.push(offered.unwrap());
+    }
+    let (rover, arm) = (
+        lax.register("rover").await.unwrap(),
+        lax.register("arm").await.unwrap(),
+    );
+    for from in [rover.robot(crex()), rover.robot(crex()).in_json()] {
+        let denied = from.invoke("drive", &()).await;
+        assert!(
+            matches!(
+                denied,
+                Err(ActionError::Dialogue(DialogueError::NotDelivered {
+                    reason: FailureReason::Refused,
+                    ..
+                }))
+            ),
+            "{denied:?}"
+        );
+        let stop = from.invoke("stop", &()).await.unwrap();
+        stop.result::<()>().await.unwrap();
+    }
+    let other = arm.robot(crex()).invoke("drive", &()).await.unwrap();
+    other.result::<()>().await.unwrap();
+    assert_eq!(runs.load(Ordering::Relaxed), 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_example_works() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let offers = example::offer(&robot).unwrap();
+    assert_eq!(offers.len(), 3);
+    let rover = there.register("rover").await.unwrap();
+    example::client(&rover.robot(crex())).await.unwrap();
+}
+
+#[test]
+fn blocking_calls_do_the_same() {
+    let config = patient();
+    let open = || fipa::blocking::Domain::open(&config).unwrap();
+    let (here, there) = (open(), open());
+    let robot = here.register("crex").unwrap();
+    let _offer = robot
+        .offer(dock(), |goal: Dock, run: Execution| {
+            run.progress(Progress::fraction(0.5));
+            Ok::<_, String>(Docked {
+                charge: goal.target.x,
+            })
+        })
+        .unwrap();
+    let _drive = robot
+        .offer(Action::new("drive"), |(): (), run: Execution| {
+            while run.stop_cause().is_none() {
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            Err::<(), _>("stopped")
+        })
+        .unwrap();
+    let rover = there.register("rover").unwrap();
+    let crex = rover.robot(crex());
+    assert_eq!(crex.actions().unwrap().len(), 2);
+    let goal = crex.invoke("dock", &target()).unwrap();
+    let mut progress = goal.progress().unwrap();
+    let mut last = None;
+    while let Some(status) = progress.next().unwrap() {
+        last = Some(status);
+    }
+    let last = last.unwrap();
+    assert_eq!(last.state, GoalState::Done);
+    assert_eq!(last.progress.unwrap().fraction, Some(0.5));
+    let docked: Docked = goal.result().unwrap();
+    assert_eq!(docked.charge, 1.5);
+    let mut goal = crex.invoke("drive", &()).unwrap();
+    assert!(goal.cancel(PATIENCE).unwrap());
+    assert_eq!(crex.status().unwrap(), []);
+}
