@@ -16,6 +16,7 @@ use crate::domain::{Domain, RegisterOptions, warn_of_name};
 use crate::endpoint::Endpoint;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
+use crate::locks::{self, LocksSlot};
 
 /// An agent of this process. Dropping it deregisters the agent.
 pub struct Agent {
@@ -28,6 +29,7 @@ pub struct Agent {
 pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
+    pub(crate) locks: LocksSlot,
 }
 
 #[cfg(feature = "monitor")]
@@ -99,6 +101,7 @@ impl Domain {
                     core: Arc::new(AgentCore {
                         endpoint: Endpoint::new(self.clone(), id, name, incarnation),
                         demultiplexer: Demultiplexer::default(),
+                        locks: LocksSlot::default(),
                     }),
                     registered: true,
                 })
@@ -277,10 +280,12 @@ impl Agent {
     /// the messages that were not received are dropped.
     pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
         self.registered = false;
+        self.core.locks.close(&self.core);
         let unread = self.core.endpoint.deregister()?;
         let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
         all.extend(unread.filter_map(|received| self.core.endpoint.decode(received)));
+        all.retain(|incoming| !locks::is_internal(&incoming.message));
         Ok(all)
     }
 }
@@ -302,6 +307,7 @@ impl Drop for Agent {
     fn drop(&mut self) {
         // In a forked child, the agent stays registered for the parent.
         if self.registered && self.core.endpoint.domain.inner.owner.is_this() {
+            self.core.locks.close(&self.core);
             match self.core.endpoint.deregister() {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}

@@ -3,6 +3,8 @@
 //! A background thread receives and acknowledges letters while the application does other work. It
 //! sleeps when it has nothing to do.
 
+#[cfg(feature = "locks")]
+mod locks;
 #[cfg(feature = "monitor")]
 mod platform;
 #[cfg(feature = "monitor")]
@@ -21,6 +23,8 @@ use crate::{
     AgentId, Config, Deliveries, DirectoryView, Incoming, Loan, ReceiveError, SendError, Unread,
 };
 
+#[cfg(feature = "locks")]
+pub use self::locks::{Lock, Owned};
 #[cfg(feature = "monitor")]
 pub use self::platform::{Ams, Df, Notifications};
 #[cfg(feature = "monitor")]

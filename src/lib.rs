@@ -31,6 +31,7 @@
 //! * [`routes`] reports the routes that letters would take now, and the reasons.
 //! * [`doctor`] checks whether a machine meets the requirements.
 //! * [`keys`] (feature `secure`) manages the keys of this host and the certificates of its peers.
+//! * [`locks`] (feature `locks`) reserves resources that agents share.
 //! * [`platform`] (feature `monitor`) registers and finds services with the directory facilitator of a
 //!   gateway, and lists agents with its agent management system.
 //! * [`Gateway`] (feature `net`) is the gateway that `fipa up` runs; robot processes do not need it.
@@ -44,6 +45,10 @@
 #![cfg_attr(
     not(feature = "secure"),
     doc = "[`keys`]: https://docs.rs/fipa/latest/fipa/keys/index.html"
+)]
+#![cfg_attr(
+    not(feature = "locks"),
+    doc = "[`locks`]: https://docs.rs/fipa/latest/fipa/locks/index.html"
 )]
 
 mod access;
@@ -80,6 +85,11 @@ mod host_directory;
 mod incoming;
 #[cfg(feature = "secure")]
 pub mod keys;
+#[cfg(feature = "locks")]
+pub mod locks;
+#[cfg(not(feature = "locks"))]
+#[path = "locks_disabled.rs"]
+mod locks;
 mod owner;
 #[cfg(feature = "monitor")]
 pub mod platform;

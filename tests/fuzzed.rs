@@ -33,6 +33,8 @@ mod host;
 mod http;
 #[path = "../fuzz/src/input.rs"]
 mod input;
+#[path = "../fuzz/src/locking.rs"]
+mod locking;
 #[path = "../fuzz/src/mdns.rs"]
 mod mdns;
 #[path = "../fuzz/src/platform.rs"]
@@ -115,7 +117,7 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, config, datagrams, delivery, exchange, framed, host, http, mdns, platform, shm,
-        texts, udt
+        access, config, datagrams, delivery, exchange, framed, host, http, locking, mdns, platform,
+        shm, texts, udt
     );
 }

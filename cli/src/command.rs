@@ -14,6 +14,9 @@ mod doctor;
 mod echo;
 mod encode;
 mod keys;
+mod lock;
+mod locks;
+mod own;
 mod protocol;
 mod routes;
 mod send;
@@ -35,6 +38,9 @@ pub(crate) enum Command {
     Coalition(coalition::Arguments),
     Df(df::Arguments),
     Ams(ams::Arguments),
+    Own(own::Arguments),
+    Lock(lock::Arguments),
+    Locks(locks::Arguments),
     Routes(routes::Arguments),
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
@@ -59,6 +65,9 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Coalition(arguments) => coalition::run(arguments, global),
         Command::Df(arguments) => df::run(arguments, global),
         Command::Ams(arguments) => ams::run(arguments, global),
+        Command::Own(arguments) => own::run(arguments, global),
+        Command::Lock(arguments) => lock::run(arguments, global),
+        Command::Locks(arguments) => locks::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),

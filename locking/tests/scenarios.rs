@@ -599,3 +599,45 @@ fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
     agent.receive("agent1", OWN, "agent2_0", granted(asked + 10_000));
     assert_eq!(agent.locks.remaining(agent.now, claim), Some(14_250));
 }
+
+#[test]
+fn a_peer_with_many_requests_takes_bounded_memory() {
+    for kind in Kind::ALL {
+        let mut owner = Agent::owner("crane", kind, &[("rover", Dialect::Own)]);
+        let requests = 100_000_u64;
+        for number in 0..requests {
+            let conversation = Conversation::new("rover".into(), number);
+            let own = number % 2 == 0;
+            let resource = match own {
+                true => bay(),
+                false => Resource::new(&format!("bay-{number}")).unwrap(),
+            };
+            let asked = Some(number);
+            let act = match number % 12 {
+                0 | 1 => Act::Request { clock: number },
+                2 | 3 => Act::RequestToken { number },
+                4 | 5 => Act::Confirm { asked },
+                6 | 7 => Act::Release,
+                8 | 9 => Act::Query { claim: !own },
+                _ => Act::Owned,
+            };
+            let message = LockMessage {
+                conversation,
+                dialect: Dialect::Own,
+                content: Content::Lock { resource, act },
+            };
+            let before = owner.out.len();
+            let locks = &mut owner.locks;
+            locks.handle(owner.now, &peer("rover"), &message, &mut owner.out);
+            // The work for a message is bounded.
+            assert!(owner.out.len() - before <= 8, "{kind}");
+            owner.out.clear();
+        }
+        // Resources of others are bounded, and the peer waits for its own at most once.
+        assert!(owner.locks.status(owner.now).count() <= 4_096, "{kind}");
+        let core = owner.locks.owner(&bay()).unwrap();
+        assert!(core.waiters().count() <= 1, "{kind}");
+        let state = format!("{:?}", owner.locks).len();
+        assert!(state < 4 << 20, "{kind}: {state} bytes");
+    }
+}

@@ -67,7 +67,7 @@ struct Questions {
 }
 
 impl PartnerWatch {
-    pub(super) fn new(core: Arc<AgentCore>) -> Self {
+    pub(crate) fn new(core: Arc<AgentCore>) -> Self {
         let domain = &core.endpoint.domain;
         Self {
             partners: Partners::new(domain.inner.rules.heartbeat()),
@@ -234,6 +234,7 @@ impl PartnerWatch {
                 let AgentCore {
                     endpoint,
                     demultiplexer,
+                    ..
                 } = &*self.core;
                 demultiplexer.now_of(endpoint, &questions.key)
             }
