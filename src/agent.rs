@@ -16,7 +16,7 @@ use crate::domain::{Domain, RegisterOptions, warn_of_name};
 use crate::endpoint::Endpoint;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
-use crate::locks::{self, LocksSlot};
+use crate::lock_slot::{self, LockSlot};
 
 /// An agent of this process. Dropping it deregisters the agent.
 pub struct Agent {
@@ -29,7 +29,7 @@ pub struct Agent {
 pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
-    pub(crate) locks: LocksSlot,
+    pub(crate) locks: LockSlot,
 }
 
 #[cfg(feature = "monitor")]
@@ -101,7 +101,7 @@ impl Domain {
                     core: Arc::new(AgentCore {
                         endpoint: Endpoint::new(self.clone(), id, name, incarnation),
                         demultiplexer: Demultiplexer::default(),
-                        locks: LocksSlot::default(),
+                        locks: LockSlot::default(),
                     }),
                     registered: true,
                 })
@@ -280,12 +280,12 @@ impl Agent {
     /// the messages that were not received are dropped.
     pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
         self.registered = false;
-        self.core.locks.close(&self.core);
+        self.core.locks.close();
         let unread = self.core.endpoint.deregister()?;
         let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
         all.extend(unread.filter_map(|received| self.core.endpoint.decode(received)));
-        all.retain(|incoming| !locks::is_internal(&incoming.message));
+        all.retain(|incoming| !lock_slot::is_of_locks(&incoming.message));
         Ok(all)
     }
 }
@@ -307,7 +307,7 @@ impl Drop for Agent {
     fn drop(&mut self) {
         // In a forked child, the agent stays registered for the parent.
         if self.registered && self.core.endpoint.domain.inner.owner.is_this() {
-            self.core.locks.close(&self.core);
+            self.core.locks.close();
             match self.core.endpoint.deregister() {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}

@@ -17,7 +17,7 @@ use tokio::sync::Notify;
 use crate::endpoint::Endpoint;
 use crate::error::ReceiveError;
 use crate::incoming::Incoming;
-use crate::{locks, presence};
+use crate::{lock_slot, presence};
 
 /// Maximum number of messages that are set aside for one reader while another reader receives.
 /// Beyond it letters stay in the agent's queue, and their senders wait.
@@ -185,7 +185,7 @@ impl Demultiplexer {
         let mut state = self.state.lock();
         if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
             let left = state.served.remove(at).queue;
-            let is_other = |left: &Incoming| !locks::is_internal(&left.message);
+            let is_other = |left: &Incoming| !lock_slot::is_of_locks(&left.message);
             state.others.extend(left.into_iter().filter(is_other));
         }
         drop(state);
@@ -363,7 +363,7 @@ impl State {
             server.queue.push_back(received);
             return;
         }
-        if locks::is_internal(message) {
+        if lock_slot::is_of_locks(message) {
             return;
         }
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {

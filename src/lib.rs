@@ -86,10 +86,12 @@ mod incoming;
 #[cfg(feature = "secure")]
 pub mod keys;
 #[cfg(feature = "locks")]
-pub mod locks;
+mod lock_slot;
 #[cfg(not(feature = "locks"))]
-#[path = "locks_disabled.rs"]
-mod locks;
+#[path = "lock_slot_disabled.rs"]
+mod lock_slot;
+#[cfg(feature = "locks")]
+pub mod locks;
 mod owner;
 #[cfg(feature = "monitor")]
 pub mod platform;

@@ -8,7 +8,7 @@ use fipa_acl::MessageBuilder;
 use fipa_locking::{AnyAlgorithm, ClaimId, Fence, Locks, Millis, Peer, Resource};
 use tokio::sync::watch;
 
-use super::shell::{ClaimState, LocksSlot, Shared};
+use super::shell::{self, ClaimState, Shared};
 use super::{LockError, message, owned};
 use crate::agent::AgentCore;
 
@@ -63,7 +63,7 @@ impl Lock {
         resources: Vec<Resource>,
         begin: impl FnOnce(&mut Locks<AnyAlgorithm>, Millis, &[Resource], &mut Actions) -> ClaimId,
     ) -> Result<Self, LockError> {
-        let shared = LocksSlot::start(core)?;
+        let shared = shell::start(core)?;
         let owners = listed_owners(core, &shared, &resources);
         let (id, state) = shared.claim(core, &owners, |locks, now, actions| {
             begin(locks, now, &resources, actions)
@@ -177,25 +177,19 @@ impl fmt::Debug for Lock {
     }
 }
 
-/// Returns the owners that the directory lists, of the resources without a known owner.
+/// Returns the owners that the directory lists, if they differ from those that the agent knows: an owner
+/// that has restarted has another registration.
 fn listed_owners(
     core: &AgentCore,
     shared: &Shared,
     resources: &[Resource],
 ) -> Vec<(Resource, Peer)> {
-    let unknown = |resource: &&Resource| {
-        shared.read(|locks, _| {
-            let known = locks.owner_of(resource);
-            // A registration that has left the directory may have been replaced.
-            !known.is_some_and(|owner| owner == locks.me() || locks.is_member(owner))
-        })
-    };
     let directory = core.endpoint.domain.directory();
-    let resources = resources.iter().filter(unknown);
-    let owner = |resource: &Resource| {
+    let listed = |resource: &Resource| {
+        let known = shared.read(|locks, _| locks.owner_of(resource).cloned());
         let owner = owned::listed_owner(directory, resource)?;
-        let peer = Peer::new(&owner.name, owner.incarnation.as_u64()).ok()?;
-        Some((resource.clone(), peer))
+        let owner = Peer::new(&owner.name, owner.incarnation.as_u64()).ok()?;
+        (known.as_ref() != Some(&owner)).then(|| (resource.clone(), owner))
     };
-    resources.filter_map(owner).collect()
+    resources.iter().filter_map(listed).collect()
 }

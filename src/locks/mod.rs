@@ -63,7 +63,6 @@ pub use self::lock::Lock;
 pub use self::message::{AdmitError, FENCE, fences_of, with_fences};
 pub use self::owned::{OwnOptions, Owned, OwnerEvent};
 pub use self::report::ResourceStatus;
-pub(crate) use self::shell::{LocksSlot, is_internal};
 pub use self::state_file::StateFileError;
 
 /// The options of an agent's locks; see [`Agent::use_locks`].
@@ -99,14 +98,13 @@ impl Default for LockOptions {
 }
 
 impl LockOptions {
-    fn core(&self, first_conversation: u64) -> Options {
+    fn core(&self) -> Options {
         let mut core = Options::default();
         core.claim = clock::millis(self.claim);
         core.discovery = clock::millis(self.discovery);
         core.probe_interval = clock::millis(self.probe_interval);
         core.probe_timeout = clock::millis(self.probe_timeout);
         core.retry = clock::millis(self.retry);
-        core.first_conversation = first_conversation;
         core
     }
 }
@@ -117,14 +115,14 @@ impl Agent {
     /// # Errors
     /// If a time is zero or longer than a day, or if the agent has used locks already.
     pub fn use_locks(&self, options: LockOptions) -> Result<(), LockError> {
-        self.core.locks.set(options)
+        shell::set(&self.core, options)
     }
 
     /// Returns the resources that this agent owns, holds or waits for, and those of other agents that it
     /// has heard of, sorted by name.
     #[must_use]
     pub fn locks(&self) -> Vec<ResourceStatus> {
-        let Some(shared) = self.core.locks.started() else {
+        let Some(shared) = shell::started(&self.core) else {
             return Vec::new();
         };
         shared.read(|core, now| {

@@ -9,7 +9,7 @@ use fipa_acl::{ErrorChain, Message};
 use fipa_locking::{Ending, Fence, Grant, Options, OwnerState, Resource};
 use fipa_sds::{Entry, RegisterError, Role};
 
-use super::shell::{LocksSlot, Shared};
+use super::shell::{self, Shared};
 use super::state_file::StateFile;
 use super::{AdmitError, LockError, OwnError, ResourceStatus, clock, message};
 use crate::agent::AgentCore;
@@ -143,7 +143,7 @@ impl Owned {
         let mut bounds = Options::default();
         bounds.lease = lease;
         bounds.check()?;
-        let shared = LocksSlot::start(&core)?;
+        let shared = shell::start(&core)?;
         let Some(mut holding) = shared.reserve(&resource) else {
             let resource = resource.as_str().to_owned();
             return Err(OwnError::Here { resource });

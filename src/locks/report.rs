@@ -1,6 +1,6 @@
 //! The state of resources, and the messages in which owners report it.
 //!
-//! A question is a `query-ref` with the protocol [`PROTOCOL`], an answer an `inform` in the same
+//! A question is a `query-ref` with the protocol [`STATUS_PROTOCOL`], an answer an `inform` in the same
 //! conversation. The content of the answer is JSON:
 //!
 //! ```json
@@ -21,9 +21,7 @@ use super::shell::Shared;
 use super::{LockError, owned};
 use crate::agent::AgentCore;
 use crate::demultiplexer::{Admitted, Party, ReaderKey};
-
-/// Protocol of questions about resources.
-pub(super) const PROTOCOL: &str = "fipa-locks";
+use crate::lock_slot::STATUS_PROTOCOL;
 
 /// Maximum length of the content of an answer, in bytes.
 const MAX_CONTENT: usize = 1 << 20;
@@ -254,7 +252,7 @@ pub(super) async fn query(
     };
     let mut question = Message::builder(Performative::QueryRef)
         .sender(endpoint.id.clone())
-        .protocol(PROTOCOL)
+        .protocol(STATUS_PROTOCOL)
         .conversation_id(id);
     let mut waits_for = receivers.len();
     for receiver in receivers {

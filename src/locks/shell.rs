@@ -3,11 +3,12 @@
 //! Calls of the application and a task change the core under a lock. Its messages go to an outbox, in
 //! order, and are encoded and sent outside of the lock.
 
+use std::any::Any;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Performative, escape};
 use fipa_locking::{
     Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Kind,
     LockMessage, Locks, Millis, Peer, Resource, codec,
@@ -18,106 +19,88 @@ use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
-use super::clock::{Timer, now};
+use super::clock::{Timer, millis, now};
 use super::owned::{Holding, OwnerEvent};
 use super::{LockError, LockOptions, report};
 use crate::agent::AgentCore;
 use crate::demultiplexer::ReaderKey;
 use crate::incoming::Incoming;
+use crate::lock_slot::{self, Running, Slot};
 use crate::protocol::{PartnerEvent, PartnerWatch};
 
 /// Maximum number of events that wait for the application of an owner. Beyond it, the earliest is
 /// dropped.
 const MAX_EVENTS: usize = 256;
 
-/// Whether a message is one of locks, which the application never reads.
-pub(crate) fn is_internal(message: &Message) -> bool {
-    let protocol = message.protocol();
-    protocol.is_some_and(|name| name == report::PROTOCOL || codec::is_lock_protocol(name))
+/// Sets the options of an agent's locks, before they are started.
+pub(super) fn set(core: &AgentCore, options: LockOptions) -> Result<(), LockError> {
+    let (kind, options) = (options.algorithm, options.core());
+    options.check()?;
+    let mut slot = core.locks.0.lock();
+    if slot.running.is_some() {
+        return Err(LockError::Started);
+    }
+    slot.options = Some((kind, options));
+    Ok(())
 }
 
-/// The locks of an agent.
-#[derive(Default)]
-pub(crate) struct LocksSlot(Mutex<Slot>);
-
-#[derive(Default)]
-struct Slot {
-    options: LockOptions,
-    shared: Option<Arc<Shared>>,
-    is_closed: bool,
+/// Returns the running locks of an agent.
+pub(super) fn started(core: &AgentCore) -> Option<Arc<Shared>> {
+    shared(&core.locks.0.lock())
 }
 
-impl LocksSlot {
-    /// Sets the options. Must be called before the locks are started.
-    pub(super) fn set(&self, options: LockOptions) -> Result<(), LockError> {
-        options.core(0).check()?;
-        let mut slot = self.0.lock();
-        if slot.shared.is_some() {
-            return Err(LockError::Started);
-        }
-        slot.options = options;
-        Ok(())
-    }
+fn shared(slot: &Slot) -> Option<Arc<Shared>> {
+    let shared = Arc::clone(&slot.running.as_ref()?.shared);
+    shared.downcast().ok()
+}
 
-    /// Returns the running locks.
-    pub(super) fn started(&self) -> Option<Arc<Shared>> {
-        self.0.lock().shared.clone()
+/// Returns the running locks of an agent. The first call starts them.
+pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
+    let endpoint = &core.endpoint;
+    endpoint.domain.inner.owner.check()?;
+    let mut slot = core.locks.0.lock();
+    if slot.is_closed {
+        return Err(LockError::Closed);
     }
-
-    /// Returns the running locks of an agent. The first call starts them.
-    pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
-        let endpoint = &core.endpoint;
-        endpoint.domain.inner.owner.check()?;
-        let mut slot = core.locks.0.lock();
-        if slot.is_closed {
-            return Err(LockError::Closed);
-        }
-        if let Some(shared) = &slot.shared {
-            return Ok(Arc::clone(shared));
-        }
-        let me = Peer::new(&endpoint.name, endpoint.incarnation.as_u64())?;
-        let runtime = &endpoint.domain.inner.service.runtime;
-        let timer = Timer::new(runtime).map_err(LockError::Timer)?;
-        let kind = slot.options.algorithm;
-        // A later registration of the name begins its conversations with higher numbers.
-        let first = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-        let options = slot
-            .options
-            .core(super::clock::millis(first.unwrap_or_default()));
-        let shared = Arc::new(Shared {
-            state: Mutex::new(State::new(Locks::new(me, kind, options))),
-            sending: Mutex::new(()),
-            changed: Notify::new(),
-            kind,
-        });
-        slot.shared = Some(Arc::clone(&shared));
-        drop(slot);
-        let task = Task {
-            // From here on, no message and no change of the directory is missed.
-            messages: core.demultiplexer.serve(Box::new(is_internal)),
-            changes: Some(endpoint.domain.directory().watch()),
-            partners: PartnerWatch::new(Arc::clone(core)),
-            watched: HashSet::new(),
-            greeted: HashSet::new(),
-            core: Arc::clone(core),
-            shared: Arc::clone(&shared),
-            timer,
-        };
-        runtime.spawn(task.run());
-        Ok(shared)
+    if let Some(shared) = shared(&slot) {
+        return Ok(shared);
     }
-
-    /// Ends the locks, before the agent is deregistered: all locks are released.
-    pub(crate) fn close(&self, core: &AgentCore) {
-        let shared = {
-            let mut slot = self.0.lock();
-            slot.is_closed = true;
-            slot.shared.take()
-        };
-        if let Some(shared) = shared {
-            shared.close(core);
-        }
-    }
+    let me = Peer::new(&endpoint.name, endpoint.incarnation.as_u64())?;
+    let runtime = &endpoint.domain.inner.service.runtime;
+    let timer = Timer::new(runtime).map_err(LockError::Timer)?;
+    let (kind, mut options) = slot.options.unwrap_or_default();
+    // A later registration of the name begins its conversations with higher numbers.
+    let time = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    options.first_conversation = millis(time.unwrap_or_default());
+    let shared = Arc::new(Shared {
+        state: Mutex::new(State::new(Locks::new(me, kind, options))),
+        sending: Mutex::new(()),
+        changed: Notify::new(),
+        kind,
+    });
+    let (ending, agent) = (Arc::clone(&shared), Arc::downgrade(core));
+    slot.running = Some(Running {
+        shared: Arc::clone(&shared) as Arc<dyn Any + Send + Sync>,
+        close: Box::new(move || {
+            if let Some(agent) = agent.upgrade() {
+                ending.close(&agent);
+            }
+        }),
+    });
+    drop(slot);
+    let task = Task {
+        // From here on, no message and no change of the directory is missed.
+        messages: core.demultiplexer.serve(Box::new(lock_slot::is_of_locks)),
+        changes: Some(endpoint.domain.directory().watch()),
+        partners: PartnerWatch::new(Arc::clone(core)),
+        watched: HashSet::new(),
+        greeted: HashSet::new(),
+        core: Arc::clone(core),
+        shared: Arc::clone(&shared),
+        timer,
+    };
+    runtime.spawn(task.run());
+    Ok(shared)
 }
 
 /// The locks of an agent, shared by its calls and its task.
@@ -534,7 +517,7 @@ impl Task {
             tracing::debug!(%message, "ignored a message of a lock: its sender is not proved");
             return;
         };
-        if message.protocol() == Some(report::PROTOCOL) {
+        if message.protocol() == Some(lock_slot::STATUS_PROTOCOL) {
             report::answer(&self.core, &self.shared, message);
             return;
         }
