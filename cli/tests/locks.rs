@@ -79,13 +79,13 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     let host = Host::new();
     let mut crane = own(&host, &["--lease", "10min"]);
     let (holder, stale, left) = hold(&host, &["--agent", "rover"], HOLD);
-    assert_eq!(stale, "1.1@crane");
-    assert_eq!(crane.line(), "granted to rover, fence 1.1@crane");
+    assert_eq!(stale, "1.1@crane#bay");
+    assert_eq!(crane.line(), "granted to rover, fence 1.1@crane#bay");
     assert_eq!(command(&host, &stale), "agree");
     assert!(
         crane
             .line()
-            .starts_with("admitted with 1.1@crane: (request")
+            .starts_with("admitted with 1.1@crane#bay: (request")
     );
 
     let late = host.run(&["lock", "bay", "--within", "300ms", "--", "true"]);
@@ -97,13 +97,13 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     let waiting = waiting.join().unwrap();
     // Long before the end of the lease.
     let (fence, _left_too) = split(&waiting.ready);
-    assert_eq!(fence, "1.2@crane");
-    assert_eq!(crane.line(), "ended with rover, fence 1.1@crane");
-    assert_eq!(crane.line(), "granted to arm, fence 1.2@crane");
+    assert_eq!(fence, "1.2@crane#bay");
+    assert_eq!(crane.line(), "ended with rover, fence 1.1@crane#bay");
+    assert_eq!(crane.line(), "granted to arm, fence 1.2@crane#bay");
     // The command of the killed holder goes on, and its fence is refused.
     assert!(left.is_running());
     assert_eq!(command(&host, &stale), "refuse");
-    assert!(crane.line().starts_with("refused: the fence 1.1@crane"));
+    assert!(crane.line().starts_with("refused: the fence 1.1@crane#bay"));
     assert_eq!(command(&host, &fence), "agree");
     assert_eq!(
         host.run(&["lock", "bay", "--within", "0s", "--", "true"])
@@ -117,14 +117,14 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
         ("resource", "bay"),
         ("owner", "crane"),
         ("holder", "arm"),
-        ("fence", "1.2@crane"),
+        ("fence", "1.2@crane#bay"),
     ] {
         assert_eq!(listed[key], value, "{listed}");
     }
     assert!(listed["lease_ms"].as_u64().unwrap() <= 600_000);
     let table = host.run(&["locks"]).done();
     assert!(
-        table.contains("1.2@crane") && table.contains("arm"),
+        table.contains("1.2@crane#bay") && table.contains("arm"),
         "{table}"
     );
 }
@@ -136,7 +136,10 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
     assert!(alone.contains("no agent owns \"bay\""), "{alone}");
     let crane = own(&host, &[]);
     let run = |arguments: &[&str]| host.run(&[&["lock", "bay", "--"], arguments].concat());
-    assert_eq!(run(&["sh", "-c", "echo $FIPA_FENCE"]).done(), "1.1@crane\n");
+    assert_eq!(
+        run(&["sh", "-c", "echo $FIPA_FENCE"]).done(),
+        "1.1@crane#bay\n"
+    );
     assert_eq!(run(&["sh", "-c", "exit 7"]).code, Some(7));
     assert_eq!(run(&["sh", "-c", "kill -KILL $$"]).code, Some(137));
     assert!(
@@ -159,7 +162,10 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
     assert_eq!(code, Some(0));
     // The epoch rises, and no lock is live, so the next run grants at once.
     let _crane = own(&host, &[]);
-    assert_eq!(run(&["sh", "-c", "echo $FIPA_FENCE"]).done(), "2.1@crane\n");
+    assert_eq!(
+        run(&["sh", "-c", "echo $FIPA_FENCE"]).done(),
+        "2.1@crane#bay\n"
+    );
     let nowhere = host
         .run(&["own", "dock", "--state-dir", "/dev/null"])
         .failed(1);

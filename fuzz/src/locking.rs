@@ -31,7 +31,7 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
     let number = u32::from(input.byte());
     let resource = input.one_of(&["bay", "bay", "bay", "dock"]);
     let fence = format!(
-        "{}.{number}@{}",
+        "{}.{number}@{}#{resource}",
         input.byte() % 3,
         input.one_of(&["crane", "arm"])
     );

@@ -422,6 +422,7 @@ impl<A: Algorithm> Locks<A> {
         let silence = state.silence().max(options.claim);
         let core = Owner::new(
             me.clone(),
+            resource.clone(),
             state.epoch(),
             lease,
             now,

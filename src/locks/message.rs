@@ -13,8 +13,8 @@ const MAX_FENCES: usize = 64;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum AdmitError {
-    /// The message has no fence of this owner.
-    #[error("the message has no fence of {owner:?}; lock {resource:?} first")]
+    /// The message has no fence of this owner for the resource.
+    #[error("the message has no fence of {owner:?} for {resource:?}; lock it first")]
     Missing {
         /// The name of the owner.
         owner: String,
@@ -90,7 +90,10 @@ mod tests {
 
     #[test]
     fn fences_survive_a_message() {
-        let fences = [fence("1.2@crane"), fence("3.4@the 100% %20 crane")];
+        let fences = [
+            fence("1.2@crane#bay"),
+            fence("3.4@the 100% %20 crane#bay 1"),
+        ];
         let empty = || Message::builder(Performative::Request);
         let message = with_fences(empty(), fences.iter()).build().unwrap();
         let message = Message::decode(&message.to_payload()).unwrap();
@@ -105,12 +108,12 @@ mod tests {
             fences_of(&message.build().unwrap())
         };
         assert_eq!(
-            read("1.2@".into()),
-            Err(FenceError::Owner(fipa_locking::NameError::Empty).into())
+            read("1.2@#b".into()),
+            Err(FenceError::Name(fipa_locking::NameError::Empty).into())
         );
         assert_eq!(read(String::new()), Err(FenceError::Form.into()));
-        assert_eq!(read("1.1@a ".repeat(65)), Err(AdmitError::TooMany));
-        let long = format!("1.1@{}", "x".repeat(10_000));
+        assert_eq!(read("1.1@a#b ".repeat(65)), Err(AdmitError::TooMany));
+        let long = format!("1.1@{}#bay", "x".repeat(10_000));
         assert!(matches!(read(long), Err(AdmitError::Fence(_))));
     }
 }

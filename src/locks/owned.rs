@@ -200,8 +200,8 @@ impl Owned {
     pub fn check(&self, message: &Message) -> Result<Fence, AdmitError> {
         let owner = &*self.core.endpoint.name;
         let mut fences = message::fences_of(message)?;
-        fences.retain(|fence| fence.owner() == owner);
-        // A lock of several resources of this owner has several of its fences.
+        fences.retain(|fence| fence.owner() == owner && fence.resource() == self.resource.as_str());
+        // A message may have an old fence beside the live one.
         if let Some(at) = fences.iter().position(|fence| self.admit(fence)) {
             return Ok(fences.swap_remove(at));
         }

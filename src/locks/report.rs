@@ -191,7 +191,7 @@ fn read(content: &[u8], owner: &str) -> Result<Vec<ResourceStatus>, ReportError>
             owner: Some(owner.to_owned()),
             is_reported: true,
             holder: row.holder,
-            fence: fence.filter(|fence| fence.owner() == owner),
+            fence: fence.filter(|fence| fence.owner() == owner && fence.resource() == row.resource),
             expires: row.expires_ms.map(Duration::from_millis),
             waiters: row.waiters,
             waiting: row.waiting,
@@ -299,7 +299,7 @@ mod tests {
     fn an_answer_is_read_as_it_was_written() {
         let status = ResourceStatus {
             holder: Some("rover".to_owned()),
-            fence: "1.2@crane".parse().ok(),
+            fence: "1.2@crane#bay".parse().ok(),
             expires: Some(Duration::from_millis(1_500)),
             waiters: vec!["arm".to_owned()],
             waiting: 1,

@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use fipa::locks::{
     AdmitError, Algorithm, Ending, Fence, LockError, LockOptions, OwnError, OwnOptions, OwnerEvent,
-    StateFileError,
+    StateFileError, with_fences,
 };
 use fipa::{Agent, AgentId, Config, Domain, Gateway, Kind, Message, Performative};
 use fipa_testbed::until_async;
@@ -139,11 +139,18 @@ async fn a_command_is_admitted_with_the_fence_of_the_live_grant_only() {
         bay.check(&guarded),
         Err(AdmitError::Stale { fence: stale, .. }) if stale == fence
     ));
-    // The fence of another owner, with the same numbers.
-    let foreign: Fence = format!("{}.{}@arm", fence.epoch(), fence.number())
-        .parse()
-        .unwrap();
-    assert!(!bay.admit(&foreign));
+    // Fences of another owner and of another resource, with the numbers of the live grant.
+    let lock = rover.lock("bay").await.unwrap();
+    let live = lock.fence().unwrap();
+    assert!(bay.admit(live));
+    for names in ["arm#bay", "crane#dock"] {
+        let (epoch, number) = live.position();
+        let foreign: Fence = format!("{epoch}.{number}@{names}").parse().unwrap();
+        assert!(!bay.admit(&foreign), "{foreign}");
+        let message = with_fences(request(&rover, "crane"), [&foreign]);
+        let checked = bay.check(&message.build().unwrap());
+        assert!(matches!(checked, Err(AdmitError::Missing { .. })));
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -286,6 +293,16 @@ async fn several_resources_are_locked_all_or_none() {
     let command = both.guard(request(&first, "crane")).build().unwrap();
     assert_eq!(bay.check(&command).as_ref().ok(), both.fence_of("bay"));
     drop(both);
+    // The lock of one resource gives no access to another of the same owner.
+    let held = first.lock("bay").await.unwrap();
+    let other = second.lock("arm").await.unwrap();
+    assert!(!arm.admit(held.fence().unwrap()));
+    let command = held.guard(request(&first, "crane")).build().unwrap();
+    assert!(matches!(
+        arm.check(&command),
+        Err(AdmitError::Missing { resource, .. }) if resource == "arm"
+    ));
+    drop((held, other));
     // The one that is free is not kept while the other is in use.
     let held = first.lock("bay").await.unwrap();
     let late = second.lock_all_within(&["bay", "arm"], Duration::from_millis(300));
