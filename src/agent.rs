@@ -19,6 +19,7 @@ use crate::domain::{Domain, RegisterOptions, warn_of_name};
 use crate::endpoint::Endpoint;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
+use crate::lock_slot::{self, LockSlot};
 
 /// An agent of this process.
 ///
@@ -43,6 +44,7 @@ struct RegistrationGuard {
 pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
+    pub(crate) locks: LockSlot,
     #[cfg(feature = "actions")]
     pub(crate) actions: crate::action_table::ActionTable,
 }
@@ -122,6 +124,7 @@ impl Domain {
                 let core = Arc::new(AgentCore {
                     endpoint: Endpoint::new(self.clone(), id, name, incarnation),
                     demultiplexer: Demultiplexer::default(),
+                    locks: LockSlot::default(),
                     #[cfg(feature = "actions")]
                     actions: crate::action_table::ActionTable::default(),
                 });
@@ -367,10 +370,12 @@ impl Agent {
             let name = Arc::clone(&self.core.endpoint.name);
             return Err(DeregisterError::NotRegistered(name));
         }
+        self.core.locks.close();
         let unread = self.core.endpoint.deregister()?;
         let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
         all.extend(unread.filter_map(|received| self.core.endpoint.decode(received)));
+        all.retain(|incoming| !lock_slot::is_of_locks(&incoming.message));
         Ok(all)
     }
 }
@@ -393,6 +398,7 @@ impl Drop for RegistrationGuard {
         let is_over = *self.is_over.get_mut();
         // In a forked child, the agent stays registered for the parent.
         if !is_over && self.core.endpoint.domain.inner.owner.is_this() {
+            self.core.locks.close();
             match self.core.endpoint.deregister() {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}

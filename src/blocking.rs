@@ -20,6 +20,8 @@
 
 #[cfg(feature = "actions")]
 pub mod actions;
+#[cfg(feature = "locks")]
+mod locks;
 #[cfg(feature = "monitor")]
 mod platform;
 #[cfg(feature = "monitor")]
@@ -44,6 +46,8 @@ use crate::{
     Unread, Watch,
 };
 
+#[cfg(feature = "locks")]
+pub use self::locks::{Lock, Owned};
 #[cfg(feature = "monitor")]
 pub use self::platform::{Ams, Df, Notifications};
 #[cfg(feature = "monitor")]

@@ -17,7 +17,7 @@ use tokio::sync::Notify;
 use crate::endpoint::Endpoint;
 use crate::error::ReceiveError;
 use crate::incoming::Incoming;
-use crate::presence;
+use crate::{lock_slot, presence};
 
 /// Maximum number of messages that are set aside for one reader while another reader receives.
 /// Beyond it letters stay in the agent's queue, and their senders wait.
@@ -185,7 +185,8 @@ impl Demultiplexer {
         let mut state = self.state.lock();
         if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
             let left = state.served.remove(at).queue;
-            state.others.extend(left);
+            let is_other = |left: &Incoming| !lock_slot::is_of_locks(&left.message);
+            state.others.extend(left.into_iter().filter(is_other));
         }
         drop(state);
         self.changed.notify_waiters();
@@ -376,6 +377,9 @@ impl State {
         let is_legal = received.violation().is_none();
         if let Some(server) = served.find(|server| is_legal && (server.opens)(received.message())) {
             server.queue.push_back(received);
+            return;
+        }
+        if lock_slot::is_of_locks(message) {
             return;
         }
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {

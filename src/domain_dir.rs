@@ -205,6 +205,12 @@ impl DomainDir {
         Ok(true)
     }
 
+    /// Returns the name of the domain.
+    #[cfg(feature = "locks")]
+    pub(crate) fn name(&self) -> &str {
+        &self.domain
+    }
+
     /// Returns the path of the directory.
     pub(crate) fn path(&self) -> PathBuf {
         self.base.join(&self.domain)

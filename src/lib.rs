@@ -58,6 +58,8 @@
 //! [`Agent::subscribe`] notify many agents. `monitor.check = "enforce"` checks all messages of a process
 //! against the protocols.
 //!
+//! [`Agent::own`] and [`Agent::lock`] (feature `locks`) reserve resources that agents share ([`locks`]).
+//!
 //! [`Agent::offer`] (feature `actions`) offers an action of a robot, and [`Agent::robot`] lists and invokes
 //! those of another ([`actions`]).
 //!
@@ -96,6 +98,10 @@
 #![cfg_attr(
     not(feature = "secure"),
     doc = "[`keys`]: https://docs.rs/fipa/latest/fipa/keys/index.html"
+)]
+#![cfg_attr(
+    not(feature = "locks"),
+    doc = "[`locks`]: https://docs.rs/fipa/latest/fipa/locks/index.html"
 )]
 
 mod access;
@@ -137,6 +143,13 @@ mod host_directory;
 mod incoming;
 #[cfg(feature = "secure")]
 pub mod keys;
+#[cfg(feature = "locks")]
+mod lock_slot;
+#[cfg(not(feature = "locks"))]
+#[path = "lock_slot_disabled.rs"]
+mod lock_slot;
+#[cfg(feature = "locks")]
+pub mod locks;
 mod owner;
 #[cfg(feature = "monitor")]
 pub mod platform;

@@ -137,6 +137,12 @@ impl Service {
         Ok(service)
     }
 
+    /// Returns the name of the domain.
+    #[cfg(feature = "locks")]
+    pub(crate) fn domain_name(&self) -> &str {
+        self.dir.name()
+    }
+
     /// Returns the current locations of the service.
     #[cfg(feature = "net")]
     pub(crate) fn all_locations(&self) -> Vec<Location> {

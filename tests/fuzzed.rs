@@ -35,6 +35,8 @@ mod host;
 mod http;
 #[path = "../fuzz/src/input.rs"]
 mod input;
+#[path = "../fuzz/src/locking.rs"]
+mod locking;
 #[path = "../fuzz/src/mdns.rs"]
 mod mdns;
 #[path = "../fuzz/src/platform.rs"]
@@ -120,8 +122,8 @@ mod bodies {
     use super::*;
 
     bodies!(
-        access, actions, config, datagrams, delivery, exchange, framed, host, http, mdns, platform,
-        recording, shm, texts, udt
+        access, actions, config, datagrams, delivery, exchange, framed, host, http, locking, mdns,
+        platform, recording, shm, texts, udt
     );
 
     #[test]

@@ -17,8 +17,11 @@ mod doctor;
 mod echo;
 mod encode;
 mod keys;
-mod man;
 mod listen;
+mod lock;
+mod locks;
+mod man;
+mod own;
 mod ping;
 mod protocol;
 mod request;
@@ -49,6 +52,9 @@ pub(crate) enum Command {
     Ams(ams::Arguments),
     Actions(actions::Arguments),
     Do(do_action::Arguments),
+    Own(own::Arguments),
+    Lock(lock::Arguments),
+    Locks(locks::Arguments),
     Routes(routes::Arguments),
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
@@ -81,6 +87,9 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Ams(arguments) => ams::run(arguments, global),
         Command::Actions(arguments) => actions::run(arguments, global),
         Command::Do(arguments) => do_action::run(arguments, global),
+        Command::Own(arguments) => own::run(arguments, global),
+        Command::Lock(arguments) => lock::run(arguments, global),
+        Command::Locks(arguments) => locks::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),

@@ -90,6 +90,11 @@ impl Failure {
         }
     }
 
+    /// The same errors with another exit code.
+    pub(crate) fn with_code(self, code: u8) -> Self {
+        Self { code, ..self }
+    }
+
     /// Prints the errors and returns the exit code.
     pub(crate) fn report(&self) -> ExitCode {
         let mut text = String::new();

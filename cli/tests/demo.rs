@@ -53,7 +53,7 @@ fn every_step_passes() {
         assert_eq!(step["ok"], true, "{step:#}");
     }
     assert!(output.status.success());
-    assert_eq!(steps.len(), 11);
+    assert_eq!(steps.len(), 12);
     let via: Vec<&Value> = steps.iter().map(|step| &step["via"]).collect();
     assert_eq!((via[1], via[2]), (&"shm".into(), &"tcp".into()));
     assert_eq!(
@@ -61,6 +61,7 @@ fn every_step_passes() {
         (&"unix".into(), &"shm".into())
     );
     assert_eq!(steps[8]["sender"], "arm_3");
+    assert_ne!(steps[9]["live"], steps[9]["stale"]);
     let itself = steps[8]["caught_itself"].as_str().unwrap();
     assert!(itself.contains("from arm_6"), "{itself}");
     assert_eq!(files(pid), Vec::<String>::new());

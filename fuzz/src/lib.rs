@@ -10,6 +10,7 @@ pub mod framed;
 pub mod host;
 pub mod http;
 pub mod input;
+pub mod locking;
 pub mod mdns;
 pub mod platform;
 pub mod recording;

@@ -282,6 +282,18 @@ impl<A: Algorithm> Locks<A> {
         self.members.keys()
     }
 
+    /// Whether this registration is a member.
+    #[must_use]
+    pub fn is_member(&self, peer: &Peer) -> bool {
+        self.members.contains_key(peer)
+    }
+
+    /// Owner of a resource, if it is known.
+    #[must_use]
+    pub fn owner_of(&self, resource: &Resource) -> Option<&Peer> {
+        self.resources.get(resource)?.owner.as_ref()
+    }
+
     // ----- claims
 
     /// Requests a resource. Fails after `within`, if it is given.
@@ -389,6 +401,19 @@ impl<A: Algorithm> Locks<A> {
     /// [`Event::Owning`] follows after [`Options::claim`], or [`Event::OwningRefused`] if another agent
     /// owns the resource. Nothing happens if this agent owns it already.
     pub fn own(&mut self, now: Millis, resource: &Resource, state: &OwnerState, out: &mut Actions) {
+        self.own_with_lease(now, resource, state, self.options.lease, out);
+    }
+
+    /// Begins to own a resource, and grants it with this lease instead of [`Options::lease`]. The state
+    /// has to be for leases of at least this time; see [`own`](Self::own).
+    pub fn own_with_lease(
+        &mut self,
+        now: Millis,
+        resource: &Resource,
+        state: &OwnerState,
+        lease: Millis,
+        out: &mut Actions,
+    ) {
         let (me, options) = (self.me.clone(), self.options);
         let entry = self.entry(resource);
         if entry.owned.is_some() {
@@ -397,8 +422,9 @@ impl<A: Algorithm> Locks<A> {
         let silence = state.silence().max(options.claim);
         let core = Owner::new(
             me.clone(),
+            resource.clone(),
             state.epoch(),
-            options.lease,
+            lease,
             now,
             silence,
             options.fault,

@@ -11,12 +11,13 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use crate::faults::{Fault, fault};
-use crate::{Act, Conversation, Dialect, Fence, Gate, Millis, Peer, Refusal};
+use crate::{Act, Conversation, Dialect, Fence, Gate, Millis, Peer, Refusal, Resource};
 
 /// The owner's state for one resource.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Owner {
     me: Peer,
+    resource: Resource,
     epoch: u64,
     /// Number of the last grant.
     number: u64,
@@ -108,6 +109,7 @@ impl Owner {
     /// Creates the state of a life that is silent for the given time.
     pub(crate) fn new(
         me: Peer,
+        resource: Resource,
         epoch: u64,
         lease: Millis,
         now: Millis,
@@ -124,6 +126,7 @@ impl Owner {
         }
         Self {
             me,
+            resource,
             epoch,
             number: 0,
             lease,
@@ -393,7 +396,7 @@ impl Owner {
             if !fault!(self.fault, ReuseFence) || self.number == 0 {
                 self.number += 1;
             }
-            let fence = Fence::new(&self.me, self.epoch, self.number);
+            let fence = Fence::new(&self.me, &self.resource, self.epoch, self.number);
             grant.fence = Some(fence.clone());
             grant.expires = Some(now.saturating_add(self.lease));
             out.push(Self::granted(

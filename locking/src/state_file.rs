@@ -31,6 +31,17 @@ impl OwnerState {
         }
     }
 
+    /// State of a life without a file. `epoch` has to rise from life to life, as the time of day does.
+    /// The owner is silent for `lease`, which has to be that of its earlier lives, too.
+    #[must_use]
+    pub fn volatile(epoch: u64, lease: Millis) -> Self {
+        Self {
+            epoch,
+            lease,
+            silence: lease,
+        }
+    }
+
     /// State of the owner's next life, whose leases are at most `lease`.
     #[must_use]
     pub fn next_life(self, lease: Millis) -> Self {

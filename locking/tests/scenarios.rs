@@ -199,7 +199,7 @@ fn a_silent_legacy_holder_is_replaced_only_by_force() {
     owner.receive("agent3", OWN, "agent3_1", confirm(9_000));
     assert_eq!(owner.sent(), []);
     owner.locks.force(owner.now, &bay(), &mut owner.out);
-    assert_eq!(fence_in(&owner.sent()).to_string(), "1.1@agent1");
+    assert_eq!(fence_in(&owner.sent()).to_string(), "1.1@agent1#bay");
 }
 
 /// In Suzuki-Kasami legacy agents send no reports: the token is the report.
@@ -321,7 +321,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
     assert_eq!(agent.sent(), []);
     // A grant that crosses the withdrawal is released at once.
     let granted = Act::Granted {
-        fence: "1.1@agent1".parse().unwrap(),
+        fence: "1.1@agent1#bay".parse().unwrap(),
         lease: 15_000,
         asked: 200,
     };
@@ -418,7 +418,7 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
         .own(0, &bay(), &stored.next_life(15_000), &mut owner.out);
     owner.receive("agent2", OWN, "agent2_0", confirm(1));
     // An earlier fence is refused at once.
-    let earlier = "1.7@agent1".parse().unwrap();
+    let earlier = "1.7@agent1#bay".parse().unwrap();
     assert!(!owner.locks.admit(0, &bay(), &earlier));
     owner.pass(14_999);
     owner.receive("agent2", OWN, "agent2_0", confirm(2));
@@ -426,7 +426,7 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
     assert!(!owner.sent().iter().any(of_lock));
     // The waiter is probed, and answers.
     owner.pass(1);
-    assert_eq!(fence_in(&owner.sent()).to_string(), "2.1@agent1");
+    assert_eq!(fence_in(&owner.sent()).to_string(), "2.1@agent1#bay");
 }
 
 #[test]
@@ -578,9 +578,9 @@ fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
     agent.receive("agent1", OWN, "agent2_0", Act::Agree { clock: 1 });
     agent.now = 14_250;
     agent.sent();
-    let fence: Fence = "1.1@agent1".parse().unwrap();
+    let fence: Fence = "1.1@agent1#bay".parse().unwrap();
     let granted = |asked| Act::Granted {
-        fence: "1.1@agent1".parse().unwrap(),
+        fence: "1.1@agent1#bay".parse().unwrap(),
         lease: 15_000,
         asked,
     };
@@ -598,4 +598,46 @@ fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
     // An answer to a request that this agent did not make, or makes later, does not count.
     agent.receive("agent1", OWN, "agent2_0", granted(asked + 10_000));
     assert_eq!(agent.locks.remaining(agent.now, claim), Some(14_250));
+}
+
+#[test]
+fn a_peer_with_many_requests_takes_bounded_memory() {
+    for kind in Kind::ALL {
+        let mut owner = Agent::owner("crane", kind, &[("rover", Dialect::Own)]);
+        let requests = 100_000_u64;
+        for number in 0..requests {
+            let conversation = Conversation::new("rover".into(), number);
+            let own = number % 2 == 0;
+            let resource = match own {
+                true => bay(),
+                false => Resource::new(&format!("bay-{number}")).unwrap(),
+            };
+            let asked = Some(number);
+            let act = match number % 12 {
+                0 | 1 => Act::Request { clock: number },
+                2 | 3 => Act::RequestToken { number },
+                4 | 5 => Act::Confirm { asked },
+                6 | 7 => Act::Release,
+                8 | 9 => Act::Query { claim: !own },
+                _ => Act::Owned,
+            };
+            let message = LockMessage {
+                conversation,
+                dialect: Dialect::Own,
+                content: Content::Lock { resource, act },
+            };
+            let before = owner.out.len();
+            let locks = &mut owner.locks;
+            locks.handle(owner.now, &peer("rover"), &message, &mut owner.out);
+            // The work for a message is bounded.
+            assert!(owner.out.len() - before <= 8, "{kind}");
+            owner.out.clear();
+        }
+        // Resources of others are bounded, and the peer waits for its own at most once.
+        assert!(owner.locks.status(owner.now).count() <= 4_096, "{kind}");
+        let core = owner.locks.owner(&bay()).unwrap();
+        assert!(core.waiters().count() <= 1, "{kind}");
+        let state = format!("{:?}", owner.locks).len();
+        assert!(state < 4 << 20, "{kind}: {state} bytes");
+    }
 }

@@ -68,7 +68,7 @@ struct Questions {
 }
 
 impl PartnerWatch {
-    pub(super) fn new(core: Arc<AgentCore>) -> Self {
+    pub(crate) fn new(core: Arc<AgentCore>) -> Self {
         let domain = &core.endpoint.domain;
         Self {
             partners: Partners::new(domain.inner.rules.heartbeat()),

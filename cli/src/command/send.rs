@@ -10,6 +10,7 @@ use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use fipa::monitor::History;
+use fipa::locks::{Fence, with_fences};
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
     Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
@@ -162,6 +163,10 @@ struct Parameters {
     /// Latest time of a reply, for example 30s (from now) or 2030-01-31T12:00:00Z
     #[arg(long, value_name = "TIME", value_parser = reply_by)]
     reply_by: Option<Time>,
+
+    /// Fence of a lock of the receiver's resource: the FIPA_FENCE of `fipa lock`; repeatable
+    #[arg(long, value_name = "FENCE")]
+    fence: Vec<Fence>,
 
     /// Language of the content
     #[arg(long, value_name = "TEXT")]
@@ -396,6 +401,7 @@ fn message(
     if let Some(time) = given.reply_by {
         builder = builder.reply_by(time);
     }
+    builder = with_fences(builder, &given.fence);
     builder.build().map_err(|error| {
         Failure::wrong_usage(
             error.to_string(),

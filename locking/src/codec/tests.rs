@@ -189,7 +189,7 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
     let number = 0..=i32::MAX as u64;
     let fence = (name(), any::<u64>(), any::<u64>()).prop_map(|(owner, epoch, number)| {
         let owner = crate::Peer::new(&owner, 0).unwrap();
-        Fence::new(&owner, epoch, number)
+        Fence::new(&owner, &Resource::new("bay").unwrap(), epoch, number)
     });
     let fence = fence.boxed();
     let agents = proptest::collection::btree_map(name().prop_map(Arc::from), number.clone(), 0..4);

@@ -18,7 +18,8 @@ use crate::report::Failure;
 ///
 /// The agents converse through shared memory and, between the hosts, over TCP. Large content is
 /// delivered without a copy, one agent is killed, shared memory breaks, a legacy peer sends a letter,
-/// and a watcher reports an agent that violates its protocol. The receiving process checks each step.
+/// a watcher reports an agent that violates its protocol, and the late command of an agent that was
+/// killed with a lock is refused. The receiving process checks each step.
 ///
 /// The exit code is 0 only if every step passed and no file is left behind.
 #[derive(Debug, Args)]

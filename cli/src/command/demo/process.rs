@@ -7,6 +7,7 @@
 use std::io::Write;
 use std::time::{Duration, Instant};
 
+use fipa::locks::{Fence, Lock, OwnOptions, Owned, with_fences};
 use fipa::monitor::Library;
 use fipa::watch::{WatchOptions, Watcher};
 use fipa::{
@@ -21,6 +22,12 @@ use crate::output;
 
 /// The protocol of messages that are sent only to measure their time.
 const MEASURING: &str = "demo-measure";
+
+/// The protocol of commands to the owner of a resource.
+const COMMAND: &str = "demo-command";
+
+/// Lease of the locks of the demo. The owner has no state file, so it waits for one lease.
+const LEASE: Duration = Duration::from_secs(2);
 
 /// An order to a process.
 #[derive(Debug, Serialize, Deserialize)]
@@ -43,6 +50,12 @@ pub(super) enum Order {
     SendLarge { to: String, len: usize },
     /// List the agents of the directory.
     Agents,
+    /// Own a resource.
+    Own { resource: String },
+    /// Lock a resource, and keep the lock to the end of the process.
+    Lock { resource: String },
+    /// Send a command with a fence.
+    Command { to: String, fence: String },
     /// Report the number of messages received so far.
     Count,
     /// Send `rounds` messages of `len` bytes, each after the confirmation of the previous one, and
@@ -66,6 +79,10 @@ pub(super) enum Event {
     Outcomes { deliveries: Value },
     /// The agents of the directory.
     Agents { agents: Vec<Listed> },
+    /// The agent owns the resource.
+    Owned,
+    /// The agent holds the resource.
+    Locked { fence: String },
     /// The number of received messages.
     Count { received: u64 },
     /// Time from sending to confirmation, in microseconds.
@@ -176,11 +193,12 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
     });
     let mut orders = orders();
     let mut received = 0;
+    let mut held = Held::default();
     loop {
         tokio::select! {
             line = next(&mut orders) => match line {
                 Some(line) => {
-                    let done = execute(&agent, &line, received).await;
+                    let done = execute(&agent, &line, received, &mut held).await;
                     emit(&done.unwrap_or_else(|error| Event::Failed { error }));
                 }
                 None => break,
@@ -192,7 +210,7 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
                     if incoming.message().protocol() != Some(MEASURING) {
                         emit(&Event::Received(received_message(&incoming)));
                     }
-                    if let Err(error) = answer(&agent, &incoming).await {
+                    if let Err(error) = answer(&agent, &incoming, &held).await {
                         emit(&Event::Failed { error });
                     }
                 }
@@ -221,7 +239,19 @@ fn emit(event: &Event) {
     }
 }
 
-async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, String> {
+/// The resources that the agent owns and holds.
+#[derive(Default)]
+struct Held {
+    owned: Option<Owned>,
+    lock: Option<Lock>,
+}
+
+async fn execute(
+    agent: &Agent,
+    line: &str,
+    received: u64,
+    held: &mut Held,
+) -> Result<Event, String> {
     let order: Order =
         serde_json::from_str(line).map_err(|error| ErrorChain(&error).to_string())?;
     match order {
@@ -274,6 +304,39 @@ async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, Stri
         Order::Agents => Ok(Event::Agents {
             agents: agents(agent),
         }),
+        Order::Own { resource } => {
+            let options = OwnOptions {
+                lease: LEASE,
+                // No file is left behind.
+                volatile: true,
+                ..OwnOptions::default()
+            };
+            let owned = agent.own(&resource, options).await;
+            held.owned = Some(owned.map_err(|error| ErrorChain(&error).to_string())?);
+            Ok(Event::Owned)
+        }
+        Order::Lock { resource } => {
+            let lock = agent.lock(&resource).await;
+            let lock = lock.map_err(|error| ErrorChain(&error).to_string())?;
+            let fence = lock.fence().ok_or("a lock without a fence")?.to_string();
+            held.lock = Some(lock);
+            Ok(Event::Locked { fence })
+        }
+        Order::Command { to, fence } => {
+            let fence: Fence = fence
+                .parse()
+                .map_err(|error| ErrorChain(&error).to_string())?;
+            let command = agent
+                .message(Performative::Request)
+                .receiver(id(&to)?)
+                .protocol(COMMAND)
+                .conversation_id(agent.unique_id());
+            let command = with_fences(command, [&fence])
+                .build()
+                .map_err(|error| ErrorChain(&error).to_string())?;
+            let deliveries = agent.send(command).await;
+            outcomes(&deliveries.map_err(|error| ErrorChain(&error).to_string())?)
+        }
         Order::Count => Ok(Event::Count { received }),
         Order::Measure { to, len, rounds } => measure(agent, &to, len, rounds).await,
     }
@@ -412,8 +475,22 @@ fn is_in_shared_memory(bytes: &[u8]) -> bool {
 }
 
 /// The participant's side of fipa-request (FIPA00026): agree, then inform of the result.
-async fn answer(agent: &Agent, incoming: &Incoming) -> Result<(), String> {
+async fn answer(agent: &Agent, incoming: &Incoming, held: &Held) -> Result<(), String> {
     let message = incoming.message();
+    if let Some(owned) = &held.owned
+        && message.protocol() == Some(COMMAND)
+    {
+        let (act, content) = match owned.check(message) {
+            Ok(fence) => (Performative::Agree, fence.to_string()),
+            Err(error) => (Performative::Refuse, ErrorChain(&error).to_string()),
+        };
+        let reply = agent.reply(message, act).content(content).build();
+        let reply = reply.map_err(|error| ErrorChain(&error).to_string())?;
+        let sent = agent.send(reply).await;
+        return sent
+            .map(drop)
+            .map_err(|error| ErrorChain(&error).to_string());
+    }
     let is_request = *message.performative() == Performative::Request
         && message.protocol() == Some("fipa-request");
     if !is_request {

@@ -50,11 +50,21 @@ impl Process {
 
     /// Sends an order to the process and waits for its result.
     pub(super) async fn run(&mut self, order: &Order) -> Result<Event, String> {
+        self.begin(order).await?;
+        self.event().await
+    }
+
+    /// Sends an order to the process.
+    pub(super) async fn begin(&mut self, order: &Order) -> Result<(), String> {
         let mut line = serde_json::to_string(order).map_err(|error| error.to_string())?;
         line.push('\n');
         let orders = self.orders.as_mut().ok_or("the process is ending")?;
         let written = orders.write_all(line.as_bytes()).await;
-        written.map_err(|error| format!("{}: {error}", self.name))?;
+        written.map_err(|error| format!("{}: {error}", self.name))
+    }
+
+    /// Waits for the result of an order that was sent.
+    pub(super) async fn result(&mut self) -> Result<Event, String> {
         self.event().await
     }
 

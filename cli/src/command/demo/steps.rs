@@ -129,6 +129,8 @@ impl Demo {
         self.step("a letter from a legacy peer", found);
         let found = self.broken_protocol().await;
         self.step("a protocol violation is detected", found);
+        let found = self.locks().await;
+        self.step("the lock of a killed agent, and its late command", found);
         let found = self.measurement().await;
         self.step("measurement", found);
     }
@@ -442,6 +444,64 @@ impl Demo {
 
     /// A call for proposals. One arm proposes; the other reports a result although it was not awarded
     /// the task. The agents do not cooperate with the watcher.
+    async fn locks(&mut self) -> Found {
+        let resource = "bay".to_owned();
+        for agent in ["crane", "lifter_1", "lifter_2"] {
+            self.processes.start("rover", agent, "agent").await?;
+        }
+        let own = Order::Own {
+            resource: resource.clone(),
+        };
+        match self.processes.get("crane")?.run(&own).await? {
+            Event::Owned => self.say("  crane owns the bay"),
+            other => return Err(format!("crane does not own the bay: {other:?}")),
+        }
+        let lock = Order::Lock { resource };
+        let locked = self.processes.get("lifter_1")?.run(&lock).await?;
+        let stale = fence(locked)?;
+        self.say(&format!("  lifter_1 holds the bay with the fence {stale}"));
+        let answer = self.command("lifter_1", &stale).await?;
+        ensure!(
+            answer.performative == "agree",
+            "answer to the holder: {answer:?}"
+        );
+        self.processes.get("lifter_2")?.begin(&lock).await?;
+        let pid = self.processes.get("lifter_1")?.pid();
+        self.processes.kill("lifter_1").await?;
+        self.say(&format!(
+            "  lifter_1 (process {pid}) was killed with SIGKILL"
+        ));
+        let locked = self.processes.get("lifter_2")?.result().await?;
+        let live = fence(locked)?;
+        self.say(&format!("  lifter_2 holds the bay with the fence {live}"));
+        // The command of the killed agent, as a slow network would deliver it.
+        let answer = self.command("arm_4", &stale).await?;
+        ensure!(
+            answer.performative == "refuse",
+            "answer to the late command: {answer:?}"
+        );
+        let reason = answer.content.unwrap_or_default();
+        self.say(&format!("  crane refused its late command: {reason}"));
+        let answer = self.command("lifter_2", &live).await?;
+        ensure!(
+            answer.performative == "agree",
+            "answer to the holder: {answer:?}"
+        );
+        self.say(&format!("  crane admitted the command with {live}"));
+        found!("stale": stale, "live": live, "refused": reason)
+    }
+
+    /// Sends a command with a fence to the owner of the bay, and returns the answer.
+    async fn command(&mut self, from: &str, fence: &str) -> Result<Received, String> {
+        let order = Order::Command {
+            to: "lock:bay".into(),
+            fence: fence.into(),
+        };
+        let deliveries = self.send(from, order).await?;
+        one_delivery(&deliveries)?;
+        self.received_by(from).await
+    }
+
     async fn broken_protocol(&mut self) -> Found {
         self.processes.start("rover", "watcher", "watcher").await?;
         for (from, performative, to) in [
@@ -567,6 +627,14 @@ impl Demo {
             )),
         };
         self.step("no files are left behind", found);
+    }
+}
+
+/// Returns the fence of a lock.
+fn fence(event: Event) -> Result<String, String> {
+    match event {
+        Event::Locked { fence } => Ok(fence),
+        other => Err(format!("expected a lock, not {other:?}")),
     }
 }
 

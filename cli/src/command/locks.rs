@@ -1,0 +1,192 @@
+//! `fipa locks`: lists resources with their owners, holders and waiting agents.
+
+use std::time::Duration;
+
+use clap::Args;
+use comfy_table::{Table, presets};
+use fipa::locks::{Fence, ResourceStatus};
+use fipa::{Agent, Config, ErrorChain, Incarnation, RegisterOptions};
+use fipa_acl::escape;
+use serde_json::{Value, json};
+
+use crate::membership;
+use crate::options::{self, Global};
+use crate::output;
+use crate::report::Failure;
+
+/// Interval of the questions with --watch.
+const INTERVAL: Duration = Duration::from_secs(1);
+
+/// List the resources of the domain with their holders
+///
+/// Asks the owners of all resources in the directory. A resource whose owner does not answer has no
+/// details.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa locks
+  fipa locks --json | jq -r '.locks[] | select(.holder) | .resource'
+  fipa locks --watch
+
+Columns:
+  OWNER    agent that grants the resource
+  HOLDER   agent that holds it; - if it is free, ? if the owner does not answer
+  FENCE    fence of the grant
+  LEASE    remaining time of the grant, unless the holder extends it
+  WAITING  agents that wait, the next one first
+
+JSON:
+  { \"domain\": text, \"locks\": [ { \"resource\", \"owner\": name, \"answered\": whether the owner answered,
+    \"holder\": name or null, \"fence\": text or null, \"lease_ms\": number or null,
+    \"waiters\": [ name ] at most 16, \"waiting\": number } ] }
+
+With --watch, the list is printed again when a grant, an owner or a waiting agent changes; with --json,
+each list is on a line of its own.")]
+pub(crate) struct Arguments {
+    /// Continue, and print the list again after each change, until Ctrl-C
+    #[arg(long, short)]
+    watch: bool,
+
+    /// Maximum wait for the answers of the owners
+    #[arg(long, value_name = "TIME", default_value = "2s", value_parser = options::duration)]
+    timeout: Duration,
+
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    membership::run(async {
+        let domain = membership::join(&config).await?;
+        let name = format!("fipa-locks-{}", Incarnation::random());
+        let options = RegisterOptions {
+            agent_type: "fipa-locks".to_owned(),
+            ..RegisterOptions::default()
+        };
+        let agent = membership::register(&domain, &name, options, &config).await?;
+        let listed = list(&agent, &arguments, &config).await;
+        drop(agent);
+        domain.close().await;
+        listed
+    })
+}
+
+async fn list(agent: &Agent, arguments: &Arguments, config: &Config) -> Result<(), Failure> {
+    let mut before = None;
+    loop {
+        let locks = agent.query_locks(arguments.timeout).await;
+        let locks = locks.map_err(|error| {
+            Failure::failed(
+                ErrorChain(&error).to_string(),
+                format!("domain {:?}", config.domain),
+                "run the command again",
+            )
+        })?;
+        let shown: Vec<_> = locks.iter().map(lasting).collect();
+        if before.as_ref() != Some(&shown) {
+            print(&locks, arguments, config)?;
+            before = Some(shown);
+        }
+        if !arguments.watch {
+            return Ok(());
+        }
+        tokio::time::sleep(INTERVAL).await;
+    }
+}
+
+/// Returns the parts of a state whose change is printed.
+fn lasting(
+    status: &ResourceStatus,
+) -> (
+    String,
+    Option<String>,
+    bool,
+    Option<String>,
+    Option<Fence>,
+    Vec<String>,
+) {
+    (
+        status.resource.clone(),
+        status.owner.clone(),
+        status.is_reported,
+        status.holder.clone(),
+        status.fence.clone(),
+        status.waiters.clone(),
+    )
+}
+
+fn print(locks: &[ResourceStatus], arguments: &Arguments, config: &Config) -> Result<(), Failure> {
+    if arguments.json {
+        let locks: Vec<Value> = locks.iter().map(in_json).collect();
+        let document = json!({ "domain": config.domain, "locks": locks });
+        return match arguments.watch {
+            true => output::json_line(&document),
+            false => output::json(&document),
+        };
+    }
+    if locks.is_empty() {
+        return output::text(&format!(
+            "no resource is owned in domain {}\n",
+            config.domain
+        ));
+    }
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_header(COLUMNS);
+    for column in table.column_iter_mut() {
+        column.set_padding((0, 2));
+    }
+    table.add_rows(locks.iter().map(cells));
+    output::text(&format!("{}\n", table.trim_fmt()))
+}
+
+const COLUMNS: [&str; 6] = ["RESOURCE", "OWNER", "HOLDER", "FENCE", "LEASE", "WAITING"];
+
+fn cells(status: &ResourceStatus) -> [String; 6] {
+    let none = match status.is_reported {
+        true => "-",
+        false => "?",
+    };
+    let name = |name: &Option<String>| match name {
+        Some(name) => escape(name).into_owned(),
+        None => none.to_owned(),
+    };
+    let lease = status.expires.map(|left| {
+        let whole = Duration::from_secs(left.as_secs());
+        humantime::format_duration(whole).to_string()
+    });
+    let mut waiting: Vec<String> = status
+        .waiters
+        .iter()
+        .map(|waiter| escape(waiter).into_owned())
+        .collect();
+    let more = status.waiting.saturating_sub(waiting.len());
+    if more > 0 {
+        waiting.push(format!("and {more} more"));
+    }
+    [
+        escape(&status.resource).into_owned(),
+        name(&status.owner),
+        name(&status.holder),
+        name(&status.fence.as_ref().map(ToString::to_string)),
+        lease.unwrap_or_else(|| none.to_owned()),
+        match waiting.is_empty() {
+            true => none.to_owned(),
+            false => waiting.join("\n"),
+        },
+    ]
+}
+
+fn in_json(status: &ResourceStatus) -> Value {
+    json!({
+        "resource": status.resource,
+        "owner": status.owner,
+        "answered": status.is_reported,
+        "holder": status.holder,
+        "fence": status.fence.as_ref().map(ToString::to_string),
+        "lease_ms": status.expires.map(|left| u64::try_from(left.as_millis()).unwrap_or(u64::MAX)),
+        "waiters": status.waiters,
+        "waiting": status.waiting,
+    })
+}

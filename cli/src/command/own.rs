@@ -1,0 +1,243 @@
+//! `fipa own`: an agent that owns a resource.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use fipa::locks::{
+    AdmitError, Algorithm, Ending, Fence, LockError, LockOptions, OwnError, OwnOptions,
+};
+use fipa::locks::{Owned, OwnerEvent};
+use fipa::{Agent, AgentId, Config, ErrorChain, Message, Performative, RegisterOptions};
+use fipa_acl::escape;
+
+use crate::membership::{self, Stop};
+use crate::options::{self, Global};
+use crate::output;
+use crate::report::{self, Failure};
+
+/// Own a resource: other agents can lock it, and commands of the holder are admitted
+///
+/// The agent prints one line for each grant and for each end of a grant, until Ctrl-C. `fipa lock`, or a
+/// program with the library, locks the resource.
+///
+/// Each request that the agent receives is a command. It is admitted (agree) if it has the fence of the
+/// live grant (`fipa send --fence`), and refused otherwise. The directory lists the agent under the name
+/// lock:RESOURCE, too.
+///
+/// The epoch of the fences is in a file, in FIPA_STATE_DIR, XDG_STATE_HOME/fipa or ~/.local/state/fipa. It
+/// is raised at each start, so a fence of an earlier run is never valid again.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa own bay
+  fipa own bay --agent crane --lease 5s
+  fipa own bay --volatile              without a state file
+
+In other terminals:
+  fipa lock bay -- ./dock.sh
+  fipa locks --watch")]
+pub(crate) struct Arguments {
+    /// Name of the resource
+    resource: String,
+
+    /// Name of the agent [default: RESOURCE-owner]
+    #[arg(long, value_name = "NAME")]
+    agent: Option<AgentId>,
+
+    /// Lease of a grant: a holder that ends without a proof delays the next one for this time
+    #[arg(long, value_name = "TIME", default_value = "15s", value_parser = options::duration)]
+    lease: Duration,
+
+    /// Keep the epoch of the fences in this directory
+    #[arg(long, value_name = "DIR", conflicts_with = "volatile")]
+    state_dir: Option<PathBuf>,
+
+    /// Use no state file: fences rise with the time of day, and each start waits for one lease
+    #[arg(long)]
+    volatile: bool,
+
+    #[command(flatten)]
+    group: Group,
+}
+
+/// Options that all agents which use a resource have in common.
+#[derive(Debug, Args)]
+pub(super) struct Group {
+    /// Algorithm that decides which agent is next; the same for all agents that use the resource
+    #[arg(long, value_name = "NAME", default_value = "ricart_agrawala_extended",
+          value_parser = algorithm)]
+    algorithm: Algorithm,
+}
+
+fn algorithm(text: &str) -> Result<Algorithm, String> {
+    let mut all = Algorithm::ALL.into_iter();
+    all.find(|one| one.protocol() == text).ok_or_else(|| {
+        let names = Algorithm::ALL.map(Algorithm::protocol);
+        format!("expected one of {}", names.join(", "))
+    })
+}
+
+impl Group {
+    pub(super) fn apply(&self, agent: &Agent) -> Result<(), LockError> {
+        agent.use_locks(LockOptions {
+            algorithm: self.algorithm,
+            ..LockOptions::default()
+        })
+    }
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    options::block_on(own(arguments, &config))?
+}
+
+async fn own(arguments: Arguments, config: &Config) -> Result<(), Failure> {
+    let mut stop = Stop::listen()?;
+    let domain = membership::join(config).await?;
+    let resource = arguments.resource;
+    let name = match &arguments.agent {
+        Some(id) => id.name().to_owned(),
+        None => format!("{resource}-owner"),
+    };
+    let options = RegisterOptions {
+        agent_type: "fipa-own".to_owned(),
+        ..RegisterOptions::default()
+    };
+    let agent = membership::register(&domain, &name, options, config).await?;
+    let begun = async {
+        arguments.group.apply(&agent)?;
+        let options = OwnOptions {
+            lease: arguments.lease,
+            state_dir: arguments.state_dir,
+            volatile: arguments.volatile,
+        };
+        agent.own(&resource, options).await
+    };
+    let begun = tokio::select! {
+        begun = begun => Some(begun),
+        () = stop.requested() => None,
+    };
+    let ended = match begun {
+        None => Ok(()),
+        Some(Err(error)) => Err(not_owned(&error, &resource)),
+        Some(Ok(owned)) => {
+            let served = tokio::select! {
+                served = serve(&agent, &owned, config) => served,
+                () = stop.requested() => Ok(()),
+            };
+            Stop::ending();
+            owned.release().await;
+            served
+        }
+    };
+    drop(agent);
+    domain.close().await;
+    ended
+}
+
+async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Failure> {
+    output::text(&format!(
+        "{} is owned by {} in domain {}; press Ctrl-C to stop\n",
+        escape(owned.resource()),
+        escape(agent.name()),
+        config.domain
+    ))?;
+    loop {
+        tokio::select! {
+            event = owned.next() => match event {
+                Some(event) => output::text(&line(&event))?,
+                None => return Ok(()),
+            },
+            received = agent.receive() => match received {
+                Ok(incoming) if incoming.violation().is_some() => {}
+                Ok(incoming) => handle(agent, owned, &incoming.message).await?,
+                Err(error) => {
+                    return Err(Failure::failed(
+                        ErrorChain(&error).to_string(),
+                        format!("agent {:?}", agent.name()),
+                        "restart the agent",
+                    ));
+                }
+            },
+        }
+    }
+}
+
+fn line(event: &OwnerEvent) -> String {
+    let fenced = |fence: &Option<Fence>| match fence {
+        Some(fence) => format!(", fence {}", escape(&fence.to_string())),
+        None => String::new(),
+    };
+    match event {
+        OwnerEvent::Granted { holder, fence } => {
+            format!("granted to {}{}\n", escape(holder), fenced(fence))
+        }
+        OwnerEvent::Ended { holder, fence, how } => {
+            let how = match how {
+                Ending::Released => "released by",
+                Ending::Expired => "expired for",
+                Ending::Gone => "ended with",
+                Ending::Forced => "taken from",
+                _ => "ended for",
+            };
+            format!("{how} {}{}\n", escape(holder), fenced(fence))
+        }
+        OwnerEvent::Contested { by } => format!("contested by {}\n", escape(by)),
+        OwnerEvent::Silent { holder } => {
+            format!("{} holds it and does not answer\n", escape(holder))
+        }
+        _ => String::new(),
+    }
+}
+
+/// Admits or refuses a command. Other messages are ignored.
+async fn handle(agent: &Agent, owned: &Owned, message: &Message) -> Result<(), Failure> {
+    if *message.performative() != Performative::Request {
+        return Ok(());
+    }
+    let (act, text) = match owned.check(message) {
+        Ok(fence) => (Performative::Agree, format!("admitted with {fence}")),
+        Err(error) => (
+            Performative::Refuse,
+            format!("refused: {}", refusal(&error)),
+        ),
+    };
+    output::text(&format!("{}: {message}\n", escape(&text)))?;
+    let answer = message.reply(act).sender(agent.id().clone()).content(text);
+    match answer.build() {
+        Ok(answer) if answer.receivers().is_empty() => {}
+        Ok(answer) => match agent.send(answer).await {
+            Ok(deliveries) if deliveries.all_succeeded() => {}
+            Ok(deliveries) => report::warn(&format!("the answer was not delivered: {deliveries}")),
+            Err(error) => report::warn(&format!("cannot answer: {}", ErrorChain(&error))),
+        },
+        Err(error) => report::warn(&format!("cannot answer: {error}")),
+    }
+    Ok(())
+}
+
+fn refusal(error: &AdmitError) -> String {
+    ErrorChain(error).to_string()
+}
+
+fn not_owned(error: &OwnError, resource: &str) -> Failure {
+    let place = format!("resource {resource:?}");
+    let problem = ErrorChain(error).to_string();
+    match error {
+        OwnError::Name(_) | OwnError::Options(_) => {
+            Failure::wrong_usage(problem, place, "`fipa own --help` describes the options")
+        }
+        OwnError::StateFile(_) => Failure::failed(
+            problem,
+            place,
+            "give a directory with --state-dir, or use no file with --volatile",
+        ),
+        OwnError::Taken { .. } => Failure::failed(
+            problem,
+            place,
+            "`fipa locks` lists the resources with their owners",
+        ),
+        _ => Failure::failed(problem, place, "run the command again"),
+    }
+}

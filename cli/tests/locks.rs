@@ -1,0 +1,203 @@
+//! `fipa own`, `fipa lock` and `fipa locks` in processes of their own.
+
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+
+use common::{Host, Running};
+use fipa_testbed::until;
+
+fn own(host: &Host, options: &[&str]) -> Running {
+    let own = host.start(&[&["own", "bay", "--agent", "crane"], options].concat());
+    let ready = format!("bay is owned by crane in domain {}", host.domain);
+    assert!(own.ready.starts_with(&ready), "{}", own.ready);
+    own
+}
+
+/// A command that prints its fence and its process, and runs until it is killed.
+const HOLD: &str = "echo $FIPA_FENCE $$; exec sleep 600";
+
+/// Starts a command that holds the bay. Returns its fence and the identifier of its process.
+fn hold(host: &Host, options: &[&str], script: &str) -> (Running, String, Process) {
+    let arguments = [&["lock", "bay"], options, &["--", "sh", "-c", script]].concat();
+    let holder = host.start(&arguments);
+    let (fence, process) = split(&holder.ready);
+    (holder, fence, process)
+}
+
+fn split(line: &str) -> (String, Process) {
+    let (fence, process) = line.split_once(' ').unwrap();
+    (fence.to_owned(), Process(process.to_owned()))
+}
+
+/// A process that outlives its parent. It is killed on drop.
+struct Process(String);
+
+impl Process {
+    fn is_running(&self) -> bool {
+        let state = fs::read_to_string(format!("/proc/{}/stat", self.0));
+        state.is_ok_and(|state| !state.contains(") Z "))
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        if self.is_running() {
+            let _ = std::process::Command::new("kill")
+                .args(["-KILL", &self.0])
+                .status();
+        }
+    }
+}
+
+/// Sends a command with this fence to the owner, and returns the performative of the answer.
+fn command(host: &Host, fence: &str) -> String {
+    let sent = host.run(&[
+        "send",
+        "--to",
+        "lock:bay",
+        "-p",
+        "request",
+        "--content",
+        "dock",
+        "--fence",
+        fence,
+        "--wait",
+        "--timeout",
+        "60s",
+        "--json",
+    ]);
+    let sent = sent.done_json();
+    sent["reply"]["performative"].as_str().unwrap().to_owned()
+}
+
+#[test]
+fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
+    let host = Host::new();
+    let mut crane = own(&host, &["--lease", "10min"]);
+    let (holder, stale, left) = hold(&host, &["--agent", "rover"], HOLD);
+    assert_eq!(stale, "1.1@crane#bay");
+    assert_eq!(crane.line(), "granted to rover, fence 1.1@crane#bay");
+    assert_eq!(command(&host, &stale), "agree");
+    assert!(
+        crane
+            .line()
+            .starts_with("admitted with 1.1@crane#bay: (request")
+    );
+
+    let late = host.run(&["lock", "bay", "--within", "300ms", "--", "true"]);
+    assert!(late.failed(124).contains("timed out waiting for \"bay\""));
+    let arguments = ["lock", "bay", "--agent", "arm", "--", "sh", "-c", HOLD];
+    let waiting = host.command(&arguments);
+    let waiting = std::thread::spawn(move || Running::new(waiting));
+    holder.send_signal("-KILL");
+    let waiting = waiting.join().unwrap();
+    // Long before the end of the lease.
+    let (fence, _left_too) = split(&waiting.ready);
+    assert_eq!(fence, "1.2@crane#bay");
+    assert_eq!(crane.line(), "ended with rover, fence 1.1@crane#bay");
+    assert_eq!(crane.line(), "granted to arm, fence 1.2@crane#bay");
+    // The command of the killed holder goes on, and its fence is refused.
+    assert!(left.is_running());
+    assert_eq!(command(&host, &stale), "refuse");
+    assert!(crane.line().starts_with("refused: the fence 1.1@crane#bay"));
+    assert_eq!(command(&host, &fence), "agree");
+    assert_eq!(
+        host.run(&["lock", "bay", "--within", "0s", "--", "true"])
+            .code,
+        Some(124)
+    );
+
+    let listed = host.run(&["locks", "--json"]).done_json();
+    let listed = &listed["locks"][0];
+    for (key, value) in [
+        ("resource", "bay"),
+        ("owner", "crane"),
+        ("holder", "arm"),
+        ("fence", "1.2@crane#bay"),
+    ] {
+        assert_eq!(listed[key], value, "{listed}");
+    }
+    assert!(listed["lease_ms"].as_u64().unwrap() <= 600_000);
+    let table = host.run(&["locks"]).done();
+    assert!(
+        table.contains("1.2@crane#bay") && table.contains("arm"),
+        "{table}"
+    );
+}
+
+#[test]
+fn exit_codes_are_those_of_the_command_and_of_env() {
+    let host = Host::new();
+    let alone = host.run(&["lock", "bay", "--", "true"]).failed(125);
+    assert!(alone.contains("no agent owns \"bay\""), "{alone}");
+    let crane = own(&host, &[]);
+    let run = |arguments: &[&str]| host.run(&[&["lock", "bay", "--"], arguments].concat());
+    assert_eq!(
+        run(&["sh", "-c", "echo $FIPA_FENCE"]).done(),
+        "1.1@crane#bay\n"
+    );
+    assert_eq!(run(&["sh", "-c", "exit 7"]).code, Some(7));
+    assert_eq!(run(&["sh", "-c", "kill -KILL $$"]).code, Some(137));
+    assert!(
+        run(&["/no/such/program"])
+            .failed(127)
+            .contains("/no/such/program")
+    );
+    let file = host.path("data");
+    fs::write(&file, "").unwrap();
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o600)).unwrap();
+    run(&[file.to_str().unwrap()]).failed(126);
+    let long = "x".repeat(10_000);
+    let long = host.run(&["lock", &long, "--", "true"]).failed(125);
+    assert!(long.contains("255"), "{long}");
+    let usage = host.run(&["lock", "bay"]);
+    assert_eq!(usage.code, Some(2));
+    let taken = host.run(&["own", "bay", "--agent", "other"]).failed(1);
+    assert!(taken.contains("owned by \"crane\""), "{taken}");
+    let (code, _) = crane.signal("-INT");
+    assert_eq!(code, Some(0));
+    // The epoch rises, and no lock is live, so the next run grants at once.
+    let _crane = own(&host, &[]);
+    assert_eq!(
+        run(&["sh", "-c", "echo $FIPA_FENCE"]).done(),
+        "2.1@crane#bay\n"
+    );
+    let nowhere = host
+        .run(&["own", "dock", "--state-dir", "/dev/null"])
+        .failed(1);
+    assert!(nowhere.contains("--volatile"), "{nowhere}");
+}
+
+#[test]
+fn the_command_is_ended_when_the_lock_is_lost() {
+    let host = Host::new();
+    let crane = own(&host, &["--lease", "2s"]);
+    let script = "trap 'echo ended; exit 0' TERM; echo $FIPA_FENCE $$; while :; do sleep 0.1; done";
+    let (mut holder, _, process) = hold(&host, &[], script);
+    crane.signal("-KILL");
+    assert_eq!(holder.line(), "ended");
+    let (code, log) = holder.end();
+    assert_eq!(code, Some(125), "{log}");
+    assert!(log.contains("the lock of \"bay\" was lost"), "{log}");
+    assert!(!process.is_running());
+
+    let crane = own(&host, &["--lease", "2s"]);
+    let stubborn = "trap '' TERM; echo $FIPA_FENCE $$; while :; do sleep 0.1; done";
+    let (mut stubborn, _, process) = hold(&host, &[], stubborn);
+    drop(crane);
+    let (code, log) = stubborn.end();
+    assert_eq!(code, Some(125), "{log}");
+    until("SIGKILL ends the command", || !process.is_running());
+
+    let crane = own(&host, &["--lease", "2s"]);
+    let script = "echo $FIPA_FENCE $$; while [ ! -e go ]; do sleep 0.1; done; exit 3";
+    let (mut kept, _, _process) = hold(&host, &["--keep"], script);
+    crane.signal("-KILL");
+    kept.wait_for_log(&["warning:", "the lock of \"bay\" was lost"]);
+    fs::write(host.path("go"), "").unwrap();
+    assert_eq!(kept.end().0, Some(3));
+}

@@ -1,0 +1,52 @@
+//! The part of an agent's locks that the agent itself needs: their end, and which messages are theirs.
+//! The locks are in `locks`.
+
+use std::any::Any;
+use std::sync::Arc;
+
+use fipa_acl::Message;
+use fipa_locking::{Kind, Options, codec};
+use parking_lot::Mutex;
+
+/// Protocol of questions to owners about their resources.
+pub(crate) const STATUS_PROTOCOL: &str = "fipa-locks";
+
+/// Whether a message is one of locks, which the application never reads.
+pub(crate) fn is_of_locks(message: &Message) -> bool {
+    let protocol = message.protocol();
+    protocol.is_some_and(|name| name == STATUS_PROTOCOL || codec::is_lock_protocol(name))
+}
+
+/// The locks of an agent, from its first call that needs them.
+#[derive(Default)]
+pub(crate) struct LockSlot(pub(crate) Mutex<Slot>);
+
+#[derive(Default)]
+pub(crate) struct Slot {
+    /// The options, unless they are the defaults.
+    pub(crate) options: Option<(Kind, Options)>,
+    pub(crate) running: Option<Running>,
+    pub(crate) is_closed: bool,
+}
+
+/// Running locks.
+pub(crate) struct Running {
+    /// The state, whose type is that of the module `locks`.
+    pub(crate) shared: Arc<dyn Any + Send + Sync>,
+    /// Releases all locks.
+    pub(crate) close: Box<dyn FnOnce() + Send>,
+}
+
+impl LockSlot {
+    /// Ends the locks, before the agent is deregistered.
+    pub(crate) fn close(&self) {
+        let running = {
+            let mut slot = self.0.lock();
+            slot.is_closed = true;
+            slot.running.take()
+        };
+        if let Some(running) = running {
+            (running.close)();
+        }
+    }
+}

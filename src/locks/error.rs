@@ -1,0 +1,129 @@
+//! Errors of locks.
+
+use std::io;
+
+use fipa_acl::BuildError;
+use fipa_locking::{Failure, NameError, OptionsError, Refusal, Resource};
+use fipa_transport::Forked;
+
+use super::StateFileError;
+use crate::error::SendError;
+
+/// The error if an agent does not get a lock, or has lost it.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LockError {
+    /// The name of the resource or of this agent is not valid.
+    #[error("a resource or its agent cannot have this name")]
+    Name(#[from] NameError),
+    /// No agent owns the resource.
+    #[error("no agent owns {resource:?}; start its owner")]
+    NoOwner {
+        /// The resource.
+        resource: String,
+    },
+    /// The owner of the resource is lost: it left, died, or does not answer.
+    #[error("{resource:?} is unreachable: its owner {owner:?} does not answer")]
+    Unreachable {
+        /// The resource.
+        resource: String,
+        /// The name of the owner.
+        owner: String,
+    },
+    /// The time of the request is over.
+    #[error("timed out waiting for {resource:?}, with an estimated {ahead} requests ahead")]
+    TimedOut {
+        /// The resource.
+        resource: String,
+        /// Estimate of the number of requests that would have been served before.
+        ahead: usize,
+    },
+    /// The owner refuses the request.
+    #[error("the owner of {resource:?} refuses: {reason}")]
+    Refused {
+        /// The resource.
+        resource: String,
+        /// The reason.
+        reason: Refusal,
+    },
+    /// The lock was lost: its lease ended without a renewal, or the owner has ended it.
+    #[error("the lock of {resource:?} was lost")]
+    Lost {
+        /// The resource.
+        resource: String,
+    },
+    /// The agent was deregistered, or its domain was closed.
+    #[error("the agent was deregistered")]
+    Closed,
+    /// The options can only be set before the agent uses locks.
+    #[error("the agent has used locks already; set the options before the first lock")]
+    Started,
+    /// An option is out of bounds.
+    #[error(transparent)]
+    Options(#[from] OptionsError),
+    /// The system has no timer left.
+    #[error("cannot create a timer")]
+    Timer(#[source] io::Error),
+    /// The question to the owners cannot be written.
+    #[error("cannot write the question to the owners")]
+    Question(#[from] BuildError),
+    /// The question to the owners cannot be sent.
+    #[error("cannot ask the owners")]
+    Send(#[from] SendError),
+    /// This process is a forked child of the one that registered the agent.
+    #[error(transparent)]
+    Forked(#[from] Forked),
+}
+
+impl LockError {
+    pub(super) fn failed(resource: &Resource, failure: Failure) -> Self {
+        let resource = resource.as_str().to_owned();
+        match failure {
+            Failure::NoOwner => Self::NoOwner { resource },
+            Failure::Unreachable { owner } => Self::Unreachable {
+                resource,
+                owner: owner.name().to_owned(),
+            },
+            Failure::TimedOut { ahead } => Self::TimedOut { resource, ahead },
+            Failure::Refused(reason) => Self::Refused { resource, reason },
+            _ => Self::Lost { resource },
+        }
+    }
+
+    pub(super) fn lost(resource: &Resource) -> Self {
+        let resource = resource.as_str().to_owned();
+        Self::Lost { resource }
+    }
+}
+
+/// The error if an agent cannot own a resource.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OwnError {
+    /// The name of the resource is not valid.
+    #[error("a resource cannot have this name")]
+    Name(#[from] NameError),
+    /// An option is out of bounds.
+    #[error(transparent)]
+    Options(#[from] OptionsError),
+    /// The state file cannot be used.
+    #[error(transparent)]
+    StateFile(#[from] StateFileError),
+    /// Another agent owns the resource.
+    #[error("{resource:?} is owned by {owner:?}; stop that agent, or own another resource")]
+    Taken {
+        /// The resource.
+        resource: String,
+        /// The name of the owner.
+        owner: String,
+    },
+    /// This agent owns the resource already.
+    #[error("this agent owns {resource:?} already")]
+    Here {
+        /// The resource.
+        resource: String,
+    },
+    /// The locks of the agent cannot be used.
+    #[error(transparent)]
+    Locks(#[from] LockError),
+}

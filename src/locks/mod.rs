@@ -1,0 +1,239 @@
+//! Locks: agents reserve a resource before they use it, and the resource refuses agents whose lock was
+//! lost.
+//!
+//! The owner of a resource is the agent whose hardware it is. It grants the resource to one agent at a
+//! time, with a [`Fence`] and a lease. The distributed algorithms decide which agent asks next; what they
+//! get wrong under loss and partition costs fairness and time, not safety (`fipa-locking`).
+//!
+//! ```no_run
+//! # async fn example(crane: fipa::Agent, rover: fipa::Agent)
+//! #     -> Result<(), Box<dyn std::error::Error>> {
+//! use std::time::Duration;
+//!
+//! use fipa::locks::OwnOptions;
+//! use fipa::{AgentId, Performative};
+//!
+//! // The owner, in the process that moves the hardware.
+//! let bay = crane.own("bay", OwnOptions::default()).await?;
+//!
+//! // Another agent, in any process of any host.
+//! let lock = rover.lock_within("bay", Duration::from_secs(10)).await?;
+//! let dock = rover.message(Performative::Request).receiver(AgentId::new("crane")?);
+//! rover.send(lock.guard(dock).content("(dock)").build()?).await?;
+//!
+//! // The owner acts on commands with the fence of the live grant only.
+//! let command = crane.receive().await?;
+//! let fence = bay.check(&command.message)?;
+//! println!("{fence} may use the bay");
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! A holder that is suspended, cut off or slow loses its lock when the lease ends, and its late commands
+//! have a fence that the owner refuses. [`Lock::is_held`] is advisory for effects that the owner does not
+//! guard.
+//!
+//! The first call of an agent that needs locks starts them: a task that answers the messages of other
+//! agents. Messages of locks never reach [`Agent::receive`]. An agent that sets 1,024 received messages
+//! aside without reading them receives no renewals, and loses its locks.
+
+mod clock;
+mod error;
+mod lock;
+mod message;
+mod owned;
+mod report;
+mod shell;
+mod state_file;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+pub use fipa_locking::{
+    Admission, Ending, Fence, FenceError, Kind as Algorithm, NameError, OptionsError,
+    OwnerStateError, Refusal,
+};
+
+use fipa_locking::{LockStatus, Options, Resource};
+
+use crate::agent::Agent;
+
+pub use self::error::{LockError, OwnError};
+pub use self::lock::Lock;
+pub use self::message::{AdmitError, FENCE, fences_of, with_fences};
+pub use self::owned::{OwnOptions, Owned, OwnerEvent};
+pub use self::report::ResourceStatus;
+pub use self::state_file::StateFileError;
+
+/// The options of an agent's locks; see [`Agent::use_locks`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LockOptions {
+    /// The algorithm. All agents that use a resource need the same one.
+    pub algorithm: Algorithm,
+    /// Time in which an existing owner can contradict a new one (1 s).
+    pub claim: Duration,
+    /// Maximum time to find the owner of a resource (2 s).
+    pub discovery: Duration,
+    /// Time without a message after which an agent that others wait for is probed (5 s).
+    pub probe_interval: Duration,
+    /// Time without an answer to a probe after which an agent is left out (2 s).
+    pub probe_timeout: Duration,
+    /// Time after which a request without an answer is repeated, and the round of
+    /// [`Agent::try_lock`] (1 s).
+    pub retry: Duration,
+}
+
+impl Default for LockOptions {
+    fn default() -> Self {
+        let core = Options::default();
+        Self {
+            algorithm: Algorithm::default(),
+            claim: Duration::from_millis(core.claim),
+            discovery: Duration::from_millis(core.discovery),
+            probe_interval: Duration::from_millis(core.probe_interval),
+            probe_timeout: Duration::from_millis(core.probe_timeout),
+            retry: Duration::from_millis(core.retry),
+        }
+    }
+}
+
+impl LockOptions {
+    fn core(&self) -> Options {
+        let mut core = Options::default();
+        core.claim = clock::millis(self.claim);
+        core.discovery = clock::millis(self.discovery);
+        core.probe_interval = clock::millis(self.probe_interval);
+        core.probe_timeout = clock::millis(self.probe_timeout);
+        core.retry = clock::millis(self.retry);
+        core
+    }
+}
+
+impl Agent {
+    /// Sets the options of this agent's locks. They are the defaults otherwise.
+    ///
+    /// # Errors
+    /// If a time is zero or longer than a day, or if the agent has used locks already.
+    pub fn use_locks(&self, options: LockOptions) -> Result<(), LockError> {
+        shell::set(&self.core, options)
+    }
+
+    /// Returns the resources that this agent owns, holds or waits for, and those of other agents that it
+    /// has heard of, sorted by name.
+    #[must_use]
+    pub fn locks(&self) -> Vec<ResourceStatus> {
+        let Some(shared) = shell::started(&self.core) else {
+            return Vec::new();
+        };
+        shared.read(|core, now| {
+            let all = core.status(now);
+            all.map(|status: LockStatus| ResourceStatus::of(&status, core.me(), now))
+                .collect()
+        })
+    }
+
+    /// Asks the owners of all resources in the directory for their state, and waits for their answers
+    /// up to `patience`. A resource whose owner does not answer is listed without details.
+    ///
+    /// # Errors
+    /// If the agent was deregistered.
+    pub async fn query_locks(&self, patience: Duration) -> Result<Vec<ResourceStatus>, LockError> {
+        report::query(&self.core, patience).await
+    }
+
+    /// Requests a resource, and waits until this agent holds it. Dropping the future withdraws the
+    /// request.
+    ///
+    /// ```no_run
+    /// # async fn example(agent: fipa::Agent) -> Result<(), fipa::locks::LockError> {
+    /// let lock = agent.lock("bay").await?;
+    /// println!("the bay is ours with fence {:?}", lock.fence());
+    /// lock.release();
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
+    /// # Errors
+    /// If no agent owns the resource, the owner is lost or refuses, or the agent was deregistered.
+    pub async fn lock(&self, resource: &str) -> Result<Lock, LockError> {
+        let resource = Resource::new(resource)?;
+        Lock::acquire(&self.core, vec![resource], |core, now, all, out| {
+            core.lock_all(now, all, None, out)
+        })
+        .await
+    }
+
+    /// Requests a resource, and withdraws the request after `within`.
+    ///
+    /// # Errors
+    /// As for [`lock`](Self::lock), and [`LockError::TimedOut`].
+    pub async fn lock_within(&self, resource: &str, within: Duration) -> Result<Lock, LockError> {
+        let resource = Resource::new(resource)?;
+        Lock::acquire(&self.core, vec![resource], |core, now, all, out| {
+            core.lock_all(now, all, Some(clock::millis(within)), out)
+        })
+        .await
+    }
+
+    /// Requests a resource, and withdraws the request after one round of messages
+    /// ([`LockOptions::retry`]), or at once if the resource is in use by this agent.
+    ///
+    /// # Errors
+    /// As for [`lock_within`](Self::lock_within).
+    pub async fn try_lock(&self, resource: &str) -> Result<Lock, LockError> {
+        let resource = Resource::new(resource)?;
+        Lock::acquire(&self.core, vec![resource], |core, now, all, out| {
+            core.try_lock(now, &all[0], out)
+        })
+        .await
+    }
+
+    /// Requests several resources, and waits until this agent holds all of them. They are acquired in
+    /// the order of their names, so that agents do not wait for each other. If one is lost, all are
+    /// released.
+    ///
+    /// # Errors
+    /// As for [`lock`](Self::lock). The agent then holds none of them.
+    pub async fn lock_all(&self, resources: &[&str]) -> Result<Lock, LockError> {
+        self.lock_all_or_time_out(resources, None).await
+    }
+
+    /// Requests several resources, and withdraws the request after `within`; see
+    /// [`lock_all`](Self::lock_all).
+    ///
+    /// # Errors
+    /// As for [`lock_within`](Self::lock_within). The agent then holds none of them.
+    pub async fn lock_all_within(
+        &self,
+        resources: &[&str],
+        within: Duration,
+    ) -> Result<Lock, LockError> {
+        self.lock_all_or_time_out(resources, Some(clock::millis(within)))
+            .await
+    }
+
+    async fn lock_all_or_time_out(
+        &self,
+        resources: &[&str],
+        within: Option<u64>,
+    ) -> Result<Lock, LockError> {
+        let resources: Result<Vec<_>, _> = resources.iter().map(|it| Resource::new(it)).collect();
+        Lock::acquire(&self.core, resources?, |core, now, all, out| {
+            core.lock_all(now, all, within, out)
+        })
+        .await
+    }
+
+    /// Begins to own a resource: other agents can lock it, and this agent admits commands of the holder
+    /// only. Waits for [`LockOptions::claim`], in which an existing owner can contradict.
+    ///
+    /// The directory lists the owner under `lock:` and the name of the resource, so a message to that
+    /// name reaches it.
+    ///
+    /// # Errors
+    /// If the state file cannot be written, unless [`OwnOptions::volatile`] is set; if another agent
+    /// owns the resource; if an option is out of bounds.
+    pub async fn own(&self, resource: &str, options: OwnOptions) -> Result<Owned, OwnError> {
+        Owned::begin(Arc::clone(&self.core), Resource::new(resource)?, options).await
+    }
+}

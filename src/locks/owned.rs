@@ -1,0 +1,358 @@
+//! The owner of a resource.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{ErrorChain, Message};
+use fipa_locking::{Ending, Fence, Grant, Options, OwnerState, Resource};
+use fipa_sds::{Entry, RegisterError, Role};
+
+use super::shell::{self, Shared};
+use super::state_file::StateFile;
+use super::{AdmitError, LockError, OwnError, ResourceStatus, clock, message};
+use crate::agent::AgentCore;
+use crate::coalition::CoalitionError;
+use crate::{Coalition, DirectoryView, RegisterOptions, background};
+
+/// Type of the directory's entry of an owned resource.
+pub(super) const TYPE: &str = "fipa-lock";
+
+/// Beginning of the name of the directory's entry of an owned resource.
+const PREFIX: &str = "lock:";
+
+/// The options of [`Agent::own`](crate::Agent::own).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OwnOptions {
+    /// Lease of a grant (15 s). A holder that ends without a proof delays the next one for this time. A
+    /// holder renews its grant three times per lease.
+    pub lease: Duration,
+    /// Directory of the state files. By default `FIPA_STATE_DIR`, else `fipa` in `XDG_STATE_HOME`, else
+    /// `~/.local/state/fipa`.
+    pub state_dir: Option<PathBuf>,
+    /// Whether to do without a state file. The fences then rise with the time of day, so they are safe
+    /// only while it is not set back. After each start the owner grants nothing for one lease, which has
+    /// to be that of its earlier runs, too.
+    pub volatile: bool,
+}
+
+impl Default for OwnOptions {
+    fn default() -> Self {
+        Self {
+            lease: Duration::from_millis(Options::default().lease),
+            state_dir: None,
+            volatile: false,
+        }
+    }
+}
+
+/// An event at the owner of a resource.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum OwnerEvent {
+    /// An agent holds the resource.
+    Granted {
+        /// The name of the holder.
+        holder: String,
+        /// The fence. An agent of the C++ library `distributed_locking` has none.
+        fence: Option<Fence>,
+    },
+    /// A grant has ended.
+    Ended {
+        /// The name of the holder.
+        holder: String,
+        /// The fence.
+        fence: Option<Fence>,
+        /// The reason.
+        how: Ending,
+    },
+    /// Another agent claims the resource. Each owner admits its own fences only.
+    Contested {
+        /// The name of the other agent.
+        by: String,
+    },
+    /// A holder without a lease, an agent of the C++ library, does not answer. [`Owned::force`] ends its
+    /// grant.
+    Silent {
+        /// The name of the holder.
+        holder: String,
+    },
+}
+
+impl OwnerEvent {
+    pub(super) fn granted(grant: Grant) -> Self {
+        Self::Granted {
+            holder: grant.holder.name().to_owned(),
+            fence: grant.fence,
+        }
+    }
+
+    pub(super) fn ended(grant: Grant, how: Ending) -> Self {
+        Self::Ended {
+            holder: grant.holder.name().to_owned(),
+            fence: grant.fence,
+            how,
+        }
+    }
+}
+
+/// The state of an ownership.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Holding {
+    Preparing,
+    Owner,
+    Refused(String),
+    /// The agent was deregistered.
+    Closed,
+}
+
+/// A resource that this agent owns. Dropping it ends the ownership: the live grant's fence is refused
+/// from then on.
+#[must_use = "dropping it ends the ownership"]
+pub struct Owned {
+    core: Arc<AgentCore>,
+    shared: Arc<Shared>,
+    resource: Resource,
+    files: Option<Files>,
+}
+
+/// The parts of an ownership that are files.
+struct Files {
+    /// The entry of the directory, if the name of the resource permits one.
+    listed: Option<Coalition>,
+    state: Option<StateFile>,
+}
+
+impl Files {
+    fn close(self, none_was_live: bool) {
+        drop(self.listed);
+        if let Some(state) = self.state {
+            state.end(none_was_live);
+        }
+    }
+}
+
+impl Owned {
+    pub(super) async fn begin(
+        core: Arc<AgentCore>,
+        resource: Resource,
+        options: OwnOptions,
+    ) -> Result<Self, OwnError> {
+        let lease = clock::millis(options.lease);
+        let mut bounds = Options::default();
+        bounds.lease = lease;
+        bounds.check()?;
+        let shared = shell::start(&core)?;
+        let Some(mut holding) = shared.reserve(&resource) else {
+            let resource = resource.as_str().to_owned();
+            return Err(OwnError::Here { resource });
+        };
+        let mut owned = Self {
+            core,
+            shared,
+            resource: resource.clone(),
+            files: None,
+        };
+        let agent = Arc::clone(&owned.core);
+        let service = &owned.core.endpoint.domain.inner.service;
+        let prepared = background::run(&service.runtime, move |_| {
+            prepare(&agent, &resource, &options)
+        });
+        let files = prepared.await.ok_or(LockError::Closed)??;
+        let life = match &files.state {
+            Some(file) => file.state(),
+            None => OwnerState::volatile(time_of_day(), lease),
+        };
+        owned.files = Some(files);
+        owned.shared.own(&owned.core, &owned.resource, &life, lease);
+        let decided = holding.wait_for(|now| *now != Holding::Preparing).await;
+        let decided = decided.map_or(Holding::Closed, |now| now.clone());
+        match decided {
+            Holding::Owner => Ok(owned),
+            Holding::Refused(owner) => Err(OwnError::Taken {
+                resource: owned.resource.as_str().to_owned(),
+                owner,
+            }),
+            Holding::Preparing | Holding::Closed => Err(LockError::Closed.into()),
+        }
+    }
+
+    /// Returns the name of the resource.
+    #[must_use]
+    pub fn resource(&self) -> &str {
+        self.resource.as_str()
+    }
+
+    /// Whether a command with this fence is carried out: only with the fence of the live grant.
+    #[must_use]
+    pub fn admit(&self, fence: &Fence) -> bool {
+        let resource = &self.resource;
+        self.shared
+            .read(|locks, now| locks.admit(now, resource, fence))
+    }
+
+    /// Checks the fence in a message, which [`Lock::guard`](super::Lock::guard) has put there. Returns
+    /// the fence of the live grant.
+    ///
+    /// # Errors
+    /// If the message must not be acted on.
+    pub fn check(&self, message: &Message) -> Result<Fence, AdmitError> {
+        let owner = &*self.core.endpoint.name;
+        let mut fences = message::fences_of(message)?;
+        fences.retain(|fence| fence.owner() == owner && fence.resource() == self.resource.as_str());
+        // A message may have an old fence beside the live one.
+        if let Some(at) = fences.iter().position(|fence| self.admit(fence)) {
+            return Ok(fences.swap_remove(at));
+        }
+        let resource = self.resource.as_str().to_owned();
+        Err(match fences.pop() {
+            Some(fence) => AdmitError::Stale { fence, resource },
+            None => AdmitError::Missing {
+                owner: owner.to_owned(),
+                resource,
+            },
+        })
+    }
+
+    /// Returns the present state: holder, fence, lease and waiting agents.
+    #[must_use]
+    pub fn status(&self) -> ResourceStatus {
+        self.shared.read(|locks, now| {
+            let mut all = locks.status(now);
+            let status = all.find(|status| status.resource == self.resource);
+            match status {
+                Some(status) => ResourceStatus::of(&status, locks.me(), now),
+                None => ResourceStatus::unknown(self.resource.as_str(), None),
+            }
+        })
+    }
+
+    /// Waits for the next event; `None` when the agent is deregistered. At most 256 events wait; then
+    /// the earliest is dropped. Dropping the future loses no event.
+    pub async fn next(&self) -> Option<OwnerEvent> {
+        self.shared.next_event(&self.resource).await
+    }
+
+    /// Ends the live grant, for a holder of the C++ library `distributed_locking` that does not answer.
+    /// That agent is not told, so stop it first.
+    pub fn force(&self) {
+        self.shared.force(&self.core, &self.resource);
+    }
+
+    /// Ends the ownership, and waits until the state file is written. The next start then grants at
+    /// once if no grant is live now.
+    pub async fn release(mut self) {
+        let none_was_live = self.shared.disown(&self.core, &self.resource);
+        let Some(files) = self.files.take() else {
+            return;
+        };
+        let runtime = &self.core.endpoint.domain.inner.service.runtime;
+        background::run(runtime, move |_| files.close(none_was_live)).await;
+    }
+}
+
+impl Drop for Owned {
+    fn drop(&mut self) {
+        // In a forked child, the resource still belongs to the parent.
+        if !self.core.endpoint.domain.inner.owner.is_this() {
+            std::mem::forget(self.files.take());
+            return;
+        }
+        let none_was_live = self.shared.disown(&self.core, &self.resource);
+        if let Some(files) = self.files.take() {
+            let runtime = &self.core.endpoint.domain.inner.service.runtime;
+            drop(runtime.spawn_blocking(move || files.close(none_was_live)));
+        }
+    }
+}
+
+impl fmt::Debug for Owned {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Owned")
+            .field("resource", &self.resource)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Writes the state file and the entry of the directory. Blocks.
+fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Result<Files, OwnError> {
+    let domain = &core.endpoint.domain;
+    let state = match options.volatile {
+        true => None,
+        false => Some(StateFile::begin(
+            options.state_dir.as_deref(),
+            [
+                domain.inner.service.domain_name(),
+                &core.endpoint.name,
+                resource.as_str(),
+            ],
+            clock::millis(options.lease),
+        )?),
+    };
+    let listing = RegisterOptions {
+        agent_type: TYPE.to_owned(),
+        description: String::new(),
+    };
+    let owner = Arc::clone(&core.endpoint.name);
+    let listed = match domain.form(&entry_name(resource), [owner], None, listing) {
+        Ok(listed) => Some(listed),
+        Err(CoalitionError::Register(RegisterError::AlreadyRegistered { holder })) => {
+            let owner = listed_members(&holder).unwrap_or(&holder.name);
+            return Err(OwnError::Taken {
+                resource: resource.as_str().to_owned(),
+                owner: owner.to_string(),
+            });
+        }
+        // The owner is found by messages. Not every name of a resource is one of an agent.
+        Err(error) => {
+            tracing::info!(
+                error = %ErrorChain(&error), "a resource is not listed in the directory"
+            );
+            None
+        }
+    };
+    Ok(Files { listed, state })
+}
+
+fn entry_name(resource: &Resource) -> String {
+    format!("{PREFIX}{resource}")
+}
+
+fn listed_members(entry: &Entry) -> Option<&Arc<str>> {
+    match &entry.role {
+        Role::Coalition(members) => members.names().first(),
+        _ => None,
+    }
+}
+
+/// Returns the resource and the owner of a directory's entry, if it is that of an owned resource. Only
+/// the owner's own process can list it.
+pub(super) fn listed(
+    directory: DirectoryView<'_>,
+    entry: &Entry,
+) -> Option<(Resource, Arc<Entry>)> {
+    let resource = entry.name.strip_prefix(PREFIX)?;
+    if entry.agent_type != TYPE {
+        return None;
+    }
+    let owner = directory.known(listed_members(entry)?)?;
+    let is_own = owner.incarnation.is_known() && owner.mts.incarnation == entry.mts.incarnation;
+    let resource = Resource::new(resource).ok()?;
+    is_own.then_some((resource, owner))
+}
+
+/// Returns the owner of a resource, if the directory lists it.
+pub(super) fn listed_owner(
+    directory: DirectoryView<'_>,
+    resource: &Resource,
+) -> Option<Arc<Entry>> {
+    let entry = directory.lookup(&entry_name(resource))?;
+    listed(directory, &entry).map(|(_, owner)| owner)
+}
+
+/// Returns the time of day in milliseconds since 1970.
+fn time_of_day() -> u64 {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    clock::millis(now.unwrap_or_default())
+}

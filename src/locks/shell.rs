@@ -1,0 +1,642 @@
+//! The shell around [`Locks`]: one per agent, started by the first call that needs it.
+//!
+//! Calls of the application and a task change the core under a lock. Its messages go to an outbox, in
+//! order, and are encoded and sent outside of the lock.
+
+use std::any::Any;
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use fipa_acl::{AgentId, ErrorChain, Performative, escape};
+use fipa_locking::{
+    Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Kind,
+    LockMessage, Locks, Millis, Peer, Resource, codec,
+};
+use fipa_mts::letter_for;
+use fipa_sds::{Change, Entry, Role, Watch};
+use fipa_transport::Incarnation;
+use parking_lot::Mutex;
+use tokio::sync::{Notify, watch};
+
+use super::clock::{Timer, millis, now};
+use super::owned::{Holding, OwnerEvent};
+use super::{LockError, LockOptions, report};
+use crate::agent::AgentCore;
+use crate::demultiplexer::ReaderKey;
+use crate::incoming::Incoming;
+use crate::lock_slot::{self, Running, Slot};
+use crate::protocol::{PartnerEvent, PartnerWatch};
+
+/// Maximum number of events that wait for the application of an owner. Beyond it, the earliest is
+/// dropped.
+const MAX_EVENTS: usize = 256;
+
+/// Sets the options of an agent's locks, before they are started.
+pub(super) fn set(core: &AgentCore, options: LockOptions) -> Result<(), LockError> {
+    let (kind, options) = (options.algorithm, options.core());
+    options.check()?;
+    let mut slot = core.locks.0.lock();
+    if slot.running.is_some() {
+        return Err(LockError::Started);
+    }
+    slot.options = Some((kind, options));
+    Ok(())
+}
+
+/// Returns the running locks of an agent.
+pub(super) fn started(core: &AgentCore) -> Option<Arc<Shared>> {
+    shared(&core.locks.0.lock())
+}
+
+fn shared(slot: &Slot) -> Option<Arc<Shared>> {
+    let shared = Arc::clone(&slot.running.as_ref()?.shared);
+    shared.downcast().ok()
+}
+
+/// Returns the running locks of an agent. The first call starts them.
+pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
+    let endpoint = &core.endpoint;
+    endpoint.domain.inner.owner.check()?;
+    let mut slot = core.locks.0.lock();
+    if slot.is_closed {
+        return Err(LockError::Closed);
+    }
+    if let Some(shared) = shared(&slot) {
+        return Ok(shared);
+    }
+    let me = Peer::new(&endpoint.name, endpoint.incarnation.as_u64())?;
+    let runtime = &endpoint.domain.inner.service.runtime;
+    let timer = Timer::new(runtime).map_err(LockError::Timer)?;
+    let (kind, mut options) = slot.options.unwrap_or_default();
+    // A later registration of the name begins its conversations with higher numbers.
+    let time = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    options.first_conversation = millis(time.unwrap_or_default());
+    let shared = Arc::new(Shared {
+        state: Mutex::new(State::new(Locks::new(me, kind, options))),
+        sending: Mutex::new(()),
+        changed: Notify::new(),
+        kind,
+    });
+    let (ending, agent) = (Arc::clone(&shared), Arc::downgrade(core));
+    slot.running = Some(Running {
+        shared: Arc::clone(&shared) as Arc<dyn Any + Send + Sync>,
+        close: Box::new(move || {
+            if let Some(agent) = agent.upgrade() {
+                ending.close(&agent);
+            }
+        }),
+    });
+    drop(slot);
+    let task = Task {
+        // From here on, no message and no change of the directory is missed.
+        messages: core.demultiplexer.serve(Box::new(lock_slot::is_of_locks)),
+        changes: Some(endpoint.domain.directory().watch()),
+        partners: PartnerWatch::new(Arc::clone(core)),
+        watched: HashSet::new(),
+        greeted: HashSet::new(),
+        core: Arc::clone(core),
+        shared: Arc::clone(&shared),
+        timer,
+    };
+    runtime.spawn(task.run());
+    Ok(shared)
+}
+
+/// The locks of an agent, shared by its calls and its task.
+pub(super) struct Shared {
+    state: Mutex<State>,
+    /// Held while the outbox is sent, so that messages leave in order.
+    sending: Mutex<()>,
+    /// Wakes the task after a change of the next timeout.
+    changed: Notify,
+    kind: Kind,
+}
+
+struct State {
+    core: Locks<AnyAlgorithm>,
+    outbox: VecDeque<(Peer, LockMessage)>,
+    claims: HashMap<ClaimId, watch::Sender<ClaimState>>,
+    owned: HashMap<Resource, OwnedState>,
+    /// Members that the task does not watch yet.
+    joined: Vec<Peer>,
+    is_closed: bool,
+}
+
+/// The state of a claim.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum ClaimState {
+    Waiting,
+    Held,
+    Failed {
+        resource: Resource,
+        failure: Failure,
+    },
+    Lost {
+        resource: Resource,
+    },
+    /// The agent was deregistered.
+    Closed,
+}
+
+/// A resource that this agent owns or prepares to own.
+struct OwnedState {
+    holding: watch::Sender<Holding>,
+    events: VecDeque<OwnerEvent>,
+    changed: Arc<Notify>,
+    /// After the end: whether no grant was live.
+    none_was_live: Option<bool>,
+}
+
+impl State {
+    fn new(core: Locks<AnyAlgorithm>) -> Self {
+        Self {
+            core,
+            outbox: VecDeque::new(),
+            claims: HashMap::new(),
+            owned: HashMap::new(),
+            joined: Vec::new(),
+            is_closed: false,
+        }
+    }
+
+    fn perform(&mut self, actions: Vec<Action>) {
+        for action in actions {
+            match action {
+                Action::Send { to, message } => self.outbox.push_back((to, message)),
+                Action::Event(event) => self.report(event),
+            }
+        }
+    }
+
+    fn report(&mut self, event: Event) {
+        match event {
+            Event::Acquired { claim } => {
+                if let Some(state) = self.claims.get(&claim) {
+                    state.send_replace(ClaimState::Held);
+                }
+            }
+            Event::Failed {
+                claim,
+                resource,
+                failure,
+            } => self.ended(claim, ClaimState::Failed { resource, failure }),
+            Event::Lost { claim, resource } => self.ended(claim, ClaimState::Lost { resource }),
+            Event::Owning { resource } => self.holds(&resource, Holding::Owner),
+            Event::OwningRefused { resource, by } => {
+                self.holds(&resource, Holding::Refused(by.name().to_owned()));
+            }
+            Event::Contested { resource, by } => {
+                tracing::warn!(
+                    resource = %escape(resource.as_str()), by = %escape(by.name()),
+                    "another agent claims a resource that this agent owns; each admits its own fences only"
+                );
+                let by = by.name().to_owned();
+                self.notify(&resource, OwnerEvent::Contested { by });
+            }
+            Event::Granted { resource, grant } => {
+                self.notify(&resource, OwnerEvent::granted(grant));
+            }
+            Event::Ended {
+                resource,
+                grant,
+                how,
+            } => self.notify(&resource, OwnerEvent::ended(grant, how)),
+            Event::Silent { resource, holder } => {
+                let holder = holder.name().to_owned();
+                self.notify(&resource, OwnerEvent::Silent { holder });
+            }
+            other => tracing::debug!(event = ?other, "lock"),
+        }
+    }
+
+    fn ended(&mut self, claim: ClaimId, how: ClaimState) {
+        if let Some(state) = self.claims.remove(&claim) {
+            state.send_replace(how);
+        }
+    }
+
+    fn holds(&self, resource: &Resource, holding: Holding) {
+        if let Some(owned) = self.owned.get(resource) {
+            owned.holding.send_replace(holding);
+        }
+    }
+
+    fn notify(&mut self, resource: &Resource, event: OwnerEvent) {
+        if let Some(owned) = self.owned.get_mut(resource) {
+            if owned.events.len() >= MAX_EVENTS {
+                owned.events.pop_front();
+            }
+            owned.events.push_back(event);
+            owned.changed.notify_waiters();
+        }
+    }
+}
+
+impl Shared {
+    /// Changes the core, and sends its messages.
+    fn act<T>(
+        &self,
+        core: &AgentCore,
+        change: impl FnOnce(&mut State, Millis, &mut Vec<Action>) -> T,
+    ) -> T {
+        let mut actions = Vec::new();
+        let mut state = self.state.lock();
+        let due = state.core.poll_timeout();
+        let result = change(&mut state, now(), &mut actions);
+        state.perform(actions);
+        let is_changed = state.core.poll_timeout() != due || !state.joined.is_empty();
+        drop(state);
+        if is_changed {
+            self.changed.notify_one();
+        }
+        self.flush(core);
+        result
+    }
+
+    /// Sends the outbox. If another thread is sending it, that thread sends the rest.
+    fn flush(&self, core: &AgentCore) {
+        loop {
+            let Some(sending) = self.sending.try_lock() else {
+                return;
+            };
+            loop {
+                // The lock on the state is released before the message is sent.
+                let next = self.state.lock().outbox.pop_front();
+                let Some((to, message)) = next else {
+                    break;
+                };
+                self.send(core, &to, &message);
+            }
+            drop(sending);
+            // Another thread may have added a message and failed to take the lock.
+            if self.state.lock().outbox.is_empty() {
+                return;
+            }
+        }
+    }
+
+    fn send(&self, core: &AgentCore, to: &Peer, message: &LockMessage) {
+        let endpoint = &core.endpoint;
+        let sent = AgentId::new(to.name())
+            .map_err(|error| error.to_string())
+            .and_then(|receiver| {
+                let message = codec::encode(message, self.kind, &endpoint.id, &receiver);
+                let message = message.map_err(|error| error.to_string())?;
+                let letter = letter_for(&message, SystemTime::now());
+                let deadline = endpoint.domain.inner.deadline;
+                let sending = endpoint.send(&message, letter, deadline);
+                // The outcome is not awaited: the algorithms repeat what has no answer.
+                sending
+                    .map(drop)
+                    .map_err(|error| ErrorChain(&error).to_string())
+            });
+        if let Err(error) = sent {
+            tracing::debug!(%error, to = %escape(to.name()), "cannot send a message of a lock");
+        }
+    }
+
+    /// Begins a claim, and returns its state.
+    pub(super) fn claim(
+        &self,
+        core: &AgentCore,
+        owners: &[(Resource, Peer)],
+        begin: impl FnOnce(&mut Locks<AnyAlgorithm>, Millis, &mut Vec<Action>) -> ClaimId,
+    ) -> (ClaimId, watch::Receiver<ClaimState>) {
+        self.act(core, |state, now, actions| {
+            for (resource, owner) in owners {
+                state
+                    .core
+                    .owner_known(now, resource, owner, Dialect::Own, actions);
+                state.note(owner);
+            }
+            let claim = begin(&mut state.core, now, actions);
+            let (sender, receiver) = watch::channel(match state.is_closed {
+                false => ClaimState::Waiting,
+                true => ClaimState::Closed,
+            });
+            if !state.is_closed {
+                state.claims.insert(claim, sender);
+            }
+            (claim, receiver)
+        })
+    }
+
+    /// Releases or withdraws a claim.
+    pub(super) fn release(&self, core: &AgentCore, claim: ClaimId) {
+        self.act(core, |state, now, actions| {
+            state.claims.remove(&claim);
+            state.core.release(now, claim, actions);
+        });
+    }
+
+    /// Reads the core.
+    pub(super) fn read<T>(&self, read: impl FnOnce(&Locks<AnyAlgorithm>, Millis) -> T) -> T {
+        read(&self.state.lock().core, now())
+    }
+
+    /// Reserves a resource that this agent prepares to own. Returns `None` if it owns it already.
+    pub(super) fn reserve(&self, resource: &Resource) -> Option<watch::Receiver<Holding>> {
+        let mut state = self.state.lock();
+        if state.owned.contains_key(resource) {
+            return None;
+        }
+        let (holding, receiver) = watch::channel(match state.is_closed {
+            false => Holding::Preparing,
+            true => Holding::Closed,
+        });
+        let reserved = OwnedState {
+            holding,
+            events: VecDeque::new(),
+            changed: Arc::new(Notify::new()),
+            none_was_live: state.is_closed.then_some(false),
+        };
+        state.owned.insert(resource.clone(), reserved);
+        Some(receiver)
+    }
+
+    /// Begins to own a reserved resource.
+    pub(super) fn own(
+        &self,
+        core: &AgentCore,
+        resource: &Resource,
+        life: &fipa_locking::OwnerState,
+        lease: Millis,
+    ) {
+        self.act(core, |state, now, actions| {
+            if !state.is_closed {
+                state
+                    .core
+                    .own_with_lease(now, resource, life, lease, actions);
+            }
+        });
+    }
+
+    /// Ends the ownership of a resource. Returns whether no grant was live.
+    pub(super) fn disown(&self, core: &AgentCore, resource: &Resource) -> bool {
+        self.act(core, |state, now, actions| {
+            let owned = state.owned.remove(resource);
+            match owned.and_then(|owned| owned.none_was_live) {
+                Some(none_was_live) => none_was_live,
+                None => state.core.disown(now, resource, actions),
+            }
+        })
+    }
+
+    /// Ends the live grant of a resource that this agent owns.
+    pub(super) fn force(&self, core: &AgentCore, resource: &Resource) {
+        self.act(core, |state, now, actions| {
+            state.core.force(now, resource, actions);
+        });
+    }
+
+    /// Waits for the next event of a resource that this agent owns.
+    pub(super) async fn next_event(&self, resource: &Resource) -> Option<OwnerEvent> {
+        let changed = {
+            let state = self.state.lock();
+            Arc::clone(&state.owned.get(resource)?.changed)
+        };
+        loop {
+            // Created before the check, so that no event after the check is missed.
+            let notified = changed.notified();
+            {
+                let mut state = self.state.lock();
+                let owned = state.owned.get_mut(resource)?;
+                if let Some(event) = owned.events.pop_front() {
+                    return Some(event);
+                }
+                if owned.none_was_live.is_some() {
+                    return None;
+                }
+            }
+            notified.await;
+        }
+    }
+
+    /// Releases all claims and ends all ownership.
+    fn close(&self, core: &AgentCore) {
+        self.act(core, |state, now, actions| {
+            state.is_closed = true;
+            for (claim, sender) in std::mem::take(&mut state.claims) {
+                state.core.release(now, claim, actions);
+                sender.send_replace(ClaimState::Closed);
+            }
+            let owned = state.owned.iter_mut();
+            for (resource, owned) in owned.filter(|(_, owned)| owned.none_was_live.is_none()) {
+                owned.none_was_live = Some(state.core.disown(now, resource, actions));
+                owned.holding.send_replace(Holding::Closed);
+                owned.changed.notify_waiters();
+            }
+        });
+        self.changed.notify_one();
+    }
+}
+
+impl State {
+    /// Has the task watch a member.
+    fn note(&mut self, peer: &Peer) {
+        if self.core.is_member(peer) {
+            self.joined.push(peer.clone());
+        }
+    }
+}
+
+/// The task of an agent's locks: messages, timeouts and changes of the directory.
+struct Task {
+    core: Arc<AgentCore>,
+    shared: Arc<Shared>,
+    messages: ReaderKey,
+    /// The changes of the directory, until the domain is closed.
+    changes: Option<Watch>,
+    partners: PartnerWatch,
+    /// The members that `partners` watches.
+    watched: HashSet<Peer>,
+    /// The registrations that were asked whether they use locks.
+    greeted: HashSet<Incarnation>,
+    timer: Timer,
+}
+
+impl Task {
+    async fn run(mut self) {
+        self.greet_all();
+        let ended = self.serve().await;
+        if let Err(error) = ended {
+            tracing::error!(%error, "the locks of an agent have ended");
+        }
+        self.core.demultiplexer.end_serving(&self.messages);
+        self.shared.close(&self.core);
+    }
+
+    async fn serve(&mut self) -> std::io::Result<()> {
+        loop {
+            let (due, joined, is_closed) = {
+                let mut state = self.shared.state.lock();
+                let joined = std::mem::take(&mut state.joined);
+                (state.core.poll_timeout(), joined, state.is_closed)
+            };
+            if is_closed {
+                return Ok(());
+            }
+            for peer in joined {
+                if !self.watched.contains(&peer) {
+                    self.partners.add(peer.name());
+                    self.watched.insert(peer);
+                }
+            }
+            self.timer.set(due)?;
+            let (core, changes) = (&self.core, self.changes.as_mut());
+            tokio::select! {
+                received = core.demultiplexer.next_served(&core.endpoint, &self.messages) => {
+                    match received {
+                        Ok(incoming) => self.handle(&incoming),
+                        // The agent was deregistered, or the domain is closed.
+                        Err(_) => return Ok(()),
+                    }
+                }
+                expired = self.timer.expired() => {
+                    expired?;
+                    self.shared.act(&self.core, |state, now, actions| {
+                        state.core.handle_timeout(now, actions);
+                    });
+                }
+                event = self.partners.next() => if let PartnerEvent::Gone { agent } = event {
+                    self.departed(&agent);
+                },
+                change = next_change(changes) => match change {
+                    Some(change) => self.handle_change(&change),
+                    None => self.changes = None,
+                },
+                () = self.shared.changed.notified() => {}
+            }
+        }
+    }
+
+    fn handle(&mut self, incoming: &Incoming) {
+        let message = &incoming.message;
+        let Some(from) = self.sender(incoming) else {
+            tracing::debug!(%message, "ignored a message of a lock: its sender is not proved");
+            return;
+        };
+        if message.protocol() == Some(lock_slot::STATUS_PROTOCOL) {
+            report::answer(&self.core, &self.shared, message);
+            return;
+        }
+        if matches!(
+            message.performative(),
+            Performative::Failure | Performative::NotUnderstood
+        ) {
+            tracing::debug!(%message, "a message of a lock has failed");
+            return;
+        }
+        let decoded = match codec::decode(message, self.shared.kind) {
+            Ok(decoded) => decoded,
+            Err(error) => {
+                tracing::debug!(
+                    %error, from = %escape(from.name()), "ignored a message of a lock"
+                );
+                return;
+            }
+        };
+        self.shared.act(&self.core, |state, now, actions| {
+            let was_member = state.core.is_member(&from);
+            state.core.handle(now, &from, &decoded, actions);
+            if !was_member {
+                state.note(&from);
+            }
+        });
+    }
+
+    /// Returns the sender of a message, as far as its connection proves it.
+    fn sender(&self, incoming: &Incoming) -> Option<Peer> {
+        let name = incoming.message.sender()?.name();
+        let directory = self.core.endpoint.domain.directory();
+        let registration = match incoming.sender {
+            proved if proved.is_known() => {
+                let peer = Peer::new(name, proved.as_u64()).ok()?;
+                if self.watched.contains(&peer) {
+                    return Some(peer);
+                }
+                let entry = directory.by_incarnation(proved)?;
+                (*entry.name == *name).then_some(proved)?
+            }
+            // A letter of this process, whose service has checked its sender.
+            _ if incoming.via.is_none() => directory.lookup(name)?.incarnation,
+            // A letter of a legacy peer cannot come from an agent with a registration.
+            unknown => match directory.lookup(name) {
+                Some(entry) if entry.incarnation.is_known() => return None,
+                _ => unknown,
+            },
+        };
+        Peer::new(name, registration.as_u64()).ok()
+    }
+
+    /// Handles the proof that an agent has left or died.
+    fn departed(&mut self, agent: &str) {
+        let entry = self.core.endpoint.domain.directory().lookup(agent);
+        let present = entry.map(|entry| entry.incarnation.as_u64());
+        let gone = |peer: &&Peer| peer.name() == agent && Some(peer.registration()) != present;
+        let gone: Vec<Peer> = self.watched.iter().filter(gone).cloned().collect();
+        for peer in gone {
+            self.watched.remove(&peer);
+            self.shared.act(&self.core, |state, now, actions| {
+                state.core.depart(now, &peer, actions);
+            });
+        }
+        // A newer registration of the name is watched from now on.
+        let newer = self.watched.iter().any(|peer| peer.name() == agent);
+        if newer {
+            self.partners.add(agent);
+        }
+    }
+
+    fn handle_change(&mut self, change: &Change) {
+        for change in change.single() {
+            match change {
+                Change::Joined(entry) | Change::Changed { after: entry, .. } => self.greet(entry),
+                Change::Left(entry) => {
+                    self.greeted.remove(&entry.incarnation);
+                }
+                _ => self.greet_all(),
+            }
+        }
+    }
+
+    fn greet_all(&mut self) {
+        for entry in self.core.endpoint.domain.directory().entries().iter() {
+            self.greet(entry);
+        }
+    }
+
+    /// Asks an agent for a sign of life. One that uses locks answers, and becomes a member.
+    fn greet(&mut self, entry: &Entry) {
+        let endpoint = &self.core.endpoint;
+        let may_use_locks = entry.role == Role::Agent
+            && !entry.is_platform_agent()
+            && entry.incarnation.is_known()
+            && entry.incarnation != endpoint.incarnation;
+        if !may_use_locks || self.greeted.contains(&entry.incarnation) {
+            return;
+        }
+        self.greeted.insert(entry.incarnation);
+        let Ok(peer) = Peer::new(&entry.name, entry.incarnation.as_u64()) else {
+            return;
+        };
+        let prefix = format!("{}_probe", endpoint.name);
+        let message = LockMessage {
+            conversation: Conversation::new(prefix.into(), now()),
+            dialect: Dialect::Own,
+            content: Content::Probe,
+        };
+        self.shared.act(&self.core, |_, _, actions| {
+            actions.push(Action::Send { to: peer, message });
+        });
+    }
+}
+
+/// Waits for the next change, without end if there is no watch.
+async fn next_change(watch: Option<&mut Watch>) -> Option<Change> {
+    match watch {
+        Some(watch) => watch.next().await,
+        None => std::future::pending().await,
+    }
+}

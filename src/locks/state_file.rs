@@ -1,0 +1,241 @@
+//! The state files of owners.
+//!
+//! The path is `<state directory>/locks/<domain>/<agent>/<resource>`, with names percent-encoded. A
+//! file beside it with the suffix `.lock` is locked while the agent owns the resource.
+
+use std::ffi::OsString;
+use std::fmt::Write as _;
+use std::fs::{self, File, TryLockError};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use fipa_locking::{Millis, OwnerState, OwnerStateError};
+
+/// Environment variable with the state directory.
+const VARIABLE: &str = "FIPA_STATE_DIR";
+
+/// Wait for the file of an owner of this process that is being closed.
+const PATIENCE: Duration = Duration::from_secs(2);
+const PAUSE: Duration = Duration::from_millis(5);
+
+/// The error of using the state file of an owner.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StateFileError {
+    /// There is no state directory.
+    #[error(
+        "no state directory: neither FIPA_STATE_DIR nor XDG_STATE_HOME nor HOME is set; set one, or \
+         own the resource without a state file (volatile)"
+    )]
+    NoDirectory,
+    /// The file cannot be read or written.
+    #[error(
+        "cannot use the state file {}; fences have to rise over restarts, so make it writable, set \
+         FIPA_STATE_DIR, or own the resource without a state file (volatile)",
+        path.display()
+    )]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The error of the operating system.
+        source: io::Error,
+    },
+    /// Another process uses the file.
+    #[error("another owner uses the state file {}; stop it", path.display())]
+    InUse {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file has other content.
+    #[error("{}", path.display())]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// The first mistake.
+        source: OwnerStateError,
+    },
+}
+
+/// The state file of one life of an owner. Other processes cannot use it until this value is dropped.
+#[derive(Debug)]
+pub(super) struct StateFile {
+    path: PathBuf,
+    state: OwnerState,
+    _lock: File,
+}
+
+impl StateFile {
+    /// Begins a life whose leases are at most `lease`: raises the epoch, and syncs the file. Blocks.
+    pub(super) fn begin(
+        directory: Option<&Path>,
+        names: [&str; 3],
+        lease: Millis,
+    ) -> Result<Self, StateFileError> {
+        let directory = match directory {
+            Some(directory) => directory.to_owned(),
+            None => default_directory(|name| std::env::var_os(name))
+                .ok_or(StateFileError::NoDirectory)?,
+        };
+        let mut path = directory.join("locks");
+        path.extend(names.map(encoded));
+        let failed = |source| StateFileError::Io {
+            path: path.clone(),
+            source,
+        };
+        let parent = path.parent().unwrap_or(&directory);
+        fs::create_dir_all(parent).map_err(failed)?;
+        let lock = File::create(with_suffix(&path, ".lock")).map_err(failed)?;
+        let started = Instant::now();
+        while let Err(error) = lock.try_lock() {
+            match error {
+                TryLockError::WouldBlock if started.elapsed() < PATIENCE => {
+                    std::thread::sleep(PAUSE);
+                }
+                TryLockError::WouldBlock => return Err(StateFileError::InUse { path }),
+                TryLockError::Error(source) => return Err(failed(source)),
+            }
+        }
+        let before = match fs::read_to_string(&path) {
+            Ok(text) => text.parse().map_err(|source| StateFileError::Content {
+                path: path.clone(),
+                source,
+            })?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => OwnerState::first(),
+            Err(source) => return Err(failed(source)),
+        };
+        let state = before.next_life(lease);
+        write(&path, &state).map_err(failed)?;
+        Ok(Self {
+            state,
+            path,
+            _lock: lock,
+        })
+    }
+
+    /// The state of this life.
+    pub(super) fn state(&self) -> OwnerState {
+        self.state
+    }
+
+    /// Ends the life. The next life grants at once if no grant is live now. Blocks.
+    pub(super) fn end(self, none_is_live: bool) {
+        if !none_is_live {
+            return;
+        }
+        if let Err(error) = write(&self.path, &self.state.closed()) {
+            tracing::warn!(
+                %error, path = %self.path.display(),
+                "cannot write the state of an owner; its next start waits for the longest lease"
+            );
+        }
+    }
+}
+
+/// Returns the state directory of this user.
+fn default_directory(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let set = |name| variable(name).filter(|value| !value.is_empty());
+    if let Some(directory) = set(VARIABLE) {
+        return Some(directory.into());
+    }
+    if let Some(directory) = set("XDG_STATE_HOME") {
+        return Some(PathBuf::from(directory).join("fipa"));
+    }
+    Some(PathBuf::from(set("HOME")?).join(".local/state/fipa"))
+}
+
+/// Replaces the file, so that a crash leaves the old or the new one.
+fn write(path: &Path, state: &OwnerState) -> io::Result<()> {
+    let new = with_suffix(path, ".new");
+    let mut file = File::create(&new)?;
+    file.write_all(state.to_string().as_bytes())?;
+    file.sync_all()?;
+    fs::rename(&new, path)?;
+    match path.parent() {
+        Some(parent) => File::open(parent)?.sync_all(),
+        None => Ok(()),
+    }
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut path = OsString::from(path);
+    path.push(suffix);
+    path.into()
+}
+
+/// Encodes a name as one component of a path. No two names have the same code, and no code ends with
+/// the suffix of another file.
+fn encoded(name: &str) -> String {
+    let mut code = String::with_capacity(name.len());
+    for byte in name.bytes() {
+        match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'_' => code.push(byte.into()),
+            // Writing to a string cannot fail.
+            _ => drop(write!(code, "%{byte:02x}")),
+        }
+    }
+    code
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NAMES: [&str; 3] = ["default", "crane", "bay/../1"];
+
+    fn begin(directory: &Path, lease: Millis) -> StateFile {
+        StateFile::begin(Some(directory), NAMES, lease).unwrap()
+    }
+
+    #[test]
+    fn the_epoch_rises_from_life_to_life() {
+        let directory = tempfile::tempdir().unwrap();
+        let first = begin(directory.path(), 100);
+        assert_eq!((first.state().epoch(), first.state().silence()), (1, 0));
+        // A crash: the file is not closed.
+        drop(first);
+        let second = begin(directory.path(), 50);
+        assert_eq!((second.state().epoch(), second.state().silence()), (2, 100));
+        second.end(true);
+        let third = begin(directory.path(), 50);
+        assert_eq!((third.state().epoch(), third.state().silence()), (3, 0));
+        third.end(false);
+        let fourth = begin(directory.path(), 50);
+        assert_eq!((fourth.state().epoch(), fourth.state().silence()), (4, 50));
+        let path = directory
+            .path()
+            .join("locks/default/crane/bay%2f%2e%2e%2f1");
+        assert!(path.is_file());
+    }
+
+    #[test]
+    fn a_file_in_use_a_damaged_one_and_a_read_only_directory_are_errors() {
+        let directory = tempfile::tempdir().unwrap();
+        let first = begin(directory.path(), 100);
+        let second = StateFile::begin(Some(directory.path()), NAMES, 100);
+        assert!(matches!(second, Err(StateFileError::InUse { .. })));
+        fs::write(&first.path, "epoch 7\n").unwrap();
+        drop(first);
+        let damaged = StateFile::begin(Some(directory.path()), NAMES, 100);
+        assert!(matches!(damaged, Err(StateFileError::Content { .. })));
+        let no_directory = directory.path().join("file");
+        fs::write(&no_directory, "").unwrap();
+        let refused = StateFile::begin(Some(&no_directory), NAMES, 100);
+        assert!(matches!(refused, Err(StateFileError::Io { .. })));
+    }
+
+    #[test]
+    fn the_state_directory_follows_the_environment() {
+        let of = |set: &[(&str, &str)]| {
+            default_directory(|name| {
+                let found = set.iter().find(|(known, _)| *known == name);
+                found.map(|(_, value)| (*value).into())
+            })
+        };
+        let all = [(VARIABLE, "/a"), ("XDG_STATE_HOME", "/b"), ("HOME", "/c")];
+        assert_eq!(of(&all), Some("/a".into()));
+        assert_eq!(of(&all[1..]), Some("/b/fipa".into()));
+        assert_eq!(of(&all[2..]), Some("/c/.local/state/fipa".into()));
+        assert_eq!(of(&[(VARIABLE, "")]), None);
+    }
+}
