@@ -375,7 +375,7 @@ impl Agent {
         let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
         all.extend(unread.filter_map(|received| self.core.endpoint.decode(received)));
-        all.retain(|incoming| !lock_slot::is_of_locks(&incoming.message));
+        all.retain(|incoming| !lock_slot::is_for_locks(incoming));
         Ok(all)
     }
 }

@@ -185,7 +185,7 @@ impl Demultiplexer {
         let mut state = self.state.lock();
         if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
             let left = state.served.remove(at).queue;
-            let is_other = |left: &Incoming| !lock_slot::is_of_locks(&left.message);
+            let is_other = |left: &Incoming| !lock_slot::is_for_locks(left);
             state.others.extend(left.into_iter().filter(is_other));
         }
         drop(state);
@@ -379,7 +379,7 @@ impl State {
             server.queue.push_back(received);
             return;
         }
-        if lock_slot::is_of_locks(message) {
+        if lock_slot::is_for_locks(&received) {
             return;
         }
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {

@@ -8,13 +8,25 @@ use fipa_acl::Message;
 use fipa_locking::{Kind, Options, codec};
 use parking_lot::Mutex;
 
+use crate::incoming::Incoming;
+
 /// Protocol of questions to owners about their resources.
 pub(crate) const STATUS_PROTOCOL: &str = "fipa-locks";
 
 /// Whether a message is one of locks, which the application never reads.
 pub(crate) fn is_of_locks(message: &Message) -> bool {
-    let protocol = message.protocol();
-    protocol.is_some_and(|name| name == STATUS_PROTOCOL || codec::is_lock_protocol(name))
+    message.protocol().is_some_and(is_lock_protocol)
+}
+
+/// Whether a received message is one of locks; does not decode it.
+pub(crate) fn is_for_locks(incoming: &Incoming) -> bool {
+    let view = incoming.view();
+    let protocol = view.protocol();
+    protocol.is_some_and(|name| is_lock_protocol(&name.as_str()))
+}
+
+fn is_lock_protocol(name: &str) -> bool {
+    name == STATUS_PROTOCOL || codec::is_lock_protocol(name)
 }
 
 /// The locks of an agent, from its first call that needs them.

@@ -1,6 +1,6 @@
 //! The items of `lock_slot.rs` in a build without the feature `locks`: there are no locks.
 
-use fipa_acl::Message;
+use crate::incoming::Incoming;
 
 #[derive(Default)]
 pub(crate) struct LockSlot(());
@@ -9,6 +9,6 @@ impl LockSlot {
     pub(crate) fn close(&self) {}
 }
 
-pub(crate) fn is_of_locks(_message: &Message) -> bool {
+pub(crate) fn is_for_locks(_incoming: &Incoming) -> bool {
     false
 }

@@ -6,9 +6,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use tokio::runtime::Runtime;
 
-use super::{Agent, Background};
+use super::{Agent, Background, Waiter};
 use crate::AgentId;
 use crate::actions::{
     self, Action, ActionDescription, ActionError, Execution, Goal, GoalError, GoalStatus,
@@ -28,7 +27,7 @@ pub struct Offer {
 #[derive(Debug, Clone)]
 pub struct Robot<'a> {
     robot: actions::Robot<'a>,
-    runtime: &'a Runtime,
+    runtime: &'a Waiter,
 }
 
 /// A goal that the robot has accepted; see [`crate::actions::GoalHandle`].
@@ -36,7 +35,7 @@ pub struct Robot<'a> {
 #[must_use = "result() returns the result"]
 pub struct GoalHandle<'a> {
     handle: actions::GoalHandle<'a>,
-    runtime: &'a Runtime,
+    runtime: &'a Waiter,
 }
 
 /// The progress of a goal; see [`crate::actions::ProgressUpdates`].
@@ -44,7 +43,7 @@ pub struct GoalHandle<'a> {
 #[must_use = "next() returns the progress"]
 pub struct ProgressUpdates<'a> {
     updates: actions::ProgressUpdates,
-    runtime: &'a Runtime,
+    runtime: &'a Waiter,
 }
 
 /// The status of all goals of a robot; see [`crate::actions::StatusUpdates`].
@@ -52,7 +51,7 @@ pub struct ProgressUpdates<'a> {
 #[must_use = "next() returns the status"]
 pub struct StatusUpdates<'a> {
     updates: actions::StatusUpdates,
-    runtime: &'a Runtime,
+    runtime: &'a Waiter,
 }
 
 impl Agent {
@@ -110,7 +109,7 @@ impl Agent {
     pub fn robot(&self, robot: AgentId) -> Robot<'_> {
         Robot {
             robot: self.agent.robot(robot),
-            runtime: &self.runtime,
+            runtime: &self.runtime.waiter,
         }
     }
 }

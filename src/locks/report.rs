@@ -267,7 +267,7 @@ pub(super) async fn query(
         let Ok(incoming) = tokio::time::timeout_at(until, next).await else {
             break;
         };
-        let message = incoming.map_err(|_| LockError::Closed)?.message;
+        let message = incoming.map_err(|_| LockError::Closed)?.into_message();
         let sender = message.sender().map(|sender| sender.name().to_owned());
         let Some(owner) = sender.filter(|name| owners.contains_key(name)) else {
             // The report of an undelivered question.

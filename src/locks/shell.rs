@@ -512,7 +512,7 @@ impl Task {
     }
 
     fn handle(&mut self, incoming: &Incoming) {
-        let message = &incoming.message;
+        let message = incoming.message();
         let Some(from) = self.sender(incoming) else {
             tracing::debug!(%message, "ignored a message of a lock: its sender is not proved");
             return;
@@ -548,7 +548,7 @@ impl Task {
 
     /// Returns the sender of a message, as far as its connection proves it.
     fn sender(&self, incoming: &Incoming) -> Option<Peer> {
-        let name = incoming.message.sender()?.name();
+        let name = incoming.message().sender()?.name();
         let directory = self.core.endpoint.domain.directory();
         let registration = match incoming.sender {
             proved if proved.is_known() => {

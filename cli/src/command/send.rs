@@ -9,8 +9,8 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
-use fipa::monitor::History;
 use fipa::locks::{Fence, with_fences};
+use fipa::monitor::History;
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
     Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
