@@ -58,7 +58,7 @@ async fn dock(rover: &Agent) -> Result<[String; 2], Failed> {
     let (in_time, late) = (command()?, command()?);
     rover.send(in_time).await?;
     let first = tokio::select! {
-        answer = rover.receive() => answer?.message.to_string(),
+        answer = rover.receive() => answer?.message().to_string(),
         // The bay belongs to another agent now.
         lost = lock.lost() => return Err(lost.into()),
     };
@@ -66,12 +66,12 @@ async fn dock(rover: &Agent) -> Result<[String; 2], Failed> {
     // A later grant has another fence.
     rover.lock_within("bay", TIMEOUT).await?.release();
     rover.send(late).await?;
-    Ok([first, rover.receive().await?.message.to_string()])
+    Ok([first, rover.receive().await?.message().to_string()])
 }
 
 /// Answers the next command: only the holder of the bay may dock.
 async fn guard(crane: &Agent, bay: &Owned) -> Result<(), Failed> {
-    let command = crane.receive().await?.message;
+    let command = crane.receive().await?.into_message();
     let answer = match bay.check(&command) {
         Ok(_) => crane.reply(&command, Performative::Agree),
         Err(error) => crane

@@ -474,7 +474,7 @@ mod tests {
         let checks = rules.checks("rover", "c-".to_owned(), &directory);
         let received = received(&message, sender, Some(Kind::Tcp));
         let origin = Origin::of(&received);
-        let incoming = Incoming::new(message, received);
+        let incoming = Incoming::new(received).unwrap();
         let checked = checks.arrived(incoming, origin, &directory, |_, _| {
             *answered += 1;
             None

@@ -60,7 +60,7 @@ async fn a_request_is_served() -> Result<()> {
 
 async fn offer(arm: &Agent, price: u32) -> Result<()> {
     // ANCHOR: propose
-    let call = arm.receive().await?.message;
+    let call = arm.receive().await?.into_message();
     let mut task = arm.take_part(&call)?;
     if task
         .propose(price.to_string(), Duration::from_secs(60))
@@ -146,7 +146,7 @@ async fn loaned_content_arrives() -> Result<()> {
     let deliveries = rover.send_loan(loan).await?;
     // ANCHOR_END: loan
     assert!(deliveries.all_succeeded(), "{deliveries}");
-    let received = arm.receive().await?.message;
+    let received = arm.receive().await?.into_message();
     assert_eq!(received.content().unwrap()[..], picture[..]);
     Ok(())
 }
@@ -187,8 +187,8 @@ async fn an_own_protocol_is_followed() -> Result<()> {
         .content("open")
         .build()?;
     rover.send(request.clone()).await?;
-    let agreed = rover.receive().await?.message;
-    let opened = rover.receive().await?.message;
+    let agreed = rover.receive().await?.into_message();
+    let opened = rover.receive().await?.into_message();
     // ANCHOR_END: own_protocol
     assert_eq!(agreed.performative(), &Performative::Agree);
     assert_eq!(opened.performative(), &Performative::Inform);

@@ -256,7 +256,9 @@ impl<'a> Side<'a> {
                 return Ok(None);
             };
             let at = Instant::now();
-            let message = received.map_err(|error| failed(from, error))?.message;
+            let message = received
+                .map_err(|error| failed(from, error))?
+                .into_message();
             let answers = message.in_reply_to().unwrap_or_default();
             if answers == reference {
                 self.answered.insert(reference.to_owned());

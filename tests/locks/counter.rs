@@ -68,7 +68,7 @@ async fn increment(worker: &Agent) -> Result<(), Box<dyn std::error::Error>> {
         worker.send(lock.guard(request).build()?).await?;
         let answered = async {
             loop {
-                let answer = worker.receive().await?.message;
+                let answer = worker.receive().await?.into_message();
                 if answer.conversation_id() == Some(&id) {
                     return Ok::<_, fipa::ReceiveError>(answer);
                 }
@@ -105,7 +105,7 @@ async fn keep(keeper: &Agent, counter: &Owned, ends: &AtomicBool) -> Kept {
         let Ok(received) = received else {
             continue;
         };
-        let message = received.unwrap().message;
+        let message = received.unwrap().into_message();
         if *message.performative() != Performative::Request {
             continue;
         }

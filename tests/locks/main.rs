@@ -119,7 +119,7 @@ async fn a_command_is_admitted_with_the_fence_of_the_live_grant_only() {
     let guarded = lock.guard(request(&rover, "lock:bay")).build().unwrap();
     assert!(rover.send(guarded.clone()).await.unwrap().all_succeeded());
     // No message of the lock precedes it.
-    let received = crane.receive().await.unwrap().message;
+    let received = crane.receive().await.unwrap().into_message();
     assert_eq!(bay.check(&received), Ok(fence.clone()));
     let bare = request(&rover, "crane").build().unwrap();
     assert!(matches!(
@@ -325,7 +325,7 @@ async fn messages_of_locks_never_reach_the_application() {
         // Letters of one sender keep their order.
         let marker = inform(from, to.name(), "marker");
         assert!(from.send(marker).await.unwrap().all_succeeded());
-        assert_eq!(text(&to.receive().await.unwrap().message), "marker");
+        assert_eq!(text(to.receive().await.unwrap().message()), "marker");
     }
     assert_eq!(rover.locks().len(), 1);
     assert!(rover.locks()[0].is_held && camera.locks().is_empty());

@@ -65,7 +65,7 @@ async fn a_restarted_agent_may_continue_conversations_of_its_earlier_registratio
     let mut request = to(&rover, Performative::Request, &arm, "lift").protocol("fipa-request");
     request = request.conversation_id("c");
     rover.send(request.build().unwrap()).await.unwrap();
-    let asked = next_message(&arm).await.unwrap().message;
+    let asked = next_message(&arm).await.unwrap().into_message();
     arm.deregister().unwrap();
     let arm = here.register("arm").await.unwrap();
     let inform = arm.reply(&asked, Performative::Inform).build().unwrap();
@@ -144,11 +144,11 @@ async fn members_of_coalitions_and_patterns_answer_a_call_of_an_enforcing_agent(
         for arm in called {
             let call = next_message(arm).await.unwrap();
             assert_eq!(call.violation(), None, "{receivers:?}");
-            let bid = arm.reply(&call.message, Performative::Propose);
+            let bid = arm.reply(call.message(), Performative::Propose);
             arm.send(bid.build().unwrap()).await.unwrap();
             let bid = next_message(&rover).await.unwrap();
             assert_eq!(bid.violation(), None, "{receivers:?}");
-            let accept = rover.reply(&bid.message, Performative::AcceptProposal);
+            let accept = rover.reply(bid.message(), Performative::AcceptProposal);
             rover.send(accept.build().unwrap()).await.unwrap();
             let accepted = next_message(arm).await.unwrap();
             assert_eq!(accepted.violation(), None, "{receivers:?}");
@@ -173,13 +173,13 @@ async fn a_message_that_was_not_delivered_can_be_sent_again() {
     let arm = there.register("arm").await.unwrap();
     let sent = rover.send(request.clone()).await.unwrap();
     assert!(sent.all_succeeded(), "{sent}");
-    let agree = next_message(&arm).await.unwrap().message;
+    let agree = next_message(&arm).await.unwrap().into_message();
     let agree = arm.reply(&agree, Performative::Agree).build().unwrap();
     arm.send(agree).await.unwrap();
     // The message transport service has reported the first attempt, too.
     let agreed = loop {
         let received = next_message(&rover).await.unwrap();
-        if *received.message.performative() == Performative::Agree {
+        if *received.message().performative() == Performative::Agree {
             break received;
         }
     };

@@ -151,7 +151,7 @@ async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Fail
             },
             received = agent.receive() => match received {
                 Ok(incoming) if incoming.violation().is_some() => {}
-                Ok(incoming) => handle(agent, owned, &incoming.message).await?,
+                Ok(incoming) => handle(agent, owned, incoming.message()).await?,
                 Err(error) => {
                     return Err(Failure::failed(
                         ErrorChain(&error).to_string(),
