@@ -60,11 +60,10 @@ impl Incoming {
     }
 
     /// Returns the message, and decodes it on the first call. [`view`](Self::view) and
-    /// [`content`](Self::content) need no owned message and do not allocate.
+    /// [`content`](Self::content) read parts of it without decoding all.
     ///
-    /// Its content may be in shared memory of the sender: it stays readable as long
-    /// as this value or a clone of the content exists, but another process of the same user can change
-    /// it.
+    /// Its content may be in shared memory of the sender: it stays readable as long as this value or a
+    /// clone of the content exists, but another process of the same user can change it.
     #[must_use]
     pub fn message(&self) -> &Message {
         self.message

@@ -21,8 +21,8 @@ use std::fmt::Debug;
 use bytes::Bytes;
 use fipa_acl::json::{Document, document_from_json, envelope_to_json, message_to_json};
 use fipa_acl::{
-    AgentId, AgentIdView, DecodeError, Dialect, Envelope, EnvelopeView, Message, MessageIndex, MessageView,
-    Payload, Representation,
+    AgentId, AgentIdView, DecodeError, Dialect, Envelope, EnvelopeView, Message, MessageIndex,
+    MessageView, Payload, Representation,
 };
 use serde_json::json;
 
