@@ -253,7 +253,8 @@ impl Agent {
     /// `message` itself is ignored.
     ///
     /// If shared memory cannot be used (a receiver on another host, not enough free memory), the
-    /// memory is on the heap. The same applies to short content for several receivers.
+    /// memory is on the heap. The same applies to short content for several receivers. The envelope
+    /// has the date of this call.
     /// [`send_loan`](Self::send_loan) works in all cases.
     ///
     /// # Errors
@@ -303,13 +304,9 @@ impl Agent {
         loan: Loan,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
         let Loan { draft, content } = loan;
-        let sending = draft
-            .complete(content.freeze(), SystemTime::now())
-            .map_err(SendError::from)
-            .and_then(|(message, letter)| {
-                let deadline = self.core.endpoint.domain.inner.deadline;
-                self.core.endpoint.send(&message, Ok(letter), deadline)
-            });
+        let (message, letter) = draft.complete(content.freeze());
+        let deadline = self.core.endpoint.domain.inner.deadline;
+        let sending = self.core.endpoint.send(&message, Ok(letter), deadline);
         async move { Ok(deliveries(sending?).await) }
     }
 

@@ -60,11 +60,10 @@ impl Incoming {
     }
 
     /// Returns the message, and decodes it on the first call. [`view`](Self::view) and
-    /// [`content`](Self::content) need no owned message and do not allocate.
+    /// [`content`](Self::content) read parts of it without decoding all.
     ///
-    /// Its content may be in shared memory of the sender: it stays readable as long
-    /// as this value or a clone of the content exists, but another process of the same user can change
-    /// it.
+    /// Its content may be in shared memory of the sender: it stays readable as long as this value or a
+    /// clone of the content exists, but another process of the same user can change it.
     #[must_use]
     pub fn message(&self) -> &Message {
         self.message
@@ -135,5 +134,92 @@ impl Incoming {
         let mut this = self;
         let violation = this.violation.take();
         (this.into_message(), violation)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use std::time::SystemTime;
+
+    use allocation_counter::measure;
+    use fipa_acl::{AgentId, Dialect, Payload, Performative};
+    use fipa_mts::letter_for;
+    use fipa_transport::Incarnation;
+
+    use super::*;
+
+    fn message() -> Message {
+        Message::builder(Performative::Request)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .protocol("fipa-request")
+            .conversation_id("c")
+            .reply_with("w")
+            .content(vec![7; 100])
+            .build()
+            .unwrap()
+    }
+
+    fn received(letter: Letter) -> Received {
+        Received {
+            letter,
+            sender: Incarnation::from_u64(1),
+            via: Some(Kind::Shm),
+            service: Incarnation::from_u64(2),
+            remote: false,
+        }
+    }
+
+    #[test]
+    fn a_message_is_decoded_once_on_first_use_and_nothing_before_allocates() {
+        let message = message();
+        let letter = letter_for(&message, SystemTime::UNIX_EPOCH).unwrap();
+        let received = received(letter);
+        let mut incoming = None;
+        let taken = measure(|| incoming = Some(Incoming::new(received).unwrap()));
+        let incoming = incoming.unwrap();
+        let viewed = measure(|| {
+            assert_eq!(incoming.content().unwrap(), vec![7; 100][..]);
+        });
+        let read = measure(|| {
+            let view = incoming.view();
+            assert_eq!(view.conversation_id().unwrap(), "c");
+            assert_eq!(view.sender().unwrap().name(), "rover");
+            assert_eq!(view.performative(), Performative::Request);
+        });
+        assert_eq!((taken.count_total, read.count_total), (0, 0));
+        // The vector of the comparison.
+        assert_eq!(viewed.count_total, 1);
+        let decoded = measure(|| assert_eq!(incoming.message().protocol(), Some("fipa-request")));
+        assert!(decoded.count_total > 1);
+        let again = measure(|| assert_eq!(incoming.message().sender().unwrap().name(), "rover"));
+        assert_eq!(again.count_total, 0);
+        assert_eq!(*incoming.message(), message);
+        assert_eq!(incoming.into_message(), message);
+    }
+
+    #[test]
+    fn a_message_in_the_string_encoding_is_read_also_if_its_letter_is_split() {
+        let message = message();
+        let text = message
+            .encode(Representation::String, Dialect::Standard)
+            .unwrap();
+        let payload = Payload {
+            head: text.slice(..20),
+            content: text.slice(20..40),
+            tail: text.slice(40..),
+        };
+        let incoming = Incoming::new(received(Letter::new(Bytes::new(), payload))).unwrap();
+        assert_eq!(*incoming.message(), message);
+        assert_eq!(incoming.content().as_ref(), message.content());
+    }
+
+    #[test]
+    fn a_letter_without_a_message_is_returned() {
+        let letter = Letter::new(Bytes::new(), Bytes::from_static(b"\xfa\x10\x0c"));
+        let (_, returned) = Incoming::new(received(letter.clone())).unwrap_err();
+        assert_eq!(returned.letter, letter);
     }
 }

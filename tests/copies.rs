@@ -63,7 +63,7 @@ async fn only_the_kernel_copies_large_content() {
             .mts
             .loan(ROVER, &["arm"], room, len, draft.tail_len());
         loan.content_mut().fill(number as u8);
-        let (_, letter) = draft.complete(loan.freeze(), SystemTime::now()).unwrap();
+        let (_, letter) = draft.complete(loan.freeze());
         let sending = rovers.mts.send(Submission {
             sender: ROVER,
             letter,

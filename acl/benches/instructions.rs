@@ -8,7 +8,7 @@ use std::hint::black_box;
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{
     AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, EnvelopeView, Message,
-    MessageView, Payload, Performative, Received, Representation, bitefficient,
+    MessageIndex, MessageView, Payload, Performative, Received, Representation, bitefficient,
 };
 
 const FIPA_SERVICES_LETTER: &[u8] = include_bytes!("../tests/vectors/tcp_letter.bin");
@@ -25,6 +25,21 @@ const PATHS: &[Path] = &[
     }),
     ("message/decode/1KB", || {
         decode(Representation::BitEfficient, 1 << 10);
+    }),
+    ("message/index/1KB", || {
+        let payload = payload();
+        let index = measured(|| MessageIndex::of(black_box(&payload)));
+        black_box(&index.expect("a message"));
+    }),
+    ("message/index/view", || {
+        let payload = payload();
+        let index = MessageIndex::of(&payload).expect("a message");
+        measured(|| black_box(index.view(black_box(&payload))).reply_by());
+    }),
+    ("message/index/content", || {
+        let payload = payload();
+        let index = MessageIndex::of(&payload).expect("a message");
+        measured(|| index.content(black_box(&payload)));
     }),
     ("message/encoded_len", || {
         let message = message(1);
@@ -121,6 +136,13 @@ fn decode(representation: Representation, content_len: usize) {
     let payload = Payload::from(bytes.expect("a message"));
     let decoded = measured(|| Message::decode(black_box(&payload)));
     decoded.expect("a message");
+}
+
+/// An encoded message in one piece.
+fn payload() -> Payload {
+    let (encoding, dialect) = (Representation::BitEfficient, Dialect::Standard);
+    let bytes = message(1 << 10).encode(encoding, dialect);
+    bytes.expect("a message").into()
 }
 
 /// The message with all 13 parameters.

@@ -5,7 +5,8 @@
 use std::hint::black_box;
 
 use allocation_counter::measure;
-use fipa_acl::{EnvelopeView, MessageView, Text};
+use bytes::Bytes;
+use fipa_acl::{EnvelopeView, MessageIndex, MessageView, Payload, Text};
 
 const MESSAGE: &[u8] = include_bytes!("vectors/m23_all_fields.be");
 const AGENTS: &[u8] = include_bytes!("vectors/m58_reply_to_multi.be");
@@ -97,6 +98,25 @@ fn reading_a_message_does_not_allocate() {
         ("XML of JADE", JADE_XML),
     ] {
         assert_eq!(allocations(bytes), 0, "{name}");
+    }
+}
+
+#[test]
+fn an_index_of_a_message_does_not_allocate() {
+    for (name, bytes) in [
+        ("bit-efficient", MESSAGE),
+        ("agents", AGENTS),
+        ("of JADE", JADE),
+        ("string", STRING),
+    ] {
+        // The memory of `Bytes` that are shared for the first time is allocated then.
+        let payload = Payload::from(Bytes::from_static(bytes));
+        let info = measure(|| {
+            let index = MessageIndex::of(black_box(&payload)).unwrap();
+            black_box(index.view(&payload).reply_by());
+            black_box(index.content(&payload));
+        });
+        assert_eq!(info.count_total, 0, "{name}");
     }
 }
 

@@ -7,7 +7,7 @@ mod arbitrary;
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{
     AgentId, DecodeError, Dialect, Envelope, EnvelopeView, Explanation, Letter, Message,
-    MessageView, Payload, Performative, Representation, bitefficient, explain,
+    MessageIndex, MessageView, Payload, Performative, Representation, bitefficient, explain,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -58,6 +58,23 @@ fn explained(bytes: &[u8]) -> Explanation {
     explanation
 }
 
+/// Checks that the index of a message gives the same message, or the same error.
+fn index_agrees(payload: &Payload) {
+    let (index, decoded) = (MessageIndex::of(payload), Message::decode(payload));
+    assert_eq!(index.as_ref().err(), decoded.as_ref().err());
+    let (Ok(index), Ok(message)) = (index, decoded) else {
+        return;
+    };
+    let view = index.view(payload);
+    assert_eq!(view.performative(), *message.performative());
+    assert_eq!(
+        view.content().as_deref(),
+        message.content().map(|all| &**all)
+    );
+    assert_eq!(index.content(payload).as_ref(), message.content());
+    assert_eq!(index.to_message(payload), message);
+}
+
 /// Counts the spans with this meaning.
 fn count(explanation: &Explanation, meaning: &str) -> usize {
     let spans = explanation.spans.iter();
@@ -78,7 +95,9 @@ fn never_panics(bytes: &[u8]) {
         view.receivers()
             .for_each(|agent| assert!(!agent.name().is_empty()));
     }
-    if let Ok(message) = Message::decode(&Payload::from(Bytes::copy_from_slice(bytes))) {
+    let payload = Payload::from(Bytes::copy_from_slice(bytes));
+    index_agrees(&payload);
+    if let Ok(message) = Message::decode(&payload) {
         let _ = message.to_string();
         let again = Message::decode(&message.to_payload());
         assert_eq!(again, Ok(message), "decoded messages can be encoded");
@@ -148,6 +167,22 @@ proptest! {
         if let Some(content) = message.content() {
             let (head, tail) = message.around_content(content.len()).unwrap();
             prop_assert_eq!((head, tail), (payload.head, payload.tail));
+        }
+    }
+
+    #[test]
+    fn an_index_gives_the_message_in_every_encoding(message in message().boxed()) {
+        index_agrees(&message.to_payload());
+        for representation in [
+            Representation::BitEfficient,
+            Representation::String,
+            Representation::Xml,
+        ] {
+            for dialect in [Dialect::Standard, Dialect::FipaServices, Dialect::Jade] {
+                if let Ok(encoded) = message.encode(representation, dialect) {
+                    index_agrees(&encoded.into());
+                }
+            }
         }
     }
 

@@ -24,8 +24,8 @@ use std::fmt::Debug;
 use bytes::Bytes;
 use fipa_acl::json::{Document, document_from_json, envelope_to_json, message_to_json};
 use fipa_acl::{
-    AgentId, AgentIdView, DecodeError, Dialect, Envelope, EnvelopeView, Message, MessageView,
-    Payload, Representation,
+    AgentId, AgentIdView, DecodeError, Dialect, Envelope, EnvelopeView, Message, MessageIndex,
+    MessageView, Payload, Representation,
 };
 use serde_json::json;
 
@@ -103,10 +103,12 @@ fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: Dialect) {
     }
 }
 
-/// Checks that the view of a message has the same values as the message, or the same error.
+/// Checks that the view and the index of a message have the same values as the message, or the same
+/// error.
 pub fn message_view_agrees(bytes: &[u8], decoded: &Result<Message, DecodeError>) {
     let view = MessageView::parse(bytes);
     assert_eq!(decoded.as_ref().err(), view.as_ref().err());
+    message_index_agrees(&payload(bytes), decoded);
     let (Ok(message), Ok(view)) = (decoded, view) else {
         return;
     };
@@ -123,6 +125,17 @@ pub fn message_view_agrees(bytes: &[u8], decoded: &Result<Message, DecodeError>)
     assert_eq!(names(&mut view.receivers()), owned(message.receivers()));
     assert_eq!(names(&mut view.reply_to()), owned(message.reply_to()));
     assert_eq!(view.user_defined().count(), message.user_defined().len());
+}
+
+/// Checks that the index of a message gives the same message, or the same error.
+fn message_index_agrees(payload: &Payload, decoded: &Result<Message, DecodeError>) {
+    let index = MessageIndex::of(payload);
+    assert_eq!(decoded.as_ref().err(), index.as_ref().err());
+    let (Ok(message), Ok(index)) = (decoded, index) else {
+        return;
+    };
+    assert_eq!(index.to_message(payload), *message);
+    assert_eq!(index.content(payload).as_ref(), message.content());
 }
 
 /// Checks that the view of an envelope has the same values as the envelope.

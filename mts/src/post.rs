@@ -31,7 +31,7 @@ pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostErro
 }
 
 /// A letter whose content is written later, into memory that is loaned for it. The message is
-/// encoded once, before.
+/// encoded once, before, and its envelope has that date.
 #[derive(Debug)]
 pub struct LetterDraft {
     message: Message,
@@ -39,26 +39,25 @@ pub struct LetterDraft {
     head: Bytes,
     tail: Bytes,
     content_len: usize,
-    envelope_len: usize,
+    envelope: Bytes,
 }
 
 impl LetterDraft {
-    /// Encodes the message around content of this length, in bytes. The message's own content is
-    /// ignored.
+    /// Encodes the message around content of this length, in bytes, and an envelope dated `utc`. The
+    /// message's own content is ignored.
     ///
     /// # Errors
     /// Fails when the message or its envelope cannot be encoded.
     pub fn new(message: Message, content_len: usize, utc: SystemTime) -> Result<Self, PostError> {
         let (head, tail) = message.around_content(content_len)?;
         let payload_len = head.len() + content_len + tail.len();
-        // Its length does not depend on the time.
-        let envelope_len = envelope_for(&message, payload_len, utc)?.len();
+        let envelope = envelope_for(&message, payload_len, utc)?;
         Ok(Self {
             message,
             head,
             tail,
             content_len,
-            envelope_len,
+            envelope,
         })
     }
 
@@ -70,7 +69,7 @@ impl LetterDraft {
     /// Length of envelope and message before the content, in bytes.
     #[must_use]
     pub fn head_len(&self) -> usize {
-        self.envelope_len + self.head.len()
+        self.envelope.len() + self.head.len()
     }
 
     /// Length of the message behind the content, in bytes.
@@ -79,23 +78,19 @@ impl LetterDraft {
         self.tail.len()
     }
 
-    /// Completes the letter, with an envelope dated `utc`. The content is shared, not copied; it has
-    /// the length given before.
-    ///
-    /// # Errors
-    /// Fails when the envelope cannot be encoded.
+    /// Completes the letter. The content is shared, not copied; it has the length given before.
     ///
     /// # Panics
     /// Panics if the content has another length.
-    pub fn complete(self, content: Bytes, utc: SystemTime) -> Result<(Message, Letter), PostError> {
+    #[must_use]
+    pub fn complete(self, content: Bytes) -> (Message, Letter) {
         assert_eq!(content.len(), self.content_len, "the length of the content");
         let payload = Payload {
             head: self.head,
             content,
             tail: self.tail,
         };
-        let envelope = envelope_for(&self.message, payload.len(), utc)?;
-        Ok((self.message, Letter::new(envelope, payload)))
+        (self.message, Letter::new(self.envelope, payload))
     }
 }
 

@@ -6,7 +6,7 @@ use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, TransportError,
@@ -56,6 +56,7 @@ pub(crate) struct Endpoint {
     uses: AtomicU64,
     node: Mutex<Option<Node<Svc>>>,
     backlogs: Arc<BacklogThreads>,
+    closing: Arc<Closing>,
     presence: RwLock<Option<Presence>>,
     doorbell: Arc<Doorbell>,
     /// Number of requests for a cleanup.
@@ -147,6 +148,7 @@ impl Endpoint {
             uses: AtomicU64::new(0),
             node: Mutex::new(Some(node)),
             backlogs: Arc::default(),
+            closing: Arc::default(),
             presence: RwLock::new(Some(presence)),
             doorbell,
             dirty: AtomicU64::new(0),
@@ -606,7 +608,7 @@ impl Endpoint {
         if self.is_closed() || self.cleaning.swap(true, Ordering::SeqCst) {
             return;
         }
-        let endpoint = Arc::downgrade(self);
+        let (endpoint, closing) = (Arc::downgrade(self), Arc::clone(&self.closing));
         // On a blocking thread: it takes milliseconds of file system calls, and waits.
         self.runtime.spawn_blocking(move || {
             loop {
@@ -617,7 +619,8 @@ impl Endpoint {
                 let cleanup_delay = now.domain.cleanup_delay(now.config.incarnation);
                 drop(now);
                 // Processes clean up one after the other; mostly the first one removes everything.
-                std::thread::sleep(cleanup_delay);
+                // A runtime that ends waits for this thread, so a process that ends ends the pause.
+                closing.wait_for(cleanup_delay);
                 let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
                     return;
                 };
@@ -656,6 +659,7 @@ impl Endpoint {
             return;
         }
         self.domain.begin_closing();
+        self.closing.begin();
         // While other processes still consider this process alive.
         self.pool.close();
         // Peers must take the remaining parcels before the outboxes are closed.
@@ -698,6 +702,27 @@ fn report_conclusions(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) 
     }
 }
 
+/// Whether the endpoint closes.
+#[derive(Debug, Default)]
+struct Closing {
+    began: Mutex<bool>,
+    changed: Condvar,
+}
+
+impl Closing {
+    fn begin(&self) {
+        *self.began.lock() = true;
+        self.changed.notify_all();
+    }
+
+    /// Waits until the endpoint closes, at most this long.
+    fn wait_for(&self, patience: Duration) {
+        let mut began = self.began.lock();
+        let is_open = |began: &mut bool| !*began;
+        self.changed.wait_while_for(&mut began, is_open, patience);
+    }
+}
+
 /// The threads that serve backlogs.
 #[derive(Debug, Default)]
 struct BacklogThreads {
@@ -725,5 +750,22 @@ impl Drop for BacklogThread<'_> {
     fn drop(&mut self) {
         *self.0.running.lock() -= 1;
         self.0.ended.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_that_closes_ends_the_pause_of_its_cleanup() {
+        let closing = Arc::new(Closing::default());
+        let pausing = Arc::clone(&closing);
+        // Hangs if the pause lasts as long as it may.
+        let pause = std::thread::spawn(move || pausing.wait_for(Duration::from_secs(86_400)));
+        closing.begin();
+        pause.join().expect("the thread ends");
+        // A pause that begins afterwards ends at once.
+        closing.wait_for(Duration::from_secs(86_400));
     }
 }

@@ -102,13 +102,13 @@ impl Agent {
         for number in 0..letters.count {
             for other in &self.others {
                 let incoming = other.receive().await.map_err(chain_text)?;
-                let content = incoming.message().content().ok_or("no content")?;
-                check(content, letters, number)?;
+                let content = incoming.content().ok_or("no content")?;
+                check(&content, letters, number)?;
             }
             let incoming = self.agent.receive().await.map_err(chain_text)?;
             at.push(now_ns());
-            let content = incoming.message().content().ok_or("no content")?;
-            check(content, letters, number)?;
+            let content = incoming.content().ok_or("no content")?;
+            check(&content, letters, number)?;
         }
         Ok(at)
     }
