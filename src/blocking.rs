@@ -334,6 +334,18 @@ impl Agent {
         self.agent.reply(to, performative)
     }
 
+    /// Announces a conversation that other agents began; see [`crate::Agent::expect_conversation`].
+    #[cfg(feature = "monitor")]
+    pub fn expect_conversation(&self, id: &str) {
+        self.agent.expect_conversation(id);
+    }
+
+    /// Sets the extent of the monitor's knowledge; see [`crate::Agent::set_history`].
+    #[cfg(feature = "monitor")]
+    pub fn set_history(&self, history: fipa_monitor::History) {
+        self.agent.set_history(history);
+    }
+
     /// Sends a message, or the message of a builder, and waits for its outcomes; see
     /// [`crate::Agent::send`].
     ///

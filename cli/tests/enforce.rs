@@ -132,3 +132,30 @@ fn the_other_commands_work_with_enforcement() {
     assert!(refused.stderr.contains("not sent"), "{}", refused.stderr);
     drop((coalition, gateway));
 }
+
+#[test]
+fn commands_with_agents_of_their_own_go_on_after_an_illegal_message() {
+    let host = Host::new();
+    let _gateway = host.start(&[&ENFORCE[..], &["--set", "mts.name=robot", "up"]].concat());
+    let watch = ["df", "watch", "--type", "lifting", "--json"];
+    let mut watching = host.start(&[&ENFORCE[..], &watch].concat());
+    let crane = ["df", "register", "crane", "lifting", "--service", "lift-1"];
+    let mut crane = host.start(&[&ENFORCE[..], &crane].concat());
+    let changed = watching.line();
+    assert!(changed.contains("lift-1"), "{changed}");
+    // All agents of the host, the temporary ones of the commands among them.
+    for to in ["crane", "fipa-.*"] {
+        let sent = host.run(&illegal(to)).done();
+        assert!(sent.contains("delivered"), "{sent}");
+    }
+    let found = host.run(&[&ENFORCE[..], &["df", "search", "--type", "lifting"]].concat());
+    assert!(found.done().contains("crane"));
+    let other = ["df", "register", "hoist", "lifting", "--service", "lift-2"];
+    let _hoist = host.start(&[&ENFORCE[..], &other].concat());
+    let changed = watching.line();
+    assert!(changed.contains("lift-2"), "{changed}");
+    crane.send_signal("-INT");
+    let left = watching.line();
+    assert!(left.contains("crane"), "{left}");
+    drop(crane);
+}

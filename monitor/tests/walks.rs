@@ -357,7 +357,7 @@ fn the_monitor_and_the_reference_agree() {
             .map(|text| text.parse::<u64>().unwrap())
     };
     let steps = number("FIPA_WALK_STEPS").unwrap_or(2_000);
-    let seeds = number("FIPA_WALK_SEEDS").unwrap_or(40);
+    let seeds = number("FIPA_WALK_SEEDS").unwrap_or(50);
     let seeds = match number("FIPA_WALK_SEED") {
         Some(seed) => seed..seed + 1,
         None => 0..seeds,
