@@ -150,6 +150,7 @@ impl MdnsDirectory {
             peer_records: Mutex::default(),
             coalition_sync: Mutex::default(),
             coalitions_changed: AtomicBool::new(false),
+            closing: AtomicBool::new(false),
             interfaces_changed: AtomicBool::new(false),
             own: Mutex::default(),
             withdrawals: broadcast::channel(64).0,
@@ -236,6 +237,8 @@ impl MdnsDirectory {
             }
             own.agents.clear();
         }
+        // Before the task is aborted: it may be about to report the end of the library.
+        self.shared.closing.store(true, Ordering::Relaxed);
         self.task.abort();
         // The last beacon reports that the coalitions are gone; other gateways wait for that.
         let (config, nothing) = (&self.shared.config, beacon::BeaconContent::default());
@@ -314,6 +317,8 @@ struct Shared {
     coalition_sync: Mutex<CoalitionSync>,
     /// Whether to send a beacon at once because coalitions changed.
     coalitions_changed: AtomicBool,
+    /// Whether this process closes the directory, so that the end of the library is no problem.
+    closing: AtomicBool,
     /// Whether to check the interfaces at once.
     interfaces_changed: AtomicBool,
     own: Mutex<OwnAgents>,
@@ -703,6 +708,10 @@ impl Shared {
     }
 
     fn failed(&self, error: String) {
+        if self.closing.load(Ordering::Relaxed) {
+            tracing::debug!(%error, "multicast DNS, while it is closed");
+            return;
+        }
         tracing::warn!(%error, "multicast DNS");
         self.status.lock().last_error = Some(error);
     }
