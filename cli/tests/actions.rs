@@ -2,7 +2,6 @@
 //! its own.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
-#![expect(clippy::print_stdout, reason = "the parent process reads it")]
 
 mod common;
 
