@@ -143,7 +143,7 @@ fn answers_survive_both_languages() {
     let to = Ask::Goal(goal("(dock :goal a)"));
     for language in LANGUAGES {
         let write = |to: &Ask, answer: &Answer| language.write_answer(&crex(), to, answer).unwrap();
-        let value = Term::parse("(docked :charge 0.5 :at (sequence 1 2))")
+        let value = Term::parse("(docked :at (sequence 1 2) :charge 0.5)")
             .unwrap()
             .into_owned();
         for answer in [

@@ -2,14 +2,13 @@
 //! its own.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
-#![expect(clippy::print_stdout, reason = "the parent process reads it")]
 
 mod common;
 
 use std::io::{BufRead as _, BufReader};
 use std::process::Stdio;
 
-use common::Host;
+use common::{Host, Ran};
 use fipa::actions::{Action, Execution, ParameterDescription, Progress};
 use fipa::config::Sources;
 use fipa::{Config, Domain};
@@ -19,6 +18,9 @@ use serde_json::{Value, json};
 
 /// Environment variable with the domain of a robot process.
 const DOMAIN: &str = "FIPA_TEST_ROBOT_DOMAIN";
+
+/// Time for each message.
+const DEADLINE: &str = "mts.deadline=30s";
 
 #[derive(Serialize, Deserialize)]
 #[serde(rename = "pose")]
@@ -51,6 +53,7 @@ fn robot_process() {
         set: vec![
             format!("domain={domain}"),
             "discovery.mdns=false".to_owned(),
+            DEADLINE.to_owned(),
         ],
         ..Sources::default()
     });
@@ -100,15 +103,20 @@ fn robot(host: &Host) -> ChildGuard {
     child
 }
 
+/// Runs a command that is patient with a loaded machine.
+fn run(host: &Host, arguments: &[&str]) -> Ran {
+    host.run(&[&["--set", DEADLINE], arguments].concat())
+}
+
 #[test]
 fn actions_are_listed_and_performed() {
     let host = Host::new();
-    let none = host.run(&["actions"]).done();
+    let none = run(&host, &["actions"]).done();
     assert_eq!(none, "no agent of this host offers actions\n");
-    let unknown = host.run(&["actions", "crex"]).failed(1);
+    let unknown = run(&host, &["actions", "crex"]).failed(1);
     assert!(unknown.contains("crex"), "{unknown}");
     let _robot = robot(&host);
-    let listed = host.run(&["actions", "crex"]).done();
+    let listed = run(&host, &["actions", "crex"]).done();
     for part in [
         "crex dock: Docks\n",
         "target=",
@@ -117,7 +125,7 @@ fn actions_are_listed_and_performed() {
     ] {
         assert!(listed.contains(part), "{part}: {listed}");
     }
-    let all = host.run(&["actions", "--json"]).done_json();
+    let all = run(&host, &["actions", "--json"]).done_json();
     assert_eq!(all[0]["robot"], "crex");
     assert_eq!(all[0]["actions"][0]["name"], "dock");
     let speed = &all[0]["actions"][0]["parameters"][1];
@@ -180,7 +188,7 @@ fn actions_are_listed_and_performed() {
             "the deadline passed",
         ),
     ] {
-        let failed = host.run(arguments).failed(code);
+        let failed = run(&host, arguments).failed(code);
         assert!(failed.contains(expected), "{arguments:?}: {failed}");
     }
 }
@@ -189,7 +197,7 @@ fn actions_are_listed_and_performed() {
 fn a_signal_cancels_the_goal() {
     let host = Host::new();
     let mut robot = robot(&host);
-    let mut running = host.start(&["do", "crex", "drive", "--json"]);
+    let mut running = host.start(&["--set", DEADLINE, "do", "crex", "drive", "--json"]);
     let accepted: Value = serde_json::from_str(&running.ready).unwrap();
     loop {
         let progress: Value = serde_json::from_str(&running.line()).unwrap();
@@ -207,10 +215,10 @@ fn a_signal_cancels_the_goal() {
     let (code, errors) = running.signal("-INT");
     assert_eq!(code, Some(1));
     assert!(errors.contains("cancelled while it ran"), "{errors}");
-    let goals = host.run(&["actions", "crex", "--goals"]).done();
+    let goals = run(&host, &["actions", "crex", "--goals"]).done();
     assert_eq!(goals, "crex runs no goals\n");
 
-    let mut running = host.start(&["do", "crex", "drive", "--json"]);
+    let mut running = host.start(&["--set", DEADLINE, "do", "crex", "drive", "--json"]);
     let _ = running.line();
     robot.kill();
     let (code, errors) = running.end();
