@@ -152,6 +152,7 @@ impl Waiter {
         }
     }
 
+    #[cfg(feature = "monitor")]
     fn enter(&self) -> tokio::runtime::EnterGuard<'_> {
         self.0.enter()
     }
