@@ -176,7 +176,7 @@ fn of_type(agent_type: &str) -> RegisterOptions {
 async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
     let (here, there) = two(&config(&[])).await;
     let mut changes = here.changes();
-    let _rover = here.register("rover").await.unwrap();
+    let rover = here.register("rover").await.unwrap();
     let arms = [
         there.register_with("arm_2", of_type("arm")).await.unwrap(),
         there.register_with("arm_1", of_type("arm")).await.unwrap(),
@@ -205,6 +205,8 @@ async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
         }
     }
     assert!(left.contains("arm_1") && left.contains("group"), "{left:?}");
+    // The stream ends with the last handle.
+    drop(rover);
     here.close().await;
     let end = async { while changes.next().await.is_some() {} };
     tokio::time::timeout(PATIENCE, end).await.unwrap();
