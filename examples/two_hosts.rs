@@ -61,6 +61,7 @@ fn host(name: &str, set: &[String]) -> fipa::Result<Config> {
         format!("domain={name}-{}", std::process::id()),
         format!("mts.name={name}"),
         "discovery.mdns=false".to_owned(),
+        "mts.deadline=30s".to_owned(),
     ];
     Ok(Config::load(&Sources {
         set: own.into_iter().chain(set.iter().cloned()).collect(),

@@ -69,7 +69,8 @@ pub struct Agent {
     runtime: Background,
 }
 
-/// The changes of a directory; see [`crate::Domain::changes`]. The iterator ends when the domain is closed.
+/// The changes of a directory; see [`crate::Domain::changes`]. The iterator ends when the last handle of the
+/// domain and its agents is dropped.
 #[derive(Debug)]
 pub struct Changes {
     changes: Watch,
@@ -158,6 +159,7 @@ impl Waiter {
         }
     }
 
+    #[cfg(feature = "monitor")]
     fn enter(&self) -> tokio::runtime::EnterGuard<'_> {
         self.0.enter()
     }
@@ -271,8 +273,8 @@ impl Domain {
 }
 
 impl Changes {
-    /// Waits for the next change; returns `None` if there is none within `patience`, or if the domain is
-    /// closed.
+    /// Waits for the next change; returns `None` if there is none within `patience`, or if the iterator
+    /// has ended.
     pub fn next_within(&mut self, patience: Duration) -> Option<Change> {
         let changes = &mut self.changes;
         let next = self

@@ -155,7 +155,8 @@ impl Domain {
     }
 
     /// Returns the changes from now on of the agents, coalitions and gateways in the directory, as a
-    /// [`Stream`](futures_core::Stream). For a complete picture, call this first and then
+    /// [`Stream`](futures_core::Stream), which ends when the last handle of the domain and its agents is
+    /// dropped. For a complete picture, call this first and then
     /// [`agents`](Self::agents); an agent that joined in between appears in both.
     ///
     /// ```no_run

@@ -25,7 +25,8 @@ fn run(name: &str) -> Vec<String> {
     let directory = tempfile::tempdir().unwrap();
     let file = |name: &str| directory.path().join(name);
     let domain = format!("example-{}", support::mark());
-    let config = format!("domain = \"{domain}\"\ndiscovery.mdns = false\n");
+    let config =
+        format!("domain = \"{domain}\"\ndiscovery.mdns = false\nmts.deadline = \"1min\"\n");
     fs::write(file("fipa.toml"), config).unwrap();
     let programs = std::env::current_exe().unwrap();
     let programs = programs.ancestors().nth(2).unwrap().join("examples");

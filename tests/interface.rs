@@ -18,10 +18,15 @@ use fipa::{
 };
 use fipa_testbed::until_async;
 use futures_core::Stream;
-use support::{config, inform, two};
+use support::{inform, two};
 
 /// Longer than any step takes, also on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Makes a configuration for a domain that no other test uses, with a deadline for busy machines.
+fn config(set: &[&str]) -> Config {
+    support::config(&[&["mts.deadline=2min"], set].concat())
+}
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_message_is_sent_by_its_builder_and_a_bad_name_is_an_error_of_send() {
@@ -171,7 +176,7 @@ fn of_type(agent_type: &str) -> RegisterOptions {
 async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
     let (here, there) = two(&config(&[])).await;
     let mut changes = here.changes();
-    let _rover = here.register("rover").await.unwrap();
+    let rover = here.register("rover").await.unwrap();
     let arms = [
         there.register_with("arm_2", of_type("arm")).await.unwrap(),
         there.register_with("arm_1", of_type("arm")).await.unwrap(),
@@ -200,7 +205,8 @@ async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
         }
     }
     assert!(left.contains("arm_1") && left.contains("group"), "{left:?}");
-    drop(_rover);
+    // The stream ends with the last handle.
+    drop(rover);
     here.close().await;
     let end = async { while changes.next().await.is_some() {} };
     tokio::time::timeout(PATIENCE, end).await.unwrap();
@@ -259,7 +265,6 @@ async fn a_loan_above_the_limit_is_refused_with_the_limit() {
 async fn memory_that_loans_hold_is_a_reason_of_its_own() {
     let config = config(&[
         "mts.transports=shm",
-        "mts.deadline=2s",
         "transport.shm.capacity=12MiB",
         "transport.shm.max_letter=4MiB",
     ]);
@@ -278,7 +283,8 @@ async fn memory_that_loans_hold_is_a_reason_of_its_own() {
         })
         .collect();
     let letter = || inform(&rover, "arm", vec![7; len]);
-    let failed = rover.send(letter()).await.unwrap();
+    let failed = rover.send_within(letter(), Duration::from_secs(5));
+    let failed = failed.await.unwrap();
     match &failed.0[0].outcome {
         Outcome::Failed { reason, attempts } => {
             assert_eq!(*reason, FailureReason::NoRoom, "{failed}");

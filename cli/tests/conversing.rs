@@ -74,12 +74,11 @@ fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
     match action.as_str() {
         "fail" => Ok(Reply::Failure("it fell".into())),
         "wait" => {
-            let reply = match task.cancelled(PATIENCE)? {
-                true => task.confirm_cancel()?,
-                false => return Ok(Reply::Failure("no cancel".into())),
-            };
+            if !task.cancelled(PATIENCE)? {
+                return Ok(Reply::Failure("no cancel".into()));
+            }
             mark("canceled");
-            Ok(reply)
+            task.confirm_cancel()
         }
         _ => Ok(Reply::Inform("lifted".into())),
     }
@@ -205,7 +204,7 @@ fn a_signal_cancels_a_request() {
     assert_eq!(request.ready, "arm_1 agreed");
     let (code, error) = request.signal("-INT");
     assert_eq!(code, Some(1));
-    assert!(error.starts_with("error: canceled by a signal"), "{error}");
+    assert!(error.contains("error: canceled by a signal"), "{error}");
     until("the arm knows it", || host.path("canceled").exists());
 }
 

@@ -19,7 +19,7 @@ use crate::output;
 use crate::report::{self, Failure};
 
 /// Maximum wait for the confirmation of a cancel at the end of the command. A second signal ends it.
-pub(super) const CANCEL_WITHIN: Duration = Duration::from_secs(3);
+pub(super) const CANCEL_WITHIN: Duration = Duration::from_secs(5);
 
 /// Request an action from an agent (FIPA00026)
 ///
