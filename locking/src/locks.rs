@@ -666,16 +666,10 @@ impl<A: Algorithm> Locks<A> {
         };
         match (act, established) {
             (Act::Query { claim }, true) => {
-                // The answer belongs to the conversation of the question. The other members did not ask.
-                let announcement = self.side_conversation("discover", now);
-                let members: Vec<_> = self.members.keys().cloned().collect();
-                for member in members {
-                    let conversation = match member == *from {
-                        true => conversation.clone(),
-                        false => announcement.clone(),
-                    };
-                    self.send(member, resource, conversation, Act::Owned, out);
-                }
+                // The other members were told when they joined. An answer to all of them would let one
+                // message cause any number of others.
+                let to = from.clone();
+                self.send(to, resource, conversation.clone(), Act::Owned, out);
                 if *claim {
                     let to = from.clone();
                     self.send(to, resource, conversation.clone(), Act::Contested, out);

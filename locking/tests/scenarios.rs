@@ -603,7 +603,10 @@ fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
 #[test]
 fn a_peer_with_many_requests_takes_bounded_memory() {
     for kind in Kind::ALL {
-        let mut owner = Agent::owner("crane", kind, &[("rover", Dialect::Own)]);
+        let names: Vec<String> = (0..50).map(|number| format!("member-{number}")).collect();
+        let members = names.iter().map(|name| (name.as_str(), Dialect::Own));
+        let members: Vec<_> = members.chain([("rover", Dialect::Own)]).collect();
+        let mut owner = Agent::owner("crane", kind, &members);
         let requests = 100_000_u64;
         for number in 0..requests {
             let conversation = Conversation::new("rover".into(), number);

@@ -116,7 +116,6 @@ impl Lock {
 
     /// Adds the fences of the lock to a message, as its user-defined parameter
     /// [`FENCE`](super::FENCE). The owner checks it with [`Owned::check`](super::Owned::check).
-    #[must_use]
     pub fn guard(&self, message: MessageBuilder) -> MessageBuilder {
         let fences = self.fences.iter().filter_map(|(_, fence)| fence.as_ref());
         message::with_fences(message, fences)

@@ -38,7 +38,6 @@ pub enum AdmitError {
 }
 
 /// Adds fences to a message, as [`Lock::guard`](super::Lock::guard) does.
-#[must_use]
 pub fn with_fences<'a>(
     message: MessageBuilder,
     fences: impl IntoIterator<Item = &'a Fence>,

@@ -310,7 +310,10 @@ mod tests {
             let locks = vec![row(status.clone())];
             serde_json::to_vec(&Answer { version, locks }).unwrap()
         };
-        assert_eq!(read(&written(1), "crane").unwrap(), [status.clone()]);
+        assert_eq!(
+            read(&written(1), "crane").unwrap(),
+            std::slice::from_ref(&status)
+        );
         // An owner cannot report the fence of another one.
         let foreign = read(&written(1), "mallory").unwrap();
         assert_eq!(foreign[0].owner.as_deref(), Some("mallory"));

@@ -82,7 +82,7 @@ async fn increment(worker: &Agent) -> Result<(), Box<dyn std::error::Error>> {
     };
     let value: u64 = ask("read".to_owned()).await?.parse()?;
     // The test stops and kills workers here, too.
-    tokio::time::sleep(Duration::from_millis(fastrand::u64(..8))).await;
+    tokio::time::sleep(Duration::from_millis(fastrand::u64(..40))).await;
     ask((value + 1).to_string()).await?;
     Ok(())
 }
