@@ -140,7 +140,7 @@ fn commands_with_agents_of_their_own_go_on_after_an_illegal_message() {
     let watch = ["df", "watch", "--type", "lifting", "--json"];
     let mut watching = host.start(&[&ENFORCE[..], &watch].concat());
     let crane = ["df", "register", "crane", "lifting", "--service", "lift-1"];
-    let mut crane = host.start(&[&ENFORCE[..], &crane].concat());
+    let crane = host.start(&[&ENFORCE[..], &crane].concat());
     let changed = watching.line();
     assert!(changed.contains("lift-1"), "{changed}");
     // All agents of the host, the temporary ones of the commands among them.
