@@ -309,7 +309,7 @@ fn no_message_of_a_projected_protocol_is_refused() {
         let mut states = [0; 3];
         let mut queues: Vec<VecDeque<String>> = vec![VecDeque::new(); 9];
         let mut idle = 0;
-        while idle < 60 {
+        while idle < 600 {
             idle += 1;
             let role = rng.usize(..3);
             let state = &locals[role].states()[states[role]];
