@@ -3,10 +3,11 @@
 //!
 //! Not in this module: the rules of the protocols (`fipa-monitor`).
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{Message, Performative};
+use fipa_acl::{Message, MessageView, Performative};
 use fipa_monitor::{
     Header, Library, LibraryError, LibraryFull, Limits, Monitor, Now, Verdict, Violation,
 };
@@ -90,7 +91,7 @@ impl Checks {
         let Some(monitored) = &self.0 else {
             return Ok(());
         };
-        match monitored.violation(&Header::from(message)) {
+        match monitored.violation(message) {
             Some(violation) if monitored.enforce => Err(SendError::Violation(violation)),
             Some(violation) => {
                 tracing::warn!("sent a message that violates its protocol: {violation}");
@@ -110,7 +111,7 @@ impl Checks {
         let Some(monitored) = &self.0 else {
             return incoming;
         };
-        let Some(violation) = monitored.violation(&Header::from(&incoming.view())) else {
+        let Some(violation) = monitored.violation_in(&incoming.view()) else {
             return incoming;
         };
         // Not-understood and failure are never answered; otherwise two agents could answer each other
@@ -121,7 +122,7 @@ impl Checks {
             && let Some(answer) = answer(incoming.message(), violation.to_string())
         {
             // The answer ends the conversation in the monitor, if the sender takes part in one.
-            let _ = monitored.violation(&Header::from(&answer));
+            let _ = monitored.violation(&answer);
         }
         tracing::warn!("received a message that violates its protocol: {violation}");
         incoming.violates(violation);
@@ -130,7 +131,23 @@ impl Checks {
 }
 
 impl Monitored {
-    fn violation(&self, header: &Header<'_>) -> Option<Box<Violation>> {
+    fn violation(&self, message: &Message) -> Option<Box<Violation>> {
+        let (act, id) = (message.performative(), message.conversation_id());
+        self.check(&Header::from(message), act, id)
+    }
+
+    fn violation_in(&self, message: &MessageView<'_>) -> Option<Box<Violation>> {
+        let id = message.conversation_id().map(|id| id.as_str());
+        let act = message.performative_name();
+        self.check(&Header::from(message), &act, id.as_deref())
+    }
+
+    fn check(
+        &self,
+        header: &Header<'_>,
+        performative: &dyn fmt::Display,
+        conversation: Option<&str>,
+    ) -> Option<Box<Violation>> {
         let now = now();
         let mut monitor = self.monitor.lock();
         if monitor.poll_elapsed().is_some_and(|due| due <= now.elapsed) {
@@ -139,7 +156,12 @@ impl Monitored {
             }
         }
         let verdict = monitor.check(header, now);
-        tracing::trace!(?header, accepted = verdict.is_accepted(), "checked");
+        tracing::trace!(
+            %performative,
+            conversation,
+            accepted = verdict.is_accepted(),
+            "checked"
+        );
         match verdict {
             Verdict::Violation(violation) => Some(violation),
             _ => None,
