@@ -3,7 +3,6 @@
 //!
 //! Not in this module: the rules of the protocols (`fipa-monitor`).
 
-use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
