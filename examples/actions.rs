@@ -70,6 +70,7 @@ pub(crate) fn offer(crex: &Agent) -> Result<[Offer; 3], Box<dyn std::error::Erro
         work(&run, way).await?;
         Ok::<_, String>(Docked { charge: 0.8 })
     })?;
+    // ANCHOR: offer
     let speed = ParameterDescription::of::<f64>("speed").unit("m/s");
     let drive = Action::new("drive")
         .described("Drives straight on")
@@ -79,6 +80,7 @@ pub(crate) fn offer(crex: &Agent) -> Result<[Offer; 3], Box<dyn std::error::Erro
     let drive = crex.offer(drive, |goal: Drive, run: Execution| async move {
         work(&run, goal.distance / goal.speed.unwrap_or(0.25)).await
     })?;
+    // ANCHOR_END: offer
     Ok([dock, drive, blink(crex)?])
 }
 
@@ -89,6 +91,7 @@ fn blink(crex: &Agent) -> Result<Offer, OfferError> {
     })
 }
 
+// ANCHOR: work
 /// Works until it is done, or is to stop.
 async fn work(run: &Execution, seconds: f64) -> Result<(), String> {
     const STEPS: u32 = 20;
@@ -103,6 +106,7 @@ async fn work(run: &Execution, seconds: f64) -> Result<(), String> {
     }
     Ok(())
 }
+// ANCHOR_END: work
 
 /// Uses the actions of the robot.
 pub(crate) async fn client(crex: &Robot<'_>) -> Result<(), ActionError> {
@@ -117,6 +121,7 @@ pub(crate) async fn client(crex: &Robot<'_>) -> Result<(), ActionError> {
         y: 0.2,
         yaw: 3.1,
     };
+    // ANCHOR: client
     let goal = crex.invoke("dock", &Dock { target }).await?;
     let mut progress = goal.progress().await?;
     while let Some(status) = progress.next().await? {
@@ -128,6 +133,7 @@ pub(crate) async fn client(crex: &Robot<'_>) -> Result<(), ActionError> {
         ));
     }
     let docked: Docked = goal.result().await?;
+    // ANCHOR_END: client
     print(&format!("docked, charge {}", docked.charge));
 
     let far = Drive {

@@ -47,6 +47,7 @@ pub(crate) async fn share(domain: &Domain, options: OwnOptions) -> Result<Vec<St
     Ok(answers)
 }
 
+// ANCHOR: rover
 /// Runs a rover: it docks while it holds the bay, and tries to when it does not.
 async fn dock(rover: &Agent) -> Result<[String; 2], Failed> {
     let lock = rover.lock_within("bay", TIMEOUT).await?;
@@ -69,6 +70,8 @@ async fn dock(rover: &Agent) -> Result<[String; 2], Failed> {
     Ok([first, rover.receive().await?.message().to_string()])
 }
 
+// ANCHOR_END: rover
+// ANCHOR: owner
 /// Answers the next command: only the holder of the bay may dock.
 async fn guard(crane: &Agent, bay: &Owned) -> Result<(), Failed> {
     let command = crane.receive().await?.into_message();
@@ -81,6 +84,7 @@ async fn guard(crane: &Agent, bay: &Owned) -> Result<(), Failed> {
     crane.send(answer.build()?).await?;
     Ok(())
 }
+// ANCHOR_END: owner
 
 #[expect(clippy::print_stdout, reason = "an example prints its results")]
 fn print(text: &str) {

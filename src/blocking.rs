@@ -193,6 +193,14 @@ impl Domain {
         Self::open(&Config::load(&Sources::from_environment())?)
     }
 
+    /// Returns the names of the agents without joining the domain; see [`crate::Domain::names`].
+    ///
+    /// # Errors
+    /// See [`crate::Domain::names`].
+    pub fn names(config: &Config) -> Result<Vec<String>, OpenError> {
+        crate::Domain::names(config)
+    }
+
     /// Registers an agent with a name and without further description.
     ///
     /// # Errors

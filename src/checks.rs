@@ -16,9 +16,7 @@ use fipa_sds::{Directory, Entry, Reach, Resolution, Role, resolve};
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 
-use crate::agent::Agent;
 use crate::config::{self, Check};
-use crate::delivery::Deliveries;
 use crate::error::{ProtocolError, SendError};
 use crate::incoming::Incoming;
 
@@ -125,6 +123,21 @@ pub(crate) struct Unsettled {
 }
 
 impl Checks {
+    /// See [`Agent::expect_conversation`](crate::Agent::expect_conversation).
+    pub(crate) fn expect_conversation(&self, id: &str) {
+        if let Some(monitored) = &self.0 {
+            monitored.monitor.lock().expect(id);
+        }
+    }
+
+    /// See [`Agent::set_history`](crate::Agent::set_history).
+    pub(crate) fn set_history(&self, history: History) {
+        if let Some(monitored) = &self.0 {
+            *monitored.earlier.lock() = None;
+            monitored.monitor.lock().set_history(history);
+        }
+    }
+
     /// Checks a message that is about to be sent. Returns the receiver of its outcomes.
     pub(crate) fn leaving(
         &self,
@@ -331,13 +344,12 @@ impl Unsettled {
         })
     }
 
-    /// Handles the outcomes: a message that was not delivered may be sent again.
-    pub(crate) fn settle(self, deliveries: &Deliveries) {
-        for delivery in &deliveries.0 {
-            if !delivery.outcome.is_success() {
-                let mut monitor = self.monitored.monitor.lock();
-                monitor.undelivered(&self.header, &delivery.receiver, now());
-            }
+    /// Handles the outcomes, of which these receivers had a failure: the message may be sent to them
+    /// again.
+    pub(crate) fn settle<'a>(self, undelivered: impl Iterator<Item = &'a str>) {
+        for receiver in undelivered {
+            let mut monitor = self.monitored.monitor.lock();
+            monitor.undelivered(&self.header, receiver, now());
         }
     }
 }
@@ -385,36 +397,6 @@ fn groups<'m>(message: &'m Message, directory: &dyn Directory) -> Vec<(&'m str, 
         }
     };
     names.filter_map(group).collect()
-}
-
-impl Agent {
-    /// Tells the monitor that another agent has begun, or will begin, a conversation with this
-    /// identifier and names this agent in a `reply-to` (FIPA00061). The answers that this agent then
-    /// receives are not unsolicited.
-    ///
-    /// Without this call, with `monitor.check` and unless `monitor.exempt` lists the protocol, such an
-    /// answer [violates](Incoming::violation) its protocol if its sender is on this host and was
-    /// registered after this agent.
-    pub fn expect_conversation(&self, id: &str) {
-        if let Some(monitored) = &self.core.endpoint.checks.0 {
-            monitored.monitor.lock().expect(id);
-        }
-    }
-
-    /// Sets the extent of the monitor's knowledge about conversations in which this agent took part
-    /// under an earlier registration of its name.
-    ///
-    /// By default, an agent on this host that was registered after this one, and a conversation id of
-    /// [`unique_id`](Self::unique_id), cannot belong to such a conversation, and all others may. A
-    /// message that may continue such a conversation is not checked. An agent that restores its
-    /// conversations after a restart sets [`History::Unknown`]: it is then not refused any message that
-    /// continues one. An agent with a name that is never used again sets [`History::Complete`].
-    pub fn set_history(&self, history: History) {
-        if let Some(monitored) = &self.core.endpoint.checks.0 {
-            *monitored.earlier.lock() = None;
-            monitored.monitor.lock().set_history(history);
-        }
-    }
 }
 
 /// Returns the current time. The monotonic clock counts while the machine is suspended.

@@ -5,7 +5,6 @@ use fipa_mts::core::Received;
 use fipa_sds::Directory;
 
 use crate::config::{self, Check};
-use crate::delivery::Deliveries;
 use crate::error::{OpenError, SendError};
 use crate::incoming::Incoming;
 
@@ -60,7 +59,7 @@ impl Origin {
 }
 
 impl Unsettled {
-    pub(crate) fn settle(self, _deliveries: &Deliveries) {
+    pub(crate) fn settle<'a>(self, _undelivered: impl Iterator<Item = &'a str>) {
         match self {}
     }
 }

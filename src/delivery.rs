@@ -60,7 +60,8 @@ pub(crate) async fn deliveries(sent: Sent) -> Deliveries {
     let delivered = outcomes.map(|(receiver, outcome)| Delivery { receiver, outcome });
     let deliveries = Deliveries(delivered.collect());
     if let Some(unsettled) = sent.unsettled {
-        unsettled.settle(&deliveries);
+        let failed = deliveries.0.iter().filter(|one| !one.outcome.is_success());
+        unsettled.settle(failed.map(|one| &*one.receiver));
     }
     deliveries
 }

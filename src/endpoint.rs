@@ -161,7 +161,8 @@ impl Endpoint {
         let origin = Origin::of(&received);
         let incoming = match Incoming::new(received) {
             Ok(incoming) => incoming,
-            Err((error, received)) => {
+            Err(refused) => {
+                let (error, received) = *refused;
                 tracing::warn!(
                     agent = %self.name, error = %ErrorChain(&error),
                     "ignored a received letter: its message cannot be decoded"

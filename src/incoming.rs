@@ -30,8 +30,8 @@ pub struct Incoming {
 }
 
 impl Incoming {
-    /// Checks the message of a received letter. The content of a bit-efficient message is not accessed.
-    pub(crate) fn new(received: Received) -> Result<Self, (DecodeError, Received)> {
+    /// Checks the message of a received letter; returns the letter if the message is malformed. The content of a bit-efficient message is not accessed.
+    pub(crate) fn new(received: Received) -> Result<Self, Box<(DecodeError, Received)>> {
         let mut received = received;
         let payload = received.letter.payload();
         let is_text = matches!(
@@ -45,7 +45,7 @@ impl Incoming {
         }
         let index = match MessageIndex::of(received.letter.payload()) {
             Ok(index) => index,
-            Err(error) => return Err((error, received)),
+            Err(error) => return Err(Box::new((error, received))),
         };
         Ok(Self {
             index,
@@ -219,7 +219,7 @@ mod tests {
     #[test]
     fn a_letter_without_a_message_is_returned() {
         let letter = Letter::new(Bytes::new(), Bytes::from_static(b"\xfa\x10\x0c"));
-        let (_, returned) = Incoming::new(received(letter.clone())).unwrap_err();
+        let (_, returned) = *Incoming::new(received(letter.clone())).unwrap_err();
         assert_eq!(returned.letter, letter);
     }
 }

@@ -111,6 +111,7 @@ mod action_table;
 #[cfg(feature = "actions")]
 pub mod actions;
 mod agent;
+mod any_error;
 mod background;
 pub mod blocking;
 #[cfg(feature = "monitor")]
@@ -162,6 +163,7 @@ mod service;
 pub mod watch;
 
 pub use agent::{Agent, Loan, Unread};
+pub use any_error::{Error, Result};
 pub use coalition::{Coalition, CoalitionError};
 pub use config::Config;
 pub use delivery::{Deliveries, Delivery};
@@ -170,7 +172,7 @@ pub use domain::{Domain, RegisterOptions};
 pub use domain_dir::DomainDirError;
 #[cfg(feature = "monitor")]
 pub use error::ProtocolError;
-pub use error::{Error, OpenError, ReceiveError, Result, SendError};
+pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
     AgentId, AgentIdError, BuildError, ContentError, DecodeError, EncodeError, Envelope,
     EnvelopeParams, ErrorChain, Letter, Message, MessageBuilder, Payload, Performative,

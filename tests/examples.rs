@@ -147,6 +147,35 @@ fn contract_net() {
 }
 
 #[test]
+fn lock() {
+    prints(
+        "lock",
+        &[
+            "(agree :sender crane :receiver (set rover_1)…",
+            "(refuse :sender crane :receiver (set rover_1)…",
+            "(agree :sender crane :receiver (set rover_2)…",
+            "(refuse :sender crane :receiver (set rover_2)…",
+        ],
+    );
+}
+
+#[test]
+fn actions() {
+    let mut printed = run("actions");
+    // The number of progress reports depends on the load of the machine.
+    printed.retain(|line| !line.starts_with("dock: "));
+    let expected = [
+        "crex offers blink, result nothing",
+        "crex offers dock, result docked(charge: number)",
+        "crex offers drive, result nothing",
+        "docked, charge 0.8",
+        "drive: cancelled",
+        "drive: refused: parameter speed: 3.0 is not within 0.1 to 0.5",
+    ];
+    assert_eq!(printed, expected);
+}
+
+#[test]
 fn serve() {
     prints(
         "serve",
@@ -213,8 +242,13 @@ fn each_example_is_short_listed_in_the_readme_and_run_here() {
     let examples = examples();
     assert!(examples.len() >= 10);
     for (name, source) in examples {
-        // An application of four programs.
-        let most = if name == "four_programs" { 140 } else { 80 };
+        // Whole applications.
+        let most = match &*name {
+            "four_programs" => 140,
+            "actions" => 165,
+            "lock" => 95,
+            _ => 80,
+        };
         assert!(source.lines().count() < most, "{name}");
         assert!(README.contains(&format!("examples/{name}.rs")), "{name}");
         assert!(tests.contains(&format!("fn {name}() {{")), "{name}");

@@ -58,7 +58,7 @@ async fn close_transports(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
 
     let receiver = arms.mts.clone();
     let receiving = tokio::spawn(async move {
-        for number in 0..total {
+        for number in 0..=total {
             let letter = timeout(WATCHDOG, receiver.receive(ARM)).await.unwrap();
             let payload = letter.unwrap().letter.into_payload();
             let message = Message::decode(&payload).unwrap();
@@ -87,15 +87,20 @@ async fn close_transports(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
     for sending in under_way {
         went.push(delivered(sending).await);
     }
+    let mut closed = Vec::new();
+    for (kind, at, closing) in pulled {
+        timeout(WATCHDOG, closing).await.unwrap().unwrap();
+        closed.push((kind, at));
+    }
+    went.push(delivered(rovers.mts.send(submission(total))).await);
     timeout(WATCHDOG, receiving).await.unwrap().unwrap();
     assert!(arms.mts.try_receive(ARM).is_none(), "a letter twice");
 
-    // The last letters take the only remaining transport. The transports of earlier ones also depend
-    // on the load of the machine.
+    // The last letter takes the only remaining transport. The transports of earlier ones also depend on
+    // the load of the machine.
     assert_eq!(went.last().unwrap().0, order[2], "{order:?}");
     let mut changes = Vec::new();
-    for (kind, at, closing) in pulled {
-        timeout(WATCHDOG, closing).await.unwrap().unwrap();
+    for (kind, at) in closed {
         let mut others = went.iter().filter(|(via, _)| *via != kind);
         let (next, known) = others.find(|(_, known)| *known > at).unwrap();
         changes.push((kind, *next, *known - at));

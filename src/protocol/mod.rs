@@ -47,6 +47,7 @@ mod auction;
 mod bids;
 mod contract_net;
 mod dialogue;
+mod history;
 mod initiator;
 mod participant;
 mod partners;

@@ -521,7 +521,7 @@ impl Shared {
             let label = record::label(name, announced.attempt);
             let properties = record::encode(&announced.entry);
             let packet = packet::announcement(&label, &announced.host_name(), &properties)?;
-            Some((label.into(), packet))
+            Some((label, packet))
         });
         packets.collect()
     }

@@ -288,16 +288,16 @@ mod tests {
             (Signature::JadeBitEfficient, AclRepresentation::BitEfficient),
         ] {
             for content in ["hello", "(a \"b\")", "grüß dich"] {
-                let here = Some("http://10.0.0.1:7778/acc");
+                let here = "http://10.0.0.1:7778/acc";
                 let [envelope, bytes] =
-                    translate(&letter(content), "arm", signature, here).unwrap();
+                    translate(&letter(content), "arm", signature, Some(here)).unwrap();
                 assert!(envelope.starts_with(b"<?xml"));
                 let (read, _) = Envelope::decode(&envelope).unwrap();
                 let effective = read.effective();
                 assert_eq!(effective.acl_representation, Some(representation.clone()));
                 let said = Message::decode(&bytes.clone().into()).unwrap();
                 assert_eq!(said.content().unwrap(), content);
-                assert_eq!(said.sender().unwrap().addresses(), [here.unwrap()]);
+                assert_eq!(said.sender().unwrap().addresses(), [here]);
                 let is_text = signature == Signature::JadeXml;
                 let named = effective.payload_encoding.is_some();
                 assert_eq!(named, is_text && !content.is_ascii());
