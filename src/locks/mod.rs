@@ -23,7 +23,7 @@
 //!
 //! // The owner acts on commands with the fence of the live grant only.
 //! let command = crane.receive().await?;
-//! let fence = bay.check(&command.message)?;
+//! let fence = bay.check(command.message())?;
 //! println!("{fence} may use the bay");
 //! # Ok(())
 //! # }

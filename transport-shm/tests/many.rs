@@ -7,7 +7,7 @@ mod common;
 use std::sync::{Arc, Barrier};
 
 use bytes::Bytes;
-use common::{FRONT, RecordingSink, TestDomain, attempt, parcel};
+use common::{FRONT, RecordingSink, TestDomain, attempt, open, parcel};
 use fipa_testbed::until;
 use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
 use fipa_transport_shm::ShmTransport;
@@ -161,7 +161,7 @@ fn concurrent_allocations_stay_within_the_capacity() {
     // Connect first, because connections use memory, too.
     let to = receiver.location();
     for sender in &senders {
-        drop(sender.loan(&to, FRONT, 100, 1).unwrap());
+        open(sender, &to);
     }
     let barrier = Barrier::new(senders.len());
     let loans = std::thread::scope(|scope| {

@@ -5,7 +5,7 @@
 mod common;
 
 use bytes::Bytes;
-use common::{FRONT, TestDomain, attempt, mapping_of, parcel};
+use common::{FRONT, TestDomain, attempt, mapping_of, open, parcel};
 use fipa_testbed::until;
 use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
 
@@ -21,6 +21,7 @@ fn loaned_content_is_never_copied() {
     let domain = TestDomain::new();
     let (sender, sent) = domain.listening();
     let (receiver, got) = domain.listening();
+    open(&sender, &receiver.location());
     for (number, len) in [2000, 4 << 20, 16 << 20].into_iter().enumerate() {
         let loan = sender.loan(&receiver.location(), FRONT, len, 1);
         let mut loan = loan.unwrap().expect("shared memory supports loans");
@@ -61,6 +62,7 @@ fn loaned_content_can_be_sent_again_and_to_another_receiver() {
     let (sender, sent) = domain.listening();
     let (first, got_first) = domain.listening();
     let (second, got_second) = domain.listening();
+    open(&sender, &first.location());
     let mut loan = sender
         .loan(&first.location(), FRONT, 5000, 1)
         .unwrap()
@@ -93,6 +95,7 @@ fn a_letter_with_a_longer_front_than_announced_is_copied() {
     let domain = TestDomain::new();
     let (sender, _) = domain.listening();
     let (receiver, got) = domain.listening();
+    open(&sender, &receiver.location());
     let mut loan = sender
         .loan(&receiver.location(), 8, 5000, 1)
         .unwrap()
@@ -111,6 +114,7 @@ fn a_loan_outlives_larger_ones_and_its_transport() {
     let domain = TestDomain::new();
     let (sender, _) = domain.listening();
     let (receiver, got) = domain.listening();
+    open(&sender, &receiver.location());
     let mut small = sender
         .loan(&receiver.location(), FRONT, 2000, 1)
         .unwrap()
@@ -139,6 +143,7 @@ fn loans_are_bounded_and_leave_room_for_letters() {
     let (sender, sent) = domain.listening();
     let (receiver, _) = domain.listening();
     let to = receiver.location();
+    open(&sender, &to);
     let most = domain.config().max_loans;
     let loans: Vec<_> = (0..most)
         .map(|_| sender.loan(&to, FRONT, 100, 1).unwrap().unwrap())

@@ -14,7 +14,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Transport, Verdict,
+    Parcel, Sink, Stream, Transport, TransportErrorKind, Verdict,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
 use std::sync::Mutex;
@@ -210,6 +210,17 @@ pub(crate) struct MappedRange {
 }
 
 /// The mapping that contains these bytes, from `/proc/self/maps`.
+/// Waits until the mailbox of the other side is open: until then, a loan fails as congested.
+pub(crate) fn open(sender: &ShmTransport, receiver: &Location) {
+    fipa_testbed::until("the mailbox is open", || {
+        match sender.loan(receiver, 100, 100, 1) {
+            Ok(loan) => loan.is_some(),
+            Err(error) if error.fault == TransportErrorKind::Congested => false,
+            Err(error) => panic!("{error}"),
+        }
+    });
+}
+
 pub(crate) fn mapping_of(bytes: &[u8]) -> MappedRange {
     let address = bytes.as_ptr() as usize;
     let maps = std::fs::read_to_string("/proc/self/maps").unwrap();

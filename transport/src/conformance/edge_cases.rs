@@ -242,10 +242,13 @@ pub fn loaned_content_arrives(fixture: &dyn Fixture) {
     let len = 100_000.min(a.transport.max_letter() / 2);
     let room = "arm_1".len() + envelope.len() + head.len();
     for (index, to) in [(0, &b), (1, &c), (2, &b)] {
-        let loan = a
-            .transport
-            .loan(&b.location, room, len, tail.len())
-            .expect("there is room for a loan");
+        // A transport may first have to open a connection.
+        let loan = until(&[&a, &b], "room for a loan", || {
+            match a.transport.loan(&b.location, room, len, tail.len()) {
+                Err(error) if error.fault == TransportErrorKind::Congested => None,
+                loan => Some(loan.expect("there is room for a loan")),
+            }
+        });
         let Some(mut loan) = loan else { return };
         assert_eq!(loan.content_mut().len(), len);
         loan.content_mut().copy_from_slice(&pattern(len));
