@@ -26,7 +26,7 @@ use crate::error::{OpenError, ReceiveError, SendError};
 #[cfg(feature = "secure")]
 use crate::keys::KeysError;
 #[cfg(feature = "locks")]
-use crate::locks::{AdmitError, LockError, OwnError};
+use crate::locks::{AdmitError, LockError, OwnError, StateFileError};
 #[cfg(feature = "monitor")]
 use crate::platform::PlatformError;
 #[cfg(feature = "monitor")]
@@ -131,6 +131,10 @@ pub enum Error {
     #[cfg(feature = "locks")]
     #[error(transparent)]
     Own(#[from] OwnError),
+    /// The state file of an owner cannot be used.
+    #[cfg(feature = "locks")]
+    #[error(transparent)]
+    StateFile(#[from] StateFileError),
     /// An owner refuses the fence of a message.
     #[cfg(feature = "locks")]
     #[error(transparent)]
