@@ -490,7 +490,14 @@ pub(crate) fn next_state(
                 true => (party.before, party.resume),
                 false => (party.resume, party.before),
             };
-            in_state(first).or_else(|kind| in_state(second).map_err(|_| kind))
+            let taken = in_state(first);
+            // A message that is void after the undelivered one did not cross it, if that one did not
+            // arrive. It then counts in the state before.
+            match (&taken, in_state(second)) {
+                (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
+                (Err(_), Ok(other)) => Ok(other),
+                _ => taken,
+            }
         }
         // What was taken for the failure of a cancel was a failure of the protocol.
         own if party.echo

@@ -35,7 +35,7 @@ impl Bench {
         let locations: Vec<Location> = locations.iter().map(|it| it.parse().unwrap()).collect();
         let directory: Arc<dyn Directory> =
             Arc::new(StaticDirectory::new([("arm", locations)]).unwrap());
-        let order = vec![Kind::Shm, Kind::Tcp, Kind::Udp];
+        let order = vec![Kind::Shm, Kind::Tcp, Kind::Udp, Kind::Udt, Kind::Http];
         let config = CoreConfig {
             window,
             ..CoreConfig::new("mts", Incarnation::from_u64(1), order)
@@ -282,6 +282,25 @@ fn letters_that_waited_for_a_silent_peer_report_its_location() {
     assert_eq!(reason(&outcome), FailureReason::TimedOut);
     assert_eq!(outcome.attempts().len(), 1, "{outcome}");
     assert_eq!(outcome.attempts()[0].location.to_string(), LEGACY);
+}
+
+#[test]
+fn a_letter_to_a_legacy_peer_that_pauses_is_not_given_up() {
+    const FAR: Duration = Duration::from_secs(60);
+    for location in [LEGACY, "udt://10.0.0.3:6790", "http://10.0.0.3:7778/acc"] {
+        let mut bench = Bench::new(&[location]);
+        bench.send_within(0, FAR);
+        let (attempt, at) = bench.dispatched();
+        assert!(at.starts_with(location), "{at}");
+        // Longer than a transport waits for a peer that has stopped reading.
+        bench.core.handle_timeout(bench.at(13_500));
+        assert!(bench.core.poll_action().is_none());
+        bench
+            .core
+            .handle_conclusion(bench.at(13_600), attempt, Conclusion::Handed);
+        let outcome = bench.outcome().unwrap();
+        assert!(outcome.is_success(), "{outcome}");
+    }
 }
 
 #[test]

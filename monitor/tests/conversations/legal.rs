@@ -211,6 +211,34 @@ fn an_undelivered_message_can_be_sent_again() {
 }
 
 #[test]
+fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
+    let dutch = |text| say_in("fipa-auction-dutch", text);
+    let closing = || dutch("inform ann>ben").reply_with("closing");
+    // With `in-reply-to` and without it.
+    for answered in [Some("price"), None] {
+        let bid = || match answered {
+            Some(text) => dutch("propose ben>ann").in_reply_to(text),
+            None => dutch("propose ben>ann"),
+        };
+        for name in [None, Some("ann")] {
+            let mut stage = Stage::new(match name {
+                None => Monitor::observer(library()),
+                Some(name) => Monitor::agent(library(), name),
+            });
+            stage.right(dutch("inform ann>ben").reply_with("opening"));
+            stage.right(dutch("cfp ann>ben").reply_with("price"));
+            assert_eq!(stage.right(closing()), "closed");
+            let now = stage.now;
+            stage.monitor.undelivered(&closing(), "ben", now);
+            // The bid fits the state before the closing, which has not arrived.
+            assert_eq!(stage.right(bid().reply_with("bid")), "bidding");
+            let again = dutch("inform ann>ben").reply_with("again");
+            assert_eq!(stage.right(again.in_reply_to("bid")), "closed");
+        }
+    }
+}
+
+#[test]
 fn messages_go_to_the_delegate_of_a_participant() {
     for name in [None, Some("ann")] {
         let mut stage = Stage::new(match name {

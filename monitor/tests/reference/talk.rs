@@ -313,7 +313,12 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                 true => (&talk.previous, &**before),
                 false => (&**before, &talk.previous),
             };
-            in_spot(first).or_else(|wrong| in_spot(second).map_err(|_| wrong))
+            // A void message counts in the other state, if it is not void there.
+            match (in_spot(first), in_spot(second)) {
+                (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
+                (Err(_), Ok(other)) => Ok(other),
+                (taken, _) => taken,
+            }
         }
         Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood(back) => {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_sds::Pattern;
-use fipa_transport::{Incarnation, Kind};
+use fipa_transport::{Incarnation, Kind, Location, Signature};
 
 /// Maximum deadline of a letter. Receivers remember taken letters for at least this long, so that
 /// none is delivered twice.
@@ -43,6 +43,10 @@ pub struct CoreConfig {
     pub custody_bytes: usize,
     /// Timeout of an attempt, for a small letter.
     pub attempt_timeout: Duration,
+    /// The same towards a legacy peer. It is longer than the timeouts of the transports: when an
+    /// attempt has begun, the letter cannot be sent again, because a legacy peer takes a copy for a
+    /// new letter.
+    pub legacy_attempt_timeout: Duration,
 }
 
 impl CoreConfig {
@@ -62,6 +66,15 @@ impl CoreConfig {
             lane_bytes: 64 << 20,
             custody_bytes: 256 << 20,
             attempt_timeout: Duration::from_secs(1),
+            legacy_attempt_timeout: Duration::from_secs(15),
+        }
+    }
+
+    /// Timeout of an attempt at this location, for a small letter.
+    pub(crate) fn timeout_at(&self, location: &Location) -> Duration {
+        match location.signature() {
+            Signature::Frames => self.attempt_timeout,
+            _ => self.legacy_attempt_timeout,
         }
     }
 

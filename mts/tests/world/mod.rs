@@ -377,6 +377,7 @@ impl World {
             lane_bytes: self.weather.lane_bytes,
             custody_bytes: self.weather.custody_bytes,
             attempt_timeout: ATTEMPT_TIMEOUT,
+            legacy_attempt_timeout: ATTEMPT_TIMEOUT,
             ..CoreConfig::new(name, incarnation, self.weather.order.to_vec())
         };
         let view = View {

@@ -394,7 +394,7 @@ impl Lane {
         };
         let size = delivery.letter.len() as u64;
         let allowance = Duration::from_millis(size.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND);
-        let times_out = now + table.config.attempt_timeout + allowance;
+        let times_out = now + table.config.timeout_at(&route) + allowance;
         let purpose = Purpose::Letter {
             lane: self.id,
             sequence: delivery.sequence,
