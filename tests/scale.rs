@@ -17,8 +17,12 @@ const AGENTS: usize = 20;
 
 /// Maximum number of descriptors of a process without peers.
 const DESCRIPTORS: usize = 60;
-/// Maximum memory of a process without peers, in bytes.
-const MEMORY: u64 = 4 << 20;
+/// Maximum memory of a process without peers, in bytes. Unoptimized code keeps larger stacks.
+const MEMORY: u64 = if cfg!(debug_assertions) {
+    6 << 20
+} else {
+    4 << 20
+};
 
 const DOMAIN: &str = "FIPA_SCALE_DOMAIN";
 const NUMBER: &str = "FIPA_SCALE_NUMBER";

@@ -1,9 +1,9 @@
 //! Views of a directory without I/O.
 
-use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 
 use fipa_transport::{Incarnation, Mandate};
+use rpds::HashTrieMapSync;
 
 use crate::{Directory, Entry};
 
@@ -58,10 +58,13 @@ impl<D: Directory + ?Sized> View for D {
 }
 
 /// The entries of a directory at one time.
+///
+/// A copy shares its entries with the original, so that a change costs the same however many entries
+/// there are.
 #[derive(Debug, Clone, Default)]
 pub struct Snapshot {
-    names: HashMap<Arc<str>, Arc<Entry>>,
-    incarnations: HashMap<Incarnation, Arc<Entry>>,
+    names: HashTrieMapSync<Arc<str>, Arc<Entry>>,
+    incarnations: HashTrieMapSync<Incarnation, Arc<Entry>>,
     sorted: OnceLock<Arc<[Arc<Entry>]>>,
 }
 
@@ -80,18 +83,18 @@ impl Snapshot {
     pub(crate) fn set(&mut self, before: Option<&Arc<Entry>>, after: Option<&Arc<Entry>>) {
         self.sorted.take();
         if let Some(before) = before {
-            self.names.remove(&before.name);
+            self.names.remove_mut(&before.name);
             if let Some(indexed) = self.incarnations.get(&before.incarnation)
                 && indexed.name == before.name
             {
-                self.incarnations.remove(&before.incarnation);
+                self.incarnations.remove_mut(&before.incarnation);
             }
         }
         if let Some(after) = after {
-            self.names.insert(after.name.clone(), Arc::clone(after));
+            self.names.insert_mut(after.name.clone(), Arc::clone(after));
             if after.incarnation.is_known() {
                 self.incarnations
-                    .insert(after.incarnation, Arc::clone(after));
+                    .insert_mut(after.incarnation, Arc::clone(after));
             }
         }
     }
