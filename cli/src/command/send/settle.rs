@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use fipa::{Agent, AgentId, ErrorChain, Message, Performative};
+use fipa::{Agent, AgentId, ErrorChain, Incoming, Message, Performative};
 use fipa_acl::escape;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
@@ -47,13 +47,16 @@ pub(super) async fn proposals(
             settled.answer(agent, reply, arguments).await?;
         }
     }
-    // One that comes later finds its initiator gone.
+    // A proposal that comes later finds its initiator gone. The result of a quick agent may be among
+    // these messages, too.
+    let mut early = Vec::new();
     while let Ok(Some(late)) = agent.try_receive() {
-        if is_proposal(late.message()) && late.message().is_reply_to(sent) {
-            settled.answer(agent, late.message(), arguments).await?;
+        match is_proposal(late.message()) && late.message().is_reply_to(sent) {
+            true => settled.answer(agent, late.message(), arguments).await?,
+            false => early.push(late),
         }
     }
-    settled.wait(agent, sent, arguments).await?;
+    settled.wait(agent, sent, early, arguments).await?;
     let bid = |name: &&AgentId| settled.accepted.iter().any(|bid| bid == name.name());
     let absent = arguments.accept.iter().filter(|name| !bid(name));
     let absent: Vec<&str> = absent.map(AgentId::name).collect();
@@ -100,14 +103,16 @@ impl Settled {
         Ok(())
     }
 
-    /// Waits for the last message of each accepted agent.
+    /// Waits for the last message of each accepted agent. `early` has what has arrived already.
     async fn wait(
         &mut self,
         agent: &Agent,
         sent: &Message,
+        early: Vec<Incoming>,
         arguments: &Arguments,
     ) -> Result<(), Failure> {
         let mut working = self.accepted.clone();
+        let mut early = early.into_iter();
         let mut partners = agent.watch_partners();
         for name in &working {
             partners.add(name);
@@ -118,7 +123,12 @@ impl Settled {
         while !working.is_empty() {
             let received = tokio::select! {
                 biased;
-                received = agent.receive() => received,
+                received = async {
+                    match early.next() {
+                        Some(incoming) => Ok(incoming),
+                        None => agent.receive().await,
+                    }
+                } => received,
                 event = partners.next() => {
                     if let fipa::protocol::PartnerEvent::Gone { agent } = event {
                         working.retain(|name| *name != agent);
