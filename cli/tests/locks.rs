@@ -175,7 +175,7 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
 #[test]
 fn the_command_is_ended_when_the_lock_is_lost() {
     let host = Host::new();
-    let crane = own(&host, &["--lease", "2s"]);
+    let crane = own(&host, &["--lease", "1s"]);
     let script = "trap 'echo ended; exit 0' TERM; echo $FIPA_FENCE $$; while :; do sleep 0.1; done";
     let (mut holder, _, process) = hold(&host, &[], script);
     crane.signal("-KILL");
@@ -185,15 +185,15 @@ fn the_command_is_ended_when_the_lock_is_lost() {
     assert!(log.contains("the lock of \"bay\" was lost"), "{log}");
     assert!(!process.is_running());
 
-    let crane = own(&host, &["--lease", "2s"]);
+    let crane = own(&host, &["--lease", "1s"]);
     let stubborn = "trap '' TERM; echo $FIPA_FENCE $$; while :; do sleep 0.1; done";
-    let (mut stubborn, _, process) = hold(&host, &[], stubborn);
+    let (mut stubborn, _, process) = hold(&host, &["--kill-after", "500ms"], stubborn);
     drop(crane);
     let (code, log) = stubborn.end();
     assert_eq!(code, Some(125), "{log}");
     until("SIGKILL ends the command", || !process.is_running());
 
-    let crane = own(&host, &["--lease", "2s"]);
+    let crane = own(&host, &["--lease", "1s"]);
     let script = "echo $FIPA_FENCE $$; while [ ! -e go ]; do sleep 0.1; done; exit 3";
     let (mut kept, _, _process) = hold(&host, &["--keep"], script);
     crane.signal("-KILL");

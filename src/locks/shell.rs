@@ -6,7 +6,7 @@
 use std::any::Any;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape};
 use fipa_locking::{
@@ -31,6 +31,10 @@ use crate::protocol::{PartnerEvent, PartnerWatch};
 /// Maximum number of events that wait for the application of an owner. Beyond it, the earliest is
 /// dropped.
 const MAX_EVENTS: usize = 256;
+
+/// Minimum deadline of the letters of a basic algorithm, which repeats nothing. A receiver that has ended
+/// is reported before.
+const UNREPEATED: Duration = Duration::from_secs(600);
 
 /// Sets the options of an agent's locks, before they are started.
 pub(super) fn set(core: &AgentCore, options: LockOptions) -> Result<(), LockError> {
@@ -284,7 +288,10 @@ impl Shared {
                 let message = codec::encode(message, self.kind, &endpoint.id, &receiver);
                 let message = message.map_err(|error| error.to_string())?;
                 let letter = letter_for(&message, SystemTime::now());
-                let deadline = endpoint.domain.inner.deadline;
+                let mut deadline = endpoint.domain.inner.deadline;
+                if !self.kind.is_extended() {
+                    deadline = deadline.max(UNREPEATED);
+                }
                 let sending = endpoint.send(&message, letter, deadline);
                 // The outcome is not awaited: the algorithms repeat what has no answer.
                 sending

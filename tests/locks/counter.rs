@@ -1,7 +1,7 @@
 //! A counter that the owner of a resource guards by fences. Workers in processes of their own read it,
 //! pause, and write the next value, while the test kills them and stops them for longer than the lease.
 //!
-//! `FIPA_LOCKS_SECONDS` is the time, 12 s by default. `FIPA_LOCKS_SEED` repeats the faults of an earlier
+//! `FIPA_LOCKS_SECONDS` is the time, 5 s by default. `FIPA_LOCKS_SEED` repeats the faults of an earlier
 //! run.
 
 #![allow(clippy::print_stdout, reason = "the counts are the result of the test")]
@@ -17,7 +17,7 @@ use fipa::{Agent, AgentId, Domain, Performative};
 use fipa_testbed::{ignored_test, send_signal, until};
 
 use super::support::{load, mark};
-use super::{agent, text};
+use super::{agent, text, watched};
 
 /// Environment variable of a worker: its name, then arguments of `--set`, separated by spaces.
 const WORKER: &str = "FIPA_LOCKS_WORKER";
@@ -173,72 +173,75 @@ impl Drop for Worker {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_guarded_counter_loses_no_increment_when_holders_are_killed_and_stopped() {
-    let seed = number("FIPA_LOCKS_SEED").unwrap_or_else(|| fastrand::u64(..));
-    println!("FIPA_LOCKS_SEED={seed}");
-    let mut random = Rng::with_seed(seed);
-    let time = Duration::from_secs(number("FIPA_LOCKS_SECONDS").unwrap_or(12));
-    let set = vec![
-        format!("domain=locks-{}", mark()),
-        "discovery.mdns=false".to_owned(),
-    ];
-    let domain = Domain::open(&load(set.clone())).await.unwrap();
-    let files = tempfile::tempdir().unwrap();
-    let keeper = Arc::new(agent(&domain, "keeper").await);
-    let options = OwnOptions {
-        lease: LEASE,
-        state_dir: Some(files.path().to_owned()),
-        volatile: false,
-    };
-    let counter = Arc::new(keeper.own("counter", options).await.unwrap());
-    let ends = Arc::new(AtomicBool::new(false));
-    let keeping = {
-        let (keeper, counter, ends) = (keeper.clone(), counter.clone(), ends.clone());
-        tokio::spawn(async move { keep(&keeper, &counter, &ends).await })
-    };
-    let chaos = tokio::task::spawn_blocking(move || {
-        let start = |number: usize| Worker::start(&format!("worker-{number}"), &set);
-        let mut workers: Vec<Worker> = (0..WORKERS).map(start).collect();
-        let (mut kills, mut stops) = (0, 0);
-        let holder = |workers: &[Worker]| {
-            let holder = counter.status().holder?;
-            let number = holder.strip_prefix("worker-")?.parse::<usize>().ok()?;
-            (number < workers.len()).then_some(number)
+    watched(async {
+        let seed = number("FIPA_LOCKS_SEED").unwrap_or_else(|| fastrand::u64(..));
+        println!("FIPA_LOCKS_SEED={seed}");
+        let mut random = Rng::with_seed(seed);
+        let time = Duration::from_secs(number("FIPA_LOCKS_SECONDS").unwrap_or(5));
+        let set = vec![
+            format!("domain=locks-{}", mark()),
+            "discovery.mdns=false".to_owned(),
+        ];
+        let domain = Domain::open(&load(set.clone())).await.unwrap();
+        let files = tempfile::tempdir().unwrap();
+        let keeper = Arc::new(agent(&domain, "keeper").await);
+        let options = OwnOptions {
+            lease: LEASE,
+            state_dir: Some(files.path().to_owned()),
+            volatile: false,
         };
-        let began = Instant::now();
-        while began.elapsed() < time {
-            std::thread::sleep(Duration::from_millis(random.u64(50..250)));
-            // Most faults hit the holder.
-            let number = match holder(&workers) {
-                Some(number) if random.u8(..4) > 0 => number,
-                _ => random.usize(..WORKERS),
+        let counter = Arc::new(keeper.own("counter", options).await.unwrap());
+        let ends = Arc::new(AtomicBool::new(false));
+        let keeping = {
+            let (keeper, counter, ends) = (keeper.clone(), counter.clone(), ends.clone());
+            tokio::spawn(async move { keep(&keeper, &counter, &ends).await })
+        };
+        let chaos = tokio::task::spawn_blocking(move || {
+            let start = |number: usize| Worker::start(&format!("worker-{number}"), &set);
+            let mut workers: Vec<Worker> = (0..WORKERS).map(start).collect();
+            let (mut kills, mut stops) = (0, 0);
+            let holder = |workers: &[Worker]| {
+                let holder = counter.status().holder?;
+                let number = holder.strip_prefix("worker-")?.parse::<usize>().ok()?;
+                (number < workers.len()).then_some(number)
             };
-            if random.bool() {
-                // The name is free again when the process has ended.
-                workers[number].end();
-                workers[number] = start(number);
-                kills += 1;
-            } else {
-                workers[number].signal("-STOP");
-                std::thread::sleep(LEASE + Duration::from_millis(random.u64(50..400)));
-                workers[number].signal("-CONT");
-                stops += 1;
+            let began = Instant::now();
+            while began.elapsed() < time {
+                std::thread::sleep(Duration::from_millis(random.u64(50..250)));
+                // Most faults hit the holder.
+                let number = match holder(&workers) {
+                    Some(number) if random.u8(..4) > 0 => number,
+                    _ => random.usize(..WORKERS),
+                };
+                if random.bool() {
+                    // The name is free again when the process has ended.
+                    workers[number].end();
+                    workers[number] = start(number);
+                    kills += 1;
+                } else {
+                    workers[number].signal("-STOP");
+                    std::thread::sleep(LEASE + Duration::from_millis(random.u64(50..400)));
+                    workers[number].signal("-CONT");
+                    stops += 1;
+                }
             }
-        }
-        // Without faults, all go on.
-        let position = || counter.status().fence.map(|fence| fence.position());
-        let at_end = position();
-        until("the counter is locked again", || {
-            position().is_some() && position() != at_end
+            // Without faults, all go on.
+            let position = || counter.status().fence.map(|fence| fence.position());
+            let at_end = position();
+            until("the counter is locked again", || {
+                position().is_some() && position() != at_end
+            });
+            (kills, stops)
         });
-        (kills, stops)
-    });
-    let (kills, stops) = chaos.await.unwrap();
-    ends.store(true, Ordering::Relaxed);
-    let kept = keeping.await.unwrap();
-    println!(
-        "{kills} kills, {stops} stops, {} grants, {} increments, {} refused commands",
-        kept.grants, kept.admitted, kept.refused
-    );
-    assert_eq!(kept.counter, kept.admitted);
-    assert!(kept.grants > 0 && kept.admitted > 0);
+        let (kills, stops) = chaos.await.unwrap();
+        ends.store(true, Ordering::Relaxed);
+        let kept = keeping.await.unwrap();
+        println!(
+            "{kills} kills, {stops} stops, {} grants, {} increments, {} refused commands",
+            kept.grants, kept.admitted, kept.refused
+        );
+        assert_eq!(kept.counter, kept.admitted);
+        assert!(kept.grants > 0 && kept.admitted > 0);
+    })
+    .await;
 }

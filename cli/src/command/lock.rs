@@ -18,8 +18,6 @@ use crate::membership;
 use crate::options::{self, Global};
 use crate::report::{self, Failure};
 
-/// Time from SIGTERM to SIGKILL after the loss of a lock.
-const GRACE: Duration = Duration::from_secs(5);
 /// Interval of looking for processes that are left in the group.
 const PAUSE: Duration = Duration::from_millis(20);
 
@@ -40,8 +38,8 @@ const NOT_FOUND: u8 = 127;
 /// The environment of the command has the fence of the lock in FIPA_FENCE. The owner of the resource
 /// refuses commands with an old fence, so pass it on (`fipa send --fence`).
 ///
-/// If the lock is lost, the command's process group gets SIGTERM, and SIGKILL after 5 s; with --keep, a
-/// warning is printed instead. SIGINT, SIGTERM and SIGHUP are passed on to the group. The command does not
+/// If the lock is lost, the command's process group gets SIGTERM, and SIGKILL after the time of
+/// --kill-after; with --keep, a warning is printed instead. SIGINT, SIGTERM and SIGHUP are passed on to the group. The command does not
 /// read from the terminal: redirect its input.
 ///
 /// If `fipa lock` itself is killed, the command goes on without the lock. The owner then refuses its fence.
@@ -69,6 +67,10 @@ pub(crate) struct Arguments {
     /// Let the command go on when the lock is lost
     #[arg(long)]
     keep: bool,
+
+    /// Time from SIGTERM to SIGKILL after the loss of the lock
+    #[arg(long, value_name = "TIME", default_value = "5s", value_parser = options::duration)]
+    kill_after: Duration,
 
     /// Name of the agent that holds the lock [default: a random name]
     #[arg(long, value_name = "NAME")]
@@ -170,7 +172,7 @@ async fn hold(lock: &Lock, arguments: &Arguments, signals: &mut Signals) -> Resu
                     report::warn(&format!("{lost}; the command goes on without it (--keep)"));
                     continue;
                 }
-                end(&mut child, group).await;
+                end(&mut child, group, arguments.kill_after).await;
                 return Err(Failure::failed(
                     format!("{lost}; the command was ended"),
                     format!("resource {resource:?}"),
@@ -217,7 +219,7 @@ fn ended(status: io::Result<ExitStatus>) -> Result<(), Failure> {
 }
 
 /// Ends the process group of the command.
-async fn end(child: &mut Child, group: Option<Pid>) {
+async fn end(child: &mut Child, group: Option<Pid>, kill_after: Duration) {
     to_group(group, Signal::TERM);
     let all_ended = async {
         // Only the group's end proves that no process of the command uses the resource.
@@ -226,7 +228,7 @@ async fn end(child: &mut Child, group: Option<Pid>) {
             tokio::time::sleep(PAUSE).await;
         }
     };
-    if tokio::time::timeout(GRACE, all_ended).await.is_err() {
+    if tokio::time::timeout(kill_after, all_ended).await.is_err() {
         to_group(group, Signal::KILL);
         let _ = child.wait().await;
     }
