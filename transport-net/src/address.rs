@@ -207,7 +207,7 @@ impl Listening {
         incarnation: Incarnation,
     ) -> Result<Vec<Location>, LocationError> {
         let locations = self.reachable.iter().map(|address| {
-            if kind == Kind::Http {
+            if kind.is_http() {
                 // Platforms know no incarnations.
                 return Location::new(kind, &format!("{address}/acc"));
             }

@@ -620,3 +620,195 @@ fn a_closed_endpoint_concludes_its_letters() {
     let after = party.send(9, &silent.location, parcel(9, "x")).unwrap_err();
     assert_eq!(after.fault, TransportErrorKind::Closed);
 }
+
+/// The same over TLS.
+#[cfg(feature = "secure")]
+mod tls {
+    use fipa_transport_net::Authorities;
+    use fipa_transport_net::secure::{Rules, Security};
+    use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
+
+    use super::*;
+    use crate::common::certificates::Host;
+
+    /// Creates an endpoint of `https` with these credentials, also as those that except legacy peers.
+    fn party(security: Security, authorities: Authorities) -> Platform {
+        let tcp = config(&["127.0.0.1:0"]);
+        let config = HttpConfig {
+            listen: tcp.listen,
+            identity: tcp.identity,
+            limits: tcp.limits,
+            security: Some(security.clone()),
+        };
+        Party::over(Recorder::default(), |runtime| {
+            HttpTransport::over_tls(config, security, authorities, runtime)
+        })
+    }
+
+    /// Returns a letter of this agent to `arm_1`.
+    fn letter(number: u64, sender: &str) -> Parcel {
+        let (from, to) = (
+            AgentId::new(sender).unwrap(),
+            AgentId::new("arm_1").unwrap(),
+        );
+        let message = Message::builder(Performative::Inform)
+            .sender(from.clone())
+            .receiver(to.clone())
+            .content(number.to_string())
+            .build()
+            .unwrap();
+        let envelope = Envelope {
+            base: EnvelopeParams {
+                from: Some(from),
+                to: vec![to.clone()],
+                intended_receivers: vec![to],
+                acl_representation: Some(AclRepresentation::BitEfficient),
+                date: Some("20261120T112644481Z".parse().unwrap()),
+                ..EnvelopeParams::default()
+            },
+            extensions: Vec::new(),
+        };
+        let payload = message.to_payload();
+        letter_parcel(
+            number,
+            Letter::new(envelope.encode_standard().unwrap(), payload),
+        )
+    }
+
+    fn failure(conclusion: Conclusion) -> (TransportErrorKind, String) {
+        match conclusion {
+            Conclusion::NotSent(error) => (error.fault, error.detail),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn platforms_with_trusted_certificates_exchange_letters() {
+        let (crex, jade) = (Host::new("crex", &[]), Host::new("jade", &["echo@jade"]));
+        let ours = party(crex.security(&[&jade]), Authorities::default());
+        let theirs = party(jade.security(&[&crex]), Authorities::default());
+        assert!(
+            ours.location()
+                .to_string()
+                .starts_with("https://127.0.0.1:")
+        );
+        for number in 0..5 {
+            ours.send(number, theirs.location(), letter(number, "rover"))
+                .unwrap();
+            assert_eq!(ours.conclusion(number), Conclusion::Handed);
+        }
+        until_some("the letters", || {
+            (theirs.sink.record.lock().unframed.len() == 5).then_some(())
+        });
+        let record = theirs.sink.record.lock();
+        for (number, (letter, via)) in record.unframed.iter().enumerate() {
+            assert_eq!(*via, Kind::Https);
+            let message = Message::decode(letter.payload()).unwrap();
+            assert_eq!(message.content().unwrap(), &number.to_string());
+            // The platform can answer.
+            let here = ours.location().to_string();
+            assert_eq!(message.sender().unwrap().addresses(), [&*here]);
+        }
+        drop(record);
+        // The certificate of the platform names one agent, and its letters are of that one.
+        theirs
+            .send(0, ours.location(), letter(0, "echo@jade"))
+            .unwrap();
+        assert_eq!(theirs.conclusion(0), Conclusion::Handed);
+        theirs
+            .send(1, ours.location(), letter(1, "brake@jade"))
+            .unwrap();
+        let (kind, text) = failure(theirs.conclusion(1));
+        assert_eq!(kind, TransportErrorKind::Refused);
+        assert!(text.contains("403"), "{text}");
+        assert_eq!(ours.sink.record.lock().unframed.len(), 1);
+    }
+
+    #[test]
+    fn a_platform_without_a_trusted_certificate_is_refused_unless_it_is_listed() {
+        let (crex, jade) = (Host::new("crex", &[]), Host::new("jade", &[]));
+        let ours = party(crex.security(&[]), Authorities::default());
+        // It trusts this host, which does not trust it.
+        let theirs = party(jade.security(&[&crex]), Authorities::default());
+        theirs
+            .send(0, ours.location(), letter(0, "echo@jade"))
+            .unwrap();
+        let (kind, text) = failure(theirs.conclusion(0));
+        assert_eq!(kind, TransportErrorKind::Refused);
+        assert!(text.contains("403"), "{text}");
+        ours.send(0, theirs.location(), letter(0, "rover")).unwrap();
+        let (kind, text) = failure(ours.conclusion(0));
+        assert_eq!(kind, TransportErrorKind::Refused);
+        assert!(text.contains("neither trusted"), "{text}");
+        let rules = Rules {
+            loopback: true,
+            legacy_peers: vec!["127.0.0.1".parse().unwrap()],
+        };
+        let listing = party(
+            Security::new(crex.credentials(&[]), rules).unwrap(),
+            Authorities::default(),
+        );
+        theirs
+            .send(1, listing.location(), letter(1, "echo@jade"))
+            .unwrap();
+        assert_eq!(theirs.conclusion(1), Conclusion::Handed);
+        // A list excepts no server from the proof: its letters would be readable for others.
+        listing
+            .send(1, theirs.location(), letter(1, "rover"))
+            .unwrap();
+        assert_eq!(
+            failure(listing.conclusion(1)).0,
+            TransportErrorKind::Refused
+        );
+        assert!(ours.sink.record.lock().unframed.is_empty());
+        assert!(theirs.sink.record.lock().unframed.is_empty());
+    }
+
+    #[test]
+    fn plain_http_is_not_read_behind_tls() {
+        let crex = Host::new("crex", &[]);
+        let ours = party(crex.security(&[]), Authorities::default());
+        let mut plain = connect(&ours);
+        plain.write_all(ONCE).unwrap();
+        let mut answer = Vec::new();
+        // The end of the connection may be a reset.
+        let _ = plain.read_to_end(&mut answer);
+        assert!(!answer.starts_with(b"HTTP/"), "{answer:?}");
+        assert!(ours.sink.record.lock().unframed.is_empty());
+    }
+
+    #[test]
+    fn an_authority_proves_the_name_of_a_platform() {
+        let key = KeyPair::generate().unwrap();
+        let mut params = CertificateParams::default();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let root = params.self_signed(&key).unwrap();
+        let authority = Issuer::new(params, key);
+        let authorities = || Authorities::new(vec![root.der().clone()]).unwrap();
+        let (crex, jade) = (
+            Host::new("crex", &[]),
+            Host::named("jade", "localhost", &authority),
+        );
+        let ours = party(crex.security(&[]), authorities());
+        let theirs = party(
+            Security::new(jade.credentials(&[]), Rules::default()).unwrap(),
+            Authorities::default(),
+        );
+        let at = theirs.location().authority().to_owned();
+        let named = format!("https://{}/acc", at.replace("127.0.0.1", "localhost"));
+        let named: Location = named.parse().unwrap();
+        ours.send(0, &named, letter(0, "rover")).unwrap();
+        assert_eq!(ours.conclusion(0), Conclusion::Handed);
+        // The certificate proves the name only, and only where the authority is listed.
+        ours.send(1, theirs.location(), letter(1, "rover")).unwrap();
+        assert_eq!(failure(ours.conclusion(1)).0, TransportErrorKind::Refused);
+        let without = party(crex.security(&[]), Authorities::default());
+        without.send(2, &named, letter(2, "rover")).unwrap();
+        assert_eq!(
+            failure(without.conclusion(2)).0,
+            TransportErrorKind::Refused
+        );
+        assert_eq!(theirs.sink.record.lock().unframed.len(), 1);
+        assert!(Authorities::new(vec![vec![1, 2, 3].into()]).is_err());
+    }
+}

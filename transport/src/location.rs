@@ -28,11 +28,13 @@ pub enum Kind {
     Udt,
     /// Letters in multipart messages over HTTP (FIPA00084): JADE's transport between platforms.
     Http,
+    /// The same over TLS.
+    Https,
 }
 
 impl Kind {
     /// All kinds. The position is the code on the wire, so new ones go last.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Shm,
         Self::Tcp,
         Self::Udp,
@@ -40,6 +42,7 @@ impl Kind {
         Self::Unix,
         Self::Udt,
         Self::Http,
+        Self::Https,
     ];
 
     /// Whether every gateway can use this kind. UDT is an option of the build, for legacy peers; where
@@ -61,7 +64,14 @@ impl Kind {
             Self::Unix => "unix",
             Self::Udt => "udt",
             Self::Http => "http",
+            Self::Https => "https",
         }
+    }
+
+    /// Whether this is HTTP, with or without TLS.
+    #[must_use]
+    pub const fn is_http(self) -> bool {
+        matches!(self, Self::Http | Self::Https)
     }
 
     /// Whether locations of this kind lead only to processes of this host. Such locations are
@@ -222,7 +232,7 @@ impl Location {
             address: address.into(),
             signature: match kind {
                 Kind::Udt => Signature::FipaServices,
-                Kind::Http => Signature::JadeProxy,
+                Kind::Http | Kind::Https => Signature::JadeProxy,
                 _ => Signature::Frames,
             },
             incarnation: Incarnation::UNKNOWN,
@@ -246,7 +256,7 @@ impl Location {
         let is_spoken = match self.kind {
             Kind::Tcp => !matches!(signature, Signature::JadeXml | Signature::JadeBitEfficient),
             Kind::Udt => signature == Signature::FipaServices,
-            Kind::Http => signature.is_jade(),
+            Kind::Http | Kind::Https => signature.is_jade(),
             _ => signature == Signature::Frames,
         };
         if !is_spoken {
@@ -273,7 +283,7 @@ impl Location {
     #[must_use]
     pub fn authority(&self) -> &str {
         match (self.kind, self.address.find('/')) {
-            (Kind::Http, Some(path)) => self.address.get(..path).unwrap_or_default(),
+            (Kind::Http | Kind::Https, Some(path)) => self.address.get(..path).unwrap_or_default(),
             _ => &self.address,
         }
     }
@@ -295,7 +305,7 @@ impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}://{}", self.kind, self.address)?;
         let is_default = match self.kind {
-            Kind::Http => self.signature == Signature::JadeProxy,
+            Kind::Http | Kind::Https => self.signature == Signature::JadeProxy,
             _ => self.signature == Signature::Frames,
         };
         if !is_default {
@@ -322,7 +332,7 @@ pub enum LocationError {
     #[error("not a location (expected for example tcp://10.0.0.2:7788): {0:?}")]
     NoScheme(String),
     /// No transport has this name.
-    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic, udt, http)")]
+    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic, udt, http, https)")]
     UnknownKind(String),
     /// The address is empty or too long.
     #[error("the address has {0} bytes; 1 to {max} are allowed", max = Location::MAX_ADDRESS)]

@@ -194,7 +194,7 @@ pub(super) fn locations_given<'a>(
     let locations = addresses.into_iter().filter_map(|address| {
         let location: Location = address.parse().ok()?;
         let location = match location.kind() {
-            Kind::Http => at_host(&location, from.address)?,
+            Kind::Http | Kind::Https => at_host(&location, from.address)?,
             _ => location,
         };
         let claimed: SocketAddr = location.authority().parse().ok()?;
@@ -221,7 +221,7 @@ fn at_host(location: &Location, host: IpAddr) -> Option<Location> {
             None => SocketAddr::new(host, HTTP_PORT),
         },
     };
-    let location = Location::new(Kind::Http, &format!("{at}{path}")).ok();
+    let location = Location::new(location.kind(), &format!("{at}{path}")).ok();
     location.filter(|_| at.port() != 0)
 }
 

@@ -77,7 +77,7 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
             "fipa.toml:4: `mts.transports` is invalid: \"tpc\": unknown transport \"tpc\" \
-             (known: shm, unix, tcp, udp, quic, udt, http); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic, udt, http, https); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
@@ -172,7 +172,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, udt, http",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix, udt, http, https",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -222,7 +222,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, udt, http",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix, udt, http, https",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",

@@ -5,13 +5,15 @@
 //! repetition for another letter.
 
 use std::io::{self, Read as _};
+#[cfg(feature = "secure")]
+use std::mem::MaybeUninit;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::escape;
-use fipa_transport::{Conclusion, Location, Signature, TransportError, TransportErrorKind};
+use fipa_transport::{Conclusion, Kind, Location, Signature, TransportError, TransportErrorKind};
 use socket2::SockRef;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
@@ -20,6 +22,7 @@ use tokio::time::{Instant, timeout_at};
 use super::HttpEndpoint;
 use super::request;
 use super::response::{Response, ResponseReader};
+use super::socket::Socket;
 use super::url::{PATH, Url};
 use crate::legacy::dialect::translate;
 use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
@@ -30,6 +33,11 @@ use crate::stream::dialing::{Unreachable, first};
 /// Time for which a connection stays open without a letter: less than the 60 s after which JADE
 /// closes it, because a letter on a connection that the platform closes is unconfirmed.
 const IDLE: Duration = Duration::from_secs(20);
+
+/// Time in which the rest of a record of TLS must arrive between two letters; else another connection is
+/// opened.
+#[cfg(feature = "secure")]
+const RECORD: Duration = Duration::from_millis(200);
 
 /// Number of bytes that are read at a time.
 const READ: usize = 4096;
@@ -46,7 +54,7 @@ pub(super) struct HttpSender {
 
 /// An open connection to a platform.
 struct Connection {
-    stream: TcpStream,
+    stream: Socket,
     reader: ResponseReader,
     /// The address of this endpoint for the answers of the platform, if it listens where the
     /// platform can reach it.
@@ -72,14 +80,18 @@ impl HttpSender {
         let not_sent = |fault, detail: &dyn std::fmt::Display| {
             Conclusion::NotSent(TransportError::new(fault, detail))
         };
-        let url = Url::parse(self.to.address())
+        let url = Url::parse(self.to.kind(), self.to.address())
             .map_err(|error| not_sent(TransportErrorKind::Unreachable, &error))?;
         let signature = self.to.signature();
         let in_dialect = |here: Option<&str>| {
             translate(&delivery.letter, &delivery.receiver, signature, here)
                 .map_err(|error| not_sent(error.fault(), &error))
         };
-        let mut connection = match self.connection.take().and_then(Connection::usable) {
+        let kept = match self.connection.take() {
+            Some(connection) => connection.usable().await,
+            None => None,
+        };
+        let mut connection = match kept {
             Some(connection) => connection,
             None => {
                 // No connection is opened for a letter that is not sent.
@@ -134,16 +146,44 @@ impl HttpSender {
             let detail = format!("{}: {what}", url.target());
             TransportError::new(TransportErrorKind::Unreachable, detail)
         })?;
-        endpoint.config.check_legacy_peer(peer)?;
         let broken = |error| TransportError::new(TransportErrorKind::Broken, error);
         prepare(&stream, endpoint.limits()).map_err(broken)?;
         let local = stream.local_addr().map_err(broken)?;
+        let stream = self.secured(url, stream, peer).await?;
         Ok(Connection {
             stream,
             reader: ResponseReader::default(),
-            here: here(&endpoint.listening(), local),
+            here: here(self.to.kind(), &endpoint.listening(), local),
             used: Instant::now(),
         })
+    }
+
+    /// Performs the handshake of TLS over a connection of `https`, in which the platform proves its
+    /// identity. Without TLS, only listed platforms are excepted from the proof.
+    async fn secured(
+        &self,
+        _url: &Url,
+        stream: TcpStream,
+        peer: SocketAddr,
+    ) -> Result<Socket, TransportError> {
+        let endpoint = &self.endpoint.stream;
+        #[cfg(feature = "secure")]
+        if let Some(super::Tls {
+            security,
+            authorities,
+        }) = &self.endpoint.tls
+        {
+            let patience = endpoint.limits().handshake_timeout;
+            let secured = super::tls::connect(security, authorities, stream, _url, patience).await;
+            let stream = secured.map_err(|what| {
+                count(&endpoint.tally().dial_failures);
+                let detail = format!("{peer}: {what}");
+                TransportError::new(TransportErrorKind::Refused, detail)
+            })?;
+            return Ok(Socket::Tls(Box::new(stream)));
+        }
+        endpoint.config.check_legacy_peer(peer)?;
+        Ok(Socket::Plain(stream))
     }
 }
 
@@ -197,16 +237,54 @@ impl Connection {
 
     /// Returns the connection if the platform has not closed it. The rest of an earlier answer may
     /// have arrived. The socket itself is queried, because the runtime learns of bytes later.
-    fn usable(mut self) -> Option<Self> {
+    async fn usable(mut self) -> Option<Self> {
         let mut bytes = [0; READ];
         loop {
-            let read = (&*SockRef::from(&self.stream)).read(&mut bytes);
+            let read = match &self.stream {
+                Socket::Plain(stream) => (&*SockRef::from(stream)).read(&mut bytes),
+                #[cfg(feature = "secure")]
+                Socket::Tls(_) => self.read_decrypted(&mut bytes).await,
+            };
             match read {
                 Ok(len @ 1..) => self.absorb(bytes.get(..len)?).then_some(())?,
                 Ok(0) => return None,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Some(self),
                 Err(_) => return None,
             }
+        }
+    }
+
+    /// Reads decrypted bytes if the runtime has some.
+    #[cfg(feature = "secure")]
+    fn poll_decrypted(&mut self, bytes: &mut [u8]) -> Option<io::Result<usize>> {
+        use std::task::{Context, Poll, Waker};
+        let mut decrypted = tokio::io::ReadBuf::new(bytes);
+        let mut context = Context::from_waker(Waker::noop());
+        let stream = std::pin::Pin::new(&mut self.stream);
+        match tokio::io::AsyncRead::poll_read(stream, &mut context, &mut decrypted) {
+            Poll::Ready(read) => Some(read.map(|()| decrypted.filled().len())),
+            Poll::Pending => None,
+        }
+    }
+
+    /// Reads bytes that have arrived over TLS.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::WouldBlock`] if none have, [`io::ErrorKind::TimedOut`] if a record is
+    /// incomplete.
+    #[cfg(feature = "secure")]
+    async fn read_decrypted(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        if let Some(read) = self.poll_decrypted(bytes) {
+            return read;
+        }
+        let socket = SockRef::from(self.stream.tcp());
+        // At the end of the stream this is `Ok(0)`, as for a read.
+        if socket.peek(&mut [MaybeUninit::uninit()])? == 0 {
+            return Ok(0);
+        }
+        match timeout_at(Instant::now() + RECORD, self.stream.read(bytes)).await {
+            Ok(read) => read,
+            Err(_) => Err(io::ErrorKind::TimedOut.into()),
         }
     }
 
@@ -229,7 +307,7 @@ impl Connection {
 }
 
 /// Returns the URL of this endpoint at the local address of a connection, if it listens there.
-fn here(listening: &[String], local: SocketAddr) -> Option<String> {
+fn here(scheme: Kind, listening: &[String], local: SocketAddr) -> Option<String> {
     let address = sockets::listening_at(listening, local)?;
-    Some(format!("http://{address}{PATH}"))
+    Some(format!("{scheme}://{address}{PATH}"))
 }

@@ -56,7 +56,7 @@ pub fn body(bytes: &[u8], boundary: &[u8]) {
         return;
     };
     let token = "0123456789abcdef0123456789abcde";
-    let url = Url::parse("10.0.0.1").expect("an address");
+    let url = Url::parse(fipa_transport::Kind::Http, "10.0.0.1").expect("an address");
     let (mut written, end) = request::write(&url, token, &envelope, (payload.len(), None), true);
     written.extend_from_slice(&payload);
     written.extend_from_slice(end.as_bytes());

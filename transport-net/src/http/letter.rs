@@ -43,6 +43,8 @@ impl LetterError {
 pub(crate) struct BodyLetter {
     /// The letter with its envelope in the standard dialect.
     pub(super) letter: Letter,
+    /// The name of the sender in the envelope.
+    from: Option<String>,
     envelope: Bytes,
     payload: Bytes,
 }
@@ -63,11 +65,13 @@ pub(crate) fn read(body: &Bytes, boundary: &[u8]) -> Result<BodyLetter, LetterEr
     if effective.to.is_empty() && effective.intended_receivers.is_empty() {
         return Err(LetterError::NoReceiver);
     }
+    let from = effective.from.map(|from| from.name().to_owned());
     let charset = effective.payload_encoding.or(parts.charset);
     let message = in_utf8(payload.clone(), charset.as_deref());
     let envelope = with_stamped_extensions(envelope).encode_standard()?;
     Ok(BodyLetter {
         letter: Letter::new(envelope, message),
+        from,
         envelope: first,
         payload,
     })
@@ -92,6 +96,17 @@ fn in_utf8(payload: Bytes, charset: Option<&str>) -> Bytes {
 }
 
 impl BodyLetter {
+    /// Whether the senders in the envelope and in the message have this property. An envelope without a
+    /// sender has it; a message must have a sender.
+    #[cfg(feature = "secure")]
+    pub(super) fn is_of(&self, property: impl Fn(&str) -> bool) -> bool {
+        let message = fipa_acl::Message::decode(self.letter.payload());
+        let sender = message
+            .ok()
+            .and_then(|it| Some(it.sender()?.name().to_owned()));
+        self.from.as_deref().is_none_or(&property) && sender.is_some_and(|name| property(&name))
+    }
+
     /// Returns the digest by which a repetition of this letter is recognized: of its envelope, with
     /// sender, date and identifiers, and of its payload.
     pub(super) fn digest(&self, key: (u64, u64)) -> u128 {

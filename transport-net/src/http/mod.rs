@@ -6,6 +6,7 @@
 //! * [`letter`]: the letter of a body.
 //! * [`repeats`]: letters that a platform repeats on another connection.
 //! * [`connections`]: the accepted connections.
+//! * `socket`, `tls`: the sockets of connections, and TLS over them for `https`.
 //!
 //! [`server`] and [`client`] do the I/O. A platform is a legacy peer: it proves no identity and
 //! confirms no delivery. [`crate::legacy`] has the parts that it shares with those over TCP.
@@ -22,8 +23,11 @@ mod repeats;
 mod request;
 mod response;
 mod server;
+mod socket;
 #[cfg(test)]
 mod tests;
+#[cfg(feature = "secure")]
+mod tls;
 mod url;
 
 use std::hash::Hasher;
@@ -43,6 +47,8 @@ use self::client::HttpSender;
 pub use self::config::HttpConfig;
 use self::connections::Connections;
 use self::repeats::Repeats;
+#[cfg(feature = "secure")]
+pub use self::tls::{Authorities, AuthoritiesError};
 use crate::end::ConnectionEnd;
 use crate::legacy::queues::LegacySenders;
 use crate::sockets;
@@ -85,9 +91,29 @@ struct HttpEndpoint {
     /// The key of digests and boundaries, which peers cannot predict.
     key: (u64, u64),
     boundaries: AtomicU64,
+    /// The proofs of `https`.
+    #[cfg(feature = "secure")]
+    tls: Option<Tls>,
+}
+
+/// The credentials of `https`, and the authorities that prove platforms.
+#[cfg(feature = "secure")]
+#[derive(Debug)]
+struct Tls {
+    security: crate::secure::Security,
+    authorities: Authorities,
 }
 
 impl HttpEndpoint {
+    /// The kind of the locations of this endpoint.
+    fn kind(&self) -> Kind {
+        #[cfg(feature = "secure")]
+        if self.tls.is_some() {
+            return Kind::Https;
+        }
+        Kind::Http
+    }
+
     /// Returns a boundary that no part contains.
     fn boundary(&self, parts: &[&[u8]]) -> Option<String> {
         let mut tries = (0..MAX_BOUNDARIES).map(|_| {
@@ -109,6 +135,42 @@ impl HttpTransport {
     /// No socket is opened before `listen`.
     #[must_use]
     pub fn new(config: HttpConfig, runtime: Handle) -> Self {
+        Self::over(
+            Kind::Http,
+            config,
+            #[cfg(feature = "secure")]
+            None,
+            runtime,
+        )
+    }
+
+    /// Creates an endpoint for `https`, with the credentials of this host. A platform proves its identity
+    /// with a trusted certificate, or, when this endpoint dials it, with one of these authorities for the
+    /// host name in its address.
+    ///
+    /// A platform that dials and has no trusted certificate is subject to the rules of the configuration for
+    /// peers that prove nothing.
+    #[cfg(feature = "secure")]
+    #[must_use]
+    pub fn over_tls(
+        config: HttpConfig,
+        security: crate::secure::Security,
+        authorities: Authorities,
+        runtime: Handle,
+    ) -> Self {
+        let tls = Tls {
+            security,
+            authorities,
+        };
+        Self::over(Kind::Https, config, Some(tls), runtime)
+    }
+
+    fn over(
+        kind: Kind,
+        config: HttpConfig,
+        #[cfg(feature = "secure")] tls: Option<Tls>,
+        runtime: Handle,
+    ) -> Self {
         let HttpConfig {
             listen,
             identity,
@@ -124,7 +186,7 @@ impl HttpTransport {
             security,
         };
         let endpoint = Arc::new(HttpEndpoint {
-            stream: Endpoint::new(Kind::Http, config, runtime),
+            stream: Endpoint::new(kind, config, runtime),
             senders: LegacySenders::default(),
             connections: Connections::default(),
             repeats: Mutex::default(),
@@ -133,6 +195,8 @@ impl HttpTransport {
                 Incarnation::random().as_u64(),
             ),
             boundaries: AtomicU64::default(),
+            #[cfg(feature = "secure")]
+            tls,
         });
         Self { listen, endpoint }
     }
@@ -146,7 +210,7 @@ impl HttpTransport {
 
 impl Transport for HttpTransport {
     fn kind(&self) -> Kind {
-        Kind::Http
+        self.endpoint.kind()
     }
 
     fn max_letter(&self) -> usize {

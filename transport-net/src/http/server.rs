@@ -10,7 +10,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant as Now};
 
 use bytes::Bytes;
-use fipa_transport::{Kind, LegacySource, Signature};
+use fipa_transport::{LegacySource, Signature};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
@@ -23,6 +23,7 @@ use super::head::MAX_HEAD;
 use super::letter::{self, LetterError};
 use super::repeats::Arrived;
 use super::request::{RequestError, RequestHead, RequestReader, Status};
+use super::socket::Socket;
 use crate::log_limit::warn_limited;
 use crate::sockets::prepare;
 use crate::stream::budget::ReservedBytes;
@@ -50,6 +51,9 @@ enum Refusal {
     Letter(#[from] LetterError),
     #[error("the peer cannot prove its identity, and is not listed in security.legacy_peers")]
     Unproved,
+    #[cfg(feature = "secure")]
+    #[error("the certificate of the platform does not name the sender of the letter")]
+    NotItsAgent,
     #[error("the head of the request arrived too slowly (handshake_timeout)")]
     SlowHead,
     #[error("the body arrived too slowly (stall_timeout)")]
@@ -97,6 +101,8 @@ impl Refusal {
             Self::Request(error) => error.status(),
             Self::Letter(error) => error.status(),
             Self::Unproved => Status::Forbidden,
+            #[cfg(feature = "secure")]
+            Self::NotItsAgent => Status::Forbidden,
             Self::SlowHead | Self::SlowBody => Status::Timeout,
             Self::NoRoom => Status::Unavailable,
         }
@@ -134,7 +140,10 @@ fn admit(endpoint: &Arc<HttpEndpoint>, stream: TcpStream, from: SocketAddr) {
     let serving = Serving {
         endpoint: endpoint.clone(),
         slot,
-        stream,
+        stream: Socket::Plain(stream),
+        is_proved: false,
+        #[cfg(feature = "secure")]
+        mandate: None,
         from,
         quota_key,
         reader: RequestReader::default(),
@@ -148,12 +157,17 @@ fn admit(endpoint: &Arc<HttpEndpoint>, stream: TcpStream, from: SocketAddr) {
 struct Serving {
     endpoint: Arc<HttpEndpoint>,
     slot: Slot,
-    stream: TcpStream,
+    stream: Socket,
     from: SocketAddr,
     quota_key: QuotaKey,
     reader: RequestReader,
     /// Whether no letter has arrived yet.
     first: bool,
+    /// Whether the platform has proved its identity with a trusted certificate.
+    is_proved: bool,
+    /// The trusted certificate, if it names agents: its platform speaks for them only.
+    #[cfg(feature = "secure")]
+    mandate: Option<Arc<crate::secure::Certified>>,
 }
 
 impl Serving {
@@ -164,12 +178,21 @@ impl Serving {
         if !self.slot.started(task) {
             return;
         }
+        #[cfg(feature = "secure")]
+        if self.endpoint.tls.is_some() {
+            self = match self.secured().await {
+                Some(secured) => secured,
+                None => return,
+            };
+        }
         let Err(End::Refused(refusal)) = self.serve().await else {
             return;
         };
         let tally = self.endpoint.stream.tally();
         let counter = match refusal {
             Refusal::Unproved => &tally.refused_unproved,
+            #[cfg(feature = "secure")]
+            Refusal::NotItsAgent => &tally.refused_unproved,
             _ => &tally.refused_nonsense,
         };
         let before = counter.fetch_add(1, Ordering::Relaxed);
@@ -181,6 +204,37 @@ impl Serving {
         let refused = self.refuse(refusal.status());
         if let Ok(Err(error)) = timeout(LAST_ANSWER, refused).await {
             tracing::debug!(%from, "cannot answer a refused request: {error}");
+        }
+    }
+
+    /// Performs the handshake of TLS.
+    #[cfg(feature = "secure")]
+    async fn secured(mut self) -> Option<Self> {
+        let endpoint = Arc::clone(&self.endpoint);
+        let security = &endpoint.tls.as_ref()?.security;
+        let patience = self.limits().handshake_timeout;
+        let Socket::Plain(stream) = self.stream else {
+            return None;
+        };
+        match super::tls::accept(security, stream, patience).await {
+            Ok((stream, certificate)) => {
+                self.stream = Socket::Tls(Box::new(stream));
+                self.is_proved = certificate.is_some();
+                self.mandate = certificate
+                    .map(|it| Arc::clone(it.certified()))
+                    .filter(|it| !it.agents().is_empty());
+                Some(self)
+            }
+            Err(what) => {
+                let tally = endpoint.stream.tally();
+                let before = tally.refused_unproved.fetch_add(1, Ordering::Relaxed);
+                let from = self.from;
+                warn_limited(
+                    before,
+                    format_args!("{from}: HTTPS connection refused: {what}"),
+                );
+                None
+            }
         }
     }
 
@@ -202,13 +256,14 @@ impl Serving {
 
     /// Serves requests until the connection ends.
     async fn serve(&mut self) -> Result<(), End> {
-        prepare(&self.stream, self.limits())?;
-        if !self
-            .endpoint
-            .stream
-            .config
-            .gives_legacy_peers_at(self.from.ip())
-        {
+        prepare(self.stream.tcp(), self.limits())?;
+        let is_admitted = self.is_proved
+            || self
+                .endpoint
+                .stream
+                .config
+                .gives_legacy_peers_at(self.from.ip());
+        if !is_admitted {
             return Err(Refusal::Unproved.into());
         }
         loop {
@@ -329,6 +384,12 @@ impl Serving {
     async fn take(&mut self, head: &RequestHead, body: Bytes) -> Result<(), End> {
         let endpoint = &self.endpoint.stream;
         let letter = letter::read(&body, &head.boundary)?;
+        #[cfg(feature = "secure")]
+        if let Some(certified) = &self.mandate
+            && !letter.is_of(|name| certified.speaks_for(name))
+        {
+            return Err(Refusal::NotItsAgent.into());
+        }
         if let Some(rate_limit) = endpoint.rate_limit(Home::Address(self.from.ip()))
             && let Some(until) = rate_limit.spend(1, body.len(), Now::now())
         {
@@ -355,7 +416,7 @@ impl Serving {
             address: self.from.ip().to_canonical(),
             signature: Signature::JadeProxy,
         };
-        sink.arrived_unframed(letter.letter, Kind::Http, source);
+        sink.arrived_unframed(letter.letter, self.endpoint.kind(), source);
         Ok(())
     }
 }

@@ -115,7 +115,7 @@ fn recorded_requests_are_read_and_written_byte_for_byte() {
         let text = head_of(bytes);
         let line = text.lines().next().unwrap();
         let url = line.split(' ').nth(1).unwrap();
-        let url = Url::parse(url.strip_prefix("http://").unwrap()).unwrap();
+        let url = Url::parse(Kind::Http, url.strip_prefix("http://").unwrap()).unwrap();
         let boundary = std::str::from_utf8(&head.boundary).unwrap();
         let payload_of = (payload.len(), None);
         let (mut written, end) = request::write(&url, boundary, envelope, payload_of, head.keeps);
@@ -379,7 +379,7 @@ proptest! {
         step in 1_usize..200,
     ) {
         let boundary = "0123456789abcdef0123456789abcde";
-        let url = Url::parse("10.0.0.1:7778/acc").unwrap();
+        let url = Url::parse(Kind::Http, "10.0.0.1:7778/acc").unwrap();
         let payload_of = (payload.len(), charset.as_deref());
         let (mut bytes, end) = request::write(&url, boundary, &envelope, payload_of, keeps);
         bytes.extend_from_slice(&payload);

@@ -1,6 +1,8 @@
-//! Addresses of HTTP: `host:port/path`, the part of a URL behind `http://`.
+//! Addresses of HTTP: `host:port/path`, the part of a URL behind `http://` or `https://`.
 
 use std::fmt;
+
+use fipa_transport::Kind;
 
 use crate::address::{self, AddressError};
 
@@ -16,14 +18,15 @@ pub(super) struct Url {
     /// Host and port, as needed for dialling.
     target: String,
     path: String,
+    scheme: Kind,
 }
 
 impl Url {
-    /// Parses the address of a location.
+    /// Parses the address of a location of this kind.
     ///
     /// # Errors
     /// When the text is not an address with an optional port and path.
-    pub(super) fn parse(address: &str) -> Result<Self, AddressError> {
+    pub(super) fn parse(scheme: Kind, address: &str) -> Result<Self, AddressError> {
         let (authority, path) = match address.find('/') {
             Some(at) => address.split_at(at),
             None => (address, PATH),
@@ -43,12 +46,25 @@ impl Url {
         Ok(Self {
             target,
             path: path.to_owned(),
+            scheme,
         })
     }
 
     /// Host and port, for dialling.
     pub(super) fn target(&self) -> &str {
         &self.target
+    }
+
+    /// The host without its port, the scope and the brackets of an IPv6 address.
+    #[cfg(feature = "secure")]
+    pub(super) fn name(&self) -> &str {
+        let host = self
+            .target
+            .rsplit_once(':')
+            .map_or(&*self.target, |(host, _)| host);
+        let host = host.strip_prefix('[').unwrap_or(host);
+        let host = host.strip_suffix(']').unwrap_or(host);
+        host.split('%').next().unwrap_or(host)
     }
 
     /// Host and port for a request. The scope of an IPv6 address is not sent (RFC 6874 clause 4).
@@ -65,7 +81,7 @@ impl Url {
 
 impl fmt::Display for Url {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "http://{}{}", self.host(), self.path)
+        write!(f, "{}://{}{}", self.scheme, self.host(), self.path)
     }
 }
 
@@ -86,10 +102,12 @@ mod tests {
             ("[::1]/acc", "[::1]:7778", "http://[::1]:7778/acc"),
             ("[fe80::1%7]:1/", "[fe80::1%7]:1", "http://[fe80::1]:1/"),
         ] {
-            let parsed = Url::parse(address).unwrap();
+            let parsed = Url::parse(Kind::Http, address).unwrap();
             assert_eq!(parsed.target(), target);
             assert_eq!(parsed.to_string(), url);
         }
+        let secure = Url::parse(Kind::Https, "[fe80::1%7]:1/x").unwrap();
+        assert_eq!(secure.to_string(), "https://[fe80::1]:1/x");
         for wrong in [
             "",
             "/acc",
@@ -98,7 +116,7 @@ mod tests {
             "10.0.0.1:x",
             "a:1/\u{e9}",
         ] {
-            assert!(Url::parse(wrong).is_err(), "{wrong}");
+            assert!(Url::parse(Kind::Https, wrong).is_err(), "{wrong}");
         }
     }
 }

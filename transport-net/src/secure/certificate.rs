@@ -4,7 +4,8 @@
 //! Service and agents are URIs in the subject alternative names (RFC 5280 section 4.2.1.6):
 //! `urn:fipa:mts:NAME`, exactly once, and `urn:fipa:agent:NAME` for each agent; without any the
 //! service may speak for every agent. Names are percent-encoded UTF-8; an agent's name that ends
-//! with `*` stands for all names with that prefix. Names are checked when they are decoded.
+//! with `*` stands for all names with that prefix. Names are checked when they are decoded. The agents of the
+//! platform itself, `ams@NAME` and `df@NAME` (FIPA00023 clause 4), need no mention.
 //!
 //! Decisions about trust do not belong here.
 
@@ -34,6 +35,9 @@ const MAX_LEN: usize = 64 * 1024;
 
 /// Maximum length of a name, in bytes.
 const MAX_NAME: usize = 1024;
+
+/// The local names of the agents of a platform.
+const PLATFORM_AGENTS: [&str; 2] = ["ams", "df"];
 
 /// Maximum number of agents in a certificate.
 const MAX_AGENTS: usize = 1024;
@@ -81,7 +85,9 @@ pub struct Certificate {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Certified {
     mts: String,
-    /// Always [`Mandate::Certified`].
+    /// The agents that the certificate names.
+    agents: Vec<String>,
+    /// Always [`Mandate::Certified`], with these agents and those of the platform.
     mandate: Mandate,
 }
 
@@ -210,10 +216,17 @@ impl Certified {
             return Err(CertificateError::Agents);
         }
         match <[String; 1]>::try_from(services) {
-            Ok([mts]) => Ok(Self {
-                mts,
-                mandate: Mandate::Certified(agents.into()),
-            }),
+            Ok([mts]) => {
+                let mut mandate = agents.clone();
+                if !mandate.is_empty() {
+                    mandate.extend(PLATFORM_AGENTS.map(|agent| format!("{agent}@{mts}")));
+                }
+                Ok(Self {
+                    mts,
+                    agents,
+                    mandate: Mandate::Certified(mandate.into()),
+                })
+            }
             Err(services) => Err(CertificateError::Services(services.len())),
         }
     }
@@ -224,17 +237,15 @@ impl Certified {
         &self.mts
     }
 
-    /// Returns the agents that the service may speak for; a name that ends with `*` stands for all
+    /// Returns the agents that the certificate names, which the service may speak for; a name that ends with `*` stands for all
     /// names with that prefix. Empty when the service may speak for every agent.
     #[must_use]
     pub fn agents(&self) -> &[String] {
-        match &self.mandate {
-            Mandate::Certified(agents) => agents,
-            Mandate::Unproved => &[],
-        }
+        &self.agents
     }
 
-    /// Whether the service may speak for the agent with this name, or for itself.
+    /// Whether the service may speak for the agent with this name: one that the certificate names, the
+    /// service itself, or its `ams@NAME` or `df@NAME`.
     #[must_use]
     pub fn speaks_for(&self, name: &str) -> bool {
         self.mts == name || self.mandate.speaks_for(name)

@@ -8,11 +8,14 @@
 //! * `certificate`: the contents of a certificate.
 //! * `advice`: remedies when a peer is not trusted.
 //! * `verify`: the verification of a presented certificate.
+//! * `platform`: the same for platforms that are reached over `https`.
 //!
 //! Files and the handling of letters do not belong here.
 
 pub(crate) mod advice;
 mod certificate;
+#[cfg(feature = "http")]
+mod platform;
 mod verify;
 
 use std::fmt;
@@ -144,6 +147,46 @@ impl Security {
 
     pub(crate) fn client(&self) -> Arc<ClientConfig> {
         self.now.read().client.clone()
+    }
+
+    /// Returns the configuration of TLS with a platform that dials. Its certificate is not required.
+    #[cfg(feature = "http")]
+    pub(crate) fn platform_server(&self) -> Result<Arc<ServerConfig>, rustls::Error> {
+        let now = self.now.read().clone();
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let mut server = ServerConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&TLS13])?
+            .with_client_cert_verifier(Arc::new(platform::AnyClient::new(&now.known)))
+            .with_single_cert(vec![now.own.der().clone()], now.key.clone_key())?;
+        server.send_tls13_tickets = 0;
+        Ok(Arc::new(server))
+    }
+
+    /// Returns the configuration of TLS with a platform that is dialed. It proves its identity with a
+    /// trusted certificate, or with one of these authorities for its name.
+    #[cfg(feature = "http")]
+    pub(crate) fn platform_client(
+        &self,
+        authorities: Option<Arc<rustls::client::WebPkiServerVerifier>>,
+    ) -> Result<Arc<ClientConfig>, rustls::Error> {
+        let now = self.now.read().clone();
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let verifier = platform::Server::new(now.known.clone(), authorities);
+        let mut client = ClientConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&TLS13])?
+            .dangerous()
+            .with_custom_certificate_verifier(Arc::new(verifier))
+            .with_client_auth_cert(vec![now.own.der().clone()], now.key.clone_key())?;
+        client.resumption = Resumption::disabled();
+        Ok(Arc::new(client))
+    }
+
+    /// Returns the trusted certificate that a platform has presented, if it is valid now.
+    #[cfg(feature = "http")]
+    pub(crate) fn proof(&self, presented: Option<&[CertificateDer<'_>]>) -> Option<Certificate> {
+        let certificate = self.peer(presented)?;
+        let now = rustls::pki_types::UnixTime::now();
+        (certificate.holds(now) == certificate::Holds::Now).then_some(certificate)
     }
 
     /// Returns the trusted certificate that a peer has presented.

@@ -35,6 +35,12 @@ impl Known {
         self.trusted.get(&Fingerprint::of(presented))
     }
 
+    /// The algorithms of signatures that are supported.
+    #[cfg(feature = "http")]
+    pub(super) fn algorithms(&self) -> WebPkiSupportedAlgorithms {
+        self.algorithms
+    }
+
     pub(super) fn trusts(&self, fingerprint: Fingerprint) -> bool {
         self.trusted.contains_key(&fingerprint)
     }
@@ -62,7 +68,7 @@ impl Known {
 }
 
 /// TLS 1.2 is not offered, so this is only reached through a protocol error.
-fn only_tls13() -> Result<HandshakeSignatureValid, Error> {
+pub(super) fn only_tls13() -> Result<HandshakeSignatureValid, Error> {
     Err(PeerIncompatible::Tls12NotOfferedOrEnabled.into())
 }
 

@@ -39,6 +39,26 @@ impl Host {
         }
     }
 
+    /// Creates a host with a certificate of an authority for this host name.
+    pub(crate) fn named(
+        name: &str,
+        host: &str,
+        authority: &rcgen::Issuer<'static, KeyPair>,
+    ) -> Self {
+        let mut params = CertificateParams::new([host.to_owned()]).unwrap();
+        for uri in alternative_names(name, &[]) {
+            params
+                .subject_alt_names
+                .push(SanType::URI(uri.try_into().unwrap()));
+        }
+        let key = KeyPair::generate().unwrap();
+        let signed = params.signed_by(&key, authority).unwrap();
+        Self {
+            certificate: Certificate::from_der(signed.der().to_vec()).unwrap(),
+            key,
+        }
+    }
+
     /// Returns its credentials with these trusted peers.
     pub(crate) fn credentials(&self, trusted: &[&Self]) -> Credentials {
         Credentials {
