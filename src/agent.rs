@@ -56,7 +56,7 @@ impl Drop for AgentCore {
     }
 }
 
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 impl AgentCore {
     /// Starts a message with this agent as its sender.
     pub(crate) fn message(&self, performative: Performative) -> MessageBuilder {

@@ -20,16 +20,16 @@ use crate::coalition::CoalitionError;
 use crate::config::{ConfigError, RuleError};
 use crate::contact::{AddressError, IntroduceError};
 use crate::domain_dir::DomainDirError;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use crate::error::ProtocolError;
 use crate::error::{OpenError, ReceiveError, SendError};
 #[cfg(feature = "secure")]
 use crate::keys::KeysError;
 #[cfg(feature = "locks")]
 use crate::locks::{AdmitError, LockError, OwnError, StateFileError};
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use crate::platform::PlatformError;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use crate::protocol::DialogueError;
 use crate::routes::AskError;
 
@@ -116,11 +116,11 @@ pub enum Error {
     #[error(transparent)]
     Post(#[from] PostError),
     /// A conversation has failed.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Dialogue(#[from] DialogueError),
     /// The directory facilitator or the agent management system has refused a request or failed.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Platform(#[from] PlatformError),
     /// A lock cannot be acquired or was lost.
@@ -158,7 +158,7 @@ pub enum Error {
     #[error(transparent)]
     Address(#[from] AddressError),
     /// A file with a protocol cannot be used.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Protocol(#[from] ProtocolError),
     /// The gateway does not report its routes.

@@ -22,9 +22,9 @@
 pub mod actions;
 #[cfg(feature = "locks")]
 mod locks;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 mod platform;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 mod protocol;
 
 use std::pin::pin;
@@ -48,9 +48,9 @@ use crate::{
 
 #[cfg(feature = "locks")]
 pub use self::locks::{Lock, Owned};
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub use self::platform::{Ams, Df, Notifications};
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub use self::protocol::Side;
 
 /// The membership of this process in a domain; see [`crate::Domain`].
@@ -159,7 +159,7 @@ impl Waiter {
         }
     }
 
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     fn enter(&self) -> tokio::runtime::EnterGuard<'_> {
         self.0.enter()
     }
@@ -345,13 +345,13 @@ impl Agent {
     }
 
     /// Announces a conversation that other agents began; see [`crate::Agent::expect_conversation`].
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     pub fn expect_conversation(&self, id: &str) {
         self.agent.expect_conversation(id);
     }
 
     /// Sets the extent of the monitor's knowledge; see [`crate::Agent::set_history`].
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     pub fn set_history(&self, history: fipa_monitor::History) {
         self.agent.set_history(history);
     }

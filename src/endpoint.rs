@@ -150,7 +150,7 @@ impl Endpoint {
     }
 
     /// Waits until the domain is closed.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     pub(crate) async fn closed(&self) {
         self.mts().gone(self.incarnation).await;
     }

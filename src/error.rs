@@ -1,12 +1,12 @@
 //! Errors of joining a domain, sending and receiving.
 
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use std::path::PathBuf;
 
 use fipa_acl::BuildError;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use fipa_monitor::LibraryFull;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use fipa_monitor::scxml::ScxmlError;
 use fipa_mts::PostError;
 #[cfg(feature = "mdns")]
@@ -37,7 +37,7 @@ pub enum OpenError {
     #[error(transparent)]
     DomainDir(#[from] DomainDirError),
     /// A file in `monitor.protocols` cannot be used.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Protocol(#[from] ProtocolError),
     /// The agent directory of the host cannot be used.
@@ -109,7 +109,7 @@ pub enum SendError {
         sender: String,
     },
     /// The message violates its protocol, and `monitor.check` is `enforce`.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     #[error("not sent: {0}")]
     Violation(Box<fipa_monitor::Violation>),
     /// The message cannot be built, for example because the name of a receiver is invalid.
@@ -152,7 +152,7 @@ pub enum ReceiveError {
 }
 
 /// The error if a file in `monitor.protocols` cannot be used.
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ProtocolError {

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
 use fipa_mts::core::Received;
 use fipa_transport::Kind;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 use {fipa_monitor::Violation, fipa_transport::Incarnation};
 
 /// A received message.
@@ -21,11 +21,11 @@ pub struct Incoming {
     /// The transport that handed the letter to this process; `None` for a letter from this
     /// process itself.
     pub via: Option<Kind>,
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     violation: Option<Box<Violation>>,
     /// The registration of the sending agent, as far as the service that handed the letter over proves
     /// it; unknown for an agent of a legacy peer, and for letters of this process itself.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     pub(crate) sender: Incarnation,
 }
 
@@ -50,11 +50,11 @@ impl Incoming {
         Ok(Self {
             index,
             message: OnceLock::new(),
-            #[cfg(feature = "monitor")]
+            #[cfg(feature = "protocols")]
             sender: received.sender,
             letter: received.letter,
             via: received.via,
-            #[cfg(feature = "monitor")]
+            #[cfg(feature = "protocols")]
             violation: None,
         })
     }
@@ -117,19 +117,19 @@ impl Incoming {
     /// }
     /// # }
     /// ```
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     #[must_use]
     pub fn violation(&self) -> Option<&Violation> {
         self.violation.as_deref()
     }
 
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     pub(crate) fn violates(&mut self, violation: Box<Violation>) {
         self.violation = Some(violation);
     }
 
     /// Separates the message from its violation.
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     pub(crate) fn into_parts(self) -> (Message, Option<Box<Violation>>) {
         let mut this = self;
         let violation = this.violation.take();

@@ -114,18 +114,18 @@ mod agent;
 mod any_error;
 mod background;
 pub mod blocking;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 mod checks;
-#[cfg(not(feature = "monitor"))]
+#[cfg(not(feature = "protocols"))]
 #[path = "checks_disabled.rs"]
 mod checks;
 mod coalition;
 pub mod config;
 pub mod contact;
 mod delivery;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 mod demultiplexer;
-#[cfg(not(feature = "monitor"))]
+#[cfg(not(feature = "protocols"))]
 #[path = "demultiplexer_disabled.rs"]
 mod demultiplexer;
 mod dir_maintenance;
@@ -152,11 +152,11 @@ mod lock_slot;
 #[cfg(feature = "locks")]
 pub mod locks;
 mod owner;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub mod platform;
-#[cfg(any(feature = "monitor", feature = "net"))]
+#[cfg(any(feature = "protocols", feature = "net"))]
 mod presence;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub mod protocol;
 pub mod routes;
 mod service;
@@ -170,7 +170,7 @@ pub use delivery::{Deliveries, Delivery};
 pub use directory_view::DirectoryView;
 pub use domain::{Domain, RegisterOptions};
 pub use domain_dir::DomainDirError;
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub use error::ProtocolError;
 pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
@@ -178,7 +178,7 @@ pub use fipa_acl::{
     EnvelopeParams, ErrorChain, Letter, Message, MessageBuilder, Payload, Performative,
     PerformativeError, Problem, Time, TimeError,
 };
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub use fipa_monitor as monitor;
 pub use fipa_mts::{DeliveryFailure, PostError};
 #[cfg(feature = "mdns")]

@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 pub(crate) const ONTOLOGY: &str = "fipa-mts-presence";
 
 /// The beginning of the conversation ids of questions.
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 pub(crate) const CONVERSATION: &str = "fipa-presence-";
 
 /// Maximum number of registrations in one letter.

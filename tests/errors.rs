@@ -135,7 +135,7 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
             format!("cannot make a key: {CAUSE}"),
         ),
     ]);
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     all.extend([
         (
             Box::new(fipa::ProtocolError::Read {

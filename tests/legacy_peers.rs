@@ -460,7 +460,7 @@ async fn an_agent_of_jade_uses_the_directory_facilitator() {
     let (_, _, answer) = ask(register("rover")).await;
     assert_eq!(*answer.performative(), Performative::Refuse, "{answer}");
     assert!(text(&answer).ends_with(" unauthorised )"), "{answer}");
-    #[cfg(feature = "monitor")]
+    #[cfg(feature = "protocols")]
     {
         let all = fipa::platform::AgentDescription::default();
         let found = rover.df().unwrap().search(&all).await.unwrap();

@@ -322,7 +322,7 @@ fn content_that_jade_does_not_escape_is_read_as_it_is() {
         assert_eq!(read.conversation_id(), Some("c"));
         assert_eq!(read.sender().unwrap().name(), "echo@jadetest");
     }
-    // Behind the content, user-defined parameters are read; in front of it, they are ambiguous.
+    // User-defined parameters are read after the content; before the content they are ambiguous.
     let last = "<fipa-message act=\"INFORM\"><content>a<b</content><X-k>v</X-k></fipa-message>";
     let last = read(last).unwrap();
     assert_eq!(last.content().unwrap(), "a<b");

@@ -45,7 +45,7 @@ pub enum GoalError {
     #[error(transparent)]
     Serialize(#[from] SerializeError),
     /// The value has no named parts.
-    #[error("the arguments of an action are a struct with named fields, or `()`")]
+    #[error("the arguments of an action must be a struct with named fields, or `()`")]
     NotNamed,
 }
 

@@ -151,7 +151,7 @@ impl<'de> Deserializer<'de> for Probe<'_> {
         len: usize,
         visitor: V,
     ) -> Result<V::Value, Error> {
-        // A functional term with arguments by position, whose names serde does not have.
+        // A functional term with arguments by position: serde does not give their names.
         self.set(Type::Any)?;
         let mut ignored = Found::default();
         visitor.visit_seq(Elements {

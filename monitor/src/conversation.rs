@@ -94,7 +94,8 @@ pub(crate) struct Party {
     pub(crate) acts: [u8; 2],
     /// Fingerprint of the last `reply-with` of each side; 0 for none.
     pub(crate) asked: [u64; 2],
-    /// [`short`] fingerprints of each side's `reply-with` before that, the last first; 0 for none.
+    /// [`short`] fingerprints of the `reply-with` values of each side before `asked`, the latest
+    /// first; 0 for none.
     pub(crate) earlier: [[u32; EARLIER]; 2],
     /// Text of the last `reply-with` of each side.
     pub(crate) asked_text: [Tail; 2],

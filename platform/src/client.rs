@@ -115,13 +115,13 @@ pub enum AnswerError {
     #[error("the answer has no content")]
     Empty,
     /// The content is not SL.
-    #[error("the content of the answer: {0}")]
+    #[error("the content of the answer is not valid SL")]
     Parse(#[from] ParseError),
     /// The content has another form.
     #[error("the content of the answer is not {0}")]
     Form(&'static str),
     /// A description in the answer is malformed.
-    #[error("a description in the answer: {0}")]
+    #[error("a description in the answer is not valid")]
     Description(#[source] Exception),
 }
 

@@ -125,10 +125,10 @@ fn keys(config: &Config, found: &mut Vec<Finding>) {
     }
 }
 
-#[cfg(not(feature = "monitor"))]
+#[cfg(not(feature = "protocols"))]
 fn protocols(_config: &Config, _found: &mut Vec<Finding>) {}
 
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 fn protocols(config: &Config, found: &mut Vec<Finding>) {
     use fipa_acl::escape;
     use fipa_monitor::Machine;
@@ -164,7 +164,7 @@ fn protocols(config: &Config, found: &mut Vec<Finding>) {
 }
 
 /// Escapes each line of a text.
-#[cfg(feature = "monitor")]
+#[cfg(feature = "protocols")]
 fn escape_lines(text: &str) -> String {
     let lines: Vec<_> = text.lines().map(fipa_acl::escape).collect();
     lines.join("\n")

@@ -27,7 +27,7 @@ pub enum AdmitError {
     /// The message has too many fences.
     #[error("the message has more than {MAX_FENCES} fences")]
     TooMany,
-    /// The fence is not that of the live grant: its lock was lost or released.
+    /// The fence is older than the present grant: its lock was lost or released.
     #[error("the fence {fence} of {resource:?} is stale; the lock was lost or released")]
     Stale {
         /// The fence.

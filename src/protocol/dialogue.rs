@@ -146,7 +146,7 @@ pub(super) struct Meaning {
 pub(super) enum DialogueState {
     /// A state of its own protocol.
     Own,
-    /// A state of a protocol within the conversation that other agents began.
+    /// A state of a subprotocol, which other agents lead within the conversation.
     Delegated,
     NotUnderstood,
     Cancelling,

@@ -328,8 +328,8 @@ impl DomainFiles {
             }
         }
         if !nameless.is_empty() {
-            // Killed during the creation or the removal of the node, so iceoryx2 has no details of
-            // it. Checked again under the lock, under which no process creates a node.
+            // These processes were killed while they created or removed a node, or they create one
+            // now. Under the lock no process creates a node, so the check is repeated there.
             let _lock = self.lock()?;
             for node in self.nodes()? {
                 if let NodeState::Dead(dead) = node

@@ -349,7 +349,7 @@ pub enum LocationError {
     #[error("the transport {1} does not support the signature {0}")]
     NotOverKind(Signature, Kind),
     /// The text after `#` is not an incarnation.
-    #[error("not an incarnation after '#' (16 hexadecimal digits expected): {0:?}")]
+    #[error("not an incarnation after '#': {0:?}; 16 hexadecimal digits are expected")]
     Incarnation(String),
 }
 

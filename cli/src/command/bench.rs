@@ -71,7 +71,7 @@ pub(crate) struct Arguments {
     /// Also measure zenoh in the same rounds, with this program (see comparison/zenoh)
     #[arg(long, value_name = "PROGRAM")]
     zenoh: Option<PathBuf>,
-    /// Address of a JADE platform with the agent of --echo; for `peers`
+    /// Address of the JADE platform that runs the agent of --echo, for `peers`
     ///
     /// `peers` measures conversations of 100 bytes in a row with that agent, through the gateway of this
     /// host (`fipa up` with the transport http). comparison/jade has the agents for JADE.

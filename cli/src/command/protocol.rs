@@ -368,7 +368,7 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The reasons that agents cannot check what they see of the protocol.
+/// Returns the reasons for which agents cannot check the messages that they send and receive.
 fn defects(machine: &Machine) -> Vec<String> {
     let defects = Projection::defects(machine).into_iter();
     let shown = defects.map(|defect| escape(&defect.to_string()).to_string());

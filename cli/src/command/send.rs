@@ -156,7 +156,7 @@ struct Parameters {
     #[arg(long, value_name = "NAME", conflicts_with = "wait")]
     reply_to: Vec<AgentId>,
 
-    /// The reply-with parameter of the message to which this is the reply
+    /// Value of the reply-with parameter of the message that this message answers
     #[arg(long, value_name = "TEXT")]
     in_reply_to: Option<String>,
 

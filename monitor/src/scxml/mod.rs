@@ -269,7 +269,7 @@ pub enum Problem {
     #[error("scope=\"participant\" needs two roles, but there are {0}: {1}")]
     RolesOfScope(usize, String),
     /// A transition has a guard, but there is one state for all participants.
-    #[error("at-most and when need scope=\"participant\"")]
+    #[error("the attributes at-most and when require scope=\"participant\"")]
     GuardOfScope,
     /// Several roles can send the first message.
     #[error("the first message has several senders: {0}; only one role may begin")]

@@ -45,8 +45,8 @@ pub(crate) struct Read {
 }
 
 /// Reads a letter to its end. Converts its envelope to the standard dialect; the message is
-/// unchanged. The connection loses its turn when no byte arrives for [`TURN`], and needs its turn
-/// to reserve much memory.
+/// unchanged. A connection needs its turn to reserve much memory, and loses it when no byte arrives
+/// for [`TURN`].
 pub(crate) async fn read(
     endpoint: &TcpEndpoint,
     turn: &QueueTurn,

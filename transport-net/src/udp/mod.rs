@@ -5,6 +5,14 @@
 //!   is [`dialling`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
 //! * [`endpoint`]: the core as a [`Protocol`](crate::datagrams::Protocol). The tasks around it, with
 //!   their sockets, are in [`crate::datagrams`], which it shares with UDT.
+//!
+//! A connection that does not answer is not replaced beside it, as a connection of
+//! [`crate::stream`] is. TCP retransmits with growing pauses, so a stream connection delivers
+//! nothing for some time after its path has healed, and its peer is given up only after
+//! `keep_alive` (10 s). This protocol retransmits by itself: [`recovery`] limits the pause to
+//! 300 ms, so the first packet after the path has healed arrives within that time. A path without
+//! acknowledgments ends the connection after [`UdpLimits::silence`] (2 s), a peer that may have
+//! moved after a quarter of it, and the next letter opens another one.
 
 mod config;
 mod connection;

@@ -434,8 +434,8 @@ impl Lane {
         self.pump(now, table);
     }
 
-    /// Checks for letters that were handed to services through which their receiver can no longer be
-    /// reached.
+    /// Ends attempts and custody at services that no longer lead to the receiver, according to the
+    /// receiver's entry in the directory.
     pub(super) fn check_next_hops(&mut self, now: Instant, table: &mut AttemptTable) {
         let mut entry: Option<(Incarnation, Option<std::sync::Arc<Entry>>)> = None;
         for index in 0..self.letters.len() {
