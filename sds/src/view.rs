@@ -1,6 +1,6 @@
 //! Views of a directory without I/O.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, OnceLock};
 
 use fipa_transport::{Incarnation, Mandate};
@@ -58,41 +58,105 @@ impl<D: Directory + ?Sized> View for D {
 }
 
 /// The entries of a directory at one time.
+///
+/// Several names may claim one registration, because other hosts choose the incarnations that they
+/// announce. The registration belongs to a proved entry before an unproved one, and to the first of
+/// equals, so that a later claim takes no letters from its agent.
 #[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     names: HashMap<Arc<str>, Arc<Entry>>,
-    incarnations: HashMap<Incarnation, Arc<Entry>>,
+    incarnations: HashMap<Incarnation, ProvedEntry>,
+    /// Entries whose registration belongs to an entry of another name; proved ones first.
+    disputed: HashMap<Incarnation, DisputedEntries>,
     sorted: OnceLock<Arc<[Arc<Entry>]>>,
 }
 
+/// An entry, and whether its origin is proved.
+pub(crate) type ProvedEntry = (Arc<Entry>, bool);
+/// Entries by whether their origin is unproved, then by name.
+type DisputedEntries = BTreeMap<(bool, Arc<str>), Arc<Entry>>;
+
 impl Snapshot {
-    /// Creates a snapshot of these entries. Of several entries of one name, the last one counts.
+    /// Creates a snapshot of these entries, all unproved. Of several entries of one name, the last
+    /// one counts.
     pub fn of<'a>(entries: impl IntoIterator<Item = &'a Arc<Entry>>) -> Self {
         let mut snapshot = Self::default();
         for entry in entries {
             let before = snapshot.names.get(&entry.name).cloned();
-            snapshot.set(before.as_ref(), Some(entry));
+            snapshot.set(before.as_ref(), Some((Arc::clone(entry), false)));
         }
         snapshot
     }
 
     /// Replaces the entry of a name.
-    pub(crate) fn set(&mut self, before: Option<&Arc<Entry>>, after: Option<&Arc<Entry>>) {
+    pub(crate) fn set(&mut self, before: Option<&Arc<Entry>>, after: Option<ProvedEntry>) {
         self.sorted.take();
         if let Some(before) = before {
             self.names.remove(&before.name);
-            if let Some(indexed) = self.incarnations.get(&before.incarnation)
-                && indexed.name == before.name
-            {
-                self.incarnations.remove(&before.incarnation);
+            let stays = after.as_ref().is_some_and(|(after, _)| {
+                after.incarnation == before.incarnation && after.name == before.name
+            });
+            self.remove(before, stays);
+        }
+        if let Some((entry, is_proved)) = after {
+            self.names.insert(entry.name.clone(), Arc::clone(&entry));
+            if entry.incarnation.is_known() {
+                self.insert(entry, is_proved);
             }
         }
-        if let Some(after) = after {
-            self.names.insert(after.name.clone(), Arc::clone(after));
-            if after.incarnation.is_known() {
-                self.incarnations
-                    .insert(after.incarnation, Arc::clone(after));
+    }
+
+    /// Removes an entry from the registrations. If an update of it follows, its registration stays
+    /// with its name.
+    fn remove(&mut self, before: &Arc<Entry>, is_updated: bool) {
+        let registration = before.incarnation;
+        let disputed = self.disputed.get_mut(&registration);
+        let is_holder = self
+            .incarnations
+            .get(&registration)
+            .is_some_and(|(holder, _)| holder.name == before.name);
+        if is_holder && !is_updated {
+            let next = disputed.and_then(BTreeMap::pop_first);
+            match next {
+                Some(((is_unproved, _), next)) => {
+                    self.incarnations.insert(registration, (next, !is_unproved));
+                }
+                None => drop(self.incarnations.remove(&registration)),
             }
+        } else if let Some(disputed) = disputed.filter(|_| !is_holder) {
+            for is_unproved in [false, true] {
+                disputed.remove(&(is_unproved, Arc::clone(&before.name)));
+            }
+        }
+        if self
+            .disputed
+            .get(&registration)
+            .is_some_and(BTreeMap::is_empty)
+        {
+            self.disputed.remove(&registration);
+        }
+    }
+
+    fn insert(&mut self, entry: Arc<Entry>, is_proved: bool) {
+        let registration = entry.incarnation;
+        let holder = self.incarnations.get(&registration);
+        let holder = holder.filter(|(holder, _)| holder.name != entry.name);
+        let loser = match holder {
+            None => {
+                self.incarnations.insert(registration, (entry, is_proved));
+                return;
+            }
+            Some((_, false)) if is_proved => {
+                self.incarnations.insert(registration, (entry, is_proved))
+            }
+            Some(_) => Some((entry, is_proved)),
+        };
+        if let Some((loser, is_proved)) = loser {
+            let key = (!is_proved, Arc::clone(&loser.name));
+            self.disputed
+                .entry(registration)
+                .or_default()
+                .insert(key, loser);
         }
     }
 }
@@ -103,7 +167,8 @@ impl View for Snapshot {
     }
 
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.incarnations.get(&incarnation).cloned()
+        let (entry, _) = self.incarnations.get(&incarnation)?;
+        Some(Arc::clone(entry))
     }
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
