@@ -223,6 +223,47 @@ fn number_of(letter: &Letter) -> Option<u64> {
     Some(u64::from_le_bytes(content))
 }
 
+/// Streams of the malicious gateway in which letters fail between others, so that a mutation of one
+/// number makes a false predecessor of a letter that failed.
+#[must_use]
+pub fn seeds() -> Vec<Vec<u8>> {
+    // The positions of the names and registrations in `NAMES` and `NAMED` agree for these.
+    let (arm, rover, liar) = (0, 1, 3);
+    // A letter that the malicious gateway sends with its certificate; see `lie`.
+    let letter = |to_far: bool, sequence, after, time| {
+        let receiver = if to_far { rover } else { arm };
+        let how = if to_far { 6 } else { 4 };
+        let header = [4, how, 6, liar, receiver, liar, receiver, receiver];
+        [&header[..], &[sequence, after, sequence, time]].concat()
+    };
+    let (at_once, later) = (0, 200);
+    let pass = vec![2, 20];
+    let mut seeds = Vec::new();
+    for to_far in [false, true] {
+        let letter = |sequence, after, time| letter(to_far, sequence, after, time);
+        // Its first letter fails, and the later ones come after letters that failed.
+        seeds.push([letter(1, 0, at_once), letter(2, 0, later)].concat());
+        seeds.push(
+            [
+                letter(1, 0, at_once),
+                letter(2, 1, at_once),
+                letter(3, 2, later),
+            ]
+            .concat(),
+        );
+        seeds.push([letter(2, 1, at_once), pass.clone(), letter(1, 0, later)].concat());
+        seeds.push(
+            [
+                letter(1, 0, later),
+                letter(3, 2, at_once),
+                letter(2, 1, later),
+            ]
+            .concat(),
+        );
+    }
+    seeds
+}
+
 /// Runs the actions that the bytes encode, then lets every deadline pass.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);

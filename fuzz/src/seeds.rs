@@ -35,6 +35,11 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
             }
             seeds
         }
+        "delivery" => {
+            let mut seeds = crate::delivery::seeds();
+            seeds.extend(drawn(48, 400));
+            seeds
+        }
         "http" => crate::http::seeds(),
         "recording" => crate::recording::seeds(),
         "presence" => {

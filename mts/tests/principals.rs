@@ -56,14 +56,20 @@ fn letter() -> Letter {
 
 impl Bench {
     fn new() -> Self {
+        Self::with(&[("rover", ROVER, HONEST)])
+    }
+
+    /// A gateway that knows these agents at other gateways.
+    fn with(agents: &[(&str, Incarnation, Incarnation)]) -> Self {
         let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
         let arm = vec![at(PROCESS, "shm://arms")];
         own.register(Registration::new("arm", ARM, arm)).unwrap();
         let contacts = Arc::new(ContactDirectory::new());
-        let rover = at(HONEST, "tcp://192.0.2.4:1");
-        contacts
-            .heard(Instant::now(), "rover", ROVER, rover)
-            .unwrap();
+        for (name, agent, gateway) in agents {
+            let location = at(*gateway, "tcp://192.0.2.4:1");
+            let heard = contacts.heard(Instant::now(), name, *agent, location);
+            heard.unwrap();
+        }
         let all: Vec<Arc<dyn Directory>> = vec![own, contacts];
         let config = CoreConfig {
             forwards: true,
@@ -180,6 +186,7 @@ fn a_service_cannot_introduce_itself_as_the_agent_of_another_host() {
             dialled: None,
             mandate: Mandate::Unproved,
         };
+        assert!(!bench.core.accepts(&introduction), "as {agent}");
         bench.core.handle_introduced(bench.now, &introduction);
         let junk = bench.letter(link(agent, LIAR), (agent, ARM), 2);
         assert!(is_refused(&junk), "{junk:?}");
@@ -204,6 +211,28 @@ fn a_connected_service_is_accepted_with_its_own_certificate_only() {
     assert!(!accepts(HONEST, LIAR));
     assert!(accepts(LIAR, LIAR));
     assert!(accepts(Incarnation::from_u64(77), LIAR));
+    // Of agents, a gateway has connected and this host has one.
+    assert!(!accepts(ROVER, LIAR));
+    assert!(!accepts(ARM, LIAR));
+}
+
+/// Another host may announce an agent of its own with the registration of the receiver.
+#[test]
+fn letters_go_to_the_registration_of_the_name_that_they_are_sent_to() {
+    let mut bench = Bench::with(&[("stray", ROVER, LIAR), ("rover", ROVER, HONEST)]);
+    let camera = Incarnation::from_u64(50);
+    bench.core.register("camera".into(), camera);
+    let submission = Submission {
+        sender: camera,
+        letter: letter(),
+        receivers: vec!["rover".into()],
+        deadline: Duration::from_secs(5),
+    };
+    bench.core.send(bench.now, submission);
+    let Some(Action::Dispatch { location, .. }) = bench.core.poll_action() else {
+        panic!("the letter is dispatched");
+    };
+    assert_eq!(location.incarnation(), HONEST);
 }
 
 #[test]

@@ -180,10 +180,33 @@ fn registered<V: View + ?Sized>(
     back_ends: &[Arc<V>],
     incarnation: Incarnation,
 ) -> Option<Arc<Entry>> {
-    let mut found = back_ends.iter().map(|one| one.registered(incarnation));
-    let entry = found.find_map(|found| found)?;
-    // An agent that lost its name in the merged view is not part of the view.
-    holder(back_ends, &entry.name).filter(|holder| holder.incarnation == incarnation)
+    let mut best: Option<NameClaim> = None;
+    for one in back_ends {
+        let Some(entry) = one.registered(incarnation) else {
+            continue;
+        };
+        let is_named = |best: &NameClaim| best.entry.name == entry.name;
+        if best.as_ref().is_some_and(is_named) {
+            continue;
+        }
+        // An agent that lost its name in the merged view is not part of the view.
+        let claim = held(back_ends, &entry.name);
+        let Some(claim) = claim.filter(|claim| claim.entry.incarnation == incarnation) else {
+            continue;
+        };
+        if claim.entry.reach == Reach::Local {
+            return Some(claim.entry);
+        }
+        // A registration that several names claim belongs to a proved one, or to that of the first
+        // directory.
+        if best
+            .as_ref()
+            .is_none_or(|best| claim.outranks(best, back_ends))
+        {
+            best = Some(claim);
+        }
+    }
+    best.map(|claim| claim.entry)
 }
 
 fn merged_entries<V: View + ?Sized>(back_ends: &[Arc<V>]) -> Arc<[Arc<Entry>]> {
@@ -209,6 +232,10 @@ fn merged_entries<V: View + ?Sized>(back_ends: &[Arc<V>]) -> Arc<[Arc<Entry>]> {
 }
 
 fn holder<V: View + ?Sized>(back_ends: &[Arc<V>], name: &str) -> Option<Arc<Entry>> {
+    held(back_ends, name).map(|claim| claim.entry)
+}
+
+fn held<V: View + ?Sized>(back_ends: &[Arc<V>], name: &str) -> Option<NameClaim> {
     let claims = back_ends.iter().enumerate().filter_map(|(at, one)| {
         let entry = one.named(name)?;
         counts(back_ends, at, &entry).then_some(NameClaim { at, entry })
@@ -217,7 +244,7 @@ fn holder<V: View + ?Sized>(back_ends: &[Arc<V>], name: &str) -> Option<Arc<Entr
         true => next,
         false => best,
     };
-    claims.reduce(better).map(|claim| claim.entry)
+    claims.reduce(better)
 }
 
 /// The entry of one directory for a name.

@@ -261,7 +261,10 @@ impl<O: Eq> Index<O> {
         let after = self.holder(&name).cloned();
         let change = Change::between(before.clone(), after.clone());
         if change.is_some() {
-            Arc::make_mut(&mut self.holders).set(before.as_ref(), after.as_ref());
+            let is_proved = self.claims.get(&name).and_then(|claims| claims.first());
+            let is_proved = is_proved.is_some_and(|(origin, _)| (self.is_proved)(origin));
+            let after = after.map(|after| (after, is_proved));
+            Arc::make_mut(&mut self.holders).set(before.as_ref(), after);
         }
         change
     }

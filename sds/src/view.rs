@@ -3,7 +3,7 @@
 use std::sync::{Arc, OnceLock};
 
 use fipa_transport::{Incarnation, Mandate};
-use rpds::HashTrieMapSync;
+use rpds::{HashTrieMapSync, RedBlackTreeMapSync};
 
 use crate::{Directory, Entry};
 
@@ -61,42 +61,118 @@ impl<D: Directory + ?Sized> View for D {
 ///
 /// A copy shares its entries with the original, so that a change costs the same however many entries
 /// there are.
+///
+/// Several names may claim one registration, because other hosts choose the incarnations that they
+/// announce. The registration belongs to a proved entry before an unproved one, and to the first of
+/// equals, so that a later claim takes no letters from its agent.
 #[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     names: HashTrieMapSync<Arc<str>, Arc<Entry>>,
-    incarnations: HashTrieMapSync<Incarnation, Arc<Entry>>,
+    incarnations: HashTrieMapSync<Incarnation, ProvedEntry>,
+    /// Entries whose registration belongs to an entry of another name; proved ones first.
+    disputed: HashTrieMapSync<Incarnation, DisputedEntries>,
     sorted: OnceLock<Arc<[Arc<Entry>]>>,
 }
 
+/// An entry, and whether its origin is proved.
+pub(crate) type ProvedEntry = (Arc<Entry>, bool);
+/// Entries by whether their origin is unproved, then by name.
+type DisputedEntries = RedBlackTreeMapSync<(bool, Arc<str>), Arc<Entry>>;
+
 impl Snapshot {
-    /// Creates a snapshot of these entries. Of several entries of one name, the last one counts.
+    /// Creates a snapshot of these entries, all unproved. Of several entries of one name, the last
+    /// one counts.
     pub fn of<'a>(entries: impl IntoIterator<Item = &'a Arc<Entry>>) -> Self {
         let mut snapshot = Self::default();
         for entry in entries {
             let before = snapshot.names.get(&entry.name).cloned();
-            snapshot.set(before.as_ref(), Some(entry));
+            snapshot.set(before.as_ref(), Some((Arc::clone(entry), false)));
         }
         snapshot
     }
 
     /// Replaces the entry of a name.
-    pub(crate) fn set(&mut self, before: Option<&Arc<Entry>>, after: Option<&Arc<Entry>>) {
+    pub(crate) fn set(&mut self, before: Option<&Arc<Entry>>, after: Option<ProvedEntry>) {
         self.sorted.take();
         if let Some(before) = before {
             self.names.remove_mut(&before.name);
-            if let Some(indexed) = self.incarnations.get(&before.incarnation)
-                && indexed.name == before.name
-            {
-                self.incarnations.remove_mut(&before.incarnation);
+            let stays = after.as_ref().is_some_and(|(after, _)| {
+                after.incarnation == before.incarnation && after.name == before.name
+            });
+            self.remove(before, stays);
+        }
+        if let Some((entry, is_proved)) = after {
+            self.names
+                .insert_mut(entry.name.clone(), Arc::clone(&entry));
+            if entry.incarnation.is_known() {
+                self.insert(entry, is_proved);
             }
         }
-        if let Some(after) = after {
-            self.names.insert_mut(after.name.clone(), Arc::clone(after));
-            if after.incarnation.is_known() {
+    }
+
+    /// Removes an entry from the registrations. If an update of it follows, its registration stays
+    /// with its name.
+    fn remove(&mut self, before: &Arc<Entry>, is_updated: bool) {
+        let registration = before.incarnation;
+        let is_holder = self
+            .incarnations
+            .get(&registration)
+            .is_some_and(|(holder, _)| holder.name == before.name);
+        let mut disputed = self.disputed_for(registration);
+        match is_holder {
+            true if is_updated => return,
+            true => {
+                let next = disputed.first();
+                match next.map(|(key, next)| (key.clone(), Arc::clone(next))) {
+                    Some((key, next)) => {
+                        disputed.remove_mut(&key);
+                        self.incarnations.insert_mut(registration, (next, !key.0));
+                    }
+                    None => {
+                        self.incarnations.remove_mut(&registration);
+                    }
+                }
+            }
+            false => {
+                for is_unproved in [false, true] {
+                    disputed.remove_mut(&(is_unproved, Arc::clone(&before.name)));
+                }
+            }
+        }
+        match disputed.is_empty() {
+            true => {
+                self.disputed.remove_mut(&registration);
+            }
+            false => self.disputed.insert_mut(registration, disputed),
+        }
+    }
+
+    fn disputed_for(&self, registration: Incarnation) -> DisputedEntries {
+        let disputed = self.disputed.get(&registration);
+        disputed.cloned().unwrap_or_default()
+    }
+
+    fn insert(&mut self, entry: Arc<Entry>, is_proved: bool) {
+        let registration = entry.incarnation;
+        let holder = self.incarnations.get(&registration);
+        let holder = holder.filter(|(holder, _)| holder.name != entry.name);
+        let (loser, is_loser_proved) = match holder.cloned() {
+            None => {
                 self.incarnations
-                    .insert_mut(after.incarnation, Arc::clone(after));
+                    .insert_mut(registration, (entry, is_proved));
+                return;
             }
-        }
+            Some((holder, false)) if is_proved => {
+                self.incarnations
+                    .insert_mut(registration, (entry, is_proved));
+                (holder, false)
+            }
+            Some(_) => (entry, is_proved),
+        };
+        let mut disputed = self.disputed_for(registration);
+        let key = (!is_loser_proved, Arc::clone(&loser.name));
+        disputed.insert_mut(key, loser);
+        self.disputed.insert_mut(registration, disputed);
     }
 }
 
@@ -106,7 +182,8 @@ impl View for Snapshot {
     }
 
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.incarnations.get(&incarnation).cloned()
+        let (entry, _) = self.incarnations.get(&incarnation)?;
+        Some(Arc::clone(entry))
     }
 
     fn all(&self) -> Arc<[Arc<Entry>]> {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, UNIX_EPOCH};
 use fipa_sds::{
     Change, Directory, Entry, Exchange, ExchangeError, Mts, Present, Reach, Role, Source,
 };
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
 /// Time for which the simulated service tries to deliver a letter.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -40,6 +40,8 @@ struct World {
     random: fastrand::Rng,
     sent: usize,
     next: u64,
+    /// The proof of each gateway's links, and addresses of other gateways that it also lists.
+    proofs: Vec<(Mandate, Principal, Vec<Location>)>,
 }
 
 fn location(index: usize) -> Location {
@@ -62,6 +64,7 @@ impl World {
             random: fastrand::Rng::with_seed(seed),
             sent: 0,
             next: 1000,
+            proofs: vec![(Mandate::Unproved, Principal::Unproved, Vec::new()); count],
         }
     }
 
@@ -75,7 +78,15 @@ impl World {
             let others = (0..self.gateways.len()).filter(|other| self.connected(index, *other));
             let present: Vec<_> = others
                 .map(|other| {
-                    Present::unproved(self.gateways[other].mts.clone(), vec![location(other)])
+                    let (mandate, principal, also) = self.proofs[other].clone();
+                    let mut locations = vec![location(other)];
+                    locations.extend(also);
+                    Present {
+                        mts: self.gateways[other].mts.clone(),
+                        locations,
+                        mandate,
+                        principal,
+                    }
                 })
                 .collect();
             let now = self.now;
@@ -619,4 +630,262 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
     exchange.handle_neighbours(now, &crowd);
     let (known, _) = exchange.goodbye();
     assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
+}
+
+/// Three gateways with certificates, and a fourth one that sends false entries: names, registrations
+/// and addresses of the others, and the incarnations of their gateways.
+struct Besieged {
+    world: World,
+    liar: usize,
+    /// Whether the liar has a trusted certificate. If so, it may keep a name or a registration that
+    /// it was the first to claim.
+    is_certified: bool,
+    version: u64,
+    /// Agents of a gateway that another gateway has listed.
+    listed: BTreeMap<(usize, String), usize>,
+}
+
+impl Besieged {
+    fn new(seed: u64) -> Self {
+        let mut world = World::new(4, seed);
+        let liar = 3;
+        let is_certified = seed.is_multiple_of(2);
+        for (index, proof) in world.proofs.iter_mut().enumerate() {
+            let at = u8::try_from(index).unwrap();
+            *proof = match index == liar && !is_certified {
+                true => (Mandate::Unproved, Principal::Unproved, Vec::new()),
+                false => (
+                    Mandate::Certified([].into()),
+                    Principal::Certificate([at; 32]),
+                    Vec::new(),
+                ),
+            };
+        }
+        world.connect();
+        Self {
+            world,
+            liar,
+            is_certified,
+            version: 0,
+            listed: BTreeMap::new(),
+        }
+    }
+
+    fn honest(&mut self) -> usize {
+        self.world.random.usize(..self.liar)
+    }
+
+    fn act(&mut self) {
+        match self.world.random.u32(..12) {
+            0 => {
+                let (at, number) = (self.honest(), self.world.next);
+                self.world.join(at, &format!("agent_{number}"));
+            }
+            1 => {
+                let at = self.honest();
+                let name = self.world.gateways[at].agents.keys().next().cloned();
+                if let Some(name) = name {
+                    self.world.leave(at, &name);
+                }
+            }
+            2 => {
+                let (one, other) = (self.honest(), self.honest());
+                if one != other {
+                    self.world.cut = vec![(one.min(other), one.max(other))];
+                    self.world.connect();
+                    // Shorter than the time for which the agents are remembered.
+                    let ms = self.world.random.u64(1..4000);
+                    self.pass(Duration::from_millis(ms));
+                    self.world.cut.clear();
+                    self.world.connect();
+                }
+            }
+            3 => {
+                let other = self.honest();
+                let of_other = location(other);
+                let own = self.world.gateways[self.liar].mts.incarnation;
+                self.world.proofs[self.liar].2 = vec![of_other.with_incarnation(own)];
+                self.world.connect();
+            }
+            4 => {
+                let (at, other) = (self.honest(), self.honest());
+                let now = self.world.now;
+                self.world.gateways[at]
+                    .exchange
+                    .handle_silence(now, &location(other));
+            }
+            5 => {
+                let ms = self.world.random.u64(1..300);
+                self.pass(Duration::from_millis(ms));
+            }
+            _ => self.lie(),
+        }
+        self.check();
+    }
+
+    /// Passes time in small steps with a check after each.
+    fn pass(&mut self, time: Duration) {
+        let end = self.world.now + time;
+        while self.world.now < end {
+            let step = Duration::from_millis(50).min(end - self.world.now);
+            self.world.run(step);
+            if self.world.random.u32(..4) == 0 {
+                self.lie();
+            }
+            self.check();
+        }
+    }
+
+    /// The liar sends one letter to an honest gateway.
+    fn lie(&mut self) {
+        let at = self.honest();
+        self.version += 1;
+        let told = match self.world.random.u32(..8) {
+            0 => serde_json::json!("goodbye"),
+            1 => serde_json::json!("again"),
+            how => {
+                let count = self.world.random.usize(..4);
+                let agents: Vec<_> = (0..count).map(|_| self.entry(at)).collect();
+                let version = self.version;
+                match how {
+                    2 | 3 => serde_json::json!({ "changes": {
+                        "from": version - 1, "to": version, "agents": agents,
+                        "left": self.world.gateways[at].agents.keys().collect::<Vec<_>>() } }),
+                    _ => serde_json::json!({ "full": {
+                        "version": version, "first": true, "last": true, "agents": agents } }),
+                }
+            }
+        };
+        let content = serde_json::json!({ "version": 1, "tell": told }).to_string();
+        let from = self.world.gateways[self.liar].mts.incarnation;
+        let now = self.world.now;
+        let taken = self.world.gateways[at]
+            .exchange
+            .handle_letter(now, from, content.as_bytes());
+        // A gateway without a connection is a stranger; nothing else is wrong with the letters.
+        assert!(
+            matches!(taken, Ok(()) | Err(ExchangeError::Stranger)),
+            "{taken:?}"
+        );
+    }
+
+    /// A false entry for this gateway.
+    fn entry(&mut self, at: usize) -> serde_json::Value {
+        let honest: Vec<(String, Incarnation)> = self.world.gateways[..self.liar]
+            .iter()
+            .flat_map(|gateway| gateway.agents.values())
+            .filter(|entry| {
+                let known = self.world.gateways[at].exchange.directory();
+                !self.is_certified || known.known(&entry.name).is_some()
+            })
+            .map(|entry| (entry.name.to_string(), entry.incarnation))
+            .collect();
+        let random = &mut self.world.random;
+        let mut one = || match honest.is_empty() {
+            true => None,
+            false => Some(honest[random.usize(..honest.len())].clone()),
+        };
+        let (named, registered) = (one(), one());
+        let name = match random.u32(..3) {
+            0 => named.map(|(name, _)| name),
+            _ => None,
+        };
+        let id = match random.u32(..4) {
+            0 => Some(Incarnation::from_u64(random.u64(1..=self.liar as u64))),
+            1 => None,
+            _ => registered.map(|(_, id)| id),
+        };
+        let mut entry = serde_json::json!({
+            "name": name.unwrap_or_else(|| format!("liar_{}", random.u32(..4))),
+            "id": id.unwrap_or_else(|| Incarnation::from_u64(random.u64(1 << 40..))).to_string(),
+            "registered": 1,
+        });
+        if random.u32(..8) == 0 {
+            entry["coalition"] = serde_json::json!({ "members": ["liar_0"], "leader": "liar_0" });
+        }
+        entry
+    }
+
+    /// Agents that an honest gateway has listed at their own gateway stay there, and letters for
+    /// their registrations go there, until they leave.
+    fn check(&mut self) {
+        let world = &self.world;
+        self.listed.retain(|(_, name), owner| {
+            let agents = &world.gateways[*owner].agents;
+            agents.contains_key(name)
+        });
+        for at in 0..self.liar {
+            let known = world.gateways[at].exchange.directory();
+            let others = (0..self.liar).filter(|other| *other != at);
+            for (owner, agent) in
+                others.flat_map(|it| world.gateways[it].agents.values().map(move |of| (it, of)))
+            {
+                let is_owners = |entry: &Arc<Entry>| entry.mts.incarnation == agent.mts.incarnation;
+                let key = (at, agent.name.to_string());
+                let holder = known.known(&agent.name);
+                if holder.as_ref().is_some_and(is_owners) {
+                    let registered = known.known_incarnation(agent.incarnation);
+                    assert_eq!(registered, holder, "the registration of another agent");
+                    self.listed.insert(key, owner);
+                } else if self.listed.contains_key(&key) {
+                    panic!(
+                        "{} of {owner} has vanished from {at}: {holder:?}",
+                        agent.name
+                    );
+                }
+            }
+            // The directory of its host has its own incarnation.
+            let others = world.gateways[..self.liar].iter().enumerate();
+            let others = others.filter(|(other, _)| *other != at);
+            let gateways: Vec<_> = others.map(|(_, it)| it.mts.incarnation).collect();
+            for entry in known.entries().iter() {
+                let is_gateways = gateways.contains(&entry.incarnation);
+                assert!(
+                    !is_gateways,
+                    "{} has the incarnation of a gateway",
+                    entry.name
+                );
+            }
+        }
+    }
+
+    /// In the end, every honest gateway has the agents of the others.
+    fn finish(&mut self) {
+        for _ in 0..40 {
+            self.pass(Duration::from_millis(500));
+        }
+        for at in 0..self.liar {
+            let known = self.world.gateways[at].exchange.directory();
+            for owner in (0..self.liar).filter(|owner| *owner != at) {
+                for agent in self.world.gateways[owner].agents.values() {
+                    let holder = known.known(&agent.name);
+                    let holder = holder.map(|entry| entry.mts.incarnation);
+                    assert_eq!(
+                        holder,
+                        Some(agent.mts.incarnation),
+                        "{} at {at}",
+                        agent.name
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// `FIPA_EXCHANGE_SEEDS` is the number of seeds, `FIPA_EXCHANGE_SEED` is a single one.
+#[test]
+fn a_neighbor_that_lies_neither_removes_nor_takes_over_agents_of_others() {
+    let number = |name: &str| std::env::var(name).ok()?.parse::<u64>().ok();
+    let seeds = match number("FIPA_EXCHANGE_SEED") {
+        Some(seed) => seed..seed + 1,
+        None => 0..number("FIPA_EXCHANGE_SEEDS").unwrap_or(10),
+    };
+    for seed in seeds {
+        println!("seed {seed}");
+        let mut besieged = Besieged::new(seed);
+        for _ in 0..120 {
+            besieged.act();
+        }
+        besieged.finish();
+    }
 }

@@ -67,8 +67,13 @@ impl Bench {
 
     /// The gateway sends its list of agents, each with this time of registration.
     fn tell(&mut self, gateway: u64, agents: &[&str], registered: u64) {
+        self.tell_as(gateway, agent_of(gateway), agents, registered);
+    }
+
+    /// The gateway sends its list of agents, each with this registration.
+    fn tell_as(&mut self, gateway: u64, id: Incarnation, agents: &[&str], registered: u64) {
         self.versions += 1;
-        let (version, id) = (self.versions, agent_of(gateway));
+        let version = self.versions;
         let agents: Vec<String> = agents
             .iter()
             .map(|name| format!(r#"{{"name":"{name}","id":"{id}","registered":{registered}}}"#))
@@ -201,6 +206,63 @@ fn without_proof_the_earlier_registration_has_the_name() {
     assert!(bench.exchange.directory().contested().is_empty());
 }
 
+#[test]
+fn a_registration_that_another_neighbor_claims_stays_with_its_agent() {
+    let mut bench = Bench::new(vec![
+        present(1, certified(&[])),
+        present(2, certified(&["crex", "drex"])),
+        present(3, Mandate::Unproved),
+    ]);
+    let directory = bench.exchange.directory();
+    let agent = || Some(directory.known_incarnation(agent_of(1))?.name.to_string());
+    // Without proof, a claim counts only until that of a certificate.
+    bench.tell_as(3, agent_of(1), &["stray"], 0);
+    assert_eq!(agent().as_deref(), Some("stray"));
+    bench.tell(1, &["rover"], 5);
+    assert_eq!(agent().as_deref(), Some("rover"));
+    for claimed in [&["crex", "drex"][..], &["drex"], &[]] {
+        bench.tell_as(2, agent_of(1), claimed, 0);
+        assert_eq!(agent().as_deref(), Some("rover"), "{claimed:?}");
+    }
+    // The agent is updated.
+    bench.tell_as(2, agent_of(1), &["crex"], 0);
+    bench.tell(1, &["rover"], 9);
+    assert_eq!(agent().as_deref(), Some("rover"));
+    bench.tell(1, &[], 0);
+    assert_eq!(agent().as_deref(), Some("crex"), "the proved claim");
+    bench.tell(2, &[], 0);
+    assert_eq!(agent().as_deref(), Some("stray"));
+    bench.tell(3, &[], 0);
+    assert_eq!(agent(), None);
+}
+
+#[test]
+fn no_agent_has_the_incarnation_of_a_connected_gateway() {
+    let mut bench = Bench::new(vec![present(1, certified(&[])), present(2, certified(&[]))]);
+    bench.tell_as(2, Incarnation::from_u64(1), &["crex"], 0);
+    assert_eq!(bench.holder("crex"), None);
+    bench.tell(2, &["crex"], 0);
+    assert_eq!(bench.holder("crex"), Some(2));
+}
+
+/// Every gateway chooses the addresses that it lists.
+#[test]
+fn a_gateway_that_lists_the_address_of_another_does_not_replace_it() {
+    let liar = Present {
+        locations: vec![location(2), location(1)],
+        ..present(2, certified(&[]))
+    };
+    let mut bench = Bench::new(vec![present(1, certified(&[])), liar]);
+    bench.tell(1, &["rover"], 5);
+    bench.tell(2, &["crex"], 5);
+    assert!(!bench.exchange.handle_silence(bench.now, &location(1)));
+    bench.neighbours.remove(0);
+    bench.connect();
+    assert_eq!(bench.holder("rover"), Some(1), "remembered for a while");
+    bench.exchange.handle_timeout(bench.now + Exchange::MEMORY);
+    assert_eq!(bench.holder("rover"), None);
+}
+
 /// A view of unproved entries, listed first, and those of neighbors.
 fn merged(bench: &Bench, unproved: Arc<dyn Directory>) -> MergedDirectory {
     MergedDirectory::new(vec![unproved, bench.exchange.directory()])
@@ -236,6 +298,17 @@ fn in_a_merged_view_proved_entries_come_first() {
     // A merged view of merged views has the same result.
     let outer = MergedDirectory::new(vec![heard("rover", 67, 7), Arc::new(view)]);
     assert!(is_proved(&outer));
+}
+
+#[test]
+fn in_a_merged_view_an_unproved_entry_takes_no_registration_of_a_proved_one() {
+    let mut bench = Bench::new(vec![present(1, certified(&[]))]);
+    let view = merged(&bench, heard("crex", 66, agent_of(1).as_u64()));
+    let agent = || Some(view.known_incarnation(agent_of(1))?.name.to_string());
+    assert_eq!(agent().as_deref(), Some("crex"));
+    bench.tell(1, &["rover"], 9);
+    assert_eq!(agent().as_deref(), Some("rover"));
+    assert!(view.known("crex").is_some(), "the name is free");
 }
 
 #[test]

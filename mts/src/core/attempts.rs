@@ -494,12 +494,18 @@ impl AttemptTable {
         });
     }
 
-    /// Resolves the receiver of a stream, if it is in the view of the directory.
+    /// Resolves the receiver of a stream, if it is in the view of the directory. Another host may
+    /// announce an agent with this registration under another name, which is not the receiver.
     pub(crate) fn receiver(&self, registration: Incarnation, name: &str) -> Option<Arc<Entry>> {
-        self.view.registered(registration).or_else(|| {
-            let nameless = registration == registration_by_name(name);
-            let entry = nameless.then(|| self.view.named(name)).flatten();
-            entry.filter(|entry| !entry.incarnation.is_known())
+        let registered = self.view.registered(registration);
+        let registered = registered.filter(|entry| *entry.name == *name);
+        registered.or_else(|| {
+            let entry = self.view.named(name)?;
+            let is_meant = match entry.incarnation.is_known() {
+                true => entry.incarnation == registration,
+                false => registration == registration_by_name(name),
+            };
+            is_meant.then_some(entry)
         })
     }
 

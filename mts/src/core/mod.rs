@@ -937,13 +937,13 @@ impl Core {
     /// to be it and is connected, or if its incarnation is that of another principal's agent.
     #[must_use]
     pub fn accepts(&self, peer: &Introduction) -> bool {
-        self.principals.accepts(peer)
+        self.principals.accepts(peer, &*self.table.view)
     }
 
     /// Handles the introduction of a service on a connection. Its incarnation now belongs to the
     /// principal that the link proves, and failed routes to it may work again.
     pub fn handle_introduced(&mut self, now: Now, peer: &Introduction) {
-        self.principals.introduced(peer);
+        self.principals.introduced(peer, &*self.table.view);
         let service = peer.hop.location.incarnation();
         if service.is_known() {
             self.handle_reachable(now, Some(service));

@@ -58,9 +58,9 @@ pub(super) enum PrincipalError {
 impl Principals {
     /// Handles the introduction of a service on a connection. The service keeps its principal while
     /// it is connected; afterwards, a service of the same name may have renewed its certificate.
-    pub(super) fn introduced(&mut self, peer: &Introduction) {
+    pub(super) fn introduced(&mut self, peer: &Introduction, view: &dyn View) {
         let incarnation = peer.hop.location.incarnation();
-        if !peer.hop.is_remote() || !incarnation.is_known() || !self.accepts(peer) {
+        if !peer.hop.is_remote() || !incarnation.is_known() || !self.accepts(peer, view) {
             return;
         }
         let service = Service {
@@ -81,7 +81,7 @@ impl Principals {
     }
 
     /// Whether the peer may be the service that it claims to be.
-    pub(super) fn accepts(&self, peer: &Introduction) -> bool {
+    pub(super) fn accepts(&self, peer: &Introduction, view: &dyn View) -> bool {
         let incarnation = peer.hop.location.incarnation();
         if !peer.hop.is_remote() || !incarnation.is_known() {
             return true;
@@ -95,7 +95,23 @@ impl Principals {
         }
         // The registration of an agent of another principal, which has written before.
         let of_others = |owner: &Option<Principal>| *owner != Some(principal);
-        !self.senders.get(&incarnation).is_some_and(of_others)
+        if self.senders.get(&incarnation).is_some_and(of_others) {
+            return false;
+        }
+        // The registration of an agent that the directory lists at a gateway of another principal.
+        let Some(agent) = view.registered(incarnation) else {
+            return true;
+        };
+        match agent.reach {
+            _ if agent.role != Role::Agent => true,
+            Reach::Local => false,
+            Reach::Remote { gateway } => {
+                let owner = self.services.get(&gateway).map(|it| it.principal);
+                // A claim without proof refuses no certificate.
+                let owner = owner.filter(|owner| *owner != Principal::Unproved);
+                owner.is_none_or(|owner| owner == principal)
+            }
+        }
     }
 
     /// Handles the end of a connection with this service.
@@ -254,27 +270,27 @@ mod tests {
     #[test]
     fn a_connected_service_keeps_its_principal() {
         let mut principals = Principals::default();
-        principals.introduced(&peer("rover", ROVER));
-        principals.introduced(&peer("crex", CREX));
-        principals.introduced(&peer("rover", CREX));
+        principals.introduced(&peer("rover", ROVER), &no_agents());
+        principals.introduced(&peer("crex", CREX), &no_agents());
+        principals.introduced(&peer("rover", CREX), &no_agents());
         assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
         let other = principals.check_service(&hop(SERVICE, CREX));
         assert_eq!(other, Err(PrincipalError::Service));
         // The end of the impostor's connection changes nothing.
         principals.parted(&peer("rover", CREX));
-        principals.introduced(&peer("rover", CREX));
+        principals.introduced(&peer("rover", CREX), &no_agents());
         assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
     }
 
     #[test]
     fn a_certificate_can_be_renewed_under_the_same_name_only() {
         let mut principals = Principals::default();
-        principals.introduced(&peer("rover", ROVER));
+        principals.introduced(&peer("rover", ROVER), &no_agents());
         principals.parted(&peer("rover", ROVER));
-        principals.introduced(&peer("crex", CREX));
+        principals.introduced(&peer("crex", CREX), &no_agents());
         let other = principals.check_service(&hop(SERVICE, CREX));
         assert_eq!(other, Err(PrincipalError::Service));
-        principals.introduced(&peer("rover", CREX));
+        principals.introduced(&peer("rover", CREX), &no_agents());
         assert_eq!(principals.check_service(&hop(SERVICE, CREX)), Ok(()));
     }
 
@@ -297,12 +313,13 @@ mod tests {
     #[test]
     fn the_number_of_services_is_bounded() {
         let mut principals = Principals::default();
+        let directory = no_agents();
         for service in 0..2 * MAX_SERVICES as u64 {
             let peer = Introduction {
                 hop: hop(1000 + service, ROVER),
                 ..peer("rover", ROVER)
             };
-            principals.introduced(&peer);
+            principals.introduced(&peer, &directory);
             principals.parted(&peer);
         }
         assert_eq!(principals.services.len(), MAX_SERVICES);

@@ -31,7 +31,7 @@ pub use directory::ExchangeDirectory;
 use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
-use crate::{Entry, Mts, Reach, Role, Source};
+use crate::{Directory as _, Entry, Mts, Reach, Role, Source};
 
 /// Ontology of the letters of the exchange.
 pub const EXCHANGE_ONTOLOGY: &str = "fipa-sds-exchange";
@@ -300,10 +300,10 @@ impl Exchange {
     }
 
     /// Ends disconnected gateways that another incarnation has replaced: a gateway that was killed
-    /// and restarted listens at the same address, or has the same certificate and name. Its agents are those that the new incarnation
-    /// sends, and letters in the custody of the old one are lost. Entries of a gateway that is
-    /// connected and answers stay: two gateways behind one address translator have the same
-    /// location.
+    /// and restarted listens at the same address, or has the same certificate and name. Its agents
+    /// are those that the new incarnation sends, and letters in the custody of the old one are lost.
+    /// Entries of a gateway that is connected and answers stay: two gateways behind one address
+    /// translator have the same location.
     fn end_replaced(&mut self) {
         let gone = self.neighbors.iter().filter(|(_, old)| old.gone.is_some());
         let replaced = gone.filter(|(gateway, old)| {
@@ -316,12 +316,16 @@ impl Exchange {
     }
 
     /// Whether another connected gateway accepts letters at one of these locations and has sent its
-    /// agents.
+    /// agents. Any gateway may list any address, so only the same certificate replaces a gateway
+    /// with a certificate.
     fn is_replaced(&self, gateway: Incarnation, locations: &[Location]) -> bool {
+        let principal = self.neighbors.get(&gateway).map(|old| old.principal);
+        let certificate = principal.filter(|it| matches!(it, Principal::Certificate(_)));
         let mut others = self.neighbors.iter();
         others.any(|(other, new)| {
             let tells = new.gone.is_none() && new.stored.is_some();
-            *other != gateway && tells && new.is_at_one_of(locations)
+            let may = certificate.is_none_or(|certificate| new.principal == certificate);
+            *other != gateway && tells && may && new.is_at_one_of(locations)
         })
     }
 
@@ -355,13 +359,18 @@ impl Exchange {
         if content.len() > Self::MAX_CONTENT {
             return Err(ExchangeError::TooLarge(content.len()));
         }
-        let Some(neighbor) = self.neighbors.get_mut(&from) else {
+        if !self.neighbors.contains_key(&from) {
             if self.early.len() < Self::MAX_NEIGHBOURS {
                 self.early.insert(from);
             }
             return Err(ExchangeError::Stranger);
+        }
+        let mut message = wire::decode(content)?;
+        self.keep_services(from, &mut message);
+        let Some(neighbor) = self.neighbors.get_mut(&from) else {
+            return Err(ExchangeError::Stranger);
         };
-        match wire::decode(content)? {
+        match message {
             ExchangeMessage::Again => {
                 neighbor.state = SyncState::nothing();
                 if let Some(under_way) = &mut neighbor.under_way {
@@ -387,6 +396,26 @@ impl Exchange {
                 neighbor.handle_changes(now, changes, &self.directory)
             }
         }
+    }
+
+    /// Removes agents whose registration is the incarnation of another connected gateway: letters
+    /// for that gateway would go to the agent, and its own letters would be refused. An agent that
+    /// was listed before that gateway connected stays.
+    fn keep_services(&self, from: Incarnation, message: &mut ExchangeMessage) {
+        let agents = match message {
+            ExchangeMessage::Full(full) => &mut full.agents,
+            ExchangeMessage::Changes(changes) => &mut changes.agents,
+            ExchangeMessage::Again | ExchangeMessage::Goodbye => return,
+        };
+        agents.retain(|agent| {
+            let is_service =
+                agent.incarnation != from && self.neighbors.contains_key(&agent.incarnation);
+            let is_listed = || {
+                let known = self.directory.known_incarnation(agent.incarnation);
+                known.is_some_and(|known| known.mts.incarnation == from)
+            };
+            !is_service || is_listed()
+        });
     }
 
     /// Handles the result of the letter in flight to this neighbor.
