@@ -860,7 +860,7 @@ impl<A: Algorithm> Locks<A> {
                 .is_some_and(|current| matches!(current.phase, Phase::Discovering { .. }));
             let act = match &entry.owned {
                 Some(owned) if owned.claim_until.is_some() => Some(Act::Query { claim: true }),
-                Some(_) => Some(Act::Owned),
+                Some(_) => (dialect == Dialect::Own).then_some(Act::Owned),
                 None => discovering.then_some(Act::Query { claim: false }),
             };
             if let Some(act) = act {
@@ -1281,7 +1281,13 @@ impl<A: Algorithm> Locks<A> {
             resource: resource.clone(),
         }));
         let conversation = self.side_conversation("discover", now);
-        let members: Vec<_> = self.members.keys().cloned().collect();
+        // Agents of `distributed_locking` accept no announcement, only answers.
+        let members: Vec<_> = self
+            .members
+            .iter()
+            .filter(|(_, member)| member.dialect == Dialect::Own)
+            .map(|(peer, _)| peer.clone())
+            .collect();
         for member in members {
             self.send(member, resource, conversation.clone(), Act::Owned, out);
         }

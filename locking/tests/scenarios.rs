@@ -644,3 +644,35 @@ fn a_peer_with_many_requests_takes_bounded_memory() {
         assert!(state < 4 << 20, "{kind}: {state} bytes");
     }
 }
+
+/// `distributed_locking` treats a second request in a conversation, and an announcement without a question, as
+/// an error of the protocol.
+#[test]
+fn legacy_agents_get_neither_repetitions_nor_announcements() {
+    for kind in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+        let mut agent = Agent::new("agent2", kind);
+        agent.locks.join(0, &peer("agent1"), LEGACY, &mut agent.out);
+        agent.locks.join(0, &peer("agent3"), OWN, &mut agent.out);
+        agent.receive("agent1", LEGACY, "agent2_discover_0", Act::Owned);
+        agent.lock(None);
+        let first = agent.sent();
+        assert_eq!(first.len(), 2, "{first:?}");
+        agent.pass(1_500);
+        let repeated = agent.sent();
+        // The token is the owner's, so no other agent needs a repetition.
+        let expected = if kind.has_token() { 0 } else { 1 };
+        assert_eq!(repeated.len(), expected, "{repeated:?}");
+        assert!(repeated.iter().all(|(receiver, ..)| receiver == "agent3"));
+    }
+    let mut owner = Agent::owner("agent1", Kind::default(), &[]);
+    owner
+        .locks
+        .join(owner.now, &peer("agent2"), LEGACY, &mut owner.out);
+    assert_eq!(owner.sent(), []);
+    owner
+        .locks
+        .join(owner.now, &peer("agent3"), OWN, &mut owner.out);
+    assert!(matches!(&owner.sent()[..], [(to, _, Act::Owned)] if to == "agent3"));
+    owner.receive("agent2", LEGACY, "agent2_0", Act::Query { claim: false });
+    assert_eq!(owner.sent(), [to("agent2", "agent2_0", Act::Owned)]);
+}

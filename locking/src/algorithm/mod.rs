@@ -134,6 +134,12 @@ impl Context<'_> {
             .get(peer)
             .map_or(Dialect::Legacy, |member| member.dialect)
     }
+
+    /// Whether a request to an agent is repeated. Agents of `distributed_locking` treat a second request
+    /// in a conversation as an error; their letters are not lost while they run.
+    fn accepts_repetition(&self, peer: &Peer) -> bool {
+        self.dialect(peer) == Dialect::Own
+    }
 }
 
 /// Result of a call of an algorithm.

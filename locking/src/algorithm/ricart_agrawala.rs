@@ -205,11 +205,13 @@ impl Algorithm for RicartAgrawala {
         }
     }
 
-    fn repeat(&mut self, _: &Context<'_>, out: &mut Vec<Step>) {
+    fn repeat(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
         if let Some(own) = &self.own
             && self.extended
         {
-            out.extend(own.awaited.iter().map(|peer| Self::ask(own, peer)));
+            let repeatable = |peer: &&Peer| context.accepts_repetition(peer);
+            let awaited = own.awaited.iter().filter(repeatable);
+            out.extend(awaited.map(|peer| Self::ask(own, peer)));
         }
     }
 

@@ -471,6 +471,7 @@ impl Algorithm for SuzukiKasami {
             && !own.entered
         {
             let owner = context.owner.filter(|owner| **owner != self.me);
+            let owner = owner.filter(|owner| context.accepts_repetition(owner));
             out.extend(owner.map(|owner| self.ask(own, owner)));
         }
     }
