@@ -216,7 +216,7 @@ impl Core {
             let wait = until.saturating_duration_since(now.instant);
             tracing::info!(
                 receiver = %entry.name,
-                ?wait,
+                wait_ms = u64::try_from(wait.as_millis()).unwrap_or(u64::MAX),
                 "letters wait until the legacy peer has found their sender by mDNS"
             );
         }
