@@ -711,17 +711,20 @@ mod tls {
         }
         drop(record);
         // The certificate of the platform names one agent, and its letters are of that one.
-        theirs
-            .send(0, ours.location(), letter(0, "echo@jade"))
-            .unwrap();
-        assert_eq!(theirs.conclusion(0), Conclusion::Handed);
+        // Its own directory facilitator needs no mention.
+        for (number, sender) in [(0, "echo@jade"), (2, "df@jade")] {
+            theirs
+                .send(number, ours.location(), letter(number, sender))
+                .unwrap();
+            assert_eq!(theirs.conclusion(number), Conclusion::Handed);
+        }
         theirs
             .send(1, ours.location(), letter(1, "brake@jade"))
             .unwrap();
         let (kind, text) = failure(theirs.conclusion(1));
         assert_eq!(kind, TransportErrorKind::Refused);
         assert!(text.contains("403"), "{text}");
-        assert_eq!(ours.sink.record.lock().unframed.len(), 1);
+        assert_eq!(ours.sink.record.lock().unframed.len(), 2);
     }
 
     #[test]
