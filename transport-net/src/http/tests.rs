@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 use fipa_acl::{Envelope, Message, Performative};
+use fipa_transport::Kind;
 use proptest::prelude::*;
 
 use super::letter;
