@@ -165,9 +165,25 @@ pub struct Transports {
     /// `[transport.http]`: letters of platforms such as JADE, and to them. With
     /// [`Security::keys`], only of [`Security::legacy_peers`].
     pub http: Listen,
+    /// `[transport.https]`: the same over TLS; needs [`Security::keys`].
+    pub https: Https,
     /// `[transport.udt]`; for legacy peers only. With [`Security::keys`], letters are exchanged only
     /// with the addresses in [`Security::legacy_peers`].
     pub udt: Listen,
+}
+
+/// `[transport.https]`: letters of platforms such as JADE, and to them, over TLS.
+///
+/// A platform proves its identity with a certificate that `fipa keys trust` trusts, or, when the gateway
+/// sends to it, with a certificate for the host name in its address from one of the authorities. Letters of a
+/// platform without a trusted certificate are accepted only from [`Security::legacy_peers`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Https {
+    /// `listen`: the addresses on which the gateway listens; see [`Listen::listen`].
+    pub listen: Vec<String>,
+    /// `authorities`: the file with the certificates of the authorities, as PEM; empty for none.
+    pub authorities: String,
 }
 
 /// `[transport.shm]`: shared memory.
@@ -442,9 +458,13 @@ impl Config {
                 },
                 udp: loopback.clone(),
                 quic: loopback.clone(),
-                udt: loopback,
+                udt: loopback.clone(),
                 http: Listen {
                     listen: vec!["127.0.0.1:7778".to_owned()],
+                },
+                https: Https {
+                    listen: loopback.listen.clone(),
+                    authorities: String::new(),
                 },
             },
             discovery: Discovery {

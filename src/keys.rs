@@ -580,3 +580,19 @@ fn only(file: &Path, pem: &[u8]) -> Result<Certificate, KeysError> {
 fn to_pem(certificate: &Certificate) -> String {
     pem::encode(&pem::Pem::new("CERTIFICATE", certificate.der().to_vec()))
 }
+
+/// Reads the certificates of authorities from a file in PEM. An empty path is none.
+///
+/// # Errors
+/// If the file cannot be read, or contains something else.
+#[cfg(feature = "http")]
+pub(crate) fn authorities(file: &Path) -> Result<fipa_transport_net::Authorities, KeysError> {
+    if file.as_os_str().is_empty() {
+        return Ok(fipa_transport_net::Authorities::default());
+    }
+    let text = read(file)?;
+    let certificates: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&text).collect();
+    let certificates = certificates.map_err(|error| contents(file, &error))?;
+    let authorities = fipa_transport_net::Authorities::new(certificates);
+    authorities.map_err(|error| contents(file, &error))
+}

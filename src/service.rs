@@ -317,6 +317,8 @@ fn transports(
             },
             #[cfg(feature = "http")]
             Kind::Http => http(config, role, &maintenance.dir, incarnation, handle),
+            #[cfg(all(feature = "http", feature = "secure"))]
+            Kind::Https => https(config, role, &maintenance.dir, incarnation, handle),
             #[cfg(feature = "udt")]
             Kind::Udt => udt(config, role, &maintenance.dir, incarnation, handle),
             // One configuration serves all processes of a robot; their features may differ.
@@ -472,6 +474,31 @@ fn http(
         security: role.security.clone(),
     };
     Ok(Arc::new(HttpTransport::new(config, handle.clone())))
+}
+
+#[cfg(all(feature = "http", feature = "secure"))]
+fn https(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{HttpConfig, HttpTransport};
+    let Some(security) = &role.security else {
+        return Err("https needs keys (security.keys)".to_owned());
+    };
+    let settings = &config.transport.https;
+    let authorities = crate::keys::authorities(settings.authorities.as_ref());
+    let authorities = authorities.map_err(|error| ErrorChain(&error).to_string())?;
+    let config = HttpConfig {
+        listen: settings.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: stream_limits(config),
+        security: Some(security.clone()),
+    };
+    let transport = HttpTransport::over_tls(config, security.clone(), authorities, handle.clone());
+    Ok(Arc::new(transport))
 }
 
 #[cfg(feature = "udt")]

@@ -348,3 +348,103 @@ fn an_agent_that_no_directory_lists_is_reached_at_a_stated_address() {
     let error = run(send("echo@else", "tcp://127.0.0.1:9", &[])).failed(2);
     assert!(error.contains("is no address of a legacy peer"), "{error}");
 }
+
+/// Returns a request of JADE with this message.
+fn posted(message: &str, to: &str, http: &str, from: &str) -> Vec<u8> {
+    let id = |name: &str, at: &str| {
+        format!(
+            "<agent-identifier><name>{name}</name><addresses><url>http://{at}/acc</url></addresses>\
+             </agent-identifier>"
+        )
+    };
+    let (to, from) = (id(to, http), id("ams@jadetest", from));
+    let body = format!(
+        "--b\r\nContent-Type: application/xml\r\n\r\n<?xml version=\"1.0\"?><envelope><params index=\"1\">\
+         <to>{to}</to><from>{from}</from><acl-representation>fipa.acl.rep.string.std</acl-representation>\
+         <date>20260101Z000000000</date><intended-receiver>{to}</intended-receiver></params></envelope>\
+         \r\n--b\r\nContent-Type: application/text\r\n\r\n{message}\r\n--b--\r\n"
+    );
+    let head = format!(
+        "POST http://{http}/acc HTTP/1.1\r\nContent-Type: multipart/mixed ; boundary=\"b\"\r\n\
+         Content-Length: {}\r\n\r\n",
+        body.len()
+    );
+    [head, body].concat().into_bytes()
+}
+
+/// Returns the recorded answer of JADE to a request, as the answer to this message.
+fn recorded_answer(name: &str, request: &Message) -> String {
+    let all = include_str!("../../platform/tests/vectors/jade_ams_df.txt");
+    let (_, exchange) = all.split_once(&format!("=== {name}\n")).unwrap();
+    let (_, answer) = exchange.split_once("\n---\n").unwrap();
+    let answer = answer.split("\n=== ").next().unwrap();
+    // The name of a slot is followed by its value, and both by blanks.
+    let mut words = answer.split_whitespace();
+    let mut value = |slot: &str| {
+        words
+            .find(|it| *it == slot)
+            .and_then(|_| words.next())
+            .unwrap()
+    };
+    let (reference, conversation) = (value(":in-reply-to"), value(":conversation-id"));
+    let slot = |slot: &str, value: Option<&str>| {
+        value.map_or_else(String::new, |value| format!("{slot} {value}"))
+    };
+    let replaced = answer
+        .replace("rusty@rustap", request.sender().unwrap().name())
+        .replace(
+            &format!(":in-reply-to  {reference}"),
+            &slot(":in-reply-to", request.reply_with()),
+        );
+    let (head, _) = replaced
+        .rsplit_once(&format!(":conversation-id  {conversation}"))
+        .unwrap();
+    format!(
+        "{head}{})",
+        slot(":conversation-id", request.conversation_id())
+    )
+}
+
+#[test]
+fn the_agents_of_a_platform_are_listed_by_its_address_alone() {
+    let host = Host::new();
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    let (_gateway, http) = gateway(&host, &[]);
+    let answers = {
+        let (platform, here) = (platform.try_clone().unwrap(), here.clone());
+        thread::spawn(move || {
+            let post = |request: &Message, message: &str| {
+                let to = request.sender().unwrap().name().to_owned();
+                post(&posted(message, &to, &http, &here), &http);
+            };
+            // An agent that the platform does not have.
+            let unknown = accept(&platform);
+            let conversation = unknown.conversation_id().unwrap();
+            let failure = format!(
+                "(FAILURE :sender (agent-identifier :name ams@jadetest :addresses (sequence http://{here}/acc)) \
+                 :receiver (set (agent-identifier :name {})) :content \"( (action (agent-identifier :name x) \
+                 (ACLMessage)) (MTS-error (agent-identifier :name {}) (internal-error \\\"Agent not found\\\")))\" \
+                 :language fipa-sl :ontology fipa-agent-management :conversation-id {conversation})",
+                unknown.sender().unwrap().name(),
+                unknown.receivers()[0].name(),
+            );
+            post(&unknown, &failure);
+            for name in ["ams_get_description", "ams_search_all"] {
+                let request = accept(&platform);
+                assert_eq!(request.receivers()[0].name(), "ams@jadetest");
+                post(&request, &recorded_answer(name, &request));
+            }
+        })
+    };
+    let address = format!("http://{here}/acc");
+    let listed = host.run(&["agents", "--platform", &address, "--json", ".*@jadetest"]);
+    let listed = listed.done_json();
+    answers.join().unwrap();
+    assert_eq!(listed["ams"], "ams@jadetest");
+    assert_eq!(listed["platform"]["name"], "jadetest");
+    let names = listed["agents"].as_array().unwrap().iter();
+    let mut names: Vec<&str> = names.map(|it| it["name"].as_str().unwrap()).collect();
+    names.sort_unstable();
+    assert_eq!(names, ["ams@jadetest", "df@jadetest", "echo@jadetest"]);
+}

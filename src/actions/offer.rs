@@ -106,6 +106,29 @@ impl Action {
         self.options.gate = Some(Box::new(admits) as Gate);
         self
     }
+
+    /// Requires the fence of a lock, and admits the fences of one owner for one resource, from the
+    /// highest that was admitted on. A holder that was stopped or cut off, and whose lock went to another
+    /// one that has sent a goal since, is refused. If this agent owns the resource, call
+    /// [`Owned::admit`](crate::locks::Owned::admit) in the check of [`fenced`](Self::fenced) instead, which
+    /// refuses a fence as soon as its lock ends.
+    ///
+    /// ```
+    /// use fipa::actions::Action;
+    /// use fipa::locks::Admission;
+    ///
+    /// # fn example() -> Result<(), Box<dyn std::error::Error>> {
+    /// let dock = Action::new("dock").fenced_by(Admission::new("crane", "bay")?);
+    /// # Ok(())
+    /// # }
+    /// ```
+    #[cfg(feature = "locks")]
+    pub fn fenced_by(self, mut admission: crate::locks::Admission) -> Self {
+        self.fenced(move |text| {
+            let fence = text.parse::<crate::locks::Fence>();
+            fence.is_ok_and(|fence| admission.admit(&fence))
+        })
+    }
 }
 
 /// The error of [`Agent::offer`].

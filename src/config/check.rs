@@ -116,6 +116,10 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
         &config.transport.http.listen,
     );
     found.listen(
+        &["transport", "https", "listen"],
+        &config.transport.https.listen,
+    );
+    found.listen(
         &["transport", "udt", "listen"],
         &config.transport.udt.listen,
     );
@@ -208,6 +212,13 @@ impl Findings {
                 &["mts", "transports"],
                 "lists quic, which needs keys",
                 "make keys (`fipa keys init`) and set security.keys, or remove quic",
+            );
+        }
+        if !has_keys && config.mts.transports.contains(&Kind::Https) {
+            self.combined(
+                &["mts", "transports"],
+                "lists https, which needs keys",
+                "make keys (`fipa keys init`) and set security.keys, or remove https",
             );
         }
         if has_keys || security.insecure {
@@ -541,14 +552,14 @@ impl Findings {
                 format_args!("lists {location}, which works only within one host"),
                 "write for example tcp://10.0.0.2:7788",
             );
-        } else if kind == Kind::Http {
+        } else if kind.is_http() {
             // The port is optional.
             let authority = location.authority();
             if !has_port(authority) && !has_port(&format!("{authority}:7778")) {
                 self.add(
                     path,
                     format_args!("lists {location}, which has no host or a wrong port"),
-                    "write for example http://10.0.0.7:7778/acc",
+                    format!("write for example {kind}://10.0.0.7:7778/acc"),
                 );
             }
         } else if !has_port(location.address()) {

@@ -173,6 +173,20 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.transport.http.listen),
     },
     Key {
+        path: &["transport", "https", "listen"],
+        shape: Shape::List,
+        expected: ADDRESSES,
+        write: |config, value| addresses(value).map(|all| config.transport.https.listen = all),
+        read: |config| Value::list(&config.transport.https.listen),
+    },
+    Key {
+        path: &["transport", "https", "authorities"],
+        shape: Shape::Text,
+        expected: r#"a file such as "/etc/ssl/certs/ca-certificates.crt", or "" for none"#,
+        write: |config, value| text(value).map(|file| config.transport.https.authorities = file),
+        read: |config| Value::Text(config.transport.https.authorities.clone()),
+    },
+    Key {
         path: &["transport", "udt", "listen"],
         shape: Shape::List,
         expected: ADDRESSES,

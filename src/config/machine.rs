@@ -61,6 +61,7 @@ fn interfaces(config: &Config, found: &mut Vec<Finding>) {
         ("udp", &transport.udp.listen),
         ("quic", &transport.quic.listen),
         ("http", &transport.http.listen),
+        ("https", &transport.https.listen),
         ("udt", &transport.udt.listen),
     ] {
         for address in listen {

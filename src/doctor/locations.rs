@@ -10,19 +10,21 @@ const LOCATIONS: &str = "locations";
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let transport = &config.transport;
-    let listens: [(Kind, &[String]); 5] = [
+    let listens: [(Kind, &[String]); 6] = [
         (Kind::Tcp, &transport.tcp.listen),
         (Kind::Udp, &transport.udp.listen),
         (Kind::Quic, &transport.quic.listen),
         (Kind::Http, &transport.http.listen),
+        (Kind::Https, &transport.https.listen),
         (Kind::Udt, &transport.udt.listen),
     ];
     let used = |kind| config.mts.transports.contains(&kind);
     let built = |kind| {
         let lacks_quic = kind == Kind::Quic && !cfg!(feature = "quic");
-        let lacks_http = kind == Kind::Http && !cfg!(feature = "http");
+        let lacks_http = kind.is_http() && !cfg!(feature = "http");
+        let lacks_tls = kind == Kind::Https && !cfg!(feature = "secure");
         let lacks_udt = kind == Kind::Udt && !cfg!(feature = "udt");
-        !lacks_quic && !lacks_http && !lacks_udt
+        !lacks_quic && !lacks_http && !lacks_tls && !lacks_udt
     };
     let mut found = Vec::new();
     for (kind, listen) in listens {
@@ -59,7 +61,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let texts: Vec<String> = found
         .iter()
         .map(|(kind, address)| match kind {
-            Kind::Http => format!("{kind}://{address}/acc"),
+            Kind::Http | Kind::Https => format!("{kind}://{address}/acc"),
             _ => format!("{kind}://{address}"),
         })
         .collect();

@@ -500,6 +500,124 @@ async fn access_rules_can_name_actions() {
     assert_eq!(runs.load(Ordering::Relaxed), 3);
 }
 
+#[cfg(feature = "locks")]
+#[tokio::test(flavor = "multi_thread")]
+async fn a_goal_runs_only_with_the_fence_of_the_live_lock() {
+    use fipa::locks::{Admission, OwnOptions};
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let crane = here.register("crane").await.unwrap();
+    let bay = crane.own("bay", OwnOptions::default()).await.unwrap();
+    let gate = here.register("gate").await.unwrap();
+    let other = gate.own("door", OwnOptions::default()).await.unwrap();
+    let ran = Arc::new(AtomicUsize::new(0));
+    let counter = Arc::clone(&ran);
+    let action = Action::new("enter").fenced_by(Admission::new("crane", "bay").unwrap());
+    let _offer = robot
+        .offer(action, move |(): (), _run: Execution| {
+            counter.fetch_add(1, Ordering::Relaxed);
+            async { Ok::<_, String>(()) }
+        })
+        .unwrap();
+
+    let rover = there.register("rover").await.unwrap();
+    let crex = rover.robot(crex());
+    assert!(crex.actions().await.unwrap()[0].fenced);
+    let with = |fence: Option<&fipa::locks::Fence>| {
+        let mut goal = crex.goal("enter", &()).unwrap();
+        goal.fence = fence.map(ToString::to_string);
+        goal
+    };
+    let refusal = |sent: Result<_, ActionError>| match sent.map(drop) {
+        Err(ActionError::Refused(reason)) => reason,
+        other => panic!("{other:?}"),
+    };
+    let lock = rover.lock_within("bay", PATIENCE).await.unwrap();
+    let first = lock.fence().unwrap().clone();
+    let mut goal = crex.send(with(Some(&first))).await.unwrap();
+    assert_eq!(goal.outcome().await.unwrap(), None);
+    lock.release();
+    let lock = rover.lock_within("bay", PATIENCE).await.unwrap();
+    let second = lock.fence().unwrap().clone();
+    let mut goal = crex.send(with(Some(&second))).await.unwrap();
+    assert_eq!(goal.outcome().await.unwrap(), None);
+    // The reason names the fence.
+    let stale = refusal(crex.send(with(Some(&first))).await);
+    assert_eq!(stale, Refusal::StaleFence(first.to_string()));
+    assert!(stale.to_string().contains(&first.to_string()), "{stale}");
+    assert_eq!(refusal(crex.send(with(None)).await), Refusal::MissingFence);
+    let door = rover.lock_within("door", PATIENCE).await.unwrap();
+    let foreign = refusal(crex.send(with(door.fence())).await);
+    assert!(matches!(foreign, Refusal::StaleFence(_)), "{foreign}");
+    let mut invented = with(None);
+    invented.fence = Some("no fence".to_owned());
+    assert!(matches!(
+        refusal(crex.send(invented).await),
+        Refusal::StaleFence(_)
+    ));
+    assert_eq!(ran.load(Ordering::Relaxed), 2);
+    drop((lock, door));
+    bay.release().await;
+    other.release().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn actions_of_a_robot_on_another_host_are_invoked_and_cancelled() {
+    use fipa::{Gateway, Kind};
+    let host = |set: &str| config(&["mts.deadline=30s", set]);
+    let far_config = host("mts.transports=shm,unix,tcp");
+    let far_gateway = Gateway::open(&far_config).await.unwrap();
+    let locations = far_gateway.locations();
+    let at = locations.iter().find(|it| it.kind() == Kind::Tcp).unwrap();
+    let far = Domain::open(&far_config).await.unwrap();
+    let peer = format!(
+        "discovery.static={{ \"far\" = [\"tcp://{}\"] }}",
+        at.address()
+    );
+    let near_config = host(&peer);
+    let near_gateway = Gateway::open(&near_config).await.unwrap();
+    let near = Domain::open(&near_config).await.unwrap();
+
+    let robot = far.register("crex").await.unwrap();
+    let offered = robot.offer(dock(), |goal: Dock, run: Execution| async move {
+        run.progress(Progress::fraction(goal.target.x));
+        Ok::<_, String>(Docked { charge: 0.8 })
+    });
+    let drive = robot.offer(endless("drive"), |(): (), run| forever(run));
+    let _offers = (offered.unwrap(), drive.unwrap());
+    let rover = near.register("rover").await.unwrap();
+    for (domain, name) in [(&near, "crex"), (&far, "rover")] {
+        until_async(name, || domain.directory().lookup(name).is_some()).await;
+    }
+    let crex = rover.robot(crex());
+    let names: Vec<String> = crex
+        .actions()
+        .await
+        .unwrap()
+        .into_iter()
+        .map(|it| it.name)
+        .collect();
+    assert_eq!(names, ["dock", "drive"]);
+    let goal = crex.invoke("dock", &target()).await.unwrap();
+    assert_eq!(
+        goal.result::<Docked>().await.unwrap(),
+        Docked { charge: 0.8 }
+    );
+    let wrong = crex.invoke("dock", &()).await.map(drop);
+    let refused = matches!(
+        wrong,
+        Err(ActionError::Refused(Refusal::MissingParameter(_)))
+    );
+    assert!(refused, "{wrong:?}");
+    let mut goal = crex.invoke("drive", &()).await.unwrap();
+    assert!(goal.cancel(PATIENCE).await.unwrap());
+    assert_eq!(crex.status().await.unwrap(), []);
+    near.close().await;
+    near_gateway.close().await;
+    far.close().await;
+    far_gateway.close().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_example_works() {
     let (here, there) = two(&patient()).await;

@@ -1,5 +1,6 @@
 //! `fipa agents`: lists the agents of a domain.
 
+mod platform;
 mod watch;
 
 use std::collections::BTreeSet;
@@ -33,6 +34,7 @@ Examples:
   fipa agents --type camera --json | jq -r '.agents[].name'
   fipa agents --location 'tcp://10\\.0\\.0\\.2:.*' --remote
   fipa agents --watch
+  fipa agents --platform http://10.0.0.7:7778/acc    of a JADE platform, as its AMS lists them
 
 Columns:
   REACH      this host, or the gateway that forwards letters to the agent
@@ -51,7 +53,7 @@ JSON:
                   location has a supported one, \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": as above } ] }
 
-With --watch, one object on each line; the first lines are the agents present at the start:
+With --platform, as `fipa ams --json`. With --watch, one object on each line; the first lines are the agents present at the start:
   { \"time\", \"change\": \"present\", \"joined\", \"changed\" or \"left\", \"agent\": as above }")]
 pub(crate) struct Arguments {
     /// Show only agents with this name or with a name that matches this pattern
@@ -90,6 +92,17 @@ pub(crate) struct Arguments {
     #[arg(long, conflicts_with = "local")]
     remote: bool,
 
+    /// List the agents of the platform at this address instead, as its agent management system reports
+    /// them; needs a gateway (`fipa up`) with the transport of the address
+    #[arg(
+        long,
+        value_name = "ADDRESS",
+        value_parser = membership::address,
+        conflicts_with_all = ["agent_type", "location", "description", "mts", "registered", "member",
+                              "local", "remote", "watch"]
+    )]
+    platform: Option<String>,
+
     /// Continue and print each agent that joins, changes or leaves, until Ctrl-C
     #[arg(long, short)]
     watch: bool,
@@ -118,6 +131,9 @@ impl Filter {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
+    if let Some(address) = &arguments.platform {
+        return platform::run(address, arguments.pattern.as_ref(), &config, arguments.json);
+    }
     let filter = Filter {
         query: Query {
             name: arguments.pattern,

@@ -1,8 +1,8 @@
 //! `fipa ams`: lists the agents of a platform.
 
 use clap::Args;
-use fipa::AgentId;
-use fipa::platform::{AmsDescription, ApDescription, State};
+use fipa::platform::{Ams, AmsDescription, ApDescription, State};
+use fipa::{Agent, AgentId, Config};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
@@ -66,7 +66,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         ownership: arguments.ownership,
         state: arguments.state,
     };
-    let (ams, platform, agents) = membership::run(async {
+    let listed = membership::run(async {
         let domain = membership::join(&config).await?;
         let asked = async {
             let agent = asking(&domain, "ams", &config).await?;
@@ -77,43 +77,75 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 }
                 None => agent.ams().map_err(|error| failed(&error, &config))?,
             };
-            let platform = ams.description().await;
-            let platform = platform.map_err(|error| failed(&error, &config))?;
-            let agents = ams.search(&template).await;
-            let mut agents = agents.map_err(|error| failed(&error, &config))?;
-            // The agent of this command is not of interest.
-            agents.retain(|it| it.name.as_ref().is_none_or(|id| !id.same_agent(agent.id())));
-            Ok((ams.id().clone(), platform, agents))
+            Listed::of(&agent, &ams, &template, &config).await
         };
         let asked = asked.await;
         domain.close().await;
         asked
     })?;
-    if arguments.json {
-        return output::json(&value(&ams, &platform, &agents));
-    }
-    let mut text = format!(
-        "platform {} of {}\n",
-        escape(&platform.name),
-        escape(ams.name())
-    );
-    for (name, addresses) in &platform.services {
-        let addresses = addresses.join(" ");
-        text.push_str(&format!("{} {}\n", escape(name), escape(&addresses)));
-    }
-    let mut table = output::table(["AGENT", "STATE", "OWNER"]);
-    table.add_rows(agents.iter().map(|agent| {
-        let state = agent.state.map(State::as_str);
-        [
-            escape(&name(agent)).into_owned(),
-            state.unwrap_or("-").to_owned(),
-            escape(agent.ownership.as_deref().unwrap_or("-")).into_owned(),
-        ]
-    }));
-    output::text(&format!("{text}{}\n", table.trim_fmt()))
+    listed.print(arguments.json)
 }
 
-fn name(agent: &AmsDescription) -> String {
+/// The agents of a platform.
+pub(super) struct Listed {
+    ams: AgentId,
+    platform: ApDescription,
+    pub(super) agents: Vec<AmsDescription>,
+}
+
+impl Listed {
+    /// Asks an agent management system for the agents that match the template.
+    pub(super) async fn of(
+        agent: &Agent,
+        ams: &Ams<'_>,
+        template: &AmsDescription,
+        config: &Config,
+    ) -> Result<Self, Failure> {
+        let platform = ams.description().await;
+        let platform = platform.map_err(|error| failed(&error, config))?;
+        let agents = ams.search(template).await;
+        let mut agents = agents.map_err(|error| failed(&error, config))?;
+        // The agent of this command is not of interest.
+        agents.retain(|it| it.name.as_ref().is_none_or(|id| !id.same_agent(agent.id())));
+        Ok(Self {
+            ams: ams.id().clone(),
+            platform,
+            agents,
+        })
+    }
+
+    pub(super) fn print(&self, json: bool) -> Result<(), Failure> {
+        let Self {
+            ams,
+            platform,
+            agents,
+        } = self;
+        if json {
+            return output::json(&value(ams, platform, agents));
+        }
+        let mut text = format!(
+            "platform {} of {}\n",
+            escape(&platform.name),
+            escape(ams.name())
+        );
+        for (name, addresses) in &platform.services {
+            let addresses = addresses.join(" ");
+            text.push_str(&format!("{} {}\n", escape(name), escape(&addresses)));
+        }
+        let mut table = output::table(["AGENT", "STATE", "OWNER"]);
+        table.add_rows(agents.iter().map(|agent| {
+            let state = agent.state.map(State::as_str);
+            [
+                escape(&name(agent)).into_owned(),
+                state.unwrap_or("-").to_owned(),
+                escape(agent.ownership.as_deref().unwrap_or("-")).into_owned(),
+            ]
+        }));
+        output::text(&format!("{text}{}\n", table.trim_fmt()))
+    }
+}
+
+pub(super) fn name(agent: &AmsDescription) -> String {
     let name = agent.name.as_ref();
     name.map_or_else(String::new, |id| id.name().to_owned())
 }

@@ -36,7 +36,7 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[transport.serial]\nlisten = []\n",
-            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, http, udt",
+            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic, http, https, udt",
         ),
         (
             "[mts]\nname.first = \"x\"\n",
