@@ -14,6 +14,7 @@ mod platform_agents;
 mod presence;
 mod publisher;
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
@@ -50,6 +51,8 @@ use crate::{AgentId, Config, background};
 /// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
 pub struct Gateway {
     config: Config,
+    /// The values of `config`, for the reports of the gateway.
+    configuration: Arc<Mutex<BTreeMap<String, String>>>,
     service: Arc<Service>,
     owner: Owner,
     network: Option<Arc<dyn Network>>,
@@ -100,6 +103,7 @@ impl Gateway {
                 #[cfg(feature = "secure")]
                 security: guard.as_ref().map(Guard::security),
                 view: &|host, mts| {
+                    contacts.neighbours.name_own(&mts.name);
                     let network = network(config, mts)?;
                     let exchanged = exchange.directory() as Arc<dyn Directory>;
                     let announced = network.clone().map(Network::directory);
@@ -123,6 +127,7 @@ impl Gateway {
         };
         let mut gateway = Self {
             config: config.clone(),
+            configuration: Arc::new(Mutex::new(config.values())),
             service: Arc::new(service),
             owner: Owner::this(),
             network,
@@ -184,6 +189,7 @@ impl Gateway {
             exchange: Arc::clone(&self.exchange),
             contacts,
             notices: Mutex::default(),
+            configuration: Arc::clone(&self.configuration),
             questions: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));
@@ -316,6 +322,7 @@ impl Gateway {
                 .transports
                 .clone_from(&config.mts.transports);
         }
+        *self.configuration.lock() = self.config.values();
         Ok(later)
     }
 

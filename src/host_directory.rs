@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fipa_sds::{Cancellation, HostConfig, HostDirectory, HostError};
+use fipa_sds::{Cancellation, HostConfig, HostDirectory, HostError, Role};
 
 use crate::domain_dir::{DomainDir, RETRIES};
 use crate::error::OpenError;
@@ -24,6 +24,21 @@ impl Domain {
         let mut names: Vec<String> = entries.iter().map(|entry| entry.name.to_string()).collect();
         names.dedup();
         Ok(names)
+    }
+
+    /// Returns the name of the gateway that runs on this host in the domain of the configuration, without
+    /// joining the domain, as [`names`](Self::names) does.
+    ///
+    /// # Errors
+    /// If the directory of the domain cannot be used.
+    pub fn gateway_name(config: &Config) -> Result<Option<String>, OpenError> {
+        let dir = DomainDir::of(&config.domain);
+        if !dir.exists()? {
+            return Ok(None);
+        }
+        let entries = HostDirectory::peek(&dir.part("directory"))?;
+        let mut gateways = entries.iter().filter(|entry| entry.role == Role::Gateway);
+        Ok(gateways.next().map(|gateway| gateway.name.to_string()))
     }
 }
 

@@ -5,6 +5,7 @@
 //! [`ONTOLOGY`]; its content is the name or pattern of the receivers, or empty for all. The answer is
 //! an `inform` in the language `json` whose content is a [`Report`].
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -18,6 +19,11 @@ use crate::{Agent, Deliveries, Message, ReceiveError, SendError};
 
 /// The ontology of a request for routes.
 pub const ONTOLOGY: &str = "fipa-mts-routes";
+
+/// The type of agents that query the gateway for a report, see
+/// [`RegisterOptions`](crate::RegisterOptions). Gateways do not announce agents of this type to other
+/// hosts: they exist for a moment, and only agents of their own host answer them.
+pub const ASKER_TYPE: &str = "fipa-asker";
 
 /// The routes of one message transport service.
 ///
@@ -39,6 +45,10 @@ pub struct Report {
     pub peers: Vec<StaticPeer>,
     /// The gateways with an open connection; empty unless the service is a gateway.
     pub neighbours: Vec<Connected>,
+    /// The configuration with which the service runs, as TOML text by key; empty unless the service is a
+    /// gateway. See [`Config::values`](crate::Config::values).
+    #[serde(default)]
+    pub configuration: BTreeMap<String, String>,
 }
 
 /// A peer in `discovery.static` and its state.
@@ -69,6 +79,20 @@ pub struct Connected {
     pub connections: usize,
     /// Seconds since the connection was opened.
     pub seconds: u64,
+    /// The security of its connections.
+    #[serde(default)]
+    pub security: LinkSecurity,
+}
+
+/// The security of the connections with a gateway. All connections with one gateway have the same.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct LinkSecurity {
+    /// Whether letters are encrypted: TLS 1.3, or QUIC.
+    pub encrypted: bool,
+    /// The fingerprint of the trusted certificate that the gateway has proved, as 64 hexadecimal digits;
+    /// `None` without encryption.
+    pub certificate: Option<String>,
 }
 
 /// The error of [`of_gateway`].

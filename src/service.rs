@@ -1,6 +1,7 @@
 //! Assembles a message transport service: the transports of the configuration, the agent directory
 //! of the host, and the runtime over both.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -178,6 +179,7 @@ impl Service {
             ways: self.mts.ways(),
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
             neighbours: Vec::new(),
+            configuration: BTreeMap::new(),
         }
     }
 

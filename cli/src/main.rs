@@ -41,7 +41,7 @@ fn main() -> ExitCode {
 
 /// Starts logging to standard error. Standard output carries only the results of a command.
 fn log_to_stderr(global: &options::Global) {
-    let default_filter = || EnvFilter::new(global.log_level());
+    let default_filter = || EnvFilter::new(global.log_filter());
     let filter = if std::env::var_os("RUST_LOG").is_some_and(|value| !value.is_empty()) {
         EnvFilter::try_from_default_env().unwrap_or_else(|error| {
             report::warn(&format!(

@@ -6,9 +6,10 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa::routes::{self, AskError, Report};
 use fipa::{
-    Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, ListenError, OpenError,
-    Reach, RegisterError, RegisterOptions, Role, contact,
+    Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
+    OpenError, Reach, RegisterError, RegisterOptions, Role, contact,
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
@@ -140,8 +141,7 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
             let used = matches!(&source, ListenError::Bind { source, .. }
                 if source.kind() == io::ErrorKind::AddrInUse);
             let advice = if used {
-                "stop the process that uses the port (`ss -lntup` lists it), or choose another port; \
-                 with port 0 the system chooses a free one"
+                "`ss -lntup` lists the process that uses the port"
             } else {
                 "use an address of this machine and a port that this user may open"
             };
@@ -257,6 +257,47 @@ pub(crate) fn gateway(domain: &Domain) -> Option<Arc<Entry>> {
     let entries = domain.directory().entries();
     let is_own = |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
     entries.iter().find(is_own).cloned()
+}
+
+/// Maximum time for the gateway's report.
+const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Requests the report of this host's gateway about the routes to these receivers, or to all. Returns
+/// `None` when no gateway is running.
+pub(crate) async fn gateway_report(
+    domain: &Domain,
+    receivers: Option<&str>,
+) -> Result<Option<Report>, Failure> {
+    let Some(gateway) = gateway(domain) else {
+        return Ok(None);
+    };
+    let name = format!("fipa-routes-{}", Incarnation::random());
+    let failed = |error: &(dyn std::error::Error + 'static)| {
+        Failure::failed(
+            ErrorChain(error).to_string(),
+            format!("gateway {:?}", gateway.name),
+            "check the log of the gateway; if it hangs, restart it (`fipa up`)",
+        )
+    };
+    let options = RegisterOptions {
+        agent_type: routes::ASKER_TYPE.to_owned(),
+        ..RegisterOptions::default()
+    };
+    let agent = domain
+        .register_with(&name, options)
+        .await
+        .map_err(|error| failed(&error))?;
+    let report = routes::of_gateway(&agent, &gateway, receivers, REPORT_TIMEOUT).await;
+    match report {
+        Ok(mut report) => {
+            report.routes.retain(|route| route.receiver != name);
+            Ok(Some(report))
+        }
+        Err(AskError::NotDelivered(_)) if domain.directory().lookup(&gateway.name).is_none() => {
+            Ok(None)
+        }
+        Err(error) => Err(failed(&error)),
+    }
 }
 
 pub(crate) fn no_gateway() -> Failure {

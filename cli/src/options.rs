@@ -118,12 +118,13 @@ impl Global {
         Ok(all)
     }
 
-    /// Default log level; `$RUST_LOG` overrides it.
-    pub(crate) fn log_level(&self) -> &'static str {
+    /// Default log filter; `$RUST_LOG` overrides it. The events of iceoryx2 contain the `Debug` text of its
+    /// values; those that matter are part of the errors of the shared memory transport.
+    pub(crate) fn log_filter(&self) -> &'static str {
         match (self.quiet, self.verbose) {
-            (true, _) => "error",
-            (false, 0) => "warn",
-            (false, 1) => "info",
+            (true, _) => "error,iceoryx2_bb_loggers=off",
+            (false, 0) => "warn,iceoryx2_bb_loggers=off",
+            (false, 1) => "info,iceoryx2_bb_loggers=off",
             (false, 2) => "debug",
             (false, _) => "trace",
         }

@@ -43,16 +43,28 @@ pub(crate) fn table<T: Into<Cell>>(columns: impl IntoIterator<Item = T>) -> Tabl
     table_within(columns, terminal_width())
 }
 
+/// Creates a table without a header, in the same style and within the same width. The caller sets the
+/// padding of its columns.
+pub(crate) fn rows() -> Table {
+    rows_within(terminal_width())
+}
+
 fn table_within<T: Into<Cell>>(
     columns: impl IntoIterator<Item = T>,
     width: Option<usize>,
 ) -> Table {
     let columns: Vec<Cell> = columns.into_iter().map(Into::into).collect();
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_header(columns);
+    let mut table = rows_within(width);
+    table.set_header(columns);
     for column in table.column_iter_mut() {
         column.set_padding((0, 2));
     }
+    table
+}
+
+fn rows_within(width: Option<usize>) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
     if let Some(width) = width.and_then(|width| u16::try_from(width).ok()) {
         table
             .set_content_arrangement(ContentArrangement::Dynamic)

@@ -95,6 +95,12 @@ impl Failure {
         Self { code, ..self }
     }
 
+    /// The problems, without their places and remedies.
+    pub(crate) fn problem(&self) -> String {
+        let problems = self.errors.iter().map(|error| error.problem.as_str());
+        problems.collect::<Vec<_>>().join("; ")
+    }
+
     /// Prints the errors and returns the exit code.
     pub(crate) fn report(&self) -> ExitCode {
         let mut text = String::new();

@@ -146,6 +146,69 @@ fn a_certificate_is_not_revoked_without_confirmation() {
     assert_eq!((count("trusted"), count("revoked")), (0, 1));
 }
 
+/// The check of `fipa doctor` with this name, as verdict and finding.
+fn finding(report: &Value, name: &str) -> (String, String) {
+    let checks = report["checks"].as_array().unwrap();
+    let check = checks.iter().find(|check| check["check"] == name);
+    let check = check.unwrap_or_else(|| panic!("no check {name}: {report}"));
+    let text = |key: &str| check[key].as_str().unwrap().to_owned();
+    (text("verdict"), text("found"))
+}
+
+#[test]
+fn the_certificate_of_each_connection_is_shown() {
+    let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+    rover.keys(&["trust", &crex.certificate()]);
+    crex.keys(&["trust", &rover.certificate()]);
+    let arm = format!("arm-{}", crex.host.domain);
+    let (_theirs, address) = crex.gateway(&[]);
+    let _arm = crex.host.echo(&arm);
+    let (ours, _) = rover.gateway(&[(&crex.name, &address)]);
+    let fingerprint = crex.list()["own"]["fingerprint"].clone();
+    let ready: Value = serde_json::from_str(&ours.ready).unwrap();
+    let trusted = json!([{ "mts": crex.name, "fingerprint": fingerprint }]);
+    let expected = json!({ "encrypted": true, "insecure": false, "trusted": trusted });
+    assert_eq!(ready["security"], expected);
+
+    let link = json!({ "encrypted": true, "certificate": fingerprint });
+    until("the agent is listed with its link", || {
+        let listed = rover.host.run(&["agents", "--json"]).done_json();
+        let agents = listed["agents"].as_array().unwrap();
+        assert!(agents.iter().all(|it| it["type"] != "fipa-asker"));
+        agents
+            .iter()
+            .any(|it| it["name"] == *arm && it["link"] == link)
+    });
+    let table = rover.host.run(&["agents", &arm]).done();
+    assert!(table.contains(", encrypted"), "{table}");
+    let routes = rover.host.run(&["routes", "--json"]).done_json();
+    assert_eq!(routes["gateway"]["neighbours"][0]["security"], link);
+    let routes = rover.host.run(&["routes"]).done();
+    assert!(
+        routes.contains("CONNECTED TO") && routes.contains("encrypted"),
+        "{routes}"
+    );
+    assert!(
+        routes.contains(&fingerprint.as_str().unwrap()[..16]),
+        "{routes}"
+    );
+    // The commands that ask the gateway are not announced to other hosts.
+    let there = crex.host.run(&["agents", "--json"]).done();
+    assert!(!there.contains("fipa-routes-"), "{there}");
+
+    // The gateway was started with other values than those that the doctor reads.
+    let report = rover.host.run(&["doctor", "--json"]).done_json();
+    let (verdict, found) = finding(&report, "configuration of the running gateway");
+    assert_eq!(verdict, "doubtful", "{found}");
+    assert!(
+        found.contains("security.keys = ")
+            && found.contains("security.loopback = true (here: false)"),
+        "{found}"
+    );
+    let (_, found) = finding(&report, "connections with other gateways");
+    assert!(found.contains(fingerprint.as_str().unwrap()), "{found}");
+}
+
 #[test]
 fn keys_are_listed_and_never_overwritten() {
     let host = KeyedHost::new(

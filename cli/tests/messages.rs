@@ -108,3 +108,11 @@ fn the_log_of_a_gateway_is_sentences() {
     assert_eq!(code, Some(0), "{log}");
     check("the log", &log);
 }
+
+#[test]
+fn cleaning_up_after_a_killed_process_prints_nothing() {
+    let host = Host::new();
+    host.echo("parrot").signal("-KILL");
+    let ran = host.run(&["agents"]);
+    assert_eq!((ran.code, ran.stderr.as_str()), (Some(0), ""));
+}

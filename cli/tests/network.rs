@@ -9,11 +9,15 @@
 mod fleet;
 mod hosts;
 
+use std::io::{BufRead as _, BufReader};
+use std::process::Stdio;
+use std::sync::mpsc::channel;
 use std::time::Duration;
 
 use fipa::Kind;
-use fipa_testbed::{enter, isolated};
+use fipa_testbed::{ChildGuard, Network, enter, isolated};
 use fleet::{ADDRESSES, Fleet, Plan};
+use serde_json::Value;
 
 const TOOLS: &[&str] = &["nft"];
 
@@ -273,5 +277,51 @@ on_a_network!(
     inside_udp_replaces_failed_tcp,
     || {
         block_each_transport(&["shm", "tcp", "udp"], Kind::Tcp, Kind::Udp);
+    }
+);
+
+on_a_network!(
+    /// No error comes back from a host whose firewall drops packets.
+    a_firewall_that_drops_is_logged_once_and_reported_by_the_doctor,
+    inside_a_firewall_that_drops_is_logged_once_and_reported_by_the_doctor,
+    || {
+        let network = Network::new(2);
+        let (here, there) = (network.host(0), network.host(1));
+        hosts::filter(there, "iifname eth0 tcp dport 7788 drop");
+        let peer = format!("discovery.static={{ crex = [\"tcp://{}:7788\"] }}", there.ipv4());
+        let settings = ["discovery.mdns=false", "security.insecure=true", &peer].map(str::to_owned);
+        let mut gateway = hosts::gateway(here, &settings);
+        gateway.stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut gateway = ChildGuard::start(&mut gateway);
+        let log = BufReader::new(gateway.child().stderr.take().unwrap());
+        let (sender, lines) = channel();
+        std::thread::spawn(move || log.lines().map_while(Result::ok).try_for_each(|it| sender.send(it)));
+        let expected = format!("nothing answered on {}:7788", there.ipv4());
+        let line = loop {
+            let line: String = lines.recv_timeout(Duration::from_secs(60)).unwrap();
+            if line.contains(&expected) {
+                break line;
+            }
+        };
+        assert!(line.contains("WARN"), "{line}");
+        assert!(line.contains("sudo ufw allow 7788/tcp"), "{line}");
+
+        let mut doctor = here.command(env!("CARGO_BIN_EXE_fipa"));
+        doctor.args(["doctor", "--json"]);
+        doctor.args(settings.iter().flat_map(|setting| ["--set", setting.as_str()]));
+        let report = doctor.stderr(Stdio::inherit()).output().unwrap().stdout;
+        let report: Value = serde_json::from_slice(&report).unwrap();
+        let checks = report["checks"].as_array().unwrap();
+        let check = |name: &str| checks.iter().find(|check| check["check"] == name).unwrap();
+        let port = check("ports of static peers");
+        assert!(port["found"].as_str().unwrap().contains("nothing answered"), "{port}");
+        assert!(port["advice"].as_str().unwrap().contains("sudo ufw allow 7788/tcp"), "{port}");
+        let gateways = check("configuration of the running gateway");
+        assert_eq!(gateways["verdict"], "fine", "{gateways}");
+
+        // The gateway has tried again meanwhile.
+        gateway.signal("-TERM");
+        assert!(gateway.wait().success());
+        assert!(lines.iter().all(|line| !line.contains("nothing answered")));
     }
 );

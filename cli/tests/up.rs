@@ -103,6 +103,29 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
 }
 
 #[test]
+fn two_gateways_of_one_name_are_reported_on_both_hosts() {
+    let (here, there) = (Host::new(), Host::new());
+    let named = ["up", "--json", "--set", "mts.name=twin"];
+    let mut far = there.start(&named);
+    let peer = format!(
+        "discovery.static={{ twin = [\"tcp://{}\"] }}",
+        far.tcp_address()
+    );
+    let mut near = here.start(&[&named[..], &["--set", &peer]].concat());
+    for gateway in [&mut near, &mut far] {
+        gateway.wait_for_log(&["WARN", "has the name of this gateway, twin", "mts.name"]);
+    }
+    for gateway in [near, far] {
+        let (_, log) = gateway.signal("-TERM");
+        assert_eq!(
+            log.matches("has the name of this gateway").count(),
+            1,
+            "{log}"
+        );
+    }
+}
+
+#[test]
 fn a_port_in_use_is_reported() {
     let host = Host::new();
     let holder = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -116,7 +139,7 @@ fn a_port_in_use_is_reported() {
         "{output}"
     );
     assert!(
-        output.contains("stop the process that uses the port"),
+        output.matches("choose another port").count() == 1 && output.contains("`ss -lntup`"),
         "{output}"
     );
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());

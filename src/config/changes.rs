@@ -1,7 +1,10 @@
-//! The keys by which two configurations differ.
+//! The keys by which two configurations differ, and the values of all keys.
+
+use std::collections::BTreeMap;
 
 use super::Config;
 use super::keys::{KEYS, MAPS};
+use super::reader::dotted;
 
 impl Config {
     /// Returns the keys whose values differ, as they are written with `--set`.
@@ -15,5 +18,22 @@ impl Config {
             .filter(|map| (map.read)(self) != (map.read)(other));
         let keys = keys.map(|key| key.path).chain(maps.map(|map| map.path));
         keys.map(|path| path.join(".")).collect()
+    }
+
+    /// Returns the value of each key as TOML text, for example `mts.deadline` with `"5s"`. Names in tables
+    /// that the user fills, such as those of `[routes]`, follow the key after a dot.
+    #[must_use]
+    pub fn values(&self) -> BTreeMap<String, String> {
+        let keys = KEYS
+            .iter()
+            .map(|key| (key.path.join("."), (key.read)(self).to_toml()));
+        let maps = MAPS.iter().flat_map(|map| {
+            let values = (map.read)(self).into_iter();
+            values.map(move |(name, value)| {
+                let path: Vec<&str> = map.path.iter().copied().chain([name]).collect();
+                (dotted(&path), value.to_toml())
+            })
+        });
+        keys.chain(maps).collect()
     }
 }

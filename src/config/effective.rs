@@ -194,7 +194,7 @@ impl Value {
         Self::List(items.iter().map(ToString::to_string).collect())
     }
 
-    fn to_toml(&self) -> String {
+    pub(super) fn to_toml(&self) -> String {
         match self {
             Self::Truth(truth) => truth.to_string(),
             Self::Number(number) => number.to_string(),

@@ -6,6 +6,8 @@
 
 mod domain_dir;
 #[cfg(feature = "net")]
+mod gateway;
+#[cfg(feature = "net")]
 mod locations;
 #[cfg(feature = "mdns")]
 mod network;
@@ -75,6 +77,21 @@ pub fn examine(config: &Config) -> Vec<Check> {
     #[cfg(feature = "net")]
     security::examine(config, &mut checks);
     queues::examine(config, &mut checks);
+    checks
+}
+
+/// Examines the gateway of this host by its report ([`routes::of_gateway`](crate::routes::of_gateway) for
+/// all receivers), or by the reason why it gave none: whether it runs with this configuration, whether its
+/// connections are encrypted, and whether the ports of the gateways that it knows let this host in. Blocks
+/// for some seconds if those do not answer.
+#[cfg(feature = "net")]
+#[must_use]
+pub fn examine_gateway(
+    config: &Config,
+    report: Result<&crate::routes::Report, &str>,
+) -> Vec<Check> {
+    let mut checks = Vec::new();
+    gateway::examine(config, report, &mut checks);
     checks
 }
 

@@ -1,4 +1,4 @@
-//! Tests whether the TCP ports of static peers let this host in.
+//! Tests whether the TCP ports of static peers, and of other gateways, let this host in.
 
 use std::io;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs as _};
@@ -26,20 +26,29 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         let tcp = tcp.filter(|location| location.kind() == Kind::Tcp);
         tcp.map(|location| (peer.name.clone(), location.address().to_owned()))
     });
-    let threads: Vec<_> = locations
+    connect_all(PORTS, locations, checks);
+}
+
+/// Connects to these addresses, at most [`MAX_CHECKED`], each with the name of its host.
+pub(super) fn connect_all(
+    title: &'static str,
+    addresses: impl Iterator<Item = (String, String)>,
+    checks: &mut Vec<Check>,
+) {
+    let threads: Vec<_> = addresses
         .take(MAX_CHECKED)
-        .map(|(name, address)| std::thread::spawn(move || check(&name, &address)))
+        .map(|(name, address)| std::thread::spawn(move || check(title, &name, &address)))
         .collect();
     // A thread that cannot report has panicked, and its check is missing.
     checks.extend(threads.into_iter().filter_map(|thread| thread.join().ok()));
 }
 
-fn check(name: &str, address: &str) -> Check {
+fn check(title: &'static str, name: &str, address: &str) -> Check {
     let found = |what: &str| format!("{name}, tcp://{address}: {what}");
     let doubtful =
-        |what: &str, advice: String| AREA.problem(PORTS, Verdict::Doubtful, found(what), advice);
+        |what: &str, advice: String| AREA.problem(title, Verdict::Doubtful, found(what), advice);
     match connect(address) {
-        Ok(()) => AREA.fine(PORTS, found("accepts connections")),
+        Ok(()) => AREA.fine(title, found("accepts connections")),
         Err(error) if error.kind() == io::ErrorKind::TimedOut => {
             let port = address.rsplit(':').next().unwrap_or_default();
             doubtful(
@@ -85,12 +94,12 @@ mod tests {
     fn an_open_and_a_closed_port_are_told_apart() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap().to_string();
-        let open = check("crex", &address);
+        let open = check(PORTS, "crex", &address);
         assert_eq!(open.verdict, Verdict::Fine, "{}", open.found);
-        let wrong = check("crex", "name without port");
+        let wrong = check(PORTS, "crex", "name without port");
         assert_eq!(wrong.verdict, Verdict::Doubtful);
         drop(listener);
-        let closed = check("crex", &address);
+        let closed = check(PORTS, "crex", &address);
         assert_eq!(closed.verdict, Verdict::Doubtful, "{}", closed.found);
         assert!(
             closed.found.contains("no process listens"),

@@ -5,7 +5,7 @@
 //! with `not-understood`.
 
 use std::collections::hash_map::Entry;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -42,6 +42,8 @@ pub(crate) struct GatewayAgent {
     pub(super) contacts: Arc<KnownPeers>,
     /// Time of the last logged notice of each gateway.
     pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
+    /// The values of the configuration in use, by key.
+    pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
     /// The questions of agents of this host about agents of other hosts.
     pub(super) questions: Mutex<Questions>,
 }
@@ -192,6 +194,7 @@ impl GatewayAgent {
         let neighbours = self.neighbours.all().into_iter();
         let report = routes::Report {
             neighbours: neighbours.map(Into::into).collect(),
+            configuration: self.configuration.lock().clone(),
             ..self.service.report(&entries)
         };
         Ok(serde_json::to_vec(&report)?)

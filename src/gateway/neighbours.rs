@@ -20,7 +20,7 @@ use fipa_transport::{Incarnation, Introduction, Location, Mandate, Principal, Tr
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
-use crate::routes::Connected;
+use crate::routes::{Connected, LinkSecurity};
 
 /// The gateways with an open connection. The number of connections bounds their number.
 #[derive(Debug, Default)]
@@ -37,6 +37,8 @@ struct State {
     peers: Vec<Peer>,
     /// Locations at which an attempt failed, and the cause.
     doubted: HashMap<Location, TransportErrorKind>,
+    /// The name of this gateway, until a neighbor with the same name was reported.
+    own_name: Option<Arc<str>>,
     /// Neighbors whose last connection has ended, with the time of the end, the latest last.
     parted: VecDeque<(Instant, Arc<Entry>)>,
 }
@@ -83,11 +85,34 @@ impl From<Neighbour> for Connected {
             locations: entry.locations.clone(),
             connections: neighbour.connections,
             seconds: since.unwrap_or_default().as_secs(),
+            security: security(neighbour.principal),
         }
     }
 }
 
+/// The security of connections that prove this identity.
+fn security(principal: Principal) -> LinkSecurity {
+    let hex = |fingerprint: [u8; 32]| {
+        fingerprint
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect()
+    };
+    match principal {
+        Principal::Certificate(fingerprint) => LinkSecurity {
+            encrypted: true,
+            certificate: Some(hex(fingerprint)),
+        },
+        Principal::Host | Principal::Unproved => LinkSecurity::default(),
+    }
+}
+
 impl Neighbours {
+    /// Sets the name of this gateway. The first neighbor with the same name is reported.
+    pub(super) fn name_own(&self, name: &Arc<str>) {
+        self.state.lock().own_name = Some(Arc::clone(name));
+    }
+
     /// Sets the peers that the configuration names, with their locations.
     pub(crate) fn name_peers(&self, peers: Vec<Peer>) {
         self.state.lock().peers = peers;
@@ -143,8 +168,24 @@ impl Neighbours {
             return;
         }
         let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));
-        if before.is_none() {
-            tracing::info!(name = %peer.name, at = %peer.hop.location, "connected with a gateway");
+        let is_new = before.is_none();
+        if is_new {
+            let security = security(peer.hop.principal);
+            tracing::info!(
+                name = %peer.name,
+                at = %peer.hop.location,
+                encrypted = security.encrypted,
+                certificate = security.certificate.as_deref(),
+                "connected with a gateway"
+            );
+        }
+        if is_new && state.is_namesake(&peer.name) {
+            tracing::warn!(
+                "the gateway at {} has the name of this gateway, {}: logs and lists do not tell the hosts \
+                 apart; set mts.name on one of them",
+                peer.hop.location,
+                escape(&peer.name)
+            );
         }
         state.present.insert(incarnation, neighbour);
         self.generation.fetch_add(1, Ordering::Release);
@@ -209,6 +250,11 @@ impl Neighbours {
 }
 
 impl State {
+    /// Whether a neighbor has the name of this gateway, and is the first one.
+    fn is_namesake(&mut self, name: &str) -> bool {
+        self.own_name.take_if(|own| **own == *name).is_some()
+    }
+
     /// Returns the neighbor with this new connection, based on its state before.
     fn neighbour(&self, peer: &Introduction, before: Option<&Neighbour>) -> Neighbour {
         let incarnation = peer.hop.location.incarnation();
@@ -454,6 +500,26 @@ mod tests {
         assert_eq!(neighbours.all()[0].peer.as_deref(), Some("crex"));
         neighbours.parted(now, &dialled);
         assert_eq!(locations(&neighbours), known);
+    }
+
+    #[test]
+    fn one_neighbour_with_the_name_of_this_gateway_is_reported() {
+        let neighbours = Neighbours::default();
+        neighbours.name_own(&"crex-mts".into());
+        let mut state = neighbours.state.lock();
+        assert!(!state.is_namesake("sherpa-mts"));
+        assert!(state.is_namesake("crex-mts"));
+        assert!(!state.is_namesake("crex-mts"));
+    }
+
+    #[test]
+    fn the_security_of_a_link_is_that_of_its_proof() {
+        let proved = security(Principal::Certificate([0xa5; 32]));
+        assert!(proved.encrypted);
+        assert_eq!(proved.certificate, Some("a5".repeat(32)));
+        for open in [Principal::Unproved, Principal::Host] {
+            assert_eq!(security(open), LinkSecurity::default());
+        }
     }
 
     #[test]

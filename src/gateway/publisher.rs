@@ -13,6 +13,7 @@ use fipa_transport::{Incarnation, Location};
 
 use super::Network;
 use crate::config::is_on_loopback;
+use crate::routes::ASKER_TYPE;
 use crate::service::Service;
 
 /// Publishes the agents of other hosts to the processes of this host, as reachable through this
@@ -78,7 +79,7 @@ impl Publisher {
 ///
 /// Without keys, the earlier registration holds the name on all hosts. With keys, the registration
 /// times of other hosts have no effect: all agents of this host are announced, and a claim that no
-/// link proves is ignored.
+/// link proves is ignored. Agents that query this gateway are not announced.
 pub(super) fn own_agents(
     host: &HostDirectory,
     known: &dyn Directory,
@@ -88,7 +89,8 @@ pub(super) fn own_agents(
     let entries = host.entries();
     let agents = entries
         .iter()
-        .filter(|entry| entry.reach == Reach::Local && entry.role != Role::Gateway);
+        .filter(|entry| entry.reach == Reach::Local && entry.role != Role::Gateway)
+        .filter(|entry| *entry.agent_type != *ASKER_TYPE);
     for entry in agents {
         let holder = other_holder(entry, known, has_keys);
         if holder.is_none() || has_keys {

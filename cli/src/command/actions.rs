@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use comfy_table::{Table, presets};
 use fipa::actions::{
     ActionDescription, ActionError, GoalStatus, ParameterDescription, Policy, Type,
 };
@@ -179,8 +178,7 @@ fn described(robot: &str, action: &ActionDescription) -> String {
         text.push_str(&format!(": {}", escape(words)));
     }
     text.push('\n');
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING);
+    let mut table = output::rows();
     table.add_rows(action.parameters.iter().map(parameter));
     if action.result != Type::Nothing {
         let result = escape(&action.result.to_string()).into_owned();
@@ -233,13 +231,9 @@ fn goals(robot: &str, all: &[GoalStatus]) -> String {
     if all.is_empty() {
         return format!("{} runs no goals\n", escape(robot));
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_header([
+    let mut table = output::table([
         "ROBOT", "GOAL", "ACTION", "CLIENT", "STATE", "AGE", "PROGRESS",
     ]);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
     table.add_rows(all.iter().map(|goal| {
         [
             escape(robot).into_owned(),

@@ -3,15 +3,20 @@
 mod platform;
 mod watch;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use fipa::{DirectoryView, Entry, Kind, Location, Matcher, Query, Reach, Role, Source, Time};
+use fipa::routes::{ASKER_TYPE, LinkSecurity};
+use fipa::{
+    DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role, Source,
+    Time,
+};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
+use super::routes::security;
 use crate::complete;
 use crate::membership;
 use crate::options::Global;
@@ -37,7 +42,8 @@ Examples:
   fipa agents --platform http://10.0.0.7:7778/acc    of a JADE platform, as its AMS lists them
 
 Columns:
-  REACH      this host, or the gateway that forwards letters to the agent
+  REACH      this host, or the gateway that forwards letters to the agent, and whether its
+             connection with the agent's host is encrypted (`fipa routes` has its certificate)
   LOCATIONS  addresses for letters, in order of preference; for a coalition, its members
   MTS        message transport service that delivers to the agent
   SOURCE     origin of the entry: host (a process of this host), mdns (announced on the network),
@@ -48,13 +54,17 @@ JSON:
   { \"domain\": text, \"gateway\": name of this host's gateway, or null,
     \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\", \"gateway\" or \"coalition\",
                   \"members\": [ name ] and \"leader\": name or null, for a coalition,
-                  \"reach\": \"local\" or \"remote\", \"gateway\": name, if remote,
+                  \"reach\": \"local\" or \"remote\", \"gateway\": name and \"link\":
+                  { \"encrypted\": true or false, \"certificate\": fingerprint or null } or null
+                  without a connection, if remote,
                   \"locations\": [ text ], \"unsupported_transports\": [ transport ], if no
                   location has a supported one, \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": as above } ] }
 
-With --platform, as `fipa ams --json`. With --watch, one object on each line; the first lines are the agents present at the start:
-  { \"time\", \"change\": \"present\", \"joined\", \"changed\" or \"left\", \"agent\": as above }")]
+With --platform, as `fipa ams --json`.
+With --watch, one object on each line; the first lines are the agents present at the start:
+  { \"time\", \"change\": \"present\", \"joined\", \"changed\" or \"left\",
+    \"agent\": as above, without a \"link\" }")]
 pub(crate) struct Arguments {
     /// Show only agents with this name or with a name that matches this pattern
     #[arg(value_parser = Matcher::parse, add = complete::agents())]
@@ -125,7 +135,9 @@ impl Filter {
             Reach::Local => !self.remote,
             Reach::Remote { .. } => !self.local,
         };
-        reach && self.query.matches(entry)
+        // A command that asks the gateway.
+        let is_asker = *entry.agent_type == *ASKER_TYPE;
+        reach && !is_asker && self.query.matches(entry)
     }
 }
 
@@ -155,13 +167,19 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let directory = domain.directory();
         directory.refresh();
         let entries = directory.entries();
+        let is_remote = |entry: &Arc<Entry>| entry.reach != Reach::Local;
+        let links = match entries.iter().any(is_remote) && !filter.local {
+            // Without its report the agents are listed as well.
+            true => links(&domain).await,
+            false => HashMap::new(),
+        };
         let listed = Listed {
             domain_is_empty: entries.is_empty(),
             gateway: gateway(directory).map(|entry| entry.name.to_string()),
             entries: entries
                 .iter()
                 .filter(|entry| filter.matches(entry))
-                .map(|entry| Row::of(entry, directory))
+                .map(|entry| Row::of(entry, directory, &links))
                 .collect(),
         };
         domain.close().await;
@@ -188,6 +206,20 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     output::text(&format!("{}\n", table.trim_fmt()))
 }
 
+/// The connections of this host's gateway, by the service at the other end.
+type Links = HashMap<Incarnation, LinkSecurity>;
+
+/// Asks the gateway of this host for its connections. Empty if it does not answer.
+async fn links(domain: &Domain) -> Links {
+    // No agent has the name of a service, so the report has no routes.
+    let report = membership::gateway_report(domain, Some("fipa-no-agent")).await;
+    let neighbours = report.ok().flatten().map(|report| report.neighbours);
+    let neighbours = neighbours.into_iter().flatten();
+    neighbours
+        .map(|neighbour| (neighbour.incarnation, neighbour.security))
+        .collect()
+}
+
 struct Listed {
     /// Whether the directory has no entry at all, before filtering.
     domain_is_empty: bool,
@@ -204,7 +236,7 @@ struct Row {
 }
 
 impl Row {
-    fn of(entry: &Entry, directory: DirectoryView<'_>) -> Self {
+    fn of(entry: &Entry, directory: DirectoryView<'_>, links: &Links) -> Self {
         let through = match entry.reach {
             Reach::Local => None,
             Reach::Remote { gateway } => Some(match directory.known_incarnation(gateway) {
@@ -227,8 +259,12 @@ impl Row {
             "registered": registered.ok().and_then(Time::to_rfc3339),
             "source": entry.source,
         });
+        let link = links.get(&entry.mts.incarnation);
         if let Some(gateway) = &through {
             json["gateway"] = gateway.as_str().into();
+            if !links.is_empty() {
+                json["link"] = json!(link);
+            }
         }
         if entry.is_unsupported() {
             let kinds = entry.locations.iter().map(|location| location.kind());
@@ -252,7 +288,10 @@ impl Row {
         };
         let reach = match through {
             None => "this host".to_owned(),
-            Some(gateway) => format!("via {}", escape(&gateway)),
+            Some(gateway) => {
+                let link = link.map(|link| format!(", {}", security(link.encrypted)));
+                format!("via {}{}", escape(&gateway), link.unwrap_or_default())
+            }
         };
         let cells = [
             escape(&entry.name).into_owned(),

@@ -1,10 +1,12 @@
 //! `fipa doctor`: checks this machine.
 
 use clap::Args;
-use fipa::doctor::{Check, Verdict, examine};
+use fipa::doctor::{Check, Verdict, examine, examine_gateway};
+use fipa::{Config, Domain};
 use fipa_acl::escape;
 use serde_json::json;
 
+use crate::membership;
 use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
@@ -14,7 +16,9 @@ use crate::report::Failure;
 /// Checks the requirements of the configured transports: the size of /dev/shm, limits, permissions,
 /// files left by dead processes, domains of other users, and the TCP ports of the peers in
 /// discovery.static. If discovery.mdns is on, it also tests multicast on each network interface, which
-/// takes three seconds. It changes nothing.
+/// takes three seconds. It asks the running gateway for its configuration, compares it with the one that
+/// this command reads, shows whether its connections are encrypted, and tests the TCP ports of the
+/// gateways that it knows. It changes nothing.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -38,7 +42,9 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    let checks = examine(&global.config()?);
+    let config = global.config()?;
+    let mut checks = examine(&config);
+    checks.extend(of_gateway(&config));
     let worst = checks.iter().map(|check| check.verdict).max();
     let worst = worst.unwrap_or(Verdict::Fine);
     if arguments.json {
@@ -61,6 +67,26 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         bad.join(", "),
         "follow the advice (->) beside each of them",
     ))
+}
+
+/// Asks the gateway of this host, if one is running. Without one, no domain is joined.
+fn of_gateway(config: &Config) -> Vec<Check> {
+    // An error has a check of its own.
+    if !matches!(Domain::gateway_name(config), Ok(Some(_))) {
+        return Vec::new();
+    }
+    let report = membership::run(async {
+        let domain = membership::join(config).await?;
+        let report = membership::gateway_report(&domain, None).await;
+        domain.close().await;
+        report
+    });
+    match report {
+        Ok(Some(report)) => examine_gateway(config, Ok(&report)),
+        // It has ended meanwhile.
+        Ok(None) => Vec::new(),
+        Err(failure) => examine_gateway(config, Err(&failure.problem())),
+    }
 }
 
 fn table(checks: &[Check]) -> String {

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use clap::Args;
-use comfy_table::{Table, presets};
 use fipa::locks::{Fence, ResourceStatus};
 use fipa::{Agent, Config, ErrorChain, Incarnation, RegisterOptions};
 use fipa_acl::escape;
@@ -132,11 +131,7 @@ fn print(locks: &[ResourceStatus], arguments: &Arguments, config: &Config) -> Re
             config.domain
         ));
     }
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_header(COLUMNS);
-    for column in table.column_iter_mut() {
-        column.set_padding((0, 2));
-    }
+    let mut table = output::table(COLUMNS);
     table.add_rows(locks.iter().map(cells));
     output::text(&format!("{}\n", table.trim_fmt()))
 }

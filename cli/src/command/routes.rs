@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use clap::Args;
 use comfy_table::Table;
-use fipa::routes::{self, AskError, Report, Route, RouteState, Standing};
-use fipa::{Domain, ErrorChain, Incarnation, Matcher, Query, Reach, RegisterOptions, Role};
+use fipa::routes::{Connected, Report, Route, RouteState, Standing};
+use fipa::{Matcher, Query};
 use fipa_acl::escape;
 use serde_json::json;
 
@@ -20,7 +20,7 @@ use crate::report::Failure;
 /// Lists, for every known agent, the routes from a new process of this host in the order in which
 /// they would be tried. For agents on other hosts it also lists the routes from the gateway, as the
 /// gateway reports them. Then it lists the gateway's counters for each route since its start, its
-/// static peers and its connected gateways.
+/// static peers and its connected gateways, with the certificates that they have proved.
 ///
 /// A route that failed is tried after all working routes until its backoff ends. The backoff grows
 /// with each further failure.
@@ -38,6 +38,8 @@ Columns:
   TAKEN        letters accepted by the peer, or sent to a peer that cannot confirm
   REJECTED     letters that the peer did not accept, for example because its queue was full
   FAILED       attempts without a connection or an answer
+  SECURITY     whether letters are encrypted (TLS or QUIC)
+  CERTIFICATE  the first digits of its fingerprint; `fipa keys list` shows all
 
 JSON:
   { \"domain\": text, \"process\": report, \"gateway\": report, or null if no gateway is running }
@@ -51,7 +53,10 @@ JSON:
                 \"failed\", \"last_error\", \"last_error_seconds\" } ],
     \"peers\": [ { \"name\", \"answers\": location or null, \"failures\": [ [ location, text ] ],
                  \"asked_again_in\": milliseconds or null } ],
-    \"neighbours\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\" } ] }")]
+    \"neighbours\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\",
+                      \"security\": { \"encrypted\": true or false,
+                                    \"certificate\": fingerprint or null } } ],
+    \"configuration\": { key: value as TOML } of a gateway }")]
 pub(crate) struct Arguments {
     /// Show only routes to agents with this name or with a name that matches this pattern
     #[arg(value_parser = parse_receivers, add = complete::agents())]
@@ -76,9 +81,6 @@ fn parse_receivers(text: &str) -> Result<Receivers, fipa::PatternError> {
     })
 }
 
-/// Maximum time for the gateway's answer.
-const GATEWAY_TIMEOUT: Duration = Duration::from_secs(5);
-
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
     let pattern = arguments.pattern.as_ref();
@@ -87,7 +89,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let domain = membership::join(&config).await?;
         domain.directory().refresh();
         let process = domain.routes(&query);
-        let gateway = gateway_report(&domain, pattern.map(|it| it.text.as_str())).await;
+        let gateway = membership::gateway_report(&domain, pattern.map(|it| it.text.as_str())).await;
         domain.close().await;
         Ok((process, gateway?))
     })?;
@@ -102,43 +104,6 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         return output::text(&format!("no agent{named} is known in domain {domain}\n"));
     }
     output::text(&described(&process, gateway.as_ref()))
-}
-
-/// Requests the report of this host's gateway. Returns `None` when no gateway is running.
-async fn gateway_report(
-    domain: &Domain,
-    receivers: Option<&str>,
-) -> Result<Option<Report>, Failure> {
-    let entries = domain.directory().entries();
-    let mut gateways = entries
-        .iter()
-        .filter(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
-    let Some(gateway) = gateways.next() else {
-        return Ok(None);
-    };
-    let name = format!("fipa-routes-{}", Incarnation::random());
-    let failed = |error: &(dyn std::error::Error + 'static)| {
-        Failure::failed(
-            ErrorChain(error).to_string(),
-            format!("gateway {:?}", gateway.name),
-            "check the log of the gateway; if it hangs, restart it (`fipa up`)",
-        )
-    };
-    let agent = domain
-        .register_with(&name, RegisterOptions::default())
-        .await
-        .map_err(|error| failed(&error))?;
-    let report = routes::of_gateway(&agent, gateway, receivers, GATEWAY_TIMEOUT).await;
-    match report {
-        Ok(mut report) => {
-            report.routes.retain(|route| route.receiver != name);
-            Ok(Some(report))
-        }
-        Err(AskError::NotDelivered(_)) if domain.directory().lookup(&gateway.name).is_none() => {
-            Ok(None)
-        }
-        Err(error) => Err(failed(&error)),
-    }
 }
 
 fn described(process: &Report, gateway: Option<&Report>) -> String {
@@ -204,17 +169,48 @@ fn gateway_described(gateway: &Report) -> String {
         };
         text.push_str(&format!("static peer {}: {status}\n", escape(&peer.name)));
     }
-    for neighbor in &gateway.neighbours {
+    if !gateway.neighbours.is_empty() {
+        text.push_str(&connections(&gateway.neighbours));
+    }
+    text
+}
+
+/// The connected gateways, whether letters to them are encrypted, and the certificates that they proved.
+fn connections(neighbours: &[Connected]) -> String {
+    let mut table = output::table([
+        "CONNECTED TO",
+        "FOR",
+        "SECURITY",
+        "CERTIFICATE",
+        "LOCATIONS",
+    ]);
+    for neighbor in neighbours {
         let locations = neighbor.locations.iter().map(ToString::to_string);
         let locations: Vec<String> = locations.collect();
         let since = humantime::format_duration(Duration::from_secs(neighbor.seconds));
-        text.push_str(&format!(
-            "connected to {} for {since}: {}\n",
-            escape(&neighbor.name),
-            locations.join(", ")
-        ));
+        let certificate = neighbor.security.certificate.as_deref();
+        table.add_row([
+            escape(&neighbor.name).into_owned(),
+            since.to_string(),
+            security(neighbor.security.encrypted).to_owned(),
+            certificate.map_or("-", fingerprint).to_owned(),
+            locations.join("\n"),
+        ]);
     }
-    text
+    format!("\n{}\n", table.trim_fmt())
+}
+
+/// The security of a link as table text.
+pub(super) fn security(encrypted: bool) -> &'static str {
+    match encrypted {
+        true => "encrypted",
+        false => "not encrypted",
+    }
+}
+
+/// The first digits of a fingerprint, which `fipa keys` accepts.
+fn fingerprint(certificate: &str) -> &str {
+    certificate.get(..16).unwrap_or(certificate)
 }
 
 fn rows_of(table: &mut Table, route: &Route, from: &str) {

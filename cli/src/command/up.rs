@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use clap::Args;
-use fipa::keys::Keys;
+use fipa::keys::{Certificate, Keys};
 use fipa::{Change, Config, Entry, Gateway, Reach};
 use fipa_acl::escape;
 use serde_json::{Value, json};
@@ -37,7 +37,9 @@ Examples:
 
 JSON, one line when the gateway is ready:
   { \"name\": text, \"incarnation\": text, \"domain\": text, \"locations\": [ text ],
-    \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one } }")]
+    \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one },
+    \"security\": { \"encrypted\": true or false, \"insecure\": security.insecure,
+                  \"trusted\": [ { \"mts\": text, \"fingerprint\": text } ] } }")]
 pub(crate) struct Arguments {
     /// Print one line of JSON when the gateway is ready
     #[arg(long)]
@@ -144,16 +146,26 @@ fn trusted_hosts(config: &Config) -> String {
             }
         };
     }
-    let trusted = Keys::at(&config.security.keys).trusted();
-    let trusted = trusted.unwrap_or_default();
-    let names: Vec<_> = trusted
-        .iter()
-        .map(|it| escape(it.certified().mts()))
-        .collect();
+    let trusted = trusted(config);
+    let name = |it: &Certificate| {
+        let fingerprint = it.fingerprint().to_string();
+        let digits = fingerprint.get(..16).unwrap_or(&fingerprint);
+        format!("{} ({digits}…)", escape(it.certified().mts()))
+    };
+    let names: Vec<_> = trusted.iter().map(name).collect();
     match names.as_slice() {
         [] => "none: no certificate is trusted yet (`fipa keys trust FILE`)".to_owned(),
         names => format!("encrypted, with the certificates of {}", names.join(", ")),
     }
+}
+
+/// The certificates of other hosts that the gateway trusts.
+fn trusted(config: &Config) -> Vec<Certificate> {
+    if config.security.keys.is_empty() {
+        return Vec::new();
+    }
+    let trusted = Keys::at(&config.security.keys).trusted();
+    trusted.unwrap_or_default()
 }
 
 fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Value {
@@ -169,6 +181,14 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
         "domain": config.domain,
         "locations": locations.collect::<Vec<_>>(),
         "discovery": discovery,
+        "security": {
+            "encrypted": !config.security.keys.is_empty(),
+            "insecure": config.security.insecure,
+            "trusted": trusted(config).iter().map(|it| json!({
+                "mts": it.certified().mts(),
+                "fingerprint": it.fingerprint().to_string(),
+            })).collect::<Vec<_>>(),
+        },
     })
 }
 

@@ -33,7 +33,8 @@ pub(super) async fn dial(
     let running = LinkTask::new(endpoint, link.clone(), sink, Some(to.clone()));
     let by = sockets.clone();
     let connect = move |address| connect(by.clone(), address);
-    let (connection, send, receive) = match reach(&limits, &link, &to, addresses, connect).await {
+    let reached = reach(running.endpoint(), &link, &to, addresses, connect);
+    let (connection, send, receive) = match reached.await {
         Ok(connected) => connected,
         Err(end) => return running.fail(end),
     };

@@ -98,6 +98,7 @@ impl Sockets {
 
 /// Returns the reason for which a connection is lost, with a remedy if it is about certificates.
 pub(super) fn loss_reason(error: &ConnectionError) -> String {
+    let text = || advice::in_words(&error.to_string());
     let (code, finder) = match error {
         ConnectionError::TransportError(error) => (u64::from(error.code), Finder::Here),
         ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),
@@ -108,12 +109,12 @@ pub(super) fn loss_reason(error: &ConnectionError) -> String {
     if let ConnectionError::TransportError(failed) = error
         && failed.reason.ends_with("NotValidYet")
     {
-        return format!("{error} ({})", advice::NOT_YET);
+        return format!("{} ({})", text(), advice::NOT_YET);
     }
     // An alert of TLS (RFC 9001 section 4.8).
     match code.checked_sub(0x100).map(u8::try_from) {
-        Some(Ok(alert)) => format!("{error} ({})", advice::of_alert(alert, finder)),
-        _ => error.to_string(),
+        Some(Ok(alert)) => format!("{} ({})", text(), advice::of_alert(alert, finder)),
+        _ => text(),
     }
 }
 

@@ -43,6 +43,30 @@ pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
     }
 }
 
+/// Writes the names of variants in an error of rustls in words: `unknown issuer` for `UnknownIssuer`. Such
+/// a name is a word with a capital letter after a small one.
+pub(crate) fn in_words(text: &str) -> String {
+    let is_end = |c: char| !c.is_ascii_alphanumeric();
+    text.split_inclusive(is_end).map(word).collect()
+}
+
+fn word(word: &str) -> String {
+    let mut pairs = word.as_bytes().windows(2);
+    let is_name = word.starts_with(|c: char| c.is_ascii_uppercase())
+        && pairs.any(|pair| matches!(pair, [b'a'..=b'z', b'A'..=b'Z']));
+    if !is_name {
+        return word.to_owned();
+    }
+    let mut words = String::with_capacity(word.len() + 4);
+    for c in word.chars() {
+        if c.is_ascii_uppercase() && !words.is_empty() {
+            words.push(' ');
+        }
+        words.push(c.to_ascii_lowercase());
+    }
+    words
+}
+
 /// Returns the remedy for an error of TLS.
 pub(crate) fn of_error(error: &Error) -> &'static str {
     match error {
@@ -55,5 +79,34 @@ pub(crate) fn of_error(error: &Error) -> &'static str {
         }
         Error::InvalidCertificate(CertificateError::NotValidYet) => NOT_YET,
         _ => DEFAULT_REMEDY,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_variants_become_words() {
+        for (text, expected) in [
+            (
+                "invalid peer certificate: UnknownIssuer",
+                "invalid peer certificate: unknown issuer",
+            ),
+            (
+                "received fatal alert: CertificateUnknown (46)",
+                "received fatal alert: certificate unknown (46)",
+            ),
+            (
+                "the peer is at TLS 1.2, not TLS 1.3",
+                "the peer is at TLS 1.2, not TLS 1.3",
+            ),
+            (
+                "invalid peer certificate: Expired",
+                "invalid peer certificate: Expired",
+            ),
+        ] {
+            assert_eq!(in_words(text), expected);
+        }
     }
 }

@@ -1,15 +1,18 @@
 //! The addresses of a location, and the order in which they are tried.
 
+use std::collections::HashSet;
 use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use fipa_transport::{Location, Sink};
+use fipa_transport::{Kind, Location, Sink};
+use parking_lot::Mutex;
 use tokio::net::lookup_host;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use super::config::Limits;
+use super::endpoint::Endpoint;
 use super::link::Link;
 use crate::address::{self, Target};
 use crate::end::ConnectionEnd;
@@ -37,9 +40,41 @@ pub(crate) fn addresses(sink: &dyn Sink, to: &Location) -> Vec<String> {
     addresses
 }
 
+/// The addresses of other hosts from which no packet came back. The first failure is logged as a
+/// warning, because in most cases a firewall is the cause, and a letter alone does not show it.
+#[derive(Debug, Default)]
+pub(crate) struct SilentPeers(Mutex<HashSet<String>>);
+
+impl SilentPeers {
+    /// Maximum number of addresses. Others announce addresses, so the number of warnings is bounded.
+    const MAX: usize = 64;
+
+    /// Logs that nothing answered at this location.
+    fn failed(&self, to: &Location, what: &str) {
+        if self.insert(to.address()) {
+            tracing::warn!("{to} is unreachable: {what}");
+        } else {
+            tracing::debug!("{to} is still unreachable: {what}");
+        }
+    }
+
+    /// Returns whether this is the first failure of this address.
+    fn insert(&self, address: &str) -> bool {
+        let mut silent = self.0.lock();
+        silent.len() < Self::MAX && silent.insert(address.to_owned())
+    }
+
+    /// Forgets a location that answers: its next failure is logged again.
+    fn answered(&self, to: &Location) {
+        if self.0.lock().remove(to.address()) {
+            tracing::info!("{to} answers");
+        }
+    }
+}
+
 /// Tries these addresses of a location with `connect`, until one succeeds or the link ends.
 pub(crate) async fn reach<T, F>(
-    limits: &Limits,
+    endpoint: &Endpoint,
     link: &Link,
     to: &Location,
     addresses: Vec<String>,
@@ -49,20 +84,40 @@ where
     T: Send + 'static,
     F: Future<Output = io::Result<T>> + Send + 'static,
 {
+    let protocol = match to.kind() {
+        Kind::Tcp => "tcp",
+        _ => "udp",
+    };
     tokio::select! {
-        connected = first(limits, addresses, connect) => {
-            connected.map_err(|Unreachable(what)| ConnectionEnd::unreachable(to, &what))
-        }
+        connected = first(endpoint.limits(), protocol, addresses, connect) => match connected {
+            Ok(connected) => {
+                endpoint.silent_peers().answered(to);
+                Ok(connected)
+            }
+            Err(Unreachable { what, is_silent }) => {
+                if is_silent {
+                    endpoint.silent_peers().failed(to, &what);
+                }
+                Err(ConnectionEnd::unreachable(to, &what))
+            }
+        },
         end = link.leaving() => Err(end),
     }
 }
 
 /// The error of opening a connection.
-pub(crate) struct Unreachable(pub(crate) String);
+pub(crate) struct Unreachable {
+    /// The cause, as text.
+    pub(crate) what: String,
+    /// Whether no packet came back.
+    is_silent: bool,
+}
 
-/// Tries these addresses with `connect` until one succeeds.
+/// Tries these addresses with `connect` until one succeeds. `protocol` is that of the ports: `tcp` or
+/// `udp`.
 pub(crate) async fn first<T, F>(
     limits: &Limits,
+    protocol: &str,
     addresses: Vec<String>,
     connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,
 ) -> Result<T, Unreachable>
@@ -84,18 +139,24 @@ where
     });
     let patience = limits.connect_timeout;
     match timeout(patience, race(attempts)).await {
-        Ok(connected) => connected.map_err(|error| Unreachable(error.to_string())),
-        Err(_) => Err(Unreachable(nothing_answered(&all, patience))),
+        Ok(connected) => connected.map_err(|error| Unreachable {
+            what: error.to_string(),
+            is_silent: error.kind() == io::ErrorKind::TimedOut,
+        }),
+        Err(_) => Err(Unreachable {
+            what: nothing_answered(&all, protocol, patience),
+            is_silent: true,
+        }),
     }
 }
 
 /// The error when no packet came back, which in most cases means that a firewall drops them.
-fn nothing_answered(addresses: &str, patience: Duration) -> String {
+fn nothing_answered(addresses: &str, protocol: &str, patience: Duration) -> String {
     let seconds = patience.as_secs_f32();
     let port = addresses.rsplit(':').next().unwrap_or_default();
     format!(
         "nothing answered on {addresses} for {seconds} s; check that a firewall there lets it in (for \
-         example: sudo ufw allow {port})"
+         example: sudo ufw allow {port}/{protocol})"
     )
 }
 
@@ -184,6 +245,19 @@ mod tests {
         let turns = parse(&["[::1]:1", "127.0.0.1:1", "[::2]:1", "[::3]:1"]);
         assert_eq!(alternating(mixed), turns);
         assert_eq!(alternating(Vec::new()), Vec::new());
+    }
+
+    #[test]
+    fn a_silent_peer_is_reported_once_until_it_answers() {
+        let silent = SilentPeers::default();
+        let to: Location = "tcp://10.0.0.2:7788".parse().unwrap();
+        assert!(silent.insert(to.address()));
+        assert!(!silent.insert(to.address()));
+        silent.answered(&to);
+        assert!(silent.insert(to.address()));
+        // Announcements of others do not fill the log.
+        let reported = (0..1000).filter(|port| silent.insert(&format!("10.0.0.3:{port}")));
+        assert_eq!(reported.count(), SilentPeers::MAX - 1);
     }
 
     #[tokio::test]

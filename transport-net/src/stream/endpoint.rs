@@ -35,6 +35,8 @@ use super::budget::{ByteBudget, Meter, ReservedBytes};
 use super::config::{Limits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
+#[cfg(feature = "ip")]
+use super::dialing::SilentPeers;
 use super::link::{Link, MAX_LINKS, of_ticket};
 use super::source::{Home, QuotaKey, Source};
 use crate::Identity;
@@ -74,6 +76,8 @@ pub(crate) struct Endpoint {
     /// Rate limits of the peers.
     #[cfg(feature = "ip")]
     rate_limits: PeerRateLimits,
+    #[cfg(feature = "ip")]
+    silent_peers: SilentPeers,
     tally: Tally,
     registry: Mutex<Registry>,
 }
@@ -254,6 +258,8 @@ impl Endpoint {
             windows: ByteBudget::default(),
             #[cfg(feature = "ip")]
             rate_limits: PeerRateLimits::default(),
+            #[cfg(feature = "ip")]
+            silent_peers: SilentPeers::default(),
             tally: Tally::default(),
             registry: Mutex::default(),
         })
@@ -292,6 +298,12 @@ impl Endpoint {
 
     pub(crate) fn tally(&self) -> &Tally {
         &self.tally
+    }
+
+    /// Returns the addresses from which no packet came back.
+    #[cfg(feature = "ip")]
+    pub(crate) fn silent_peers(&self) -> &SilentPeers {
+        &self.silent_peers
     }
 
     /// Returns the sink while the endpoint is open.

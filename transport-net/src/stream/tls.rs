@@ -87,7 +87,8 @@ fn handshake_error(error: &io::Error) -> String {
     let inner = error.get_ref().and_then(|it| it.downcast_ref());
     match inner {
         Some(inner) => format!(
-            "TLS handshake failed: {error} ({})",
+            "TLS handshake failed: {} ({})",
+            advice::in_words(&error.to_string()),
             advice::of_error(inner)
         ),
         None if is_end(error) => format!(
@@ -224,7 +225,8 @@ impl Incoming {
             // In TLS 1.3 a client completes the handshake before the server has accepted its
             // certificate.
             processed.map_err(|error| {
-                let told = format!("{error} ({})", advice::of_error(&error));
+                let text = advice::in_words(&error.to_string());
+                let told = format!("{text} ({})", advice::of_error(&error));
                 io::Error::new(io::ErrorKind::InvalidData, told)
             })?;
         }

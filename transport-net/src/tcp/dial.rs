@@ -43,7 +43,15 @@ pub(crate) async fn dial(
         sink,
         Some(to.clone()),
     );
-    let (stream, peer) = match reach(&limits, &link, &to, addresses, connect_with_retries).await {
+    let (stream, peer) = match reach(
+        &endpoint.stream,
+        &link,
+        &to,
+        addresses,
+        connect_with_retries,
+    )
+    .await
+    {
         Ok(connected) => connected,
         Err(end) => return running.fail(end),
     };

@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use fipa::{Change, Config, DirectoryView, Entry, Time};
 use serde_json::json;
 
-use super::{Filter, Row};
+use super::{Filter, Links, Row};
 use crate::membership::{self, Stop};
 use crate::options;
 use crate::output;
@@ -157,7 +157,8 @@ fn print(
     directory: DirectoryView<'_>,
     json: bool,
 ) -> Result<(), Failure> {
-    let row = Row::of(entry, directory);
+    // The connections change without a change of the entry.
+    let row = Row::of(entry, directory, &Links::default());
     let time = Time::from_system_time(SystemTime::now()).ok();
     let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
     if json {

@@ -126,6 +126,12 @@ pub(super) struct Listed {
     pub(super) locations: Vec<String>,
 }
 
+/// An event, or a part of one, as JSON text for an error message.
+pub(super) fn shown(value: &impl Serialize) -> String {
+    // Events have text keys only, so this cannot fail.
+    serde_json::to_string(value).unwrap_or_default()
+}
+
 /// Runs the gateway of the configured domain until standard input ends.
 pub(super) async fn gateway(config: &Config) -> Result<(), String> {
     let gateway = Gateway::open(config)

@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
-use super::process::{Event, Order, Received};
+use super::process::{Event, Order, Received, shown};
 
 /// Timeout for actions that normally take milliseconds.
 const STEP_TIMEOUT: Duration = Duration::from_secs(20);
@@ -80,7 +80,11 @@ impl Process {
         }
         match self.next().await? {
             Event::Received(received) => Ok(received),
-            other => Err(format!("{}: expected a message, not {other:?}", self.name)),
+            other => Err(format!(
+                "{}: expected a message, not {}",
+                self.name,
+                shown(&other)
+            )),
         }
     }
 
@@ -161,7 +165,12 @@ impl Processes {
         };
         match process.event().await? {
             Event::Ready { locations } => process.locations = locations,
-            other => return Err(format!("{name}: expected `ready`, not {other:?}")),
+            other => {
+                return Err(format!(
+                    "{name}: expected `ready`, not {other}",
+                    other = shown(&other)
+                ));
+            }
         }
         self.by_name.insert(name.to_owned(), process);
         Ok(())

@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 
-use super::process::{Event, Listed, Order, Received};
+use super::process::{Event, Listed, Order, Received, shown};
 use super::processes::{Process, Processes};
 use crate::report::Failure;
 
@@ -196,7 +196,8 @@ impl Demo {
             let has = |kind: &str| entry.locations.iter().any(|url| url.starts_with(kind));
             ensure!(
                 entry.local && has("shm://") && has("unix://") && !has("tcp://"),
-                "{agent}: {entry:?}"
+                "{agent}: {entry}",
+                entry = shown(&entry)
             );
         }
         let remote = agents.iter().find(|agent| agent.name == "crex_camera");
@@ -210,7 +211,10 @@ impl Demo {
     async fn agents_seen_by(&mut self, name: &str) -> Result<Vec<Listed>, String> {
         match self.processes.get(name)?.run(&Order::Agents).await? {
             Event::Agents { agents } => Ok(agents),
-            other => Err(format!("{name}: expected a list of agents, not {other:?}")),
+            other => Err(format!(
+                "{name}: expected a list of agents, not {other}",
+                other = shown(&other)
+            )),
         }
     }
 
@@ -219,7 +223,10 @@ impl Demo {
             Event::Outcomes {
                 deliveries: Value::Array(deliveries),
             } => Ok(deliveries),
-            other => Err(format!("{from}: expected outcomes, not {other:?}")),
+            other => Err(format!(
+                "{from}: expected outcomes, not {other}",
+                other = shown(&other)
+            )),
         }
     }
 
@@ -247,7 +254,8 @@ impl Demo {
             seen.performative == "request"
                 && seen.sender == "rover"
                 && seen.content.as_deref() == Some("(lift sample-3)"),
-            "{to} received {seen:?}"
+            "{to} received {seen}",
+            seen = shown(&seen)
         );
         for (performative, content) in [("agree", "agreed"), ("inform", "done")] {
             let seen = self.received_by("rover").await?;
@@ -262,7 +270,8 @@ impl Demo {
                     && seen.in_reply_to.as_deref() == Some("question-1")
                     && seen.conversation_id == Some(format!("rover-to-{to}"))
                     && seen.protocol.as_deref() == Some("fipa-request"),
-                "rover received {seen:?}"
+                "rover received {seen}",
+                seen = shown(&seen)
             );
         }
         found!("via": via, "attempts": went["attempts"])
@@ -316,13 +325,15 @@ impl Demo {
         reached.sort_unstable();
         ensure!(
             reached == ["arm_1", "arm_2", "arm_3"],
-            "delivered to {reached:?}"
+            "delivered to {reached}",
+            reached = shown(&reached)
         );
         for arm in ["arm_1", "arm_2", "arm_3"] {
             let seen = self.received_by(arm).await?;
             ensure!(
                 seen.sender == "arm_4" && seen.content.as_deref() == Some("stop"),
-                "{arm} received {seen:?}"
+                "{arm} received {seen}",
+                seen = shown(&seen)
             );
             self.say(&format!(
                 "  {arm} received {} from arm_4",
@@ -332,7 +343,12 @@ impl Demo {
         // A copy for arm_4 would have arrived by now: the others have their copies.
         match self.processes.get("arm_4")?.run(&Order::Count).await? {
             Event::Count { received: 0 } => {}
-            other => return Err(format!("arm_4 received its own message: {other:?}")),
+            other => {
+                return Err(format!(
+                    "arm_4 received its own message: {other}",
+                    other = shown(&other)
+                ));
+            }
         }
         found!("via": "shm", "receivers": reached)
     }
@@ -360,7 +376,8 @@ impl Demo {
         let failure = seen.content.clone().unwrap_or_default();
         ensure!(
             seen.performative == "failure" && failure.contains(&reason) && !reason.is_empty(),
-            "rover received {seen:?}, the outcome was {went}"
+            "rover received {seen}, the outcome was {went}",
+            seen = shown(&seen)
         );
         self.say(&format!(
             "  rover received a FIPA failure message: {failure}"
@@ -398,7 +415,8 @@ impl Demo {
         ensure!(
             seen.via.as_deref() == Some("unix")
                 && seen.content.as_deref() == Some("by another route"),
-            "arm_5 received {seen:?}"
+            "arm_5 received {seen}",
+            seen = shown(&seen)
         );
         let why = went["attempts"][0]["error"].as_str().unwrap_or_default();
         self.say(&format!(
@@ -436,7 +454,8 @@ impl Demo {
             seen.performative == "request"
                 && seen.sender == "cpp-sender"
                 && seen.content.as_deref() == Some("hello"),
-            "echo received {seen:?}"
+            "echo received {seen}",
+            seen = shown(&seen)
         );
         self.say("  echo received request from cpp-sender: hello");
         found!("via": "tcp", "sender": seen.sender, "content": seen.content)
@@ -454,7 +473,12 @@ impl Demo {
         };
         match self.processes.get("crane")?.run(&own).await? {
             Event::Owned => self.say("  crane owns the bay"),
-            other => return Err(format!("crane does not own the bay: {other:?}")),
+            other => {
+                return Err(format!(
+                    "crane does not own the bay: {other}",
+                    other = shown(&other)
+                ));
+            }
         }
         let lock = Order::Lock { resource };
         let locked = self.processes.get("lifter_1")?.run(&lock).await?;
@@ -463,7 +487,8 @@ impl Demo {
         let answer = self.command("lifter_1", &stale).await?;
         ensure!(
             answer.performative == "agree",
-            "answer to the holder: {answer:?}"
+            "answer to the holder: {answer}",
+            answer = shown(&answer)
         );
         self.processes.get("lifter_2")?.begin(&lock).await?;
         let pid = self.processes.get("lifter_1")?.pid();
@@ -478,14 +503,16 @@ impl Demo {
         let answer = self.command("arm_4", &stale).await?;
         ensure!(
             answer.performative == "refuse",
-            "answer to the late command: {answer:?}"
+            "answer to the late command: {answer}",
+            answer = shown(&answer)
         );
         let reason = answer.content.unwrap_or_default();
         self.say(&format!("  crane refused its late command: {reason}"));
         let answer = self.command("lifter_2", &live).await?;
         ensure!(
             answer.performative == "agree",
-            "answer to the holder: {answer:?}"
+            "answer to the holder: {answer}",
+            answer = shown(&answer)
         );
         self.say(&format!("  crane admitted the command with {live}"));
         found!("stale": stale, "live": live, "refused": reason)
@@ -517,7 +544,11 @@ impl Demo {
             };
             one_delivery(&self.send(from, order).await?)?;
             let seen = self.received_by(to).await?;
-            ensure!(seen.performative == performative, "{to} received {seen:?}");
+            ensure!(
+                seen.performative == performative,
+                "{to} received {seen}",
+                seen = shown(&seen)
+            );
             self.say(&format!("  {from} sends {performative} to {to}"));
         }
         let (sender, performative, text, accepted) =
@@ -528,7 +559,12 @@ impl Demo {
                     text,
                     accepted,
                 } => (sender, performative, text, accepted),
-                other => return Err(format!("expected a violation, not {other:?}")),
+                other => {
+                    return Err(format!(
+                        "expected a violation, not {other}",
+                        other = shown(&other)
+                    ));
+                }
             };
         ensure!(
             sender == "arm_3"
@@ -568,7 +604,12 @@ impl Demo {
         let violating = converse("inform", "rover");
         let error = match self.processes.get("arm_6")?.run(&violating).await {
             Err(error) => error,
-            Ok(other) => return Err(format!("the message of arm_6 was sent: {other:?}")),
+            Ok(other) => {
+                return Err(format!(
+                    "the message of arm_6 was sent: {other}",
+                    other = shown(&other)
+                ));
+            }
         };
         ensure!(
             error.contains("not sent: inform from arm_6") && error.contains("expected"),
@@ -580,7 +621,8 @@ impl Demo {
         let seen = self.received_by("rover").await?;
         ensure!(
             seen.performative == "propose" && seen.sender == "arm_6",
-            "rover received {seen:?}"
+            "rover received {seen}",
+            seen = shown(&seen)
         );
         self.say("  arm_6 sends propose to rover instead");
         Ok(error)
@@ -634,7 +676,10 @@ impl Demo {
 fn fence(event: Event) -> Result<String, String> {
     match event {
         Event::Locked { fence } => Ok(fence),
-        other => Err(format!("expected a lock, not {other:?}")),
+        other => Err(format!(
+            "expected a lock, not {other}",
+            other = shown(&other)
+        )),
     }
 }
 

@@ -1,0 +1,147 @@
+//! Checks the running gateway of this host by its report.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use fipa_transport::Signature;
+
+use super::peers;
+use super::{Area, Check, Verdict};
+use crate::routes::{Connected, Report};
+use crate::{Config, Kind};
+
+const AREA: Area = Area("gateway");
+const CONFIGURATION: &str = "configuration of the running gateway";
+const CONNECTIONS: &str = "connections with other gateways";
+const PORTS: &str = "ports of known gateways";
+
+/// Maximum number of values that are shown.
+const MAX_SHOWN: usize = 8;
+
+pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &mut Vec<Check>) {
+    let report = match report {
+        Ok(report) => report,
+        Err(why) => {
+            let advice = "see the log of the gateway; if it hangs, restart it (`fipa up`)";
+            checks.push(AREA.problem(CONFIGURATION, Verdict::Doubtful, why, advice));
+            return;
+        }
+    };
+    checks.push(configuration(config, report));
+    checks.extend(report.neighbours.iter().map(connection));
+    peers::connect_all(PORTS, unconnected(config, report).into_iter(), checks);
+}
+
+/// Compares the configuration of the gateway with this one.
+fn configuration(config: &Config, report: &Report) -> Check {
+    let here = config.values();
+    let keys: BTreeSet<&String> = here.keys().chain(report.configuration.keys()).collect();
+    let differing = keys.into_iter().filter_map(|key| {
+        let (own, its) = (here.get(key), report.configuration.get(key));
+        let shown = |value: Option<&String>| value.map_or("not set", String::as_str).to_owned();
+        (own != its).then(|| format!("{key} = {} (here: {})", shown(its), shown(own)))
+    });
+    let differing: Vec<String> = differing.collect();
+    let name = &report.mts;
+    if differing.is_empty() {
+        return AREA.fine(
+            CONFIGURATION,
+            format!("{name} runs with the configuration that this command has read"),
+        );
+    }
+    let more = match differing.len().saturating_sub(MAX_SHOWN) {
+        0 => String::new(),
+        more => format!("; and {more} more"),
+    };
+    let shown = differing.iter().take(MAX_SHOWN).cloned();
+    let shown: Vec<String> = shown.collect();
+    AREA.problem(
+        CONFIGURATION,
+        Verdict::Doubtful,
+        format!("{name} runs with other values: {}{more}", shown.join("; ")),
+        "write the values into ~/.config/fipa/fipa.toml, which all commands and programs read, instead of \
+         --set; then restart the gateway",
+    )
+}
+
+/// Describes the security of a connection. Connections without encryption are the subject of the check of
+/// the keys.
+fn connection(connected: &Connected) -> Check {
+    let name = &connected.name;
+    let security = match &connected.security.certificate {
+        Some(certificate) => format!("encrypted, certificate {certificate}"),
+        None => "not encrypted".to_owned(),
+    };
+    AREA.fine(CONNECTIONS, format!("{name}: {security}"))
+}
+
+/// The TCP addresses of gateways that are known but not connected, without those of the configuration,
+/// which have a check of their own. Each has the name of an agent there.
+fn unconnected(config: &Config, report: &Report) -> Vec<(String, String)> {
+    let listed = config.discovery.peers.iter();
+    let listed: BTreeSet<&str> = listed
+        .flat_map(|peer| &peer.locations)
+        .map(|location| location.address())
+        .collect();
+    let connected = report.neighbours.iter().map(|it| it.incarnation);
+    let connected: BTreeSet<_> = connected.collect();
+    let mut addresses = BTreeMap::new();
+    for route in &report.routes {
+        let Some(gateway) = route.gateway.filter(|it| !connected.contains(it)) else {
+            continue;
+        };
+        for way in &route.ways {
+            let location = &way.location;
+            if location.kind() == Kind::Tcp
+                && location.signature() == Signature::Frames
+                && location.incarnation() == gateway
+                && !listed.contains(location.address())
+            {
+                let name = format!("the gateway of {}", route.receiver);
+                addresses.insert(location.address().to_owned(), name);
+            }
+        }
+    }
+    addresses
+        .into_iter()
+        .map(|(address, name)| (name, address))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The report of a gateway with this configuration, and without peers.
+    fn report(config: &Config) -> Report {
+        let empty = serde_json::json!({
+            "mts": "sherpa", "incarnation": "0000000000000001", "locations": [], "routes": [],
+            "ways": [], "peers": [], "neighbours": [],
+        });
+        let mut report: Report = serde_json::from_value(empty).unwrap();
+        report.configuration = config.values();
+        report
+    }
+
+    #[test]
+    fn values_that_differ_from_those_of_the_gateway_are_listed() {
+        let config = Config::for_host("sherpa");
+        let same = configuration(&config, &report(&config));
+        assert_eq!(same.verdict, Verdict::Fine, "{}", same.found);
+        let mut other = Config::for_host("sherpa");
+        other.security.loopback = true;
+        other.mts.queue = 7;
+        let differs = configuration(&config, &report(&other));
+        assert_eq!(differs.verdict, Verdict::Doubtful);
+        let expected = "sherpa runs with other values: mts.queue = 7 (here: 256); security.loopback = true \
+                        (here: false)";
+        assert_eq!(differs.found, expected);
+    }
+
+    #[test]
+    fn a_gateway_that_does_not_answer_is_doubtful() {
+        let mut checks = Vec::new();
+        examine(&Config::for_host("sherpa"), Err("no answer"), &mut checks);
+        assert_eq!(checks.len(), 1);
+        assert_eq!(checks[0].verdict, Verdict::Doubtful);
+    }
+}
