@@ -18,8 +18,8 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         (Kind::Https, &transport.https.listen),
         (Kind::Udt, &transport.udt.listen),
     ];
-    let used = |kind| config.mts.transports.contains(&kind);
-    let built = |kind| {
+    let used = |kind: Kind| config.mts.transports.contains(&kind);
+    let built = |kind: Kind| {
         let lacks_quic = kind == Kind::Quic && !cfg!(feature = "quic");
         let lacks_http = kind.is_http() && !cfg!(feature = "http");
         let lacks_tls = kind == Kind::Https && !cfg!(feature = "secure");
