@@ -47,14 +47,15 @@ impl Entry {
     /// Whether this entry keeps the name when `other` claims it too.
     ///
     /// Entries of this host precede entries from the network regardless of registration times: a
-    /// record on the network must not be able to cut a host's own traffic. Otherwise the earlier
-    /// registration keeps the name, and the lower incarnation breaks a tie, so that all hosts that
-    /// have both entries decide alike.
+    /// record on the network must not be able to cut a host's own traffic. A [contact](Source::Contact)
+    /// precedes no entry of a directory. Otherwise the earlier registration keeps the name, and the
+    /// lower incarnation breaks a tie, so that all hosts that have both entries decide alike.
     #[must_use]
     pub fn precedes(&self, other: &Self) -> bool {
         let rank = |entry: &Self| {
             let remote = entry.reach != Reach::Local;
-            (remote, entry.registered, entry.incarnation)
+            let contact = entry.source == Source::Contact;
+            (remote, contact, entry.registered, entry.incarnation)
         };
         rank(self) < rank(other)
     }

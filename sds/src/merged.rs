@@ -125,6 +125,7 @@ impl Directory for MergedDirectory {
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         if let Some(holder) = self.lookup(&registration.name)
             && holder.incarnation != registration.incarnation
+            && holder.source != Source::Contact
         {
             return Err(RegisterError::AlreadyRegistered { holder });
         }

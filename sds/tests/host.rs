@@ -784,6 +784,45 @@ async fn a_name_that_was_registered_meanwhile_is_lost() {
     assert!(here.deregister("arm", ours.incarnation).is_err());
 }
 
+/// A late letter of an agent that has left makes it a contact on the host to which it moves.
+#[tokio::test]
+async fn a_contact_keeps_no_agent_from_its_name() {
+    let (_parent, dir) = fresh_dir();
+    let gateway = HostDirectory::open(HostConfig {
+        gateway: true,
+        ..config(&dir)
+    })
+    .unwrap();
+    let here = open(&dir);
+    let contact = Entry {
+        name: "rover".into(),
+        agent_type: String::new(),
+        incarnation: Incarnation::random(),
+        locations: vec!["shm://gateway".parse().unwrap()],
+        mts: Mts::new("10.0.0.2:7788", Incarnation::random()),
+        description: String::new(),
+        registered: std::time::UNIX_EPOCH,
+        source: Source::Contact,
+        reach: Reach::Local,
+        role: Role::Agent,
+    };
+    gateway.publish_remote(vec![contact]).unwrap();
+    assert_eq!(here.lookup("rover").unwrap().source, Source::Contact);
+
+    let rover = here.register(registration("rover")).unwrap();
+    let third = open(&dir);
+    assert_eq!(
+        third.lookup("rover").unwrap().incarnation,
+        rover.incarnation
+    );
+    match third.register(registration("rover")) {
+        Err(RegisterError::AlreadyRegistered { holder }) => {
+            assert_eq!(holder.incarnation, rover.incarnation)
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
 #[tokio::test]
 async fn changes_during_the_removal_of_the_directory_are_written_afterwards() {
     let (_parent, dir) = fresh_dir();

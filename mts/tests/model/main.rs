@@ -142,6 +142,20 @@ fn the_receiver_is_registered_anew() {
     }
 }
 
+/// Four letters, two custodians as two routes, two registrations of the receiver.
+#[test]
+#[ignore = "explores 311,353 states, which takes minutes"]
+fn four_letters_and_a_new_registration() {
+    let routes = moving(protocol(Topology::Routes, state::MAX_LETTERS, 0));
+    holds(
+        &Protocol {
+            window: 2,
+            ..routes
+        },
+        usize::MAX,
+    );
+}
+
 #[test]
 fn lanes_are_full() {
     for topology in TOPOLOGIES {

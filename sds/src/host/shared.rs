@@ -13,7 +13,7 @@ use super::file::{self, Entries, FileError};
 use super::host_dir::{Guard, HostDir, Id, MAX_ENTRIES_FILE, Name, Version};
 use super::{Cancellation, HostError, SocketId};
 use crate::table::Table;
-use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
+use crate::{DeregisterError, Entry, Mts, Reach, RegisterError, Source};
 
 /// The state behind a [`HostDirectory`](super::HostDirectory), shared with its task.
 ///
@@ -377,6 +377,11 @@ impl Shared {
         while let Some((id, holder)) = self.table.holder(&entry.name) {
             let ours = id == self.host_dir().id();
             if ours && holder.incarnation == entry.incarnation {
+                break;
+            }
+            // A contact is only the sender of a letter, which may have left since. Claims of
+            // directories precede it, so no other process holds the name.
+            if holder.source == Source::Contact {
                 break;
             }
             if ours || self.host_dir().is_running(id).map_err(failed)? {
