@@ -245,10 +245,11 @@ fn no_agent_has_the_incarnation_of_a_connected_gateway() {
     assert_eq!(bench.holder("crex"), Some(2));
 }
 
-/// Every gateway chooses the addresses that it lists.
+/// Every gateway chooses the addresses that it lists, and its name.
 #[test]
 fn a_gateway_that_lists_the_address_of_another_does_not_replace_it() {
     let liar = Present {
+        mts: Mts::new("mts-1", Incarnation::from_u64(2)),
         locations: vec![location(2), location(1)],
         ..present(2, certified(&[]))
     };
