@@ -89,6 +89,9 @@ impl Change<'_> {
         let Move {
             side, next_state, ..
         } = made;
+        if let Some(world) = next_state.world {
+            party.settle(world);
+        }
         let answers = party.last != side && !made.reported;
         self.late |= party.deadline != 0 && party.deadline < self.now && answers;
         let cancels = next_state.state == CANCELLING && party.state != CANCELLING;
@@ -106,6 +109,11 @@ impl Change<'_> {
             self.state = self.state.or(Some(party.state));
             return;
         }
+        party.begin_step(
+            side,
+            act_number(self.observed.act),
+            self.observed.reply_with,
+        );
         party.before = next_state.before.unwrap_or(party.state);
         if cancels {
             party.canceling_side = side;

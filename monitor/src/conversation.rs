@@ -103,6 +103,47 @@ pub(crate) struct Party {
     pub(crate) cancel: u64,
     /// Deadline of the next message in milliseconds of the monotonic clock; 0 for none.
     pub(crate) deadline: u64,
+    /// The last message that has changed the party, and the values before it.
+    pub(crate) last_step: Option<LastStep>,
+    /// After a message that was not delivered, or of which that is uncertain.
+    pub(crate) worlds: Option<Box<Worlds>>,
+}
+
+/// The last message that has changed a party, and the values before it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LastStep {
+    side: Side,
+    /// [`act_number`] of the message.
+    act: u8,
+    reply_with: u64,
+    state: u16,
+    resume: u16,
+    before: u16,
+    last: Side,
+    canceling_side: Side,
+    echo: bool,
+    /// Values of the side that sent the message.
+    own_act: u8,
+    own_asked: u64,
+    /// The `reply-with` that the message has displaced from [`Party::earlier`].
+    displaced: u32,
+    cancel: u64,
+    deadline: u64,
+}
+
+/// The party if a message that was reported as failed has not arrived, and if it has arrived. The next
+/// message shows which is true.
+#[derive(Debug, Clone)]
+pub(crate) struct Worlds {
+    missing: Party,
+    arrived: Party,
+}
+
+/// One of two [`Worlds`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum World {
+    Missing,
+    Arrived,
 }
 
 impl Party {
@@ -121,7 +162,85 @@ impl Party {
             asked_text: [Tail::default(); 2],
             cancel: 0,
             deadline: 0,
+            last_step: None,
+            worlds: None,
         }
+    }
+
+    /// Records the message that is about to change the party.
+    pub(crate) fn begin_step(&mut self, side: Side, act: u8, reply_with: u64) {
+        let index = side_index(side);
+        self.last_step = Some(LastStep {
+            side,
+            act,
+            reply_with,
+            state: self.state,
+            resume: self.resume,
+            before: self.before,
+            last: self.last,
+            canceling_side: self.canceling_side,
+            echo: self.echo,
+            own_act: self.acts[index],
+            own_asked: self.asked[index],
+            displaced: self.earlier[index][EARLIER - 1],
+            cancel: self.cancel,
+            deadline: self.deadline,
+        });
+    }
+
+    /// Decides that a message which was reported as failed has arrived, or has not.
+    pub(crate) fn settle(&mut self, world: World) {
+        if let Some(worlds) = self.worlds.take() {
+            let Worlds { missing, arrived } = *worlds;
+            let peer = self.peer;
+            *self = match world {
+                World::Missing => missing,
+                World::Arrived => arrived,
+            };
+            self.peer = peer;
+        }
+    }
+
+    /// Takes a message back, because it was not delivered, or because that is uncertain. Returns whether
+    /// the message is the last one.
+    pub(crate) fn take_back(&mut self, side: Side, act: u8, reply_with: u64) -> bool {
+        let is_it =
+            |step: &LastStep| step.side == side && step.act == act && step.reply_with == reply_with;
+        let cancels = act == act_number(CANCEL);
+        let Some(step) = self.last_step.take_if(|step| is_it(step)) else {
+            // A message of the other side may have crossed the cancel.
+            if cancels
+                && self.state == CANCELLING
+                && self.canceling_side == side
+                && self.cancel == reply_with
+            {
+                (self.state, self.echo) = (self.resume, false);
+                return true;
+            }
+            return false;
+        };
+        let arrived = self.clone();
+        let index = side_index(side);
+        (self.state, self.resume, self.before) = (step.state, step.resume, step.before);
+        (self.last, self.canceling_side, self.echo) = (step.last, step.canceling_side, step.echo);
+        (self.cancel, self.deadline) = (step.cancel, step.deadline);
+        self.acts[index] = step.own_act;
+        if self.asked[index] != step.own_asked {
+            self.asked[index] = step.own_asked;
+            // The text is for descriptions only.
+            self.asked_text[index] = Tail::default();
+            if step.own_asked != 0 {
+                self.earlier[index].rotate_left(1);
+                self.earlier[index][EARLIER - 1] = step.displaced;
+            }
+        }
+        // Nothing follows the other messages, if they have arrived.
+        if ![AFTER_NOT_UNDERSTOOD, CANCELLED].contains(&arrived.state) {
+            let missing = self.clone();
+            (self.state, self.resume, self.before) = (FAILED, arrived.state, missing.state);
+            self.worlds = Some(Box::new(Worlds { missing, arrived }));
+        }
+        true
     }
 
     /// Whether no message was sent yet.
@@ -216,9 +335,12 @@ pub(crate) struct Rare {
     /// Agents that receive messages instead of a participant, and may continue in its place: the index
     /// of the party and the agent.
     pub(crate) delegates: Vec<(u32, Name)>,
-    /// Other states to which the first message may have led, if the conversation may have begun before
-    /// the monitor.
-    pub(crate) alternatives: Vec<u16>,
+    /// Whether the conversation may have begun before the monitor.
+    pub(crate) may_continue: bool,
+    /// If it may, other states to which the first message to a party may have led: the index of the
+    /// party, or [`NONE`] for the members of a multicast, and the state. [`FAILED`] stands for any
+    /// state: a message to the party was not delivered.
+    pub(crate) alternatives: Vec<(u32, u16)>,
     /// The conversation as the role of the monitored agent sees it.
     pub(crate) local: Option<LocalRun>,
     /// The last messages of which an observer gets each copy by itself.
@@ -252,11 +374,13 @@ impl Conversation {
             false => 0,
         };
         let unnamed = self.unnamed.as_ref().map_or(0, |_| size_of::<Party>());
+        let uncertain = self.parties.iter().filter(|party| party.worlds.is_some());
+        let worlds = uncertain.count() * size_of::<Worlds>();
         let rare = self.rare.as_deref().map_or(0, |rare| {
             let copies = rare.copied.iter();
             size_of::<Rare>()
                 + rare.delegates.capacity() * size_of::<(u32, Name)>()
-                + rare.alternatives.capacity() * size_of::<u16>()
+                + rare.alternatives.capacity() * size_of::<(u32, u16)>()
                 + rare.copied.capacity() * size_of::<Copied>()
                 + copies
                     .map(|copied| 8 * copied.seen.capacity())
@@ -268,6 +392,7 @@ impl Conversation {
             + bound
             + self.reply_to.capacity() * size_of::<Name>()
             + unnamed
+            + worlds
             + rare
             + self.charged_names
     }
@@ -417,6 +542,8 @@ pub(crate) struct NextState {
     pub(crate) guard: Guard,
     /// The state in which the message fits, if it is not the present one.
     pub(crate) before: Option<u16>,
+    /// Whether the message shows that one reported as failed has arrived, or that it has not.
+    pub(crate) world: Option<World>,
     /// Whether the message answers a cancel, and is no step of the protocol itself.
     pub(crate) answers_cancel: bool,
 }
@@ -432,6 +559,7 @@ impl NextState {
             roles: (0, 0),
             guard: Guard::default(),
             before: None,
+            world: None,
             answers_cancel: false,
         }
     }
@@ -477,6 +605,7 @@ pub(crate) fn next_state(
         }
         AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
         // A message that was reported as failed may have arrived, or is sent again.
+        FAILED if let Some(worlds) = &party.worlds => in_worlds(machine, party, worlds, message),
         FAILED => {
             let in_state = |state| {
                 let taken = in_state(machine, party, state, message)?;
@@ -517,6 +646,40 @@ pub(crate) fn next_state(
             })
         }
         own => in_state(machine, party, own, message),
+    }
+}
+
+/// Returns the state after a message that follows one which was not delivered, or of which that is
+/// uncertain.
+fn in_worlds(
+    machine: &Machine,
+    party: &Party,
+    worlds: &Worlds,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
+    let in_world = |world| {
+        let party = match world {
+            World::Missing => &worlds.missing,
+            World::Arrived => &worlds.arrived,
+        };
+        let taken = next_state(machine, party, message)?;
+        Ok(NextState {
+            world: Some(world),
+            ..taken
+        })
+    };
+    let taken = in_world(World::Missing);
+    let arrived = in_world(World::Arrived);
+    match (&taken, arrived) {
+        (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
+        // A void message shows nothing.
+        (Ok(void), Ok(_)) if void.void => Ok(NextState {
+            void: true,
+            resume: party.resume,
+            ..NextState::to(FAILED)
+        }),
+        (Err(_), Ok(other)) => Ok(other),
+        _ => taken,
     }
 }
 
@@ -686,7 +849,7 @@ fn has_crossed(machine: &Machine, party: &Party, state: u16, message: &PartyMess
         }
         answered => {
             answered != party.asked[other]
-                && party.earlier[other].contains(&short(answered))
+                && may_have_asked(&party.earlier[other], answered)
                 && machine.states.iter().any(fits)
         }
     }
@@ -732,6 +895,12 @@ fn by_default(
     }
 }
 
+/// Whether a side may have sent this `reply-with` before its last one. Beyond the bound, the monitor does
+/// not know.
+fn may_have_asked(earlier: &[u32; EARLIER], reply_with: u64) -> bool {
+    earlier.contains(&short(reply_with)) || earlier[EARLIER - 1] != 0
+}
+
 /// The message that a message answers.
 enum Reply {
     /// The last message of the other side, or unspecified.
@@ -746,7 +915,7 @@ fn in_reply(party: &Party, message: &PartyMessage<'_>) -> Result<Reply, Kind> {
     let (asked, earlier) = (party.asked[other], &party.earlier[other]);
     if !message.answers || [0, asked].contains(&message.in_reply_to) || asked == 0 {
         Ok(Reply::ToLast)
-    } else if earlier.contains(&short(message.in_reply_to)) && !message.own {
+    } else if may_have_asked(earlier, message.in_reply_to) && !message.own {
         Ok(Reply::ToEarlier)
     } else {
         Err(Kind::WrongReply)

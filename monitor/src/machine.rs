@@ -251,6 +251,11 @@ impl Machine {
         targets
     }
 
+    /// Whether a message like the first one may come later, and then leads to another state.
+    pub(crate) fn may_repeat(&self, act: Act<'_>, first: &Transition) -> bool {
+        !self.later_targets(act, first).is_empty()
+    }
+
     fn returns(&self) -> bool {
         let mut all = self.states.iter().flat_map(|state| &state.transitions);
         all.any(|step| step.target == self.initial)

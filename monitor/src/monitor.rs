@@ -11,11 +11,11 @@ use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
-    CANCELLING, Conversation, Copied, FAILED, Holders, NONE, Party, RoleBinding, Side, act_number,
-    is_final, is_over, side_index, state_name,
+    Conversation, Copied, FAILED, Holders, NONE, NextState, Party, RoleBinding, Side, act_number,
+    is_final, is_over, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
-use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, failed, judge};
+use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope, step};
 use crate::memory::{Refused, Removed};
@@ -276,7 +276,7 @@ impl Monitor {
                         &mut slot.conversation,
                         &self.names,
                         (sender, receiver),
-                        (act_number(act), act == CANCEL, reply_with),
+                        (act_number(act), reply_with),
                     )
                 {
                     self.touch(main, now.millis());
@@ -757,7 +757,7 @@ impl Monitor {
             });
         };
         let at = self.insert(id, parent, machine, (header, observed), now)?;
-        let certain = parent != NONE || self.is_certain(id);
+        let may_continue = parent == NONE && !self.is_certain(id);
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
             conversation.initiator = conversation.acquire(&mut self.names, observed.sender);
@@ -765,11 +765,8 @@ impl Monitor {
                 let party = Party::new(NONE, protocol.initial);
                 conversation.parties.push(party);
             }
-            if !certain {
-                let others = protocol.later_targets(observed.act, begins);
-                if !others.is_empty() {
-                    conversation.rare().alternatives = others;
-                }
+            if may_continue && protocol.may_repeat(observed.act, begins) {
+                conversation.rare().may_continue = true;
             }
         }
         let passed = self.advance(at, header, observed, now);
@@ -994,6 +991,7 @@ impl Monitor {
             void: false,
             state: None,
         };
+        let before = PartiesBefore::of(&slot.conversation, machine);
         for made in &self.moves {
             if machine.scope == Scope::Conversation {
                 change.bind(&mut slot.conversation, made.next_state.roles);
@@ -1010,9 +1008,8 @@ impl Monitor {
         if let Some(((fingerprint, receiver), roles)) = copied.zip(roles) {
             keep_copied(&mut slot.conversation, fingerprint, receiver, roles);
         }
-        if !opened {
-            still_uncertain(machine, &mut slot.conversation, observed);
-        }
+        let moves = (self.moves.as_slice(), before);
+        keep_alternatives(machine, &mut slot.conversation, observed, moves);
         let passed = Passed::in_state_of(&slot.conversation, machine, index);
         let passed = Passed {
             state: moved.unwrap_or(passed.state),
@@ -1352,32 +1349,88 @@ fn keep_copied(
     });
 }
 
-/// Removes the other states of a conversation that may have begun before the monitor, if the message
-/// does not fit them.
-fn still_uncertain(
+/// The parties of a conversation before a message.
+#[derive(Debug, Clone, Copy)]
+struct PartiesBefore {
+    /// Number of the parties with messages.
+    count: usize,
+    has_unnamed: bool,
+}
+
+impl PartiesBefore {
+    fn of(conversation: &Conversation, machine: &Machine) -> Self {
+        let mut parties = conversation.parties.iter();
+        // With one state for all participants, the party exists before the first message.
+        let is_new =
+            machine.scope == Scope::Conversation && parties.all(|party| party.acts == [0; 2]);
+        Self {
+            count: if is_new {
+                0
+            } else {
+                conversation.parties.len()
+            },
+            has_unnamed: conversation.unnamed.is_some(),
+        }
+    }
+}
+
+/// If the conversation may have begun before the monitor: notes the other states to which the first
+/// message to a party may have led, and removes those which a later message does not fit.
+fn keep_alternatives(
     machine: &Machine,
     conversation: &mut Conversation,
     observed: &ObservedMessage<'_>,
+    (moves, before): (&[Move], PartiesBefore),
 ) {
     let Some(rare) = conversation.rare.as_deref_mut() else {
         return;
     };
+    if !rare.may_continue {
+        return;
+    }
+    let index = |at: usize| u32::try_from(at).unwrap_or(NONE);
+    let is_moved = |party: u32| {
+        let mut steps = moves.iter().filter(|made| {
+            let NextState { void, state, .. } = made.next_state;
+            !void && !made.reported && state != FAILED
+        });
+        steps.any(|made| match made.target {
+            MoveTarget::Party(at) => index(at) == party,
+            MoveTarget::Unnamed => party == NONE,
+            MoveTarget::Receiver(_) | MoveTarget::Sender => false,
+        })
+    };
     let alternatives = std::mem::take(&mut rare.alternatives);
-    let fits = alternatives.iter().filter_map(|state| {
-        let state = machine.state(*state)?;
-        step(&state.steps, observed.act, u32::MAX, u32::MAX)
+    let kept = alternatives.into_iter().filter_map(|(party, state)| {
+        if state == FAILED || !is_moved(party) {
+            return Some((party, state));
+        }
+        let state = machine.state(state)?;
+        let step = step(&state.steps, observed.act, u32::MAX, u32::MAX)?;
+        Some((party, step.target))
     });
-    rare.alternatives = fits.map(|step| step.target).collect();
+    rare.alternatives = kept.collect();
+    let first = &machine.initial().steps;
+    let Some(first) = step(first, observed.act, u32::MAX, u32::MAX) else {
+        return;
+    };
+    let unnamed = (conversation.unnamed.is_some() && !before.has_unnamed).then_some(NONE);
+    let new = (before.count..conversation.parties.len()).map(index);
+    let others = machine.later_targets(observed.act, first);
+    for party in new.chain(unnamed) {
+        let others = others.iter().map(|state| (party, *state));
+        rare.alternatives.extend(others);
+    }
 }
 
-/// Takes a message of a sender to a receiver back, if it is the last one between them: a standard
-/// performative by its number, whether it is a cancel, and its `reply-with`.
+/// Takes a message of a sender to a receiver back, if it is the last one between them: the number of its
+/// performative, and its `reply-with`.
 fn take_back(
     machine: &Machine,
     conversation: &mut Conversation,
     names: &Names,
     (sender, receiver): (&str, &str),
-    (act, cancels, reply_with): (u8, bool, u64),
+    (act, reply_with): (u8, u64),
 ) -> bool {
     let leads = names.is(conversation.initiator, sender)
         || conversation.is_designated(names, sender) && conversation.party(names, sender).is_none();
@@ -1398,27 +1451,17 @@ fn take_back(
         }
         Scope::Conversation => (0, Side::Other),
     };
-    let Some(party) = conversation.parties.get_mut(at) else {
-        return false;
-    };
-    let index = side_index(side);
-    let is_last = match cancels && party.state == CANCELLING {
-        true => party.canceling_side == side && party.cancel == reply_with,
-        false => party.last == side && party.acts[index] == act && party.asked[index] == reply_with,
-    };
-    if is_last {
-        let made = failed(at, party);
-        (party.state, party.resume, party.echo) = (
-            made.next_state.state,
-            made.next_state.resume,
-            made.next_state.echo,
-        );
-        // The other side answers the message before it, and need not be told which.
-        if act != act_number(CANCEL) {
-            party.asked[index] = 0;
+    let party = conversation.parties.get_mut(at);
+    let taken = party.is_some_and(|party| party.take_back(side, act, reply_with));
+    let rare = conversation.rare.as_deref_mut();
+    if let Some(rare) = rare.filter(|rare| taken && rare.may_continue) {
+        // The message that has ruled out states has no effect.
+        let unknown = (u32::try_from(at).unwrap_or(NONE), FAILED);
+        if !rare.alternatives.contains(&unknown) {
+            rare.alternatives.push(unknown);
         }
     }
-    is_last
+    taken
 }
 
 #[cfg(test)]

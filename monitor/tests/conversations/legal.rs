@@ -175,7 +175,7 @@ fn an_undelivered_message_can_be_sent_again() {
         assert_eq!(stage.right(request("agree ben>ann")), "agreed");
         // The answer proves the delivery, so a later report changes nothing.
         stage.monitor.undelivered(&ask(), "ben", now);
-        assert_eq!(stage.wrong(ask()).kind, Kind::Unexpected);
+        assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
         // So it is with an answer, with a cancel, and with one of several receivers.
         stage
             .monitor
@@ -236,6 +236,163 @@ fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
             assert_eq!(stage.right(again.in_reply_to("bid")), "closed");
         }
     }
+}
+
+/// The monitors of all agents, and of this one.
+fn monitors(agent: &str) -> [Stage; 2] {
+    [
+        Stage::observer(),
+        Stage::new(Monitor::agent(library(), agent)),
+    ]
+}
+
+#[test]
+fn after_an_undelivered_not_understood_the_conversation_goes_on() {
+    for mut stage in monitors("ben") {
+        let not_understood = || request("not-understood ben>ann").in_reply_to("q");
+        stage.right(request("request ann>ben").reply_with("q"));
+        assert_eq!(stage.right(not_understood()), "not-understood");
+        let now = stage.now;
+        stage.monitor.undelivered(&not_understood(), "ann", now);
+        // It is sent again, and lost again.
+        assert_eq!(stage.right(not_understood()), "not-understood");
+        stage.monitor.undelivered(&not_understood(), "ann", now);
+        assert_eq!(stage.right(request("agree ben>ann")), "agreed");
+        assert_eq!(stage.right(request("inform ben>ann")), "done");
+        assert_eq!(stage.wrong(not_understood()).kind, Kind::Ended);
+    }
+}
+
+#[test]
+fn an_answer_that_is_lost_several_times_is_sent_again() {
+    for mut stage in monitors("ben") {
+        stage.right(request("request ann>ben").reply_with("q"));
+        for text in ["1", "2", "3"] {
+            let agree = || request("agree ben>ann").reply_with(text).in_reply_to("q");
+            assert_eq!(stage.right(agree()), "agreed", "{text}");
+            let now = stage.now;
+            stage.monitor.undelivered(&agree(), "ann", now);
+        }
+        assert_eq!(stage.right(request("refuse ben>ann")), "refused");
+    }
+}
+
+#[test]
+fn an_undelivered_answer_to_a_cancel_is_sent_again() {
+    for act in ["inform ben>ann", "failure ben>ann"] {
+        for mut stage in monitors("ben") {
+            stage.right(request("request ann>ben"));
+            stage.right(request("agree ben>ann"));
+            stage.right(request("cancel ann>ben").reply_with("x"));
+            let answer = || request(act).in_reply_to("x");
+            let state = stage.right(answer());
+            let now = stage.now;
+            stage.monitor.undelivered(&answer(), "ann", now);
+            assert_eq!(stage.right(answer()), state);
+        }
+    }
+}
+
+#[test]
+fn a_cancel_of_uncertain_delivery_may_be_answered() {
+    for (act, state) in [
+        ("inform ben>ann", "cancelled"),
+        ("failure ben>ann", "agreed"),
+    ] {
+        for mut stage in monitors("ann") {
+            stage.right(request("request ann>ben").reply_with("q"));
+            stage.right(request("agree ben>ann").in_reply_to("q"));
+            let cancel = || request("cancel ann>ben").reply_with("x");
+            stage.right(cancel());
+            let now = stage.now;
+            stage.monitor.undelivered(&cancel(), "ben", now);
+            assert_eq!(stage.right(request(act).in_reply_to("x")), state);
+        }
+    }
+}
+
+#[test]
+fn a_bid_belongs_to_the_last_call_that_was_delivered() {
+    let english = |text| say_in("fipa-auction-english", text);
+    for mut stage in monitors("ann") {
+        stage.right(english("inform ann>ben").reply_with("opening"));
+        stage.right(english("cfp ann>ben").reply_with("1"));
+        stage.right(english("cfp ann>ben").reply_with("2"));
+        let lost = || english("cfp ann>ben").reply_with("3");
+        stage.right(lost());
+        let now = stage.now;
+        stage.monitor.undelivered(&lost(), "ben", now);
+        // The first bid is too late, the second answers the last call.
+        let Verdict::Accepted(first) =
+            stage.check(&english("propose ben>ann").in_reply_to("1").reply_with("a"))
+        else {
+            panic!();
+        };
+        assert!(first.void);
+        let second = english("propose ben>ann").in_reply_to("2").reply_with("b");
+        assert_eq!(stage.right(second), "bidding");
+        let accepted = english("accept-proposal ann>ben").in_reply_to("b");
+        assert_eq!(stage.right(accepted), "leading");
+    }
+    // The call arrived after all.
+    for mut stage in monitors("ann") {
+        stage.right(english("inform ann>ben").reply_with("opening"));
+        stage.right(english("cfp ann>ben").reply_with("1"));
+        let call = || english("cfp ann>ben").reply_with("2");
+        stage.right(call());
+        let now = stage.now;
+        stage.monitor.undelivered(&call(), "ben", now);
+        let bid = english("propose ben>ann").in_reply_to("2");
+        assert_eq!(stage.right(bid), "bidding");
+    }
+}
+
+#[test]
+fn a_bid_may_answer_a_call_that_the_monitor_does_not_remember() {
+    let dutch = |text| say_in("fipa-auction-dutch", text);
+    for mut stage in monitors("ann") {
+        stage.right(dutch("inform ann>ben").reply_with("opening"));
+        for number in 0..9 {
+            let call = dutch("cfp ann>ben").reply_with(number.to_string());
+            assert_eq!(stage.right(call), "called");
+        }
+        let bid = dutch("propose ben>ann").in_reply_to("0");
+        let Verdict::Accepted(bid) = stage.check(&bid) else {
+            panic!();
+        };
+        assert!(bid.void);
+        stage.right(dutch("propose ben>ann").in_reply_to("8").reply_with("a"));
+    }
+    // Few messages are all known.
+    for mut stage in monitors("ann") {
+        stage.right(dutch("inform ann>ben").reply_with("opening"));
+        stage.right(dutch("cfp ann>ben").reply_with("1"));
+        let bid = dutch("propose ben>ann").in_reply_to("0");
+        assert_eq!(stage.wrong(bid).kind, Kind::WrongReply);
+    }
+}
+
+#[test]
+fn each_participant_of_a_forgotten_conversation_may_be_in_a_later_state() {
+    let english = |text| say_in("fipa-auction-english", text);
+    let monitor = Monitor::agent(library(), "ann").with_history(History::Unknown);
+    let mut stage = Stage::new(monitor);
+    // The auction begins for ben.
+    stage.right(english("inform ann>ben"));
+    stage.right(english("cfp ann>ben"));
+    // It ends for cid, whose bid crosses the end.
+    stage.right(english("inform ann>cid"));
+    assert_eq!(stage.check(&english("propose cid>ann")), UNKNOWN);
+    // The end is not delivered, so the auction goes on for ben.
+    let monitor = Monitor::agent(library(), "ann").with_history(History::Unknown);
+    let mut stage = Stage::new(monitor);
+    let end = || english("inform ann>ben").reply_with("3");
+    stage.right(end());
+    let now = stage.now;
+    stage.monitor.undelivered(&end(), "ben", now);
+    stage.right(english("cfp ann>ben").reply_with("4"));
+    let bid = english("propose ben>ann").in_reply_to("2");
+    assert_eq!(stage.check(&bid), UNKNOWN);
 }
 
 #[test]

@@ -63,8 +63,10 @@ struct Conversation<'l> {
     joined: bool,
     /// Participants and the agents that continue in their places.
     delegates: Vec<(&'static str, &'static str)>,
-    /// Other states to which the first message may have led.
-    alternatives: Vec<String>,
+    /// Whether it may have begun before the monitor.
+    may_continue: bool,
+    /// If so, other states to which the first message to a participant may have led.
+    alternatives: Vec<(&'static str, String)>,
     /// Time of the last accepted message.
     touched: u64,
     /// Embedded conversations, the latest first.
@@ -176,7 +178,7 @@ impl<'l> Reference<'l> {
         if begins(machine, words.act) {
             let mut conversation = Conversation::new(machine, words.from, self.agent);
             if self.removed.contains(&words.id) {
-                conversation.alternatives = later_targets(machine, words.act);
+                conversation.may_continue = !later_targets(machine, words.act).is_empty();
             }
             evict_alike(alike, &mut self.removed, words, self.agent);
             return match conversation.check(words, now) {
@@ -327,6 +329,7 @@ impl<'l> Conversation<'l> {
             designated: Vec::new(),
             joined: false,
             delegates: Vec::new(),
+            may_continue: false,
             alternatives: Vec::new(),
             touched: 0,
             inner: Vec::new(),
@@ -639,24 +642,53 @@ impl Conversation<'_> {
         for (_, talk) in &mut self.talks {
             talk.expire(self.machine, now);
         }
+        let before = self.lengths();
         let verdict = match self.machine.scope() {
             Scope::Participant => self.check_per_participant(words, now),
             _ => self.check_per_conversation(words, now),
         }?;
         self.touched = now;
-        if let ReferenceVerdict::Accepted(_, [false, ..]) = &verdict {
-            let machine = self.machine;
-            let before = std::mem::take(&mut self.alternatives);
-            let fitting = before.iter().filter_map(|id| {
-                let all = options(machine, id);
-                let step = all
-                    .iter()
-                    .find(|step| matches(step.performative(), words.act))?;
-                Some(machine.target(step).to_owned())
-            });
-            self.alternatives = fitting.collect();
+        if self.may_continue && matches!(&verdict, ReferenceVerdict::Accepted(..)) {
+            self.keep_alternatives(words, &before);
         }
         Ok(verdict)
+    }
+
+    /// Returns the numbers of messages to the participants; `*` is a multicast.
+    fn lengths(&self) -> HashMap<&'static str, usize> {
+        let talks = self.talks.iter().map(|(peer, talk)| (*peer, talk));
+        let talks = talks.chain(self.multicast.iter().map(|talk| ("*", talk)));
+        let began = |(_, talk): &(&str, &Talk)| {
+            self.machine.scope() == Scope::Participant || !talk.said.is_empty()
+        };
+        talks
+            .filter(began)
+            .map(|(peer, talk)| (peer, talk.said.len()))
+            .collect()
+    }
+
+    fn keep_alternatives(&mut self, words: &Words, before: &HashMap<&'static str, usize>) {
+        let machine = self.machine;
+        let after = self.lengths();
+        let known = std::mem::take(&mut self.alternatives).into_iter();
+        let kept = known.filter_map(|(peer, id)| {
+            if before.get(peer) == after.get(peer) {
+                return Some((peer, id));
+            }
+            let all = options(machine, &id);
+            let step = all
+                .iter()
+                .find(|step| matches(step.performative(), words.act))?;
+            Some((peer, machine.target(step).to_owned()))
+        });
+        self.alternatives = kept.collect();
+        if begins(machine, words.act) {
+            let new = after.keys().filter(|peer| !before.contains_key(*peer));
+            for peer in new {
+                let others = later_targets(machine, words.act).into_iter();
+                self.alternatives.extend(others.map(|id| (*peer, id)));
+            }
+        }
     }
 
     fn view<'w>(&self, words: &'w Words, by_initiator: bool) -> View<'w> {

@@ -137,13 +137,15 @@ impl Talk {
         said.find(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel)
     }
 
-    /// Whether one of the six questions before the last message has this `reply-with`.
+    /// Whether one of the questions before the last message may have this `reply-with`: the last six are
+    /// known.
     pub(super) fn asked_earlier(&self, initiator: bool, text: &str) -> bool {
         let said = self.said.iter().rev();
         let own = said
             .filter(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel);
         let mut asked = own.skip(1).filter_map(|said| said.reply_with.as_deref());
-        asked.by_ref().take(6).any(|asked| asked == text)
+        let known: Vec<&str> = asked.by_ref().take(6).collect();
+        known.len() == 6 || known.contains(&text)
     }
 
     pub(super) fn cancel(&self) -> Option<&SentMessage> {
