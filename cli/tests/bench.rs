@@ -10,7 +10,7 @@ use serde_json::Value;
 fn bench(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
     command
-        .arg("bench")
+        .args(["--set", "monitor.check=enforce", "bench"])
         .args(arguments)
         .stdin(Stdio::null())
         .env_remove("FIPA_CONFIG")

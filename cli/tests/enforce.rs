@@ -159,3 +159,43 @@ fn commands_with_agents_of_their_own_go_on_after_an_illegal_message() {
     assert!(left.contains("crane"), "{left}");
     drop(crane);
 }
+
+#[test]
+fn a_question_to_a_platform_goes_on_after_an_illegal_message() {
+    let host = Host::new();
+    let mut silent = host.start(&["listen", "manager"]);
+    let mut asking = host.command(&[&ENFORCE[..], &["ams", "--ams", "manager"]].concat());
+    let asking = std::thread::spawn(move || asking.output().unwrap());
+    let line = silent.line();
+    assert!(line.contains("request"), "{line}");
+    let sent = host.run(&illegal("fipa-.*")).done();
+    assert!(sent.contains("delivered"), "{sent}");
+    assert!(!asking.is_finished());
+    drop(silent);
+    let ended = asking.join().unwrap();
+    assert_eq!(ended.status.code(), Some(1));
+    let errors = String::from_utf8(ended.stderr).unwrap();
+    assert!(errors.contains("violates its protocol"), "{errors}");
+    assert!(errors.contains("manager"), "{errors}");
+}
+
+#[test]
+fn watching_and_an_agent_of_the_demo_go_on_after_an_illegal_message() {
+    let host = Host::new();
+    let mut watching = host.start(&[&ENFORCE[..], &["watch", "--json"]].concat());
+    let mut agent = host.ordered_agent("arm_1", &ENFORCE);
+    host.run(&illegal("arm_1")).done();
+    let letter = |watching: &mut common::Running| -> serde_json::Value {
+        serde_json::from_str(&watching.line()).unwrap()
+    };
+    let seen = letter(&mut watching);
+    assert_eq!(seen["verdict"]["verdict"], "violation", "{seen:#}");
+    assert!(agent.line().contains("accept-proposal"));
+    host.run(&["send", "--to", "arm_1", "--content", "hello"])
+        .done();
+    assert!(agent.line().contains("hello"));
+    let seen = letter(&mut watching);
+    assert_eq!(seen["verdict"]["verdict"], "unchecked", "{seen:#}");
+    agent.write_line(r#"{"do":"count"}"#);
+    assert!(agent.line().contains("count"));
+}

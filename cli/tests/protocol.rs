@@ -213,3 +213,67 @@ fn the_transitions_of_every_protocol_are_drawn_on_request() {
         assert!(auction.contains("undelivered"), "{auction}");
     }
 }
+
+#[test]
+fn a_check_says_why_a_protocol_with_three_roles_is_only_watched() {
+    let host = Host::new();
+    let checked = |states: &str, arguments: &[&str]| {
+        let file = host.path("three.scxml");
+        fs::write(&file, format!("<scxml initial=\"1\">{states}</scxml>")).unwrap();
+        let check = ["protocol", "check", file.to_str().unwrap()];
+        host.run(&[&check, arguments].concat()).done()
+    };
+    let step = |act: &str, from: &str, to: &str, target: u8| {
+        format!(
+            "<transition performative=\"{act}\" from=\"{from}\" to=\"{to}\" target=\"{target}\"/>"
+        )
+    };
+    let state = |id: u8, steps: &[String]| format!("<state id=\"{id}\">{}</state>", steps.concat());
+    let end = |id: u8| format!("<state id=\"{id}\" final=\"yes\"/>");
+    // The role c is told the same in two cases, and its answer may be the wrong one.
+    let asked = [
+        state(
+            1,
+            &[step("request", "a", "b", 2), step("propose", "a", "b", 3)],
+        ),
+        state(2, &[step("request", "b", "c", 4)]),
+        state(3, &[step("request", "b", "c", 5)]),
+        state(4, &[step("agree", "c", "b", 6)]),
+        state(5, &[step("refuse", "c", "b", 6)]),
+        end(6),
+    ];
+    let shown = checked(&asked.concat(), &[]);
+    for defect in [
+        "only watched: c cannot know when to send",
+        "b does not expect",
+    ] {
+        assert!(shown.contains(defect), "{defect}: {shown}");
+    }
+    // The role c is told one of two decisions, and waits for the other one too.
+    let untold = [
+        state(
+            1,
+            &[step("request", "a", "b", 2), step("propose", "a", "b", 3)],
+        ),
+        state(2, &[step("request", "b", "c", 4)]),
+        state(3, &[step("inform", "b", "a", 4)]),
+        end(4),
+    ];
+    let report = checked(&untold.concat(), &["--json"]);
+    let report: Value = serde_json::from_str(&report).unwrap();
+    let defects = report[0]["defects"].as_array().unwrap();
+    let deadlock = |defect: &Value| defect.as_str().unwrap().starts_with("deadlock: ");
+    assert!(defects.iter().any(deadlock), "{report:#}");
+    // No transition leads to the state.
+    let apart = [
+        state(1, &[step("request", "a", "b", 2)]),
+        end(2),
+        state(3, &[step("inform", "b", "a", 2)]),
+    ];
+    let file = host.path("apart.scxml");
+    let text = format!("<scxml initial=\"1\">{}</scxml>", apart.concat());
+    fs::write(&file, text).unwrap();
+    let wrong = host.run(&["protocol", "check", file.to_str().unwrap()]);
+    let wrong = wrong.failed(1);
+    assert!(wrong.contains("\"3\""), "{wrong}");
+}

@@ -7,9 +7,12 @@ mod common;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
+use std::time::{Duration, SystemTime};
 
 use common::{Host, Running};
-use serde_json::Value;
+use fipa::monitor::recording::{self, Recorded};
+use fipa::{AgentId, Message, Performative};
+use serde_json::{Value, json};
 
 /// Starts `fipa watch --json` and waits until it watches all running processes.
 fn watch(host: &Host, arguments: &[&str]) -> Running {
@@ -444,6 +447,107 @@ fn recorded_letters_are_judged_later() {
             .failed(1);
         assert!(failed.contains(name), "{failed}");
     }
+}
+
+#[test]
+fn conversations_that_may_have_begun_before_the_watching_are_unchecked() {
+    let host = Host::new();
+    let (mut rover, mut arm) = (
+        host.ordered_agent("rover", &[]),
+        host.ordered_agent("arm", &[]),
+    );
+    let converse = |agent: &mut Running, act: &str, to: &str, conversation: &str| {
+        let order = json!({
+            "do": "converse", "performative": act, "to": to, "conversation": conversation
+        });
+        agent.write_line(&order.to_string());
+        while next(agent)["event"] != "outcomes" {}
+    };
+    converse(&mut rover, "cfp", "arm", "earlier");
+    let file = host.path("late.rec");
+    let file = file.to_str().unwrap();
+    let mut watching = watch(&host, &["--record", file]);
+    let mut verdicts = |agent: &mut Running, act: &str, to: &str, conversation: &str| {
+        converse(agent, act, to, conversation);
+        let seen = next_of(&mut watching, "letter");
+        assert_eq!(seen["performative"], act, "{seen:#}");
+        let verdict = seen["verdict"]["verdict"].as_str();
+        verdict.unwrap().to_owned()
+    };
+    // It began before the command.
+    assert_eq!(
+        verdicts(&mut arm, "propose", "rover", "earlier"),
+        "unchecked"
+    );
+    assert_eq!(
+        verdicts(&mut rover, "accept-proposal", "arm", "earlier"),
+        "unchecked"
+    );
+    // It begins while it is watched.
+    assert_eq!(verdicts(&mut rover, "cfp", "arm", "later"), "accepted");
+    assert_eq!(verdicts(&mut arm, "inform", "rover", "later"), "violation");
+    // One of the agents registers later.
+    let mut crane = host.ordered_agent("crane", &[]);
+    assert_eq!(verdicts(&mut crane, "propose", "arm", "other"), "violation");
+    let (code, errors) = watching.signal("-INT");
+    assert_eq!((code, errors.as_str()), (Some(0), ""));
+    // The recording has the same verdicts.
+    let replayed = host.run(&["protocol", "replay", file]);
+    assert_eq!(replayed.code, Some(1));
+    let shown = String::from_utf8(replayed.stdout).unwrap();
+    let summary = "letters: 5, accepted: 1, violations: 2, unchecked: 2, not judged: 0";
+    assert_eq!(shown.lines().last(), Some(summary), "{shown}");
+}
+
+#[test]
+fn letters_that_were_lost_make_no_violations() {
+    // A recording with a loss between the opening and the inform.
+    let message = |act: Performative, from: &str, to: &str| {
+        let agent = |name| AgentId::new(name).unwrap();
+        let message = Message::builder(act)
+            .sender(agent(from))
+            .receiver(agent(to))
+            .protocol("fipa-contract-net")
+            .conversation_id("c");
+        message.build().unwrap()
+    };
+    let written = |after_loss: bool| {
+        let mut file = Vec::new();
+        recording::begin(&mut file);
+        for (number, message) in [
+            message(Performative::Cfp, "rover", "arm"),
+            message(Performative::Inform, "arm", "rover"),
+        ]
+        .into_iter()
+        .enumerate()
+        {
+            let recorded = Recorded {
+                at: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
+                receiver: message.receivers()[0].name().to_owned(),
+                undelivered: false,
+                from_service: false,
+                may_continue: true,
+                after_loss: after_loss && number == 1,
+                message: Some(message),
+            };
+            recording::append(&recorded, &mut file).unwrap();
+        }
+        file
+    };
+    let host = Host::new();
+    let judged = |after_loss| {
+        let file = written(after_loss);
+        let ran = host.run_with_input(&["protocol", "replay", "-"], &file);
+        (ran.code, String::from_utf8(ran.stdout).unwrap())
+    };
+    let (code, shown) = judged(true);
+    assert_eq!(code, Some(0), "{shown}");
+    assert!(
+        shown.contains("accepted: 1, violations: 0, unchecked: 1"),
+        "{shown}"
+    );
+    let (code, shown) = judged(false);
+    assert_eq!(code, Some(1), "{shown}");
 }
 
 #[test]

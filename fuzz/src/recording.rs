@@ -71,6 +71,8 @@ pub fn seeds() -> Vec<Vec<u8>> {
             receiver: to.to_owned(),
             undelivered: false,
             from_service: false,
+            may_continue: number == 2,
+            after_loss: number == 3,
             message: message.ok(),
         };
         append(&recorded, &mut file).expect("a short entry");

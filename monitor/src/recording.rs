@@ -7,8 +7,9 @@
 //!
 //! All integers are little-endian. `version` is 1. `length` counts the bytes of the entry after itself,
 //! at most [`MAX_ENTRY`]. `time` is in nanoseconds since 1970-01-01T00:00:00Z. `flags` is the sum of 1
-//! for a letter that was not delivered, and 2 for a letter of a message transport service. `receiver` is
-//! the name of the agent that got, or was to get, the letter, in UTF-8. `message` is the message without
+//! for a letter that was not delivered, 2 for a letter of a message transport service, 4 for a letter
+//! whose conversation may have begun before the recording, and 8 if letters before this one are missing.
+//! A reader ignores other flags. `receiver` is the name of the agent that got, or was to get, the letter, in UTF-8. `message` is the message without
 //! its content in bit-efficient encoding (FIPA00069), or empty if it is unknown. The entries are in the
 //! order in which the letters were sent.
 //!
@@ -33,6 +34,8 @@ const FIXED: usize = 8 + 1 + 2;
 
 const UNDELIVERED: u8 = 1;
 const FROM_SERVICE: u8 = 2;
+const MAY_CONTINUE: u8 = 4;
+const AFTER_LOSS: u8 = 8;
 
 /// A recorded letter to one receiver.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,6 +49,10 @@ pub struct Recorded {
     pub undelivered: bool,
     /// Whether a message transport service wrote the letter.
     pub from_service: bool,
+    /// Whether the conversation of the letter may have begun before the recording.
+    pub may_continue: bool,
+    /// Whether letters before this one are missing, so that the conversations so far are unknown.
+    pub after_loss: bool,
     /// The message; its content is not recorded.
     pub message: Option<Message>,
 }
@@ -105,13 +112,11 @@ pub fn append(recorded: &Recorded, out: &mut Vec<u8>) -> Result<(), TooLong> {
     let length = length.ok_or(TooLong)?;
     let since = recorded.at.duration_since(UNIX_EPOCH).unwrap_or_default();
     let nanos = u64::try_from(since.as_nanos()).unwrap_or(u64::MAX);
-    let mut flags = 0;
-    if recorded.undelivered {
-        flags |= UNDELIVERED;
-    }
-    if recorded.from_service {
-        flags |= FROM_SERVICE;
-    }
+    let flag = |set: bool, flag: u8| if set { flag } else { 0 };
+    let flags = flag(recorded.undelivered, UNDELIVERED)
+        | flag(recorded.from_service, FROM_SERVICE)
+        | flag(recorded.may_continue, MAY_CONTINUE)
+        | flag(recorded.after_loss, AFTER_LOSS);
     out.extend_from_slice(&length.to_le_bytes());
     out.extend_from_slice(&nanos.to_le_bytes());
     out.push(flags);
@@ -217,6 +222,8 @@ fn entry_of(entry: &[u8]) -> Result<Recorded, &'static str> {
         receiver: receiver.to_owned(),
         undelivered: flags & UNDELIVERED != 0,
         from_service: flags & FROM_SERVICE != 0,
+        may_continue: flags & MAY_CONTINUE != 0,
+        after_loss: flags & AFTER_LOSS != 0,
         message: Message::decode(&bytes::Bytes::copy_from_slice(message).into()).ok(),
     })
 }
@@ -240,6 +247,8 @@ mod tests {
             receiver: "ben".to_owned(),
             undelivered: number % 2 == 1,
             from_service: number % 3 == 1,
+            may_continue: number % 4 == 3,
+            after_loss: number == 4,
             message: message.ok().filter(|_| number != 2),
         }
     }

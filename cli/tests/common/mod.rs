@@ -75,6 +75,17 @@ impl Host {
         Running::new(self.command(arguments))
     }
 
+    /// Starts an agent of the demo, which executes orders from standard input, and waits until it is
+    /// registered.
+    pub(crate) fn ordered_agent(&self, name: &str, arguments: &[&str]) -> Running {
+        let role = ["demo", "--role", "agent", "--name", name];
+        let mut command = self.command(&[arguments, &role].concat());
+        command.stdin(Stdio::piped());
+        let running = Running::new(command);
+        assert!(running.ready.contains("ready"), "{}", running.ready);
+        running
+    }
+
     /// Starts an echo agent and waits until it is registered.
     pub(crate) fn echo(&self, name: &str) -> Running {
         let running = self.start(&["echo", name]);
@@ -197,6 +208,13 @@ impl Running {
         };
         running.ready = running.line();
         running
+    }
+
+    /// Writes a line to its standard input, which must be a pipe.
+    #[track_caller]
+    pub(crate) fn write_line(&mut self, line: &str) {
+        let input = self.child.child().stdin.as_mut();
+        writeln!(input.unwrap(), "{line}").unwrap();
     }
 
     /// Waits for the next line of standard output.

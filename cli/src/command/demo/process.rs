@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 
-use crate::command::watch::checker::{CheckResult, Checker, Letter};
+use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::output;
 
 /// The protocol of messages that are sent only to measure their time.
@@ -154,6 +154,8 @@ pub(super) async fn watcher(config: &Config) -> Result<(), String> {
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let mut watcher = watcher.map_err(|error| ErrorChain(&error).to_string())?;
     let mut checker = Checker::new(Library::standard());
+    let mut earlier = Earlier::default();
+    earlier.add(watcher.directory());
     emit(&Event::Ready {
         locations: Vec::new(),
     });
@@ -170,7 +172,7 @@ pub(super) async fn watcher(config: &Config) -> Result<(), String> {
         let fipa::watch::Event::Letter(passage) = seen else {
             continue;
         };
-        match checker.check(Letter::from(&*passage)) {
+        match checker.check(Letter::of(&passage, &earlier)) {
             CheckResult::Accepted { .. } => accepted += 1,
             CheckResult::Violation(violation) => emit(&Event::Violation {
                 sender: violation.sender.clone(),

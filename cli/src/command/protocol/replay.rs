@@ -126,6 +126,9 @@ impl Replay {
 
     fn letter(&mut self, recorded: &Recorded) -> Result<(), Failure> {
         self.counts.letters += 1;
+        if recorded.after_loss {
+            self.checker.forget();
+        }
         let message = recorded.message.as_ref();
         let protocol = message.and_then(|message| message.protocol());
         // A message of a judged conversation need not name the protocol.
@@ -143,6 +146,7 @@ impl Replay {
             at: recorded.at,
             from_service: recorded.from_service,
             undelivered: recorded.undelivered,
+            may_continue: recorded.may_continue,
         });
         match checked {
             CheckResult::Accepted { .. } => self.counts.accepted += 1,

@@ -1,5 +1,6 @@
 //! Checks letters against the protocols of their conversations.
 
+use std::collections::HashSet;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -7,13 +8,16 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use fipa::watch::{Fate, Passage};
-use fipa::{Message, Outcome};
-use fipa_monitor::{Event, Header, Library, LibraryError, Monitor, Unchecked, Verdict, Violation};
+use fipa::{DirectoryView, Message, Outcome};
+use fipa_monitor::{
+    Event, Header, History, Library, LibraryError, Monitor, Unchecked, Verdict, Violation,
+};
 
 use crate::report::Failure;
 
 /// Checks every observed letter.
 pub(in crate::command) struct Checker {
+    library: Arc<Library>,
     monitor: Monitor,
 }
 
@@ -82,17 +86,46 @@ pub(in crate::command) struct Letter<'a> {
     /// Whether a message transport service wrote it.
     pub(in crate::command) from_service: bool,
     pub(in crate::command) undelivered: bool,
+    /// Whether its conversation may have begun before the observation.
+    pub(in crate::command) may_continue: bool,
 }
 
-impl<'a> From<&'a Passage> for Letter<'a> {
-    fn from(passage: &'a Passage) -> Self {
+impl<'a> Letter<'a> {
+    /// Returns the data of an observed letter.
+    pub(in crate::command) fn of(passage: &'a Passage, earlier: &Earlier) -> Self {
         Self {
             message: passage.message.as_ref(),
             receiver: &passage.receiver,
             at: passage.at,
             from_service: passage.from_service,
             undelivered: matches!(passage.fate, Fate::Settled(Outcome::Failed { .. })),
+            may_continue: earlier.may_have_begun(passage),
         }
+    }
+}
+
+/// The agents that were registered before the observation began: conversations among them may have begun
+/// before it. An agent that registers later cannot continue a conversation, unless it has a name of
+/// before.
+#[derive(Debug, Default)]
+pub(in crate::command) struct Earlier {
+    names: HashSet<Arc<str>>,
+}
+
+impl Earlier {
+    /// Adds the agents that are registered now.
+    pub(in crate::command) fn add(&mut self, directory: DirectoryView<'_>) {
+        directory.refresh();
+        let entries = directory.entries();
+        self.names
+            .extend(entries.iter().map(|entry| Arc::clone(&entry.name)));
+    }
+
+    fn may_have_begun(&self, passage: &Passage) -> bool {
+        // The directory may not have had all agents of other hosts.
+        let crosses_hosts = passage.from_elsewhere || passage.gateway.is_some();
+        let was_there = |name: &str| self.names.contains(name);
+        crosses_hosts || passage.sender().is_none_or(was_there) && was_there(&passage.receiver)
     }
 }
 
@@ -124,9 +157,16 @@ pub(in crate::command) fn protocols(
 impl Checker {
     /// Creates a checker with these protocols.
     pub(in crate::command) fn new(library: Library) -> Self {
+        let library = Arc::new(library);
         Self {
-            monitor: Monitor::observer(Arc::new(library)),
+            monitor: Monitor::observer(Arc::clone(&library)),
+            library,
         }
+    }
+
+    /// Forgets all conversations, because letters are missing.
+    pub(in crate::command) fn forget(&mut self) {
+        self.monitor = Monitor::observer(Arc::clone(&self.library));
     }
 
     pub(in crate::command) fn check(&mut self, letter: Letter<'_>) -> CheckResult {
@@ -139,6 +179,10 @@ impl Checker {
         if letter.undelivered {
             return CheckResult::Excluded("not delivered");
         }
+        self.monitor.set_history(match letter.may_continue {
+            true => History::Unknown,
+            false => History::Complete,
+        });
         // A letter has exactly one receiver, a message can have several.
         let header = Header::from(message).copy_for(letter.receiver);
         match self.monitor.check(&header, letter.at) {

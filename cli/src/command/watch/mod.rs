@@ -19,7 +19,7 @@ use fipa::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::{Config, Matcher, Performative};
 use tokio::time::Instant;
 
-use self::checker::{CheckResult, Checker, Letter};
+use self::checker::{CheckResult, Checker, Earlier, Letter};
 use self::conversations::Conversations;
 use self::filter::Filter;
 use self::recorder::Recorder;
@@ -40,6 +40,10 @@ use crate::report::Failure;
 /// Letters are shown in the order in which they were sent, each when its outcome is known or after
 /// 250 ms. A later outcome is printed on a line of its own. If the output is read too slowly, the
 /// command reports the number of lost records.
+///
+/// A conversation that may have begun before the command is unchecked until a message begins another
+/// one: the agents of its letter were registered before, or one of them is on another host. After lost
+/// records, this holds for all conversations.
 ///
 /// Ctrl-C stops the command and prints a summary.
 #[derive(Debug, Args)]
@@ -163,6 +167,8 @@ async fn watch(
     let content = arguments.content.unwrap_or(0);
     let watcher = Watcher::open(config, WatchOptions { content }).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
+    let mut earlier = Earlier::default();
+    earlier.add(watcher.directory());
     let mut display = Display {
         filter: Filter {
             agents: &arguments.agent,
@@ -172,6 +178,7 @@ async fn watch(
             violations: arguments.violations,
         },
         checker,
+        earlier,
         recorder,
         tally: Tally::default(),
         conversations: (arguments.sequence || arguments.mermaid.is_some())
@@ -198,7 +205,12 @@ async fn watch(
                 .is_none_or(|count| display.tally.shown < count)
         {
             tokio::select! {
-                event = watcher.next() => display.event(&event)?,
+                event = watcher.next() => {
+                    if let Event::Lost { .. } = event {
+                        display.lose(&watcher);
+                    }
+                    display.event(&event)?;
+                }
                 () = tokio::time::sleep(TICK) => {}
                 () = &mut stopped => break,
                 () = at(ends) => break,
@@ -213,6 +225,9 @@ async fn watch(
     };
     if !full() {
         while let Some(event) = watcher.finish() {
+            if let Event::Lost { .. } = event {
+                display.lose(&watcher);
+            }
             display.event(&event)?;
         }
     }
@@ -237,6 +252,7 @@ async fn at(end: Option<Instant>) {
 struct Display<'a> {
     filter: Filter<'a>,
     checker: Checker,
+    earlier: Earlier,
     recorder: Option<Recorder>,
     tally: Tally,
     conversations: Option<Conversations>,
@@ -266,6 +282,15 @@ impl Display<'_> {
     fn print(&mut self, text: &str) -> Result<(), Failure> {
         self.has_reader &= output::bytes_if_read(text.as_bytes())?;
         Ok(())
+    }
+
+    /// Handles the loss of letters: the conversations of the present agents are unknown.
+    fn lose(&mut self, watcher: &Watcher) {
+        self.earlier.add(watcher.directory());
+        self.checker.forget();
+        if let Some(recorder) = &mut self.recorder {
+            recorder.lose();
+        }
     }
 
     fn event(&mut self, event: &Event) -> Result<(), Failure> {
@@ -311,10 +336,11 @@ impl Display<'_> {
     fn letter(&mut self, passage: &Passage) -> Result<(), Failure> {
         // Every letter is checked, whether shown or not: the state of a conversation depends on all its
         // letters.
-        let checked = self.checker.check(Letter::from(passage));
+        let letter = Letter::of(passage, &self.earlier);
         if let Some(recorder) = &mut self.recorder {
-            recorder.add(passage)?;
+            recorder.add(&letter)?;
         }
+        let checked = self.checker.check(letter);
         self.tally.letter(passage, &checked);
         if !self.filter.takes(passage, &checked) {
             return Ok(());

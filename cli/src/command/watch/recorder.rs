@@ -4,7 +4,6 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use fipa::watch::Passage;
 use fipa_monitor::recording::{self, Recorded};
 
 use super::checker::Letter;
@@ -19,6 +18,8 @@ pub(super) struct Recorder {
     path: PathBuf,
     file: File,
     buffer: Vec<u8>,
+    /// Whether letters before the next one are missing.
+    after_loss: bool,
 }
 
 impl Recorder {
@@ -31,23 +32,31 @@ impl Recorder {
             path: path.to_owned(),
             file,
             buffer,
+            after_loss: false,
         };
         recorder.flush()?;
         Ok(recorder)
     }
 
+    /// Notes that letters are missing.
+    pub(super) fn lose(&mut self) {
+        self.after_loss = true;
+    }
+
     /// Adds a letter.
-    pub(super) fn add(&mut self, passage: &Passage) -> Result<(), Failure> {
-        let letter = Letter::from(passage);
+    pub(super) fn add(&mut self, letter: &Letter<'_>) -> Result<(), Failure> {
         let recorded = Recorded {
             at: letter.at,
             receiver: letter.receiver.to_owned(),
             undelivered: letter.undelivered,
             from_service: letter.from_service,
+            may_continue: letter.may_continue,
+            after_loss: std::mem::take(&mut self.after_loss),
             message: letter.message.cloned(),
         };
         if let Err(error) = recording::append(&recorded, &mut self.buffer) {
             report::warn(&format!("a letter is not recorded: {error}"));
+            self.after_loss = true;
         }
         match self.buffer.len() >= BUFFERED {
             true => self.flush(),
