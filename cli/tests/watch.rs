@@ -7,7 +7,7 @@ mod common;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use common::{Host, Running};
 use fipa::monitor::recording::{self, Recorded};
@@ -357,10 +357,10 @@ fn the_files_of_a_killed_watcher_are_removed() {
     };
     assert_eq!(sockets(), 1);
     watching.signal("-KILL");
-    let began = std::time::Instant::now();
+    let began = Instant::now();
     while sockets() > 0 {
         assert!(began.elapsed().as_secs() < 60, "the socket was not removed");
-        std::thread::sleep(std::time::Duration::from_millis(5));
+        std::thread::sleep(Duration::from_millis(5));
     }
     send(&host, &["--to", "arm_1", "--content", "unwatched"]);
     arm.signal("-INT");
