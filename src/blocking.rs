@@ -201,6 +201,14 @@ impl Domain {
         crate::Domain::names(config)
     }
 
+    /// Returns the name of the gateway on this host; see [`crate::Domain::gateway_name`].
+    ///
+    /// # Errors
+    /// See [`crate::Domain::gateway_name`].
+    pub fn gateway_name(config: &Config) -> Result<Option<String>, OpenError> {
+        crate::Domain::gateway_name(config)
+    }
+
     /// Registers an agent with a name and without further description.
     ///
     /// # Errors

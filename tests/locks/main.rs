@@ -98,10 +98,13 @@ async fn agents_take_turns_with_each_algorithm() {
                         is_used.store(false, Ordering::SeqCst);
                         lock.release();
                     }
+                    user
                 }));
             }
+            // In the basic form of Suzuki-Kasami, an agent that leaves takes the token with it.
+            let mut stay = Vec::new();
             for user in users {
-                user.await.unwrap();
+                stay.push(user.await.unwrap());
             }
             assert_eq!(last.load(Ordering::SeqCst), 3 * TURNS, "{algorithm}");
             until_async("the bay is free", || bay.status().holder.is_none()).await;

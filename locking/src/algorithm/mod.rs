@@ -25,7 +25,8 @@ pub enum Kind {
     /// Ricart-Agrawala with probes and repeated requests.
     #[default]
     RicartAgrawalaExtended,
-    /// Suzuki-Kasami for members and messages that are never lost.
+    /// Suzuki-Kasami for members and messages that are never lost. An agent that is deregistered takes
+    /// the token with it.
     SuzukiKasami,
     /// Suzuki-Kasami with probes and repeated requests. The token returns to the owner, which replaces
     /// it when it is lost.
