@@ -112,6 +112,10 @@ listen = [\"127.0.0.1:0\"]             # default
 [transport.http]
 listen = [\"127.0.0.1:7778\"]          # default
 
+[transport.https]
+listen = [\"127.0.0.1:0\"]             # default
+authorities = \"\"                     # default
+
 [transport.udt]
 listen = [\"127.0.0.1:0\"]             # default
 

@@ -116,10 +116,14 @@ fn a_gateway_calls_the_gate_with_the_registered_name() {
         directory.register(agent).unwrap();
     }
     let mut core = Core::new(config(true), Arc::new(directory)).gated(gate.clone());
-    for called in ["brake", "arm"] {
-        let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, called, 1));
-        assert_eq!(verdict, refused(), "{called}");
-    }
+    let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, "brake", 1));
+    assert_eq!(verdict, refused());
+    // No agent has this registration and this name.
+    let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, "arm", 1));
+    let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+        panic!("{verdict:?}");
+    };
+    assert_eq!(reason, FailureReason::NoSuchAgent);
     assert!(core.poll_action().is_none(), "the refusal caused no action");
     for _ in 0..2 {
         let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(ARM, "arm", 1));
@@ -127,7 +131,7 @@ fn a_gateway_calls_the_gate_with_the_registered_name() {
     }
     assert_eq!(
         *gate.0.lock(),
-        ["brake", "brake", "arm"],
+        ["brake", "arm"],
         "the copy is in custody already"
     );
     assert!(matches!(core.poll_action(), Some(Action::Dispatch { .. })));

@@ -245,8 +245,10 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
     for (party, agents) in [(&to, ["rover", "rover_*"]), (&from, ["crex", "arm_1"])] {
         let record = party.sink.record.lock();
         let mandates: Vec<_> = record.introduced.iter().map(|it| &it.mandate).collect();
-        let agents = Mandate::Certified(agents.map(str::to_owned).into());
-        assert_eq!(mandates, [&agents]);
+        // The platform agents of the service itself belong to it.
+        let own = ["ams", "df"].map(|agent| format!("{agent}@{NAME}"));
+        let agents: Vec<String> = agents.map(str::to_owned).into_iter().chain(own).collect();
+        assert_eq!(mandates, [&Mandate::Certified(agents.into())]);
     }
     let claimed = letter_parcel(3, letter_from("crex"));
     from.send(3, to.location(), claimed).unwrap();

@@ -127,7 +127,7 @@ fn guards_are_attributes_of_transitions_with_a_state_per_participant() {
     for (from, to, problem) in [
         (r#"f:when="all""#, r#"f:when="any""#, "expected all"),
         (r#"f:when="all""#, r#"f:at-most="0""#, "expected a number"),
-        (r#"f:scope="participant""#, "", "need scope"),
+        (r#"f:scope="participant""#, "", "require scope"),
     ] {
         let wrong = Machine::read("lock", &LOCK.replace(from, to)).unwrap_err();
         assert!(wrong.to_string().contains(problem), "{wrong}");
