@@ -11,7 +11,7 @@
 
 mod greeting;
 
-use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -27,6 +27,7 @@ use super::connection::{Connection, Event, MAX_ID};
 use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
+use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
@@ -34,9 +35,6 @@ use crate::log_limit::warn_limited;
 use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer};
 use crate::stream::budget::{ByteBudget, Meter};
 use crate::stream::source::{Home, QuotaKey};
-
-/// Upper bound of connection numbers (see [`Ticket`]).
-const MAX_CONNECTIONS: u32 = 1 << 24;
 
 /// Maximum number of queued datagrams to unproved peers; further ones are dropped.
 const MAX_OUTBOX: usize = 64;
@@ -62,7 +60,7 @@ pub(crate) struct Core {
     listening: Vec<String>,
     cookies: Cookies,
     random: Random,
-    connections: HashMap<u32, Entry>,
+    connections: Connections<Entry>,
     /// Connections by the identifier that peers put on their datagrams.
     ids: HashMap<u64, u32>,
     /// Connections opened by this side, by location.
@@ -74,20 +72,14 @@ pub(crate) struct Core {
     inbound: HashMap<Inbound, (u64, u32)>,
     /// Accepted connections by the source address and the initiator number of their hello.
     greeted: HashMap<(SocketAddr, u64), u32>,
-    ready: VecDeque<u32>,
-    timers: BTreeSet<(Instant, u32)>,
     outbox: VecDeque<Outbound>,
-    eventful: VecDeque<u32>,
     /// Events of the endpoint, delivered before the events of connections.
     notes: VecDeque<CoreEvent>,
-    /// Removed connections.
-    gone: Vec<u32>,
     /// Rate limits of the peers.
     rate_limits: PeerRateLimits,
     /// Memory of parcels that wait for earlier ones.
     byte_budget: ByteBudget,
     counters: UdpCounters,
-    last_number: u32,
     last_serial: u64,
 }
 
@@ -101,9 +93,20 @@ struct Entry {
     greeted: Option<(SocketAddr, u64)>,
     /// Time of the ping that was sent because another peer claims to be the same service.
     asked: Option<Instant>,
-    timer: Option<Instant>,
-    is_ready: bool,
-    is_eventful: bool,
+}
+
+impl Scheduled for Entry {
+    fn path(&self) -> Option<Path> {
+        self.connection.path()
+    }
+
+    fn has_events(&self) -> bool {
+        self.connection.has_events()
+    }
+
+    fn poll_timeout(&self) -> Option<Instant> {
+        self.connection.poll_timeout()
+    }
 }
 
 /// The key of a peer's connections for one location. It contains the address, so that an unproved
@@ -130,22 +133,17 @@ impl Core {
             listening,
             cookies,
             random,
-            connections: HashMap::new(),
+            connections: Connections::new(),
             ids: HashMap::new(),
             dialled: HashMap::new(),
             known: HashMap::new(),
             inbound: HashMap::new(),
             greeted: HashMap::new(),
-            ready: VecDeque::new(),
-            timers: BTreeSet::new(),
             outbox: VecDeque::new(),
-            eventful: VecDeque::new(),
             notes: VecDeque::new(),
-            gone: Vec::new(),
             rate_limits: PeerRateLimits::default(),
             byte_budget: ByteBudget::default(),
             counters: UdpCounters::default(),
-            last_number: 0,
             last_serial: 0,
         }
     }
@@ -183,7 +181,7 @@ impl Core {
             Some(number) => (number, false),
             None => (self.create(now, to)?, true),
         };
-        let Some(entry) = self.connections.get_mut(&number) else {
+        let Some(entry) = self.connections.get_mut(number) else {
             return Err(TransportError::new(
                 TransportErrorKind::Broken,
                 "the connection has ended",
@@ -198,7 +196,7 @@ impl Core {
             }
             return Err(error);
         }
-        self.touch(number);
+        self.connections.touch(number);
         Ok(fresh.then_some(number))
     }
 
@@ -210,15 +208,7 @@ impl Core {
     /// Ends the connections that are bound to addresses that this host no longer has. `local`
     /// returns the address of a socket that belongs to one connection.
     pub(crate) fn lost(&mut self, lost: &HashSet<IpAddr>, local: impl Fn(u32) -> Option<IpAddr>) {
-        let numbers: Vec<(u32, IpAddr)> = self
-            .connections
-            .iter()
-            .filter_map(|(number, entry)| {
-                let path = entry.connection.path()?;
-                let ip = path.local.or_else(|| local(path.socket))?;
-                lost.contains(&ip).then_some((*number, ip))
-            })
-            .collect();
+        let numbers = self.connections.bound_to(lost, local);
         for (number, ip) in numbers {
             let what = format!("this host no longer has the address {ip}");
             self.end(number, &ConnectionEnd::Broken(what));
@@ -227,7 +217,7 @@ impl Core {
 
     /// Whether a new connection has yet to be opened.
     pub(crate) fn is_opening(&self, number: u32) -> bool {
-        let entry = self.connections.get(&number);
+        let entry = self.connections.get(number);
         entry.is_some_and(|entry| entry.connection.is_opening())
     }
 
@@ -308,7 +298,7 @@ impl Core {
             Datagram::Data { to, number, frames } => {
                 let entry = self.ids.get(&to).copied();
                 let from = entry
-                    .and_then(|entry| self.connections.get(&entry))
+                    .and_then(|entry| self.connections.get(entry))
                     .and_then(|entry| entry.connection.path())
                     .map(|path| path.remote);
                 match entry {
@@ -352,83 +342,60 @@ impl Core {
                 segment: None,
             });
         }
-        while let Some(number) = self.ready.front().copied() {
-            if let Some(entry) = self.connections.get_mut(&number) {
-                let next = entry.connection.poll_transmit(now, &mut self.counters);
-                if let Some((path, contents)) = next {
-                    return Some(Transmit {
-                        connection: Some(number),
-                        path,
-                        contents,
-                        segment: None,
-                    });
-                }
-                entry.is_ready = false;
-            }
-            self.ready.pop_front();
-            self.reschedule(number);
-        }
-        None
+        let counters = &mut self.counters;
+        let (number, (path, contents)) = self
+            .connections
+            .poll_ready(|entry| entry.connection.poll_transmit(now, counters))?;
+        Some(Transmit {
+            connection: Some(number),
+            path,
+            contents,
+            segment: None,
+        })
     }
 
     pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
         if let Some(told) = self.notes.pop_front() {
             return Some(told);
         }
-        while let Some(number) = self.eventful.front().copied() {
-            if let Some(entry) = self.connections.get_mut(&number) {
-                match (entry.connection.poll_event(), &entry.peer) {
-                    (Some(Event::Concluded(attempt, conclusion)), _) => {
-                        return Some(CoreEvent::Concluded(attempt, conclusion));
-                    }
-                    (Some(Event::Arrived { id, parcel }), Some(peer)) => {
-                        let ticket = Ticket(u64::from(number) * MAX_ID + id);
-                        let from = peer.hop.clone();
-                        return Some(CoreEvent::Arrived {
-                            parcel,
-                            from,
-                            ticket,
-                        });
-                    }
-                    (Some(Event::Arrived { .. }), None) | (None, _) => entry.is_eventful = false,
+        self.connections.poll_eventful(|number, entry| {
+            match (entry.connection.poll_event()?, &entry.peer) {
+                (Event::Concluded(attempt, conclusion), _) => {
+                    Some(CoreEvent::Concluded(attempt, conclusion))
                 }
+                (Event::Arrived { id, parcel }, Some(peer)) => Some(CoreEvent::Arrived {
+                    parcel,
+                    from: peer.hop.clone(),
+                    ticket: Ticket(u64::from(number) * MAX_ID + id),
+                }),
+                (Event::Arrived { .. }, None) => None,
             }
-            self.eventful.pop_front();
-        }
-        None
+        })
     }
 
     /// Whether there are events to deliver.
     pub(crate) fn has_events(&self) -> bool {
-        !self.notes.is_empty() || !self.eventful.is_empty()
+        !self.notes.is_empty() || self.connections.has_events()
     }
 
     /// Returns the next removed connection, so that its sockets can be closed.
     pub(crate) fn poll_gone(&mut self) -> Option<u32> {
-        self.gone.pop()
+        self.connections.poll_gone()
     }
 
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
-        self.timers.first().map(|(due, _)| *due)
+        self.connections.poll_timeout()
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Instant) {
-        // Each connection once: its timer stays due until its datagrams have been polled.
-        let due: Vec<u32> = self
-            .timers
-            .iter()
-            .take_while(|(due, _)| *due <= now)
-            .map(|(_, number)| *number)
-            .collect();
-        for number in due {
+        for number in self.connections.due(now) {
             self.with(number, |connection, _| connection.handle_timeout(now));
         }
     }
 
     /// Ends every connection.
     pub(crate) fn close(&mut self) {
-        let numbers: Vec<u32> = self.connections.keys().copied().collect();
-        for number in numbers {
+        for number in self.connections.numbers() {
             self.end(number, &ConnectionEnd::Closed);
         }
     }
@@ -456,42 +423,12 @@ impl Core {
         number: u32,
         act: impl FnOnce(&mut Connection, &mut UdpCounters) -> Result<(), ConnectionEnd>,
     ) {
-        let Some(entry) = self.connections.get_mut(&number) else {
+        let Some(entry) = self.connections.get_mut(number) else {
             return;
         };
         match act(&mut entry.connection, &mut self.counters) {
-            Ok(()) => self.touch(number),
+            Ok(()) => self.connections.touch(number),
             Err(end) => self.end(number, &end),
-        }
-    }
-
-    /// Schedules a connection that has changed.
-    fn touch(&mut self, number: u32) {
-        if let Some(entry) = self.connections.get_mut(&number)
-            && !std::mem::replace(&mut entry.is_ready, true)
-        {
-            self.ready.push_back(number);
-        }
-        self.reschedule(number);
-    }
-
-    fn reschedule(&mut self, number: u32) {
-        let Some(entry) = self.connections.get_mut(&number) else {
-            return;
-        };
-        let due = entry.connection.poll_timeout();
-        if due != entry.timer {
-            if let Some(before) = entry.timer {
-                self.timers.remove(&(before, number));
-            }
-            if let Some(due) = due {
-                self.timers.insert((due, number));
-            }
-            entry.timer = due;
-        }
-        // Sending may have concluded parcels that are too large.
-        if entry.connection.has_events() && !std::mem::replace(&mut entry.is_eventful, true) {
-            self.eventful.push_back(number);
         }
     }
 
@@ -526,32 +463,22 @@ impl Core {
         dialled: Option<Location>,
         greeted: Option<(SocketAddr, u64)>,
     ) -> u32 {
-        loop {
-            self.last_number = (self.last_number + 1) % MAX_CONNECTIONS;
-            if !self.connections.contains_key(&self.last_number) {
-                break;
-            }
-        }
-        let number = self.last_number;
-        self.ids.insert(connection.id(), number);
-        let entry = Entry {
+        let id = connection.id();
+        let number = self.connections.insert(Entry {
             connection,
             dialled,
             peer: None,
             greeted,
             asked: None,
-            timer: None,
-            is_ready: false,
-            is_eventful: false,
-        };
-        self.connections.insert(number, entry);
+        });
+        self.ids.insert(id, number);
         number
     }
 
     /// Registers the peer of a connection.
     fn enter(&mut self, now: Instant, number: u32, name: Arc<str>, hop: Hop) {
         self.doubt_others(now, number, hop.location.incarnation());
-        if let Some(entry) = self.connections.get_mut(&number) {
+        if let Some(entry) = self.connections.get_mut(number) {
             let incarnation = hop.location.incarnation();
             let peer = Introduction {
                 name,
@@ -571,29 +498,26 @@ impl Core {
     /// connections of the service that it claims to be.
     fn doubt_others(&mut self, now: Instant, number: u32, incarnation: Incarnation) {
         let remote = |entry: &Entry| Some(entry.connection.path()?.remote.ip());
-        let here = self.connections.get(&number).and_then(remote);
+        let here = self.connections.get(number).and_then(remote);
         let others = self.known.get(&incarnation).cloned().unwrap_or_default();
         for other in others {
-            if let Some(entry) = self.connections.get_mut(&other)
+            if let Some(entry) = self.connections.get_mut(other)
                 && remote(entry) != here
             {
                 entry.connection.doubt(now, Duration::ZERO);
-                self.touch(other);
+                self.connections.touch(other);
             }
         }
     }
 
     /// Removes a connection from every table.
     fn remove(&mut self, number: u32) -> Option<Entry> {
-        let entry = self.connections.remove(&number)?;
+        let entry = self.connections.remove(number)?;
         self.ids.remove(&entry.connection.id());
         self.dialled.retain(|_, other| *other != number);
         self.inbound.retain(|_, (_, other)| *other != number);
         if let Some(greeted) = entry.greeted {
             self.greeted.remove(&greeted);
-        }
-        if let Some(timer) = entry.timer {
-            self.timers.remove(&(timer, number));
         }
         if entry.peer.is_some() {
             self.counters.connections -= 1;
@@ -602,9 +526,6 @@ impl Core {
                 !numbers.is_empty()
             });
         }
-        self.ready.retain(|other| *other != number);
-        self.eventful.retain(|other| *other != number);
-        self.gone.push(number);
         Some(entry)
     }
 

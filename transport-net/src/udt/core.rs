@@ -8,7 +8,7 @@
 //! counts with the number of its socket (30 random bits), from the address that the connection was
 //! opened from.
 
-use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::net::{IpAddr, SocketAddr};
 use std::time::Instant;
 
@@ -26,6 +26,7 @@ use super::packet::{
 };
 use super::receiver::{Arrived, Receiver};
 use super::sequence;
+use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
@@ -56,25 +57,19 @@ pub(crate) struct Core {
     access: Access,
     cookies: Cookies,
     random: Random,
-    connections: HashMap<u32, Entry>,
+    connections: Connections<Entry>,
     /// Connections by the number of their socket.
     sockets: HashMap<u32, u32>,
     /// Connections opened by this side, by location.
     dialled: HashMap<Location, u32>,
     /// Connections opened by peers, by their origin.
     accepted: HashMap<Origin, u32>,
-    ready: VecDeque<u32>,
-    timers: BTreeSet<(Instant, u32)>,
     outbox: VecDeque<Outbound>,
-    eventful: VecDeque<u32>,
     /// Conclusions of connections that have ended.
     concluded: VecDeque<(AttemptId, Conclusion)>,
-    /// Removed connections.
-    gone: Vec<u32>,
     rate_limits: PeerRateLimits,
     byte_budget: ByteBudget,
     counters: UdtCounters,
-    last_number: u32,
 }
 
 struct Entry {
@@ -83,9 +78,20 @@ struct Entry {
     dialled: Option<Location>,
     /// The origin, if the peer opened it.
     origin: Option<Origin>,
-    timer: Option<Instant>,
-    is_ready: bool,
-    is_eventful: bool,
+}
+
+impl Scheduled for Entry {
+    fn path(&self) -> Option<Path> {
+        self.connection.path()
+    }
+
+    fn has_events(&self) -> bool {
+        self.connection.has_events()
+    }
+
+    fn poll_timeout(&self) -> Option<Instant> {
+        self.connection.poll_timeout()
+    }
 }
 
 /// The handshake by which a peer opened a connection: its address, its socket and its first packet.
@@ -104,20 +110,15 @@ impl Core {
             access,
             cookies,
             random,
-            connections: HashMap::new(),
+            connections: Connections::new(),
             sockets: HashMap::new(),
             dialled: HashMap::new(),
             accepted: HashMap::new(),
-            ready: VecDeque::new(),
-            timers: BTreeSet::new(),
             outbox: VecDeque::new(),
-            eventful: VecDeque::new(),
             concluded: VecDeque::new(),
-            gone: Vec::new(),
             rate_limits: PeerRateLimits::default(),
             byte_budget: ByteBudget::default(),
             counters: UdtCounters::default(),
-            last_number: 0,
         }
     }
 
@@ -148,7 +149,7 @@ impl Core {
             Some(number) => number,
             None => self.create(now, to)?,
         };
-        let sender = self.connections.get_mut(&number);
+        let sender = self.connections.get_mut(number);
         let sent = match sender.and_then(|entry| entry.connection.sender_mut()) {
             Some(sender) => sender.send(attempt, letter),
             None => Err(ConnectionEnd::Hangup.after()),
@@ -159,7 +160,7 @@ impl Core {
             }
             return Err(error);
         }
-        self.touch(number);
+        self.connections.touch(number);
         Ok(there.is_none().then_some(number))
     }
 
@@ -171,15 +172,7 @@ impl Core {
         lost: &HashSet<IpAddr>,
         local: impl Fn(u32) -> Option<IpAddr>,
     ) {
-        let numbers: Vec<(u32, IpAddr)> = self
-            .connections
-            .iter()
-            .filter_map(|(number, entry)| {
-                let path = entry.connection.path()?;
-                let ip = path.local.or_else(|| local(path.socket))?;
-                lost.contains(&ip).then_some((*number, ip))
-            })
-            .collect();
+        let numbers = self.connections.bound_to(lost, local);
         for (number, ip) in numbers {
             let what = format!("this host no longer has the address {ip}");
             self.end(now, number, &ConnectionEnd::Broken(what));
@@ -188,7 +181,7 @@ impl Core {
 
     /// Whether a new connection has yet to be opened.
     pub(crate) fn is_opening(&self, number: u32) -> bool {
-        let entry = self.connections.get(&number);
+        let entry = self.connections.get(number);
         entry.is_some_and(|entry| entry.connection.is_opening())
     }
 
@@ -247,7 +240,7 @@ impl Core {
             return self.greet(now, path, handshake);
         }
         let number = self.sockets.get(&to).copied();
-        let entry = number.and_then(|number| Some((number, self.connections.get_mut(&number)?)));
+        let entry = number.and_then(|number| Some((number, self.connections.get_mut(number)?)));
         let Some((number, entry)) = entry else {
             self.counters.ignored += 1;
             return;
@@ -299,79 +292,58 @@ impl Core {
                 segment: None,
             });
         }
-        while let Some(number) = self.ready.front().copied() {
-            if let Some(entry) = self.connections.get_mut(&number) {
-                let next = entry.connection.poll_transmit(now, &mut self.counters);
-                if let Some((path, contents, segment)) = next {
-                    return Some(Transmit {
-                        connection: Some(number),
-                        path,
-                        contents,
-                        segment,
-                    });
-                }
-                entry.is_ready = false;
-            }
-            self.ready.pop_front();
-            self.reschedule(number);
-        }
-        None
+        let counters = &mut self.counters;
+        let (number, (path, contents, segment)) = self
+            .connections
+            .poll_ready(|entry| entry.connection.poll_transmit(now, counters))?;
+        Some(Transmit {
+            connection: Some(number),
+            path,
+            contents,
+            segment,
+        })
     }
 
     pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
         if let Some((attempt, conclusion)) = self.concluded.pop_front() {
             return Some(CoreEvent::Concluded(attempt, conclusion));
         }
-        while let Some(number) = self.eventful.front().copied() {
-            if let Some(entry) = self.connections.get_mut(&number) {
-                if let Some((attempt, conclusion)) = entry.connection.poll_concluded() {
-                    self.counters.letters_out += 1;
-                    return Some(CoreEvent::Concluded(attempt, conclusion));
-                }
-                if let (Some(arrived), Some(path)) =
-                    (entry.connection.poll_arrived(), entry.connection.path())
-                {
-                    self.counters.letters_in += 1;
-                    return Some(CoreEvent::Arrived(arrived, path.remote));
-                }
-                entry.is_eventful = false;
+        let counters = &mut self.counters;
+        self.connections.poll_eventful(|_, entry| {
+            if let Some((attempt, conclusion)) = entry.connection.poll_concluded() {
+                counters.letters_out += 1;
+                return Some(CoreEvent::Concluded(attempt, conclusion));
             }
-            self.eventful.pop_front();
-        }
-        None
+            let arrived = entry.connection.poll_arrived()?;
+            let path = entry.connection.path()?;
+            counters.letters_in += 1;
+            Some(CoreEvent::Arrived(arrived, path.remote))
+        })
     }
 
     /// Whether there are events to deliver.
     pub(crate) fn has_events(&self) -> bool {
-        !self.concluded.is_empty() || !self.eventful.is_empty()
+        !self.concluded.is_empty() || self.connections.has_events()
     }
 
     /// Returns the next removed connection, so that its sockets can be closed.
     pub(crate) fn poll_gone(&mut self) -> Option<u32> {
-        self.gone.pop()
+        self.connections.poll_gone()
     }
 
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
-        self.timers.first().map(|(due, _)| *due)
+        self.connections.poll_timeout()
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Instant) {
-        // Each connection once: its timer stays due until its datagrams have been polled.
-        let due: Vec<u32> = self
-            .timers
-            .iter()
-            .take_while(|(due, _)| *due <= now)
-            .map(|(_, number)| *number)
-            .collect();
-        for number in due {
+        for number in self.connections.due(now) {
             self.with(now, number, |connection, _| connection.handle_timeout(now));
         }
     }
 
     /// Ends every connection.
     pub(crate) fn close(&mut self, now: Instant) {
-        let numbers: Vec<u32> = self.connections.keys().copied().collect();
-        for number in numbers {
+        for number in self.connections.numbers() {
             self.end(now, number, &ConnectionEnd::Closed);
         }
     }
@@ -411,7 +383,7 @@ impl Core {
         let max_packet = handshake.max_packet.min(MAX_PACKET);
         if let Some(number) = self.accepted.get(&origin) {
             // The answer was lost.
-            if let Some(entry) = self.connections.get(number) {
+            if let Some(entry) = self.connections.get(*number) {
                 let answer = entry.connection.answer(handshake, max_packet);
                 self.put_out(path, answer);
             }
@@ -439,7 +411,7 @@ impl Core {
         let answer = connection.answer(handshake, max_packet);
         let number = self.insert(connection, None, Some(origin));
         self.counters.accepted += 1;
-        self.touch(number);
+        self.connections.touch(number);
         self.put_out(path, answer);
     }
 
@@ -455,7 +427,7 @@ impl Core {
             return true;
         }
         let idle = numbers.into_iter().filter_map(|number| {
-            let entry = self.connections.get(&number)?;
+            let entry = self.connections.get(number)?;
             Some((entry.connection.idle_since()?, number))
         });
         match idle.min() {
@@ -517,41 +489,12 @@ impl Core {
         number: u32,
         act: impl FnOnce(&mut Connection, &mut UdtCounters) -> Result<(), ConnectionEnd>,
     ) {
-        let Some(entry) = self.connections.get_mut(&number) else {
+        let Some(entry) = self.connections.get_mut(number) else {
             return;
         };
         match act(&mut entry.connection, &mut self.counters) {
-            Ok(()) => self.touch(number),
+            Ok(()) => self.connections.touch(number),
             Err(end) => self.end(now, number, &end),
-        }
-    }
-
-    /// Schedules a connection that has changed.
-    fn touch(&mut self, number: u32) {
-        if let Some(entry) = self.connections.get_mut(&number)
-            && !std::mem::replace(&mut entry.is_ready, true)
-        {
-            self.ready.push_back(number);
-        }
-        self.reschedule(number);
-    }
-
-    fn reschedule(&mut self, number: u32) {
-        let Some(entry) = self.connections.get_mut(&number) else {
-            return;
-        };
-        let due = entry.connection.poll_timeout();
-        if due != entry.timer {
-            if let Some(before) = entry.timer {
-                self.timers.remove(&(before, number));
-            }
-            if let Some(due) = due {
-                self.timers.insert((due, number));
-            }
-            entry.timer = due;
-        }
-        if entry.connection.has_events() && !std::mem::replace(&mut entry.is_eventful, true) {
-            self.eventful.push_back(number);
         }
     }
 
@@ -588,30 +531,20 @@ impl Core {
         dialled: Option<Location>,
         origin: Option<Origin>,
     ) -> u32 {
-        loop {
-            self.last_number = self.last_number.wrapping_add(1);
-            if !self.connections.contains_key(&self.last_number) {
-                break;
-            }
-        }
-        let number = self.last_number;
-        self.sockets.insert(connection.id(), number);
-        self.accepted.extend(origin.map(|origin| (origin, number)));
-        let entry = Entry {
+        let id = connection.id();
+        let number = self.connections.insert(Entry {
             connection,
             dialled,
             origin,
-            timer: None,
-            is_ready: false,
-            is_eventful: false,
-        };
-        self.connections.insert(number, entry);
+        });
+        self.sockets.insert(id, number);
+        self.accepted.extend(origin.map(|origin| (origin, number)));
         number
     }
 
     /// Removes a connection from every table.
     fn remove(&mut self, number: u32) -> Option<Entry> {
-        let entry = self.connections.remove(&number)?;
+        let entry = self.connections.remove(number)?;
         self.sockets.remove(&entry.connection.id());
         if let Some(location) = &entry.dialled {
             self.dialled.remove(location);
@@ -619,12 +552,6 @@ impl Core {
         if let Some(origin) = &entry.origin {
             self.accepted.remove(origin);
         }
-        if let Some(timer) = entry.timer {
-            self.timers.remove(&(timer, number));
-        }
-        self.ready.retain(|other| *other != number);
-        self.eventful.retain(|other| *other != number);
-        self.gone.push(number);
         Some(entry)
     }
 

@@ -51,7 +51,7 @@ impl Core {
         }
         if let Some(number) = self.greeted.get(&(from, initiator)) {
             // The welcome was lost.
-            if let Some(entry) = self.connections.get(number) {
+            if let Some(entry) = self.connections.get(*number) {
                 let id = entry.connection.id();
                 let own = self.own_hello(0, String::new());
                 self.reply(path, packet::welcome(initiator, id, &own));
@@ -120,7 +120,7 @@ impl Core {
         self.counters.accepted += 1;
         let own = self.own_hello(0, String::new());
         self.reply(path, packet::welcome(initiator, id, &own));
-        self.touch(number);
+        self.connections.touch(number);
     }
 
     /// Checks whether the service with this incarnation may be the peer of a new connection. An
@@ -130,7 +130,7 @@ impl Core {
     fn claim_status(&mut self, now: Instant, inbound: &Inbound) -> ClaimStatus {
         let mut status = ClaimStatus::Free;
         for number in self.conflicting(inbound) {
-            let Some(other) = self.connections.get_mut(&number) else {
+            let Some(other) = self.connections.get_mut(number) else {
                 continue;
             };
             let asked = other.asked.filter(|asked| now < *asked + PING_VALIDITY);
@@ -138,7 +138,7 @@ impl Core {
                 None => {
                     other.asked = Some(now);
                     other.connection.ask();
-                    self.touch(number);
+                    self.connections.touch(number);
                 }
                 Some(asked) if other.connection.received_since(asked) => return ClaimStatus::Taken,
                 Some(asked) if now >= asked + RESPONSE_TIMEOUT => {
@@ -160,7 +160,7 @@ impl Core {
         let same = self.inbound.get(inbound).map(|(_, number)| *number);
         let known = self.known.get(&inbound.incarnation);
         let conflicts = |number: &u32| {
-            let Some(entry) = self.connections.get(number) else {
+            let Some(entry) = self.connections.get(*number) else {
                 return false;
             };
             let there = entry.connection.path().map(|path| path.remote.ip());
@@ -218,7 +218,7 @@ impl Core {
         let meant = self.connections.iter();
         let meant = meant
             .filter(|(_, entry)| is_meant(&entry.connection))
-            .map(|(number, _)| *number)
+            .map(|(number, _)| number)
             .next();
         match meant {
             Some(number) => {
@@ -238,7 +238,7 @@ impl Core {
         act: impl FnOnce(u32, &mut Connection) -> Result<(), ConnectionEnd>,
     ) {
         let number = self.ids.get(&to).copied();
-        let entry = number.and_then(|number| self.connections.get_mut(&number));
+        let entry = number.and_then(|number| self.connections.get_mut(number));
         let meant = entry
             .and_then(|entry| entry.connection.dialling_mut())
             .is_some_and(|dialling| dialling.uses(path));
