@@ -8,9 +8,8 @@ mod support;
 use std::collections::HashSet;
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::{
-    AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative, RegisterError,
+    AgentId, Deliveries, Domain, FailureReason, Kind, Outcome, Performative, RegisterError,
 };
 use support::{config, inform, two};
 
@@ -352,15 +351,7 @@ async fn large_content_for_several_receivers_is_in_memory_once() {
 async fn large_content_for_several_receivers_also_reaches_those_without_shared_memory() {
     let config = config(&["mts.transports=shm,unix"]);
     let domain = format!("domain={}", config.domain);
-    let plain = Config::load(&Sources {
-        set: vec![
-            domain,
-            "discovery.mdns=false".into(),
-            "mts.transports=unix".into(),
-        ],
-        ..Sources::default()
-    });
-    let plain = plain.unwrap();
+    let plain = support::load([&*domain, "discovery.mdns=false", "mts.transports=unix"]);
     let here = Domain::open(&config).await.unwrap();
     let (there, beyond) = (
         Domain::open(&config).await.unwrap(),

@@ -2,34 +2,21 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+mod support;
 
-use fipa::config::Sources;
+use std::time::{Duration, SystemTime};
+
 use fipa::platform::{
     AgentDescription, AmsDescription, Exception, PlatformError, ServiceDescription, limits,
 };
 use fipa::{AgentId, Config, Domain, Gateway, Kind, Performative, blocking};
+use fipa_testbed::until_async;
 
 /// Time limit of all waits, which a passing test does not reach.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn config(set: &[&str]) -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let mark = format!("{}-{number}", std::process::id());
-    let own = [
-        format!("domain=platform-{mark}"),
-        format!("mts.name=mts-{mark}"),
-        "discovery.mdns=false".to_owned(),
-        "mts.deadline=30s".to_owned(),
-    ];
-    let set = set.iter().map(|&one| one.to_owned());
-    Config::load(&Sources {
-        set: own.into_iter().chain(set).collect(),
-        ..Sources::default()
-    })
-    .unwrap()
+    support::config(&[&["mts.deadline=30s"], set].concat())
 }
 
 async fn host(config: &Config) -> (Gateway, Domain) {
@@ -50,16 +37,8 @@ async fn two_hosts(set: &[&str]) -> [(Gateway, Domain); 2] {
     [near, far]
 }
 
-async fn until(what: &str, condition: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !condition() {
-        assert!(started.elapsed() < PATIENCE, "never: {what}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-}
-
 async fn knows(domain: &Domain, name: &str) {
-    until(name, || domain.directory().lookup(name).is_some()).await;
+    until_async(name, || domain.directory().lookup(name).is_some()).await;
 }
 
 fn lifting() -> AgentDescription {
@@ -228,7 +207,7 @@ async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
     for prefix in ["ams@", "df@"] {
         let plain = format!("{prefix}{}", near.name());
         for domain in [&at_home, &abroad] {
-            until("two agents", || listed(domain, prefix).len() == 2).await;
+            until_async("two agents", || listed(domain, prefix).len() == 2).await;
             let names = listed(domain, prefix);
             assert_eq!(names[0], plain);
             let digits = names[1].strip_prefix(&format!("{plain}-")).unwrap();

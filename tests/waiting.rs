@@ -3,28 +3,18 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod support;
+
 use std::fs::{File, TryLockError};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::task::Poll;
 
-use fipa::config::Sources;
 use fipa::{Change, Config, Domain, RegisterError};
 
 /// Makes a configuration for a domain that no other test uses.
 fn config() -> Config {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    Config::load(&Sources {
-        set: vec![
-            format!("domain=waiting-{}-{number}", std::process::id()),
-            "discovery.mdns=false".to_owned(),
-            "mts.transports=unix".to_owned(),
-        ],
-        ..Sources::default()
-    })
-    .unwrap()
+    support::config(&["mts.transports=unix"])
 }
 
 /// The directory of a domain with the files and locks of its processes.

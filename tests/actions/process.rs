@@ -7,9 +7,10 @@ use std::io::{BufRead as _, BufReader};
 use std::process::Stdio;
 
 use fipa::actions::{Action, Execution, Orphans};
-use fipa::config::Sources;
-use fipa::{AgentId, Config, Domain};
+use fipa::{AgentId, Domain};
 use fipa_testbed::{ChildGuard, ignored_test};
+
+use crate::support;
 
 /// Environment variable with the role of a child process, `robot` or `client`, then arguments of `--set`,
 /// separated by spaces.
@@ -36,17 +37,14 @@ pub(crate) fn run() {
     };
     let mut words = role.split(' ').map(str::to_owned);
     let role = words.next().unwrap();
-    let config = Config::load(&Sources {
-        set: words.collect(),
-        ..Sources::default()
-    });
+    let config = support::load(words);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
         .build()
         .unwrap();
     runtime.block_on(async {
-        let domain = Domain::open(&config.unwrap()).await.unwrap();
+        let domain = Domain::open(&config).await.unwrap();
         let agent = domain.register(&role).await.unwrap();
         if role == "robot" {
             let offered = agent.offer(endless("drive"), |(): (), run| forever(run));

@@ -18,6 +18,8 @@
 mod cluster;
 mod process;
 mod scenarios;
+#[path = "../support/mod.rs"]
+mod support;
 
 use std::time::Instant;
 

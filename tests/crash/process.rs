@@ -13,13 +13,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::{
     Agent, AgentId, Config, Delivery, Domain, Gateway, Incoming, Kind, Message, MessageBuilder,
     Outcome, Performative,
 };
 use tokio::sync::mpsc::{Receiver, channel};
 use tokio::task::JoinSet;
+
+use crate::support;
 
 /// Environment variable with the role of a child process.
 pub(crate) const ROLE: &str = "FIPA_CRASH_ROLE";
@@ -74,11 +75,7 @@ impl Role {
     }
 
     fn config(&self) -> Config {
-        Config::load(&Sources {
-            set: self.settings.split(' ').map(str::to_owned).collect(),
-            ..Sources::default()
-        })
-        .unwrap()
+        support::load(self.settings.split(' '))
     }
 }
 

@@ -6,14 +6,15 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 mod process;
+#[path = "../support/mod.rs"]
+mod support;
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa::protocol::{DialogueError, PartnerEvent};
 use fipa::{Agent, AgentId, Domain, Gateway, Message, MessageBuilder, Performative};
-use process::{Process, config};
+use process::Process;
 use rustix::process::Signal;
 
 /// Time limit of all calls, which a passing test does not reach.
@@ -27,12 +28,7 @@ fn process_entry() {
 
 /// Returns the settings of a host that no other test uses.
 fn host(set: &[&str]) -> Vec<String> {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let mark = format!(
-        "{}-{}",
-        std::process::id(),
-        NEXT.fetch_add(1, Ordering::Relaxed)
-    );
+    let mark = support::mark();
     let own = [
         format!("domain=gone-{mark}"),
         format!("mts.name=gateway-{mark}"),
@@ -63,7 +59,7 @@ fn gone<T: std::fmt::Debug>(result: &Result<T, DialogueError>, name: &str) {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     let host = host(&[]);
-    let domain = Domain::open(&config(&host)).await.unwrap();
+    let domain = Domain::open(&support::load(host.clone())).await.unwrap();
     let rover = Arc::new(domain.register("rover").await.unwrap());
     let mut arm = Process::start("arm", &host);
     let ask = |act| to(&rover, act, "arm");
@@ -163,7 +159,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
 #[test]
 fn a_killed_partner_ends_a_blocking_call() {
     let host = host(&[]);
-    let domain = fipa::blocking::Domain::open(&config(&host)).unwrap();
+    let domain = fipa::blocking::Domain::open(&support::load(host.clone())).unwrap();
     let rover = domain.register("rover").unwrap();
     let mut arm = Process::start("arm", &host);
     let receiver = AgentId::new("arm").unwrap();
@@ -184,7 +180,7 @@ fn a_killed_partner_ends_a_blocking_call() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_participant_learns_that_its_initiator_was_killed() {
     let host = host(&[]);
-    let domain = Domain::open(&config(&host)).await.unwrap();
+    let domain = Domain::open(&support::load(host.clone())).await.unwrap();
     let rover = domain.register("rover").await.unwrap();
     let mut starter = Process::start("starter", &host);
     let first = rover.receive().await.unwrap().into_message();
@@ -198,7 +194,7 @@ async fn a_participant_learns_that_its_initiator_was_killed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_that_leaves_or_registers_again_is_gone() {
     let host = host(&[]);
-    let (here, there) = (config(&host), config(&host));
+    let (here, there) = (support::load(host.clone()), support::load(host.clone()));
     let here = Domain::open(&here).await.unwrap();
     let there = Domain::open(&there).await.unwrap();
     let rover = here.register("rover").await.unwrap();
@@ -224,8 +220,8 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
     let host = host(&[]);
-    let here = Domain::open(&config(&host)).await.unwrap();
-    let there = Domain::open(&config(&host)).await.unwrap();
+    let here = Domain::open(&support::load(host.clone())).await.unwrap();
+    let there = Domain::open(&support::load(host.clone())).await.unwrap();
     let rover = here.register("rover").await.unwrap();
     for _ in 0..20 {
         let arm = there.register("arm").await.unwrap();
@@ -253,7 +249,7 @@ impl TwoHosts {
         let far = Process::start("gateway", &there);
         let address = far.address.clone().unwrap();
         let knows = format!("discovery.static={{ far = [\"tcp://{address}\"] }}");
-        let here = config(&host(&[set, &[&knows]].concat()));
+        let here = support::load(host(&[set, &[&knows]].concat()));
         Self {
             _near: Gateway::open(&here).await.unwrap(),
             domain: Domain::open(&here).await.unwrap(),

@@ -11,10 +11,11 @@ use std::sync::Arc;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use fipa::config::Sources;
 use fipa::protocol::{DialogueError, Reply, Task};
 use fipa::{Agent, AgentId, Config, Domain, Gateway, Kind, Message, Performative};
 use tokio::sync::Semaphore;
+
+use crate::support;
 
 /// Environment variable with the role of a child process: `gateway` or the name of an agent, then
 /// arguments of `--set`, separated by spaces.
@@ -22,14 +23,6 @@ const ROLE: &str = "FIPA_DEPARTURES_ROLE";
 
 /// Longer than any test runs.
 const FOREVER: Duration = Duration::from_secs(600);
-
-pub(crate) fn config(set: &[String]) -> Config {
-    Config::load(&Sources {
-        set: set.to_vec(),
-        ..Sources::default()
-    })
-    .unwrap()
-}
 
 fn say(line: &str) {
     let mut out = std::io::stdout().lock();
@@ -45,7 +38,7 @@ pub(crate) fn run() {
     say("");
     let mut words = role.split(' ').map(str::to_owned);
     let name = words.next().unwrap();
-    let config = config(&words.collect::<Vec<_>>());
+    let config = support::load(words);
     let finish = Arc::new(Semaphore::new(0));
     let finished = Arc::clone(&finish);
     std::thread::spawn(move || {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use fipa::RegisterOptions;
 use fipa::protocol::{PartnerEvent, Subscription};
+use fipa_testbed::until_async;
 
 use super::*;
 
@@ -315,15 +316,6 @@ async fn item(subscription: &mut Subscription) -> Option<Result<Message, Dialogu
     std::future::poll_fn(|context| Pin::new(&mut *subscription).poll_next(context)).await
 }
 
-/// Waits until a condition holds.
-async fn until(what: &str, holds: impl Fn() -> bool) {
-    let started = std::time::Instant::now();
-    while !holds() {
-        assert!(started.elapsed() < PATIENCE, "never: {what}");
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
@@ -353,14 +345,14 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     assert_eq!(text(&heat), "heat");
     unserved.abort();
 
-    until("three subscribers", || charge.subscribers() == 3).await;
+    until_async("three subscribers", || charge.subscribers() == 3).await;
     assert_eq!(charge.names(), ["leaver", "quitter", "rover"]);
     assert_eq!(charge.publish("99").await, 3);
     assert_eq!(text(&at_rover.next().await.unwrap()), "99");
     at_quitter.cancel(PATIENCE).await.unwrap();
-    until("one has cancelled", || charge.subscribers() == 2).await;
+    until_async("one has cancelled", || charge.subscribers() == 2).await;
     drop(leaver);
-    until("one is gone", || charge.subscribers() == 1).await;
+    until_async("one is gone", || charge.subscribers() == 1).await;
     drop(at_leaver);
     assert_eq!(charge.publish("98").await, 1);
     // The subscription does not borrow the agent, and is a stream.
