@@ -57,6 +57,14 @@ pub fn may_dispatch<R: PartialEq>(
     earlier_open.all(|other| other == registration)
 }
 
+/// Whether the sender's process may dispatch a letter, given its position among the letters of its lane
+/// and that of the first open letter. A receiver remembers this many letters that it has taken. The
+/// outcome of a letter that it has forgotten could not be learned.
+#[must_use]
+pub fn is_remembered(first_open: u64, position: u64, memory: usize) -> bool {
+    position.saturating_sub(first_open) < memory as u64
+}
+
 /// Whether the sender's process may move a letter to a new registration of its receiver: only
 /// when every attempt ended with a certain *not taken*.
 #[must_use]

@@ -20,6 +20,7 @@ impl World {
             return Ok(());
         };
         let (name, life) = self.processes[at].agents.remove(agent);
+        self.trace(|| format!("{name} ({life}) leaves {at}"));
         while self.take(at, life) {}
         self.end_registrations(self.processes[at].host, &[life]);
         let now = self.clocks();
@@ -70,6 +71,7 @@ impl World {
             return Ok(());
         };
         let life = self.incarnation();
+        self.trace(|| format!("{name} ({life}) comes to {at}"));
         let known = self.news_times(self.processes[at].host);
         let process = &mut self.processes[at];
         process.core.register(Arc::clone(&name), life);

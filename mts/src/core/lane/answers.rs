@@ -8,12 +8,14 @@ use fipa_transport::{
     Report, Signature, TransportError, TransportErrorKind,
 };
 
-use super::super::attempts::{AttemptTable, Settlement};
+use super::super::attempts::{AttemptTable, Settlement, registration_of};
 use super::super::routes::Tally;
 use super::super::rules::{self, AttemptEnd, Belief, CustodyReport};
 use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::{Departure, State};
-use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
+use super::{
+    BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, LaneKey, MOVING_PATIENCE,
+};
 
 impl Lane {
     /// Handles the conclusion of an attempt.
@@ -231,13 +233,11 @@ impl Lane {
                 .is_some();
             match departure.map(|it| *it) {
                 Some(Departure::Unknown { refused }) if is_known => {
-                    let reason = FailureReason::NoSuchAgent;
-                    match refused {
-                        Some((location, detail)) => {
-                            self.refused(now, index, &location, (reason, detail), table);
-                        }
-                        None => self.fail(now, index, reason, table),
+                    if let Some((location, detail)) = refused {
+                        let fault = TransportErrorKind::Refused;
+                        self.letters[index].failed_at(&location, TransportError { fault, detail });
                     }
+                    self.contradicted(now, index, table);
                 }
                 Some(_) => {
                     self.recovering = true;
@@ -248,6 +248,31 @@ impl Lane {
         }
         self.pump(now, table);
         self.is_fresh = false;
+    }
+
+    /// Handles a letter whose receiver is in the directory, but not known to its service. The directory
+    /// may show an agent that has left, and not yet show its successor; or the service may not yet know
+    /// an agent that has come. The sender's process sends the letter again for a while.
+    fn contradicted(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
+        let is_custody = self.is_custody();
+        let registration = self.letters[index].registration;
+        let progress = &mut self.letters[index].progress;
+        let since = *progress.unknown_since.get_or_insert(now);
+        if is_custody || now >= since + MOVING_PATIENCE {
+            return self.fail(now, index, FailureReason::NoSuchAgent, table);
+        }
+        progress.tried.clear();
+        self.recovering = true;
+        let successor = match &self.key {
+            LaneKey::Name(_, name) => table.view.named(name),
+            LaneKey::Service(_) | LaneKey::Custody(_) => None,
+        };
+        match successor.is_some_and(|entry| registration_of(&entry) != registration) {
+            true => {
+                self.receiver_left(now, index, table);
+            }
+            false => self.pause(now),
+        }
     }
 
     /// Handles the final refusal of a letter by the other side.

@@ -25,6 +25,8 @@ pub(crate) struct Delivery {
     pub(crate) origin: Origin,
     pub(crate) letter: Letter,
     pub(crate) sequence: u64,
+    /// Position among the letters of the lane since it was empty, at the sender's process.
+    pub(super) position: u64,
     /// The receiver's registration that the letter is for.
     pub(crate) registration: Incarnation,
     /// The predecessor: at a custodian as received with the letter, at the sender's process as in
@@ -57,6 +59,8 @@ pub(super) struct Progress {
     pub(super) busy: bool,
     /// Time since which it fits none of the receiver's kinds of transport.
     pub(super) unfit_since: Option<Instant>,
+    /// Time since which its receiver's service does not know the receiver that the directory shows.
+    pub(super) unknown_since: Option<Instant>,
     /// Set when the letter came back because its predecessor was not taken.
     pub(super) hold: Option<Holding>,
     /// Set while the letter waits for a refresh of the directory.
@@ -136,6 +140,7 @@ impl Delivery {
             uncertain: false,
             busy: false,
             unfit_since: None,
+            unknown_since: None,
             hold: None,
             departure: None,
         };
@@ -143,6 +148,7 @@ impl Delivery {
             origin,
             letter,
             sequence,
+            position: 0,
             registration,
             after: 0,
             deadline,

@@ -87,6 +87,8 @@ pub(crate) struct Lane {
     /// The location that the receiver stated itself, if it is not in the directory.
     stated: Option<Arc<Entry>>,
     letters: VecDeque<Delivery>,
+    /// Number of letters that were pushed since the lane was empty.
+    pushed: u64,
     bytes: usize,
     under_way: usize,
     /// The route of the letters in transit.
@@ -145,6 +147,7 @@ impl Lane {
             receiver,
             stated: None,
             letters: VecDeque::new(),
+            pushed: 0,
             bytes: 0,
             under_way: 0,
             route: None,
@@ -273,7 +276,9 @@ impl Lane {
     }
 
     /// Inserts a letter at its position in the order.
-    pub(crate) fn push(&mut self, delivery: Delivery, table: &mut AttemptTable) {
+    pub(crate) fn push(&mut self, mut delivery: Delivery, table: &mut AttemptTable) {
+        delivery.position = self.pushed;
+        self.pushed += 1;
         let len = delivery.letter.len();
         table.held += len;
         self.bytes += len;
@@ -322,6 +327,9 @@ impl Lane {
             if !rules::may_dispatch(self.first_registration(), registration) {
                 break;
             }
+            if !self.is_remembered(index, table) {
+                break;
+            }
             if !self.letters[index].is_waiting() || self.is_held_back(index) {
                 index += 1;
                 continue;
@@ -364,6 +372,17 @@ impl Lane {
                 }
             }
         }
+    }
+
+    /// Whether the receiver still remembers the first open letter after it has taken the letter at this
+    /// index. Custodians hold what the sender's process has dispatched.
+    fn is_remembered(&self, index: usize, table: &AttemptTable) -> bool {
+        let (first, letter) = (self.letters.front(), self.letters.get(index));
+        let (Some(first), Some(letter)) = (first, letter) else {
+            return true;
+        };
+        self.is_custody()
+            || rules::is_remembered(first.position, letter.position, table.config.lane)
     }
 
     fn first_registration(&self) -> impl Iterator<Item = Incarnation> {
@@ -656,6 +675,7 @@ impl Lane {
         table.held -= len;
         self.bytes -= len;
         if self.letters.is_empty() {
+            self.pushed = 0;
             self.route = None;
             self.busy = false;
             self.ended = None;
