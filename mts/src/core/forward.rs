@@ -163,6 +163,7 @@ impl Core {
         };
         let mut upstream = Upstream {
             back: from.location.clone(),
+            remote: from.is_remote(),
             transfer: parcel.transfer,
             unanswered,
         };
@@ -363,9 +364,8 @@ impl Core {
     }
 
     /// Whether this lane has room for a letter whose sender cannot be held back.
-    pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
-        let bytes = self.table.held.saturating_add(len);
-        bytes <= self.table.config.custody_bytes && self.has_room(lane, len)
+    pub(super) fn has_room_for_stranger(&self, lane: LaneId, receiver: &str, len: usize) -> bool {
+        self.table.has_room(receiver, len) && self.has_room(lane, len)
     }
 
     /// Handles a legacy peer's letter for the agents of this host in its envelope. If its message
@@ -453,7 +453,7 @@ impl Core {
                         letter: letter.clone(),
                     });
                 let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
-                if !self.has_room_for_stranger(lane, letter.len()) {
+                if !self.has_room_for_stranger(lane, &entry.name, letter.len()) {
                     self.table.undelivered.push_back(Undelivered {
                         sender: FailureTarget::Remote { from: Some(from) },
                         receiver: Arc::clone(&entry.name),

@@ -103,8 +103,9 @@ impl Principals {
             return true;
         };
         match agent.reach {
-            _ if agent.role != Role::Agent => true,
+            // An agent or a service of this host.
             Reach::Local => false,
+            _ if agent.role != Role::Agent => true,
             Reach::Remote { gateway } => {
                 let owner = self.services.get(&gateway).map(|it| it.principal);
                 // A claim without proof refuses no certificate.
@@ -136,16 +137,31 @@ impl Principals {
         }
     }
 
-    /// Checks whether the link proves the service that it names; called for every parcel.
-    pub(super) fn check_service(&self, from: &Hop) -> Result<(), PrincipalError> {
+    /// Checks whether the link proves the service that it names; called for every parcel. A link
+    /// with another host never proves a service that the directory lists on this one. A certificate
+    /// proves only a service that introduced itself with it; letters have their own check.
+    pub(super) fn check_service(
+        &self,
+        from: &Hop,
+        is_letter: bool,
+        view: &dyn View,
+    ) -> Result<(), PrincipalError> {
         // Processes of this user are trusted.
         if !from.is_remote() {
             return Ok(());
         }
-        let known = self.services.get(&from.location.incarnation());
-        match known {
-            Some(known) if known.principal != from.principal => Err(PrincipalError::Service),
-            _ => Ok(()),
+        let incarnation = from.location.incarnation();
+        let is_proved = match self.services.get(&incarnation) {
+            Some(known) => known.principal == from.principal,
+            None => {
+                let listed = view.registered(incarnation);
+                (is_letter || from.principal == Principal::Unproved)
+                    && listed.is_none_or(|it| it.reach != Reach::Local)
+            }
+        };
+        match is_proved {
+            true => Ok(()),
+            false => Err(PrincipalError::Service),
         }
     }
 
@@ -273,13 +289,19 @@ mod tests {
         principals.introduced(&peer("rover", ROVER), &no_agents());
         principals.introduced(&peer("crex", CREX), &no_agents());
         principals.introduced(&peer("rover", CREX), &no_agents());
-        assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
-        let other = principals.check_service(&hop(SERVICE, CREX));
+        assert_eq!(
+            principals.check_service(&hop(SERVICE, ROVER), true, &no_agents()),
+            Ok(())
+        );
+        let other = principals.check_service(&hop(SERVICE, CREX), true, &no_agents());
         assert_eq!(other, Err(PrincipalError::Service));
         // The end of the impostor's connection changes nothing.
         principals.parted(&peer("rover", CREX));
         principals.introduced(&peer("rover", CREX), &no_agents());
-        assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
+        assert_eq!(
+            principals.check_service(&hop(SERVICE, ROVER), true, &no_agents()),
+            Ok(())
+        );
     }
 
     #[test]
@@ -288,10 +310,13 @@ mod tests {
         principals.introduced(&peer("rover", ROVER), &no_agents());
         principals.parted(&peer("rover", ROVER));
         principals.introduced(&peer("crex", CREX), &no_agents());
-        let other = principals.check_service(&hop(SERVICE, CREX));
+        let other = principals.check_service(&hop(SERVICE, CREX), true, &no_agents());
         assert_eq!(other, Err(PrincipalError::Service));
         principals.introduced(&peer("rover", CREX), &no_agents());
-        assert_eq!(principals.check_service(&hop(SERVICE, CREX)), Ok(()));
+        assert_eq!(
+            principals.check_service(&hop(SERVICE, CREX), true, &no_agents()),
+            Ok(())
+        );
     }
 
     #[test]

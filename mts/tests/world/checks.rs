@@ -40,7 +40,9 @@ pub(crate) enum Invariant {
     NotPassedOver,
     /// A letter sent after all faults is delivered within a bound.
     Liveness,
-    /// A receiver remembers every letter that can be open.
+    /// A receiver remembers as many letters of each sender as can be open. It may take more while
+    /// one is open, because the report about that one is late; then the outcome of that one is
+    /// *unconfirmed*.
     Remembered,
     /// A letter to an agent that was registered on the sender's host before it was sent does not
     /// fail as unknown.
@@ -128,7 +130,10 @@ impl World {
             });
         }
         let forgotten = |attempt: &Attempt| attempt.error.detail == "too long ago to tell";
-        if attempts.iter().any(forgotten) && !self.is_liars_name(receiver) {
+        if attempts.iter().any(forgotten)
+            && !self.is_liars_name(receiver)
+            && self.taken_since(number, receiver) < self.forecast.lane
+        {
             self.breach(Invariant::Remembered, || {
                 format!("letter {number}: {outcome}")
             });
@@ -147,6 +152,23 @@ impl World {
                 format!("letter {number} to {receiver} met a full queue at most: {outcome}")
             });
         }
+    }
+
+    /// Number of letters of the same sender that a registration of this name has accepted after
+    /// this letter; of several registrations, the most.
+    fn taken_since(&self, number: u64, receiver: &str) -> usize {
+        let Some(sender) = self.sent.get(&number).map(|sent| sent.sender) else {
+            return 0;
+        };
+        let of_sender = |later: &u64| self.sent.get(later).is_some_and(|it| it.sender == sender);
+        let registrations = self.names.iter().filter(|(_, name)| ***name == *receiver);
+        let counts = registrations.map(|(agent, _)| {
+            let accepted = self.accepted.iter().filter(|(by, _)| by == agent);
+            accepted
+                .filter(|(_, later)| *later > number && of_sender(later))
+                .count()
+        });
+        counts.max().unwrap_or_default()
     }
 
     /// Checks a letter that was sent by a closed service: it has already failed as such.
