@@ -93,26 +93,29 @@ impl Principals {
             let is_claim = known.principal == Principal::Unproved;
             return renewed || is_claim || known.principal == principal;
         }
+        let listed = view.registered(incarnation);
+        let reach = listed.as_ref().map(|it| it.reach);
+        // An agent or a service of this host.
+        if reach == Some(Reach::Local) {
+            return false;
+        }
+        if listed.is_some_and(|it| it.role != Role::Agent) {
+            // A letter in its name, before it connected, does not keep it out.
+            return true;
+        }
         // The registration of an agent of another principal, which has written before.
         let of_others = |owner: &Option<Principal>| *owner != Some(principal);
         if self.senders.get(&incarnation).is_some_and(of_others) {
             return false;
         }
         // The registration of an agent that the directory lists at a gateway of another principal.
-        let Some(agent) = view.registered(incarnation) else {
+        let Some(Reach::Remote { gateway }) = reach else {
             return true;
         };
-        match agent.reach {
-            // An agent or a service of this host.
-            Reach::Local => false,
-            _ if agent.role != Role::Agent => true,
-            Reach::Remote { gateway } => {
-                let owner = self.services.get(&gateway).map(|it| it.principal);
-                // A claim without proof refuses no certificate.
-                let owner = owner.filter(|owner| *owner != Principal::Unproved);
-                owner.is_none_or(|owner| owner == principal)
-            }
-        }
+        let owner = self.services.get(&gateway).map(|it| it.principal);
+        // A claim without proof refuses no certificate.
+        let owner = owner.filter(|owner| *owner != Principal::Unproved);
+        owner.is_none_or(|owner| owner == principal)
     }
 
     /// Handles the end of a connection with this service.
