@@ -16,6 +16,7 @@ use super::departed::Departed;
 use super::lane::{Delivery, LaneId};
 use super::routes::Tallies;
 use super::{CoreConfig, News, Notice, SendId};
+use crate::failure::Failed;
 use crate::{Map, Set};
 
 /// An action that the runtime performs for the delivery core.
@@ -104,12 +105,15 @@ pub enum Action {
 /// Origin of a delivery, which determines the receiver of its outcome.
 #[derive(Debug)]
 pub(crate) enum Origin {
-    /// Other message transport services, which get a late answer or a report.
+    /// An agent of this process, which gets an outcome.
     Local { send: SendId },
-    /// The source at a legacy peer, which gets a failure message.
+    /// Other message transport services, which get a late answer or a report.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
-    /// A failure message; its outcome is not reported.
-    LegacyPeer { from: LegacySource },
+    /// The source at a legacy peer, which gets this in a failure message, if anything.
+    LegacyPeer {
+        from: LegacySource,
+        failed: Option<Arc<Failed>>,
+    },
     /// A failure message; its outcome is not reported.
     FailureMessage,
 }
@@ -139,12 +143,17 @@ pub(crate) enum Settlement {
 }
 
 /// Receiver of a failure message.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) enum FailureTarget {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An agent of another service. `from` is the source of a legacy peer's letter.
-    Remote { from: Option<LegacySource> },
+    /// An agent of another service.
+    Remote,
+    /// The source of a legacy peer's letter.
+    LegacyPeer {
+        from: LegacySource,
+        failed: Arc<Failed>,
+    },
 }
 
 /// A failed delivery that a failure message reports.

@@ -641,9 +641,12 @@ impl Lane {
             false => reason,
         };
         let attempts = std::mem::take(&mut delivery.progress.attempts);
-        let sender = match delivery.origin {
+        let sender = match &delivery.origin {
             Origin::Local { .. } => Some(FailureTarget::Ours(self.sender)),
-            Origin::LegacyPeer { from } => Some(FailureTarget::Remote { from: Some(from) }),
+            Origin::LegacyPeer { from, failed } => {
+                let (from, failed) = (*from, failed.clone());
+                failed.map(|failed| FailureTarget::LegacyPeer { from, failed })
+            }
             Origin::Forwarded { .. } | Origin::FailureMessage => None,
         };
         if let Some(sender) = sender {
