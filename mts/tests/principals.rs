@@ -32,6 +32,8 @@ struct Bench {
     core: Core,
     now: Now,
     tickets: u64,
+    /// The predecessor of letters.
+    after: u64,
 }
 
 fn at(service: Incarnation, address: &str) -> Location {
@@ -110,6 +112,7 @@ impl Bench {
             core,
             now,
             tickets: 0,
+            after: 0,
         }
     }
 
@@ -129,7 +132,7 @@ impl Bench {
             },
             stream: Stream { sender, receiver },
             sequence,
-            after: 0,
+            after: self.after,
             transfer: 1,
             remaining: Duration::from_secs(5),
             body,
@@ -164,6 +167,22 @@ fn a_gateway_speaks_for_itself() {
     assert!(is_refused(&goodbye), "{goodbye:?}");
     let own = bench.letter(link(HONEST, HONEST), (HONEST, GATEWAY), 1);
     assert_eq!(own, Verdict::Now(Answer::Accepted));
+}
+
+/// Sequences begin with 1, and a predecessor is below its letter: what follows predecessors ends.
+#[test]
+fn a_letter_that_is_its_own_predecessor_is_refused() {
+    let mut bench = Bench::new();
+    for (sequence, after) in [(0, 0), (0, 1), (1, 1), (5, u64::MAX), (u64::MAX, u64::MAX)] {
+        bench.after = after;
+        let circular = bench.letter(link(HONEST, HONEST), (ROVER, ARM), sequence);
+        assert!(is_refused(&circular), "{sequence} after {after}");
+        let circular = bench.letter(link(HONEST, HONEST), (ROVER, GATEWAY), sequence);
+        assert!(is_refused(&circular), "{sequence} after {after}");
+    }
+    bench.after = 4;
+    let next = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 5);
+    assert_eq!(next, Verdict::Later);
 }
 
 #[test]

@@ -45,6 +45,10 @@ const MAX_UNFRAMED_PATTERNS: usize = 1;
 /// compile.
 const MAX_UNFRAMED_PATTERN: usize = 128;
 
+/// Maximum number of agents that one letter of a legacy peer stands for. The core takes 2 µs for the
+/// letter to each.
+const MAX_UNFRAMED_COPIES: usize = 1024;
+
 /// A letter of a legacy peer, parsed as far as the core needs it, with its receivers looked up.
 /// That takes time in proportion to the bytes of the letter, so it happens before the core is
 /// locked.
@@ -81,7 +85,7 @@ impl Unframed {
             Ok(message) => Failed::of_message(message, &letter),
             Err(_) => Failed::of_envelope(&letter),
         };
-        let (sender, fault) = match (too_many(&names), message) {
+        let (sender, mut fault) = match (too_many(&names), message) {
             (Some(fault), _) => {
                 names.truncate(1);
                 (None, Some(fault))
@@ -97,7 +101,13 @@ impl Unframed {
             };
             (name.into(), resolved.unwrap_or(Resolution::None))
         };
-        let receivers = names.into_iter().map(resolved).collect();
+        let mut receivers: Vec<_> = names.into_iter().map(resolved).collect();
+        if receivers.iter().map(|(_, it)| copies(it)).sum::<usize>() > MAX_UNFRAMED_COPIES {
+            receivers.truncate(1);
+            fault = Some(format!(
+                "the receivers of the letter are more than {MAX_UNFRAMED_COPIES} agents"
+            ));
+        }
         Ok(Self {
             letter,
             via,
@@ -107,6 +117,15 @@ impl Unframed {
             failed: failed.map(Arc::new),
             fault,
         })
+    }
+}
+
+/// Number of agents, present or missing, that a receiver stands for.
+fn copies(resolution: &Resolution) -> usize {
+    match resolution {
+        Resolution::Exact(_) | Resolution::None => 1,
+        Resolution::Multicast(entries) => entries.len(),
+        Resolution::Coalition { agents, missing } => agents.len() + missing.len(),
     }
 }
 
