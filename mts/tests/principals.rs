@@ -128,6 +128,7 @@ impl Bench {
             receiver: match receiver {
                 GATEWAY => "mts".into(),
                 LAMP => "lamp".into(),
+                ROVER => "rover".into(),
                 _ => "arm".into(),
             },
             stream: Stream { sender, receiver },
@@ -199,6 +200,37 @@ fn letters_in_the_stream_of_another_host_are_refused() {
     // Another host cannot speak for an agent of this one either.
     let own = bench.letter(link(LIAR, LIAR), (ARM, GATEWAY), 1);
     assert!(is_refused(&own), "{own:?}");
+}
+
+/// The gateway of the sender is listed and has not connected yet: no other peer sends in its stead.
+#[test]
+fn letters_of_a_listed_agent_wait_until_its_gateway_has_introduced_itself() {
+    let away = Incarnation::from_u64(8);
+    let mut bench = Bench::with(&[("rover", ROVER, away)]);
+    let early = bench.letter(link(LIAR, LIAR), (ROVER, ARM), 1);
+    assert_eq!(early, Verdict::Now(Answer::Busy));
+    let introduction = Introduction {
+        name: "away".into(),
+        hop: link(away, away),
+        dialled: None,
+        mandate: Mandate::Unproved,
+    };
+    bench.core.handle_introduced(bench.now, &introduction);
+    let junk = bench.letter(link(LIAR, LIAR), (ROVER, ARM), 1);
+    assert!(is_refused(&junk), "{junk:?}");
+    let real = bench.letter(link(away, away), (ROVER, ARM), 1);
+    assert_eq!(real, Verdict::Later);
+}
+
+#[test]
+fn letters_of_one_host_are_not_relayed_to_another() {
+    let mut bench = Bench::new();
+    let own = Incarnation::from_u64(99);
+    let verdict = bench.letter(link(LIAR, LIAR), (own, ROVER), 1);
+    let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+        panic!("{verdict:?}");
+    };
+    assert_eq!(reason, FailureReason::NoSuchAgent);
 }
 
 #[test]
@@ -319,12 +351,16 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
     };
     let custody = Conclusion::Answered(Answer::Custody);
     bench.core.handle_conclusion(bench.now, attempt, custody);
-    let report = |bench: &mut Bench, from| {
+    let report_on = |bench: &mut Bench, from, receiver| {
         let delivered = Outcome::Delivered {
             via: Kind::Tcp,
             attempts: Vec::new(),
         };
         let report = Parcel {
+            stream: Stream {
+                receiver,
+                ..parcel.stream
+            },
             body: Body::Report(Report::Settled(delivered)),
             ..parcel.clone()
         };
@@ -341,9 +377,11 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
             .filter(|action| matches!(action, Action::Outcome { .. }))
             .count()
     };
-    assert_eq!(report(&mut bench, link(LIAR, LIAR)), 0);
-    assert_eq!(report(&mut bench, link(HONEST, LIAR)), 0);
-    assert_eq!(report(&mut bench, link(HONEST, HONEST)), 1);
+    assert_eq!(report_on(&mut bench, link(LIAR, LIAR), ROVER), 0);
+    assert_eq!(report_on(&mut bench, link(HONEST, LIAR), ROVER), 0);
+    // About a letter for another registration of the name.
+    assert_eq!(report_on(&mut bench, link(HONEST, HONEST), LAMP), 0);
+    assert_eq!(report_on(&mut bench, link(HONEST, HONEST), ROVER), 1);
 }
 
 /// Hands the process of `arm` a letter of `rover`, which it takes into custody, and returns the
