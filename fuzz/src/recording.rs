@@ -4,12 +4,15 @@
 //! * The entries of a recording are the same after they are written and read again.
 //! * The letters can be judged.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_monitor::recording::{Reader, Recorded, RecordingError, append, begin};
 use fipa_monitor::{Header, Library, Monitor};
+
+/// Parsing the standard protocols takes longer than anything else here.
+static PROTOCOLS: LazyLock<Arc<Library>> = LazyLock::new(|| Arc::new(Library::standard()));
 
 fn read(file: &[u8], piece: usize) -> (Vec<Recorded>, Result<bool, RecordingError>) {
     let (mut reader, mut all) = (Reader::new(), Vec::new());
@@ -38,7 +41,7 @@ pub fn play(bytes: &[u8]) {
     let kept: Vec<Recorded> = kept.collect();
     let (again, complete) = read(&file, 64);
     assert_eq!((&again, complete), (&kept, Ok(true)));
-    let mut monitor = Monitor::observer(Arc::new(Library::standard()));
+    let mut monitor = Monitor::observer(Arc::clone(&PROTOCOLS));
     for one in &kept {
         if let Some(message) = &one.message {
             let header = Header::from(message).copy_for(one.receiver.as_str());

@@ -27,44 +27,64 @@ use fipa_transport::wire::truncated;
 pub use self::read::DeliveryFailure;
 use crate::letter_for;
 
-/// The failed delivery of a letter to one receiver.
-pub(crate) struct Failure<'a> {
+/// The parts of a letter that a message about its failure repeats.
+#[derive(Debug)]
+pub(crate) struct Failed {
     /// Receiver of the failure message.
     pub(crate) sender: AgentId,
-    /// Intended receiver of the letter.
-    pub(crate) receiver: &'a str,
-    /// The failed message, unless it cannot be decoded.
-    message: Option<Message>,
-    reason: FailureReason,
-    detail: &'a str,
+    protocol: Option<String>,
+    conversation_id: Option<String>,
+    reply_with: Option<String>,
     /// Services that stamped the letter, in order.
     path: Vec<String>,
 }
 
-impl<'a> Failure<'a> {
-    /// The failure of this letter. `None` if neither its message nor its envelope names a sender, or
-    /// the message is a failure message itself.
-    pub(crate) fn of(
-        letter: &Letter,
-        receiver: &'a str,
-        reason: FailureReason,
-        detail: &'a str,
-    ) -> Option<Self> {
-        let (sender, message) = match Message::decode(letter.payload()) {
-            Ok(message) if *message.performative() == Performative::Failure => return None,
-            Ok(message) => (sender_of(&message, letter)?, Some(message)),
-            Err(_) => (letter.parse_envelope().ok()?.effective().from?, None),
-        };
+impl Failed {
+    /// Decodes the message, in time in proportion to its bytes. `None` if neither the message nor
+    /// the envelope names a sender, or the message is a failure message itself.
+    pub(crate) fn of(letter: &Letter) -> Option<Self> {
+        match Message::decode(letter.payload()) {
+            Ok(message) => Self::of_message(&message, letter),
+            Err(_) => Self::of_envelope(letter),
+        }
+    }
+
+    /// The same for a message that is decoded already.
+    pub(crate) fn of_message(message: &Message, letter: &Letter) -> Option<Self> {
+        if *message.performative() == Performative::Failure {
+            return None;
+        }
         Some(Self {
-            sender,
-            receiver,
-            message,
-            reason,
-            detail,
+            sender: sender_of(message, letter)?,
+            protocol: message.protocol().map(str::to_owned),
+            conversation_id: message.conversation_id().map(str::to_owned),
+            reply_with: message.reply_with().map(str::to_owned),
             path: path(letter),
         })
     }
 
+    /// The same for a message that cannot be decoded.
+    pub(crate) fn of_envelope(letter: &Letter) -> Option<Self> {
+        Some(Self {
+            sender: letter.parse_envelope().ok()?.effective().from?,
+            protocol: None,
+            conversation_id: None,
+            reply_with: None,
+            path: path(letter),
+        })
+    }
+}
+
+/// The failed delivery of a letter to one receiver.
+pub(crate) struct Failure<'a> {
+    pub(crate) letter: &'a Failed,
+    /// Intended receiver of the letter.
+    pub(crate) receiver: &'a str,
+    pub(crate) reason: FailureReason,
+    pub(crate) detail: &'a str,
+}
+
+impl Failure<'_> {
     /// Encodes the failure message of this service for a sender that reads this dialect.
     pub(crate) fn written_for(
         &self,
@@ -74,7 +94,7 @@ impl<'a> Failure<'a> {
     ) -> Result<Letter, Box<dyn Error>> {
         let mut failure = Message::builder(Performative::Failure)
             .sender(AgentId::new(mts)?)
-            .receiver(self.sender.clone())
+            .receiver(self.letter.sender.clone())
             .ontology("fipa-agent-management");
         failure = match dialect {
             Dialect::FipaServices => match self.path_content(mts) {
@@ -87,16 +107,14 @@ impl<'a> Failure<'a> {
             },
             _ => failure.language("fipa-sl").content(self.sl_content()),
         };
-        if let Some(message) = &self.message {
-            if let Some(protocol) = message.protocol() {
-                failure = failure.protocol(protocol);
-            }
-            if let Some(conversation) = message.conversation_id() {
-                failure = failure.conversation_id(conversation);
-            }
-            if let Some(reply_with) = message.reply_with() {
-                failure = failure.in_reply_to(reply_with);
-            }
+        if let Some(protocol) = &self.letter.protocol {
+            failure = failure.protocol(protocol);
+        }
+        if let Some(conversation) = &self.letter.conversation_id {
+            failure = failure.conversation_id(conversation);
+        }
+        if let Some(reply_with) = &self.letter.reply_with {
+            failure = failure.in_reply_to(reply_with);
         }
         Ok(letter_for(&failure.build()?, utc)?)
     }
@@ -106,7 +124,7 @@ impl<'a> Failure<'a> {
         format!(
             "((action (agent-identifier :name {}) (ACLMessage)) \
              (MTS-error (agent-identifier :name {}) (internal-error {})))",
-            sl_string(self.sender.name()),
+            sl_string(self.letter.sender.name()),
             sl_string(self.receiver),
             sl_string(&text),
         )
@@ -121,10 +139,10 @@ impl<'a> Failure<'a> {
     }
 
     fn path_content(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
-        let mut path = self.path.clone();
+        let mut path = self.letter.path.clone();
         path.push(mts.to_owned());
         let report = Message::builder(Performative::Inform)
-            .sender(self.sender.clone())
+            .sender(self.letter.sender.clone())
             .receiver(AgentId::new(self.receiver)?)
             .language("internal-error")
             .content(format!(

@@ -8,16 +8,19 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration};
+use fipa_sds::{
+    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration, Role,
+};
 use fipa_transport::{
-    Answer, Arrival, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction, Kind,
-    Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
+    Kind, Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
 };
 
 const GATEWAY: Incarnation = Incarnation::from_u64(1);
 /// A process of this host, with the agent `arm`.
 const PROCESS: Incarnation = Incarnation::from_u64(2);
 const ARM: Incarnation = Incarnation::from_u64(3);
+const LAMP: Incarnation = Incarnation::from_u64(7);
 /// A gateway of another host, with the agent `rover`.
 const HONEST: Incarnation = Incarnation::from_u64(4);
 const ROVER: Incarnation = Incarnation::from_u64(5);
@@ -29,6 +32,8 @@ struct Bench {
     core: Core,
     now: Now,
     tickets: u64,
+    /// The predecessor of letters.
+    after: u64,
 }
 
 fn at(service: Incarnation, address: &str) -> Location {
@@ -42,6 +47,14 @@ fn link(service: Incarnation, holder: Incarnation) -> Hop {
     Hop {
         location: at(service, "tcp://192.0.2.4:1"),
         principal: Principal::Certificate([number; 32]),
+    }
+}
+
+/// A link of another host without keys that claims this service.
+fn stranger(service: Incarnation) -> Hop {
+    Hop {
+        principal: Principal::Unproved,
+        ..link(service, LIAR)
     }
 }
 
@@ -61,8 +74,13 @@ impl Bench {
 
     /// A gateway that knows these agents at other gateways.
     fn with(agents: &[(&str, Incarnation, Incarnation)]) -> Self {
+        Self::with_process(agents, "shm://arms")
+    }
+
+    /// The same, with the process of `arm` at this address.
+    fn with_process(agents: &[(&str, Incarnation, Incarnation)], process: &str) -> Self {
         let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
-        let arm = vec![at(PROCESS, "shm://arms")];
+        let arm = vec![at(PROCESS, process)];
         own.register(Registration::new("arm", ARM, arm)).unwrap();
         let contacts = Arc::new(ContactDirectory::new());
         for (name, agent, gateway) in agents {
@@ -94,6 +112,7 @@ impl Bench {
             core,
             now,
             tickets: 0,
+            after: 0,
         }
     }
 
@@ -106,10 +125,15 @@ impl Bench {
         let ((sender, receiver), (sequence, body)) = (stream, what);
         self.tickets += 1;
         let parcel = Parcel {
-            receiver: if receiver == GATEWAY { "mts" } else { "arm" }.into(),
+            receiver: match receiver {
+                GATEWAY => "mts".into(),
+                LAMP => "lamp".into(),
+                ROVER => "rover".into(),
+                _ => "arm".into(),
+            },
             stream: Stream { sender, receiver },
             sequence,
-            after: 0,
+            after: self.after,
             transfer: 1,
             remaining: Duration::from_secs(5),
             body,
@@ -146,6 +170,22 @@ fn a_gateway_speaks_for_itself() {
     assert_eq!(own, Verdict::Now(Answer::Accepted));
 }
 
+/// Sequences begin with 1, and a predecessor is below its letter: what follows predecessors ends.
+#[test]
+fn a_letter_that_is_its_own_predecessor_is_refused() {
+    let mut bench = Bench::new();
+    for (sequence, after) in [(0, 0), (0, 1), (1, 1), (5, u64::MAX), (u64::MAX, u64::MAX)] {
+        bench.after = after;
+        let circular = bench.letter(link(HONEST, HONEST), (ROVER, ARM), sequence);
+        assert!(is_refused(&circular), "{sequence} after {after}");
+        let circular = bench.letter(link(HONEST, HONEST), (ROVER, GATEWAY), sequence);
+        assert!(is_refused(&circular), "{sequence} after {after}");
+    }
+    bench.after = 4;
+    let next = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 5);
+    assert_eq!(next, Verdict::Later);
+}
+
 #[test]
 fn letters_in_the_stream_of_another_host_are_refused() {
     let mut bench = Bench::new();
@@ -160,6 +200,37 @@ fn letters_in_the_stream_of_another_host_are_refused() {
     // Another host cannot speak for an agent of this one either.
     let own = bench.letter(link(LIAR, LIAR), (ARM, GATEWAY), 1);
     assert!(is_refused(&own), "{own:?}");
+}
+
+/// The gateway of the sender is listed and has not connected yet: no other peer sends in its stead.
+#[test]
+fn letters_of_a_listed_agent_wait_until_its_gateway_has_introduced_itself() {
+    let away = Incarnation::from_u64(8);
+    let mut bench = Bench::with(&[("rover", ROVER, away)]);
+    let early = bench.letter(link(LIAR, LIAR), (ROVER, ARM), 1);
+    assert_eq!(early, Verdict::Now(Answer::Busy));
+    let introduction = Introduction {
+        name: "away".into(),
+        hop: link(away, away),
+        dialled: None,
+        mandate: Mandate::Unproved,
+    };
+    bench.core.handle_introduced(bench.now, &introduction);
+    let junk = bench.letter(link(LIAR, LIAR), (ROVER, ARM), 1);
+    assert!(is_refused(&junk), "{junk:?}");
+    let real = bench.letter(link(away, away), (ROVER, ARM), 1);
+    assert_eq!(real, Verdict::Later);
+}
+
+#[test]
+fn letters_of_one_host_are_not_relayed_to_another() {
+    let mut bench = Bench::new();
+    let own = Incarnation::from_u64(99);
+    let verdict = bench.letter(link(LIAR, LIAR), (own, ROVER), 1);
+    let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+        panic!("{verdict:?}");
+    };
+    assert_eq!(reason, FailureReason::NoSuchAgent);
 }
 
 #[test]
@@ -280,12 +351,16 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
     };
     let custody = Conclusion::Answered(Answer::Custody);
     bench.core.handle_conclusion(bench.now, attempt, custody);
-    let report = |bench: &mut Bench, from| {
+    let report_on = |bench: &mut Bench, from, receiver| {
         let delivered = Outcome::Delivered {
             via: Kind::Tcp,
             attempts: Vec::new(),
         };
         let report = Parcel {
+            stream: Stream {
+                receiver,
+                ..parcel.stream
+            },
             body: Body::Report(Report::Settled(delivered)),
             ..parcel.clone()
         };
@@ -302,50 +377,200 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
             .filter(|action| matches!(action, Action::Outcome { .. }))
             .count()
     };
-    assert_eq!(report(&mut bench, link(LIAR, LIAR)), 0);
-    assert_eq!(report(&mut bench, link(HONEST, LIAR)), 0);
-    assert_eq!(report(&mut bench, link(HONEST, HONEST)), 1);
+    assert_eq!(report_on(&mut bench, link(LIAR, LIAR), ROVER), 0);
+    assert_eq!(report_on(&mut bench, link(HONEST, LIAR), ROVER), 0);
+    // About a letter for another registration of the name.
+    assert_eq!(report_on(&mut bench, link(HONEST, HONEST), LAMP), 0);
+    assert_eq!(report_on(&mut bench, link(HONEST, HONEST), ROVER), 1);
 }
 
-#[test]
-fn a_report_from_the_network_in_the_name_of_a_local_process_is_ignored() {
-    let mut bench = Bench::new();
+/// Hands the process of `arm` a letter of `rover`, which it takes into custody, and returns the
+/// letter's parcel.
+fn handed_to_process(bench: &mut Bench) -> Parcel {
     let taken = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
     assert_eq!(taken, Verdict::Later);
-    let Some(Action::Dispatch {
-        attempt,
-        location,
-        parcel,
-    }) = std::iter::from_fn(|| bench.core.poll_action())
-        .find(|action| matches!(action, Action::Dispatch { .. }))
-    else {
-        panic!("the letter is passed on");
-    };
+    let (attempt, location, parcel) = dispatched(bench).expect("the letter is passed on");
     assert_eq!(location.incarnation(), PROCESS);
     let custody = Conclusion::Answered(Answer::Custody);
     bench.core.handle_conclusion(bench.now, attempt, custody);
+    parcel
+}
+
+fn dispatched(bench: &mut Bench) -> Option<(AttemptId, Location, Parcel)> {
+    std::iter::from_fn(|| bench.core.poll_action()).find_map(|action| match action {
+        Action::Dispatch {
+            attempt,
+            location,
+            parcel,
+        } => Some((attempt, location, parcel)),
+        _ => None,
+    })
+}
+
+fn process_at(address: &str) -> Hop {
+    Hop {
+        location: at(PROCESS, address),
+        principal: Principal::Host,
+    }
+}
+
+/// Also for a process that the gateway reaches over TCP.
+#[test]
+fn a_report_from_the_network_in_the_name_of_a_local_process_is_ignored() {
+    for address in ["shm://arms", "tcp://127.0.0.1:9"] {
+        let mut bench = Bench::with_process(&[("rover", ROVER, HONEST)], address);
+        let parcel = handed_to_process(&mut bench);
+        let delivered = Outcome::Delivered {
+            via: Kind::Shm,
+            attempts: Vec::new(),
+        };
+        let report = |bench: &mut Bench, from| {
+            let arrival = Arrival {
+                parcel: Parcel {
+                    body: Body::Report(Report::Settled(delivered.clone())),
+                    ..parcel.clone()
+                },
+                from,
+                ticket: Ticket(1000),
+            };
+            let now = bench.now;
+            bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
+            std::iter::from_fn(|| bench.core.poll_action())
+                .any(|action| matches!(action, Action::Answer { .. }))
+        };
+        for other in [link(PROCESS, LIAR), stranger(PROCESS)] {
+            assert!(!report(&mut bench, other), "at {address}");
+        }
+        assert!(report(&mut bench, process_at(address)), "at {address}");
+    }
+}
+
+/// A credit makes a letter go again, so another peer could have it sent as often as it likes.
+#[test]
+fn only_the_service_that_was_busy_gives_credit() {
+    for address in ["shm://arms", "tcp://127.0.0.1:9"] {
+        let mut bench = Bench::with_process(&[("rover", ROVER, HONEST)], address);
+        bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
+        let (attempt, _, _) = dispatched(&mut bench).expect("the letter is passed on");
+        let busy = Conclusion::Answered(Answer::Busy);
+        bench.core.handle_conclusion(bench.now, attempt, busy);
+        for other in [link(LIAR, LIAR), link(PROCESS, LIAR), stranger(PROCESS)] {
+            bench.arrives(other, (ROVER, ARM), (0, Body::Credit));
+            assert!(dispatched(&mut bench).is_none(), "at {address}");
+        }
+        bench.arrives(process_at(address), (ROVER, ARM), (0, Body::Credit));
+        assert!(dispatched(&mut bench).is_some(), "at {address}");
+    }
+}
+
+/// The gateway of the receiver has not connected yet, so its incarnation is a claim.
+#[test]
+fn a_report_counts_only_from_a_service_that_introduced_itself_with_its_certificate() {
+    let away = Incarnation::from_u64(8);
+    let mut bench = Bench::with(&[("rover", ROVER, away)]);
+    let camera = Incarnation::from_u64(50);
+    bench.core.register("camera".into(), camera);
+    let submission = Submission {
+        sender: camera,
+        letter: letter(),
+        receivers: vec!["rover".into()],
+        deadline: Duration::from_secs(5),
+    };
+    bench.core.send(bench.now, submission);
+    let (_, location, parcel) = dispatched(&mut bench).expect("the letter is dispatched");
+    assert_eq!(location.incarnation(), away);
     let delivered = Outcome::Delivered {
-        via: Kind::Shm,
+        via: Kind::Tcp,
         attempts: Vec::new(),
     };
-    let report = |bench: &mut Bench, from| {
+    let mut report = |principal| {
         let arrival = Arrival {
             parcel: Parcel {
                 body: Body::Report(Report::Settled(delivered.clone())),
                 ..parcel.clone()
             },
-            from,
-            ticket: Ticket(1000),
+            from: Hop {
+                principal,
+                ..link(away, LIAR)
+            },
+            ticket: Ticket(1),
         };
         let now = bench.now;
         bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
         std::iter::from_fn(|| bench.core.poll_action())
-            .any(|action| matches!(action, Action::Answer { .. }))
+            .any(|action| matches!(action, Action::Outcome { .. }))
     };
-    assert!(!report(&mut bench, link(PROCESS, LIAR)));
-    let process = Hop {
-        location: at(PROCESS, "shm://arms"),
-        principal: Principal::Host,
+    assert!(!report(link(away, LIAR).principal));
+    assert!(report(Principal::Unproved), "without keys, claims count");
+}
+
+/// A lowered predecessor would let a letter pass over an earlier one.
+#[test]
+fn only_the_service_that_handed_a_letter_over_lowers_its_predecessor() {
+    let mut bench = Bench::new();
+    let camera = Incarnation::from_u64(50);
+    let listed = vec![at(PROCESS, "tcp://127.0.0.1:9")];
+    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    own.register(Registration::new("camera", camera, listed.clone()))
+        .unwrap();
+    own.register(Registration::new("arm", ARM, listed)).unwrap();
+    bench
+        .core
+        .set_view(Arc::new(MergedDirectory::new(vec![own])));
+    let handed = bench.letter(process_at("tcp://127.0.0.1:9"), (camera, ARM), 7);
+    assert_eq!(handed, Verdict::Later);
+    let note = |bench: &mut Bench, from| bench.arrives(from, (camera, ARM), (7, Body::Predecessor));
+    for other in [link(LIAR, LIAR), link(PROCESS, LIAR), stranger(PROCESS)] {
+        let answer = note(&mut bench, other);
+        assert_ne!(answer, Verdict::Now(Answer::Accepted));
+    }
+    let own = note(&mut bench, process_at("tcp://127.0.0.1:9"));
+    assert_eq!(own, Verdict::Now(Answer::Accepted));
+}
+
+/// The names of gateways and agents of this host are public.
+#[test]
+fn no_other_host_is_a_service_that_this_host_lists() {
+    let mut bench = Bench::new();
+    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", GATEWAY)));
+    let mut gateway = Registration::new("mts", GATEWAY, vec![at(GATEWAY, "shm://mts")]);
+    gateway.role = Role::Gateway;
+    own.register(gateway).unwrap();
+    bench
+        .core
+        .set_view(Arc::new(MergedDirectory::new(vec![own])));
+    let introduction = Introduction {
+        name: "liar".into(),
+        hop: link(GATEWAY, LIAR),
+        dialled: None,
+        mandate: Mandate::Unproved,
     };
-    assert!(report(&mut bench, process));
+    assert!(!bench.core.accepts(&introduction));
+    let letter = bench.letter(link(GATEWAY, LIAR), (Incarnation::from_u64(99), ARM), 1);
+    assert!(is_refused(&letter), "{letter:?}");
+}
+
+#[test]
+fn letters_that_one_receiver_leaves_in_custody_do_not_use_up_the_room_of_others() {
+    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    for (name, agent) in [("arm", ARM), ("lamp", LAMP)] {
+        let location = vec![at(PROCESS, "shm://arms")];
+        own.register(Registration::new(name, agent, location))
+            .unwrap();
+    }
+    let config = CoreConfig {
+        forwards: true,
+        custody_bytes: 50 * letter().len(),
+        ..CoreConfig::new("mts", GATEWAY, vec![Kind::Shm])
+    };
+    let mut bench = Bench::new();
+    bench.core = Core::new(config, Arc::new(MergedDirectory::new(vec![own])));
+    let fill = |bench: &mut Bench, receiver| {
+        let verdict = |sequence| bench.letter(link(HONEST, HONEST), (ROVER, receiver), sequence);
+        let verdicts = (1..=100).map(verdict);
+        verdicts.take_while(|it| *it == Verdict::Later).count()
+    };
+    let (arm, lamp) = (fill(&mut bench, ARM), fill(&mut bench, LAMP));
+    assert!(arm < 100, "the custody is bounded");
+    assert!(lamp >= arm / 2, "{arm} letters, then {lamp}");
 }

@@ -16,7 +16,7 @@ use world::{Deadlines, Weather, World};
 
 /// `FIPA_SIM_SEEDS=100000 cargo test -p fipa-mts --test simulation` runs more of them, and
 /// `FIPA_SIM_SEED=17` one. With `FIPA_SIM_TRACE=1` it prints the events.
-fn seeds(usually: u64) -> Vec<u64> {
+fn seeds(usually: u64, hard: &[u64]) -> Vec<u64> {
     let number = |name: &str| {
         std::env::var(name)
             .ok()
@@ -25,7 +25,9 @@ fn seeds(usually: u64) -> Vec<u64> {
     if let Some(seed) = number("FIPA_SIM_SEED") {
         return vec![seed];
     }
-    (0..number("FIPA_SIM_SEEDS").unwrap_or(usually)).collect()
+    let count = number("FIPA_SIM_SEEDS").unwrap_or(usually);
+    let hard = hard.iter().copied().filter(|seed| *seed >= count);
+    (0..count).chain(hard).collect()
 }
 
 /// Each profile of faults is a test, and each profile with hostile members is another.
@@ -48,7 +50,8 @@ macro_rules! profiles {
                 $(#[$doc])*
                 #[test]
                 fn $name() {
-                    run($weather.with_liars(), FEW_SEEDS);
+                    let hard = hard_among_liars(stringify!($name));
+                    run_with($weather.with_liars(), FEW_SEEDS, hard);
                 }
             )*
         }
@@ -60,15 +63,37 @@ const SEEDS: u64 = 20;
 /// Number of seeds of each profile with hostile members.
 const FEW_SEEDS: u64 = 2;
 
+/// Seeds of a profile with hostile members that run always, because the faults that they show are
+/// rare.
+fn hard_among_liars(profile: &str) -> &'static [u64] {
+    match profile {
+        // A liar reports on letters in the name of a process that is reached over TCP.
+        "everything_at_once_holds_up_no_stream" => &[507],
+        "heavy_losses_break_no_promise" => &[499, 848, 866],
+        "hosts_that_are_cut_off_break_no_promise" => &[384, 880],
+        // Letters to liars fill the custody of gateways.
+        "bytes_of_queues_and_lanes_are_bounded" => &[162],
+        // Letters with the sequence 0 come to lanes in which letters fail.
+        "losses_and_delays_break_no_promise" => &[11],
+        // A report is late, and the receiver takes more letters in the meantime than it remembers.
+        "copies_and_overtaking_break_no_promise" => &[60, 823],
+        _ => &[],
+    }
+}
+
+fn run(weather: Weather, usually: u64) -> u64 {
+    run_with(weather, usually, &[])
+}
+
 /// Runs every seed, and fails with the first violation of each invariant and the number of seeds
 /// that violated it. Returns the number of letters that a later registration of their receiver
 /// took.
-fn run(weather: Weather, usually: u64) -> u64 {
+fn run_with(weather: Weather, usually: u64, hard: &[u64]) -> u64 {
     let (mut letters, mut followed, mut bounded) = (0, 0, 0);
     let mut slowest = Duration::ZERO;
     let mut most = (0.0, 0);
     let mut breaches = BTreeMap::new();
-    let seeds = seeds(usually);
+    let seeds = seeds(usually, hard);
     for &seed in &seeds {
         let mut world = World::new(seed, weather);
         for (invariant, breach) in world.run().err().unwrap_or_default() {
@@ -140,7 +165,7 @@ fn letters_to_agents_that_the_sender_does_not_know_yet_wait_for_a_refresh() {
         ..weather
     };
     run(rough, SEEDS);
-    let found: u64 = seeds(SEEDS)
+    let found: u64 = seeds(SEEDS, &[])
         .into_iter()
         .map(|seed| {
             let mut world = World::new(seed, weather);

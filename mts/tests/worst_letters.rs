@@ -13,7 +13,7 @@ use bytes::Bytes;
 use fipa_acl::{AgentId, Envelope, EnvelopeParams, Letter, Message, Performative, Received, Time};
 #[cfg(debug_assertions)]
 use fipa_mts::core::work;
-use fipa_mts::core::{Core, CoreConfig, Now, Unframed};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Unframed};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
@@ -26,8 +26,12 @@ const PEER: Incarnation = Incarnation::from_u64(2);
 const PROCESS: Incarnation = Incarnation::from_u64(3);
 
 fn core() -> (Core, Arc<dyn Directory>) {
+    core_with(AGENTS)
+}
+
+fn core_with(agents: u64) -> (Core, Arc<dyn Directory>) {
     let directory = MemoryDirectory::new(Mts::new("mts", PROCESS));
-    for number in 0..AGENTS {
+    for number in 0..agents {
         let at = Location::new(Kind::Shm, "process").unwrap();
         let at = vec![at.with_incarnation(PROCESS)];
         let agent = Incarnation::from_u64(100 + number);
@@ -135,6 +139,24 @@ fn a_letter_of_a_legacy_peer_to_the_maximum_of_receivers() {
             let what = format!("{what}, {parameters} parameters");
             unframed(&mut core, &*directory, &what, letter(receivers, parameters));
         }
+    }
+}
+
+/// Of 1,025 agents, one more than a letter of a legacy peer may be for, each would get a copy.
+#[test]
+fn a_letter_of_a_legacy_peer_to_too_many_agents_goes_to_none() {
+    for (agents, copies) in [(1024, 1024), (1025, 0)] {
+        let (mut core, directory) = core_with(agents);
+        let from = LegacySource {
+            address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+            signature: Signature::FipaServices,
+        };
+        let letter = letter(&["arm_.*".to_owned()], 0);
+        let read = Unframed::read(letter, Kind::Tcp, from, &*directory).unwrap();
+        core.handle_unframed(now(), Duration::from_secs(5), read);
+        let actions = std::iter::from_fn(|| core.poll_action());
+        let sent = actions.filter(|action| matches!(action, Action::Dispatch { .. }));
+        assert_eq!(sent.count(), copies);
     }
 }
 

@@ -16,6 +16,7 @@ use super::departed::Departed;
 use super::lane::{Delivery, LaneId};
 use super::routes::Tallies;
 use super::{CoreConfig, News, Notice, SendId};
+use crate::failure::Failed;
 use crate::{Map, Set};
 
 /// An action that the runtime performs for the delivery core.
@@ -104,12 +105,15 @@ pub enum Action {
 /// Origin of a delivery, which determines the receiver of its outcome.
 #[derive(Debug)]
 pub(crate) enum Origin {
-    /// Other message transport services, which get a late answer or a report.
+    /// An agent of this process, which gets an outcome.
     Local { send: SendId },
-    /// The source at a legacy peer, which gets a failure message.
+    /// Other message transport services, which get a late answer or a report.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
-    /// A failure message; its outcome is not reported.
-    LegacyPeer { from: LegacySource },
+    /// The source at a legacy peer, which gets this in a failure message, if anything.
+    LegacyPeer {
+        from: LegacySource,
+        failed: Option<Arc<Failed>>,
+    },
     /// A failure message; its outcome is not reported.
     FailureMessage,
 }
@@ -119,6 +123,8 @@ pub(crate) enum Origin {
 pub(crate) struct Upstream {
     /// Location for reports to it.
     pub(crate) back: Location,
+    /// Whether it is on another host.
+    pub(crate) remote: bool,
     /// The attempt number of its latest hand-over of the letter, which a report names.
     pub(crate) transfer: u64,
     /// Its arrival that has no answer yet.
@@ -137,12 +143,17 @@ pub(crate) enum Settlement {
 }
 
 /// Receiver of a failure message.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) enum FailureTarget {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An agent of another service. `from` is the source of a legacy peer's letter.
-    Remote { from: Option<LegacySource> },
+    /// An agent of another service.
+    Remote,
+    /// The source of a legacy peer's letter.
+    LegacyPeer {
+        from: LegacySource,
+        failed: Arc<Failed>,
+    },
 }
 
 /// A failed delivery that a failure message reports.
@@ -207,6 +218,8 @@ pub(crate) struct AttemptTable {
     pub(crate) departed: Departed,
     /// Total bytes of the letters in all lanes.
     pub(crate) held: usize,
+    /// At a gateway, the bytes of them for each receiver.
+    held_for: Map<Arc<str>, usize>,
     pub(super) tallies: Tallies,
     /// Whether a watcher is notified of events.
     pub(crate) watched: bool,
@@ -253,6 +266,7 @@ impl AttemptTable {
             repeated: VecDeque::new(),
             departed: Departed::default(),
             held: 0,
+            held_for: Map::default(),
             tallies: Tallies::default(),
             watched: false,
             health: Map::default(),
@@ -363,6 +377,39 @@ impl AttemptTable {
         }
     }
 
+    /// Counts the bytes of a letter that came into a lane.
+    pub(crate) fn hold(&mut self, receiver: &Arc<str>, len: usize) {
+        self.held += len;
+        if self.config.forwards {
+            *self.held_for.entry(Arc::clone(receiver)).or_default() += len;
+        }
+    }
+
+    /// Counts the bytes of a letter that left its lane.
+    pub(crate) fn release(&mut self, receiver: &Arc<str>, len: usize) {
+        self.held -= len;
+        if let Some(held) = self.held_for.get_mut(receiver) {
+            *held -= len;
+            if *held == 0 {
+                self.held_for.remove(receiver);
+            }
+        }
+    }
+
+    /// Whether a gateway has room for a letter of this many bytes for this receiver. One letter of
+    /// any size is always accepted.
+    ///
+    /// A receiver that takes its letters slowly, or a peer that keeps letters in custody, does not
+    /// use up the room of others: the letters for one receiver have at most half as many bytes as
+    /// remain free. One letter for each receiver is accepted while there is room at all.
+    pub(crate) fn has_room(&self, receiver: &str, len: usize) -> bool {
+        let most = self.config.custody_bytes;
+        let held = self.held.saturating_add(len);
+        let own = self.held_for.get(receiver).copied().unwrap_or_default();
+        let is_share = own == 0 || own.saturating_add(len) <= most.saturating_sub(held) / 2;
+        self.held == 0 || (held <= most && is_share)
+    }
+
     pub(crate) fn credit(&mut self, stream: Stream, receiver: Arc<str>, back: Location) {
         let parcel = note_parcel(stream, receiver, 0, Body::Credit);
         self.note(Note {
@@ -468,6 +515,7 @@ impl AttemptTable {
             back,
             transfer,
             unanswered,
+            ..
         } = upstream;
         if let Some((kind, ticket)) = unanswered {
             let answer = brief.clone().unwrap_or(Answer::Custody);

@@ -39,7 +39,8 @@ pub struct CoreConfig {
     /// size.
     pub lane_bytes: usize,
     /// Bytes of letters of others in a gateway's custody at which more are held back. One letter of
-    /// any size is always accepted.
+    /// any size is always accepted. The letters for one receiver have at most half as many bytes as
+    /// remain free, so that no receiver uses up the room of others.
     pub custody_bytes: usize,
     /// Timeout of an attempt, for a small letter.
     pub attempt_timeout: Duration,

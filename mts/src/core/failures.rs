@@ -4,7 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{Dialect, ErrorChain};
+use fipa_acl::{AgentId, Dialect, ErrorChain};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
 use fipa_transport::{FailureReason, Incarnation, Kind, LegacySource, Location, Signature, Stream};
 
@@ -12,7 +12,7 @@ use super::attempts::{Action, FailureTarget, Origin, Undelivered, registration_o
 use super::inbox::Received;
 use super::lane::Delivery;
 use super::{Core, News, Now, own_lane, work};
-use crate::failure::Failure;
+use crate::failure::{Failed, Failure};
 use crate::stamp;
 
 /// Deadline of a failure message to a legacy peer's agent.
@@ -39,9 +39,7 @@ impl Core {
             let named = stamp::sender(&received.letter);
             let known = self.table.view.registered(registration);
             match known {
-                Some(entry) if named.as_deref() == Some(&*entry.name) => {
-                    FailureTarget::Remote { from: None }
-                }
+                Some(entry) if named.as_deref() == Some(&*entry.name) => FailureTarget::Remote,
                 _ => return,
             }
         };
@@ -67,29 +65,40 @@ impl Core {
             } = undelivered;
             let name = Arc::clone(&self.table.config.name);
             let name = &*name;
-            let from = match sender {
-                FailureTarget::Ours(_) => None,
-                FailureTarget::Remote { from } => {
-                    // Before the message is decoded, by the name in the envelope.
-                    let named = stamp::sender(&letter).unwrap_or_default();
-                    let address = from.map(|from| from.address);
-                    if !self.failure_limit.allows(now.instant, address, &named) {
-                        continue;
-                    }
-                    // Messages are decoded only in proportion to the received bytes.
-                    if !self
-                        .failure_limit
-                        .covers(now.instant, address, letter.len())
-                    {
-                        continue;
-                    }
-                    from
+            let from = match &sender {
+                FailureTarget::LegacyPeer { from, .. } => Some(*from),
+                FailureTarget::Ours(_) | FailureTarget::Remote => None,
+            };
+            if !matches!(sender, FailureTarget::Ours(_)) {
+                // Before a message is decoded, by the name in the envelope.
+                let named = stamp::sender(&letter).unwrap_or_default();
+                let address = from.map(|from| from.address);
+                if !self.failure_limit.allows(now.instant, address, &named) {
+                    continue;
+                }
+                // Failure messages are encoded only in proportion to the received bytes.
+                if !self
+                    .failure_limit
+                    .covers(now.instant, address, letter.len())
+                {
+                    continue;
+                }
+            }
+            let failed = match &sender {
+                FailureTarget::LegacyPeer { failed, .. } => Some(Arc::clone(failed)),
+                FailureTarget::Ours(_) | FailureTarget::Remote => {
+                    work::steps(letter.len() / 512);
+                    Failed::of(&letter).map(Arc::new)
                 }
             };
-            // The message is decoded, and a new one encoded.
-            work::steps(letter.len() / 512);
-            let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
+            let Some(failed) = failed else {
                 continue;
+            };
+            let report = Failure {
+                letter: &failed,
+                receiver: &receiver,
+                reason,
+                detail: &detail,
             };
             let own = self.table.config.incarnation;
             let sequence = self.sequence_of(own);
@@ -121,13 +130,13 @@ impl Core {
                 continue;
             }
             // The directory has the sender, or a legacy peer's letter states its address.
-            let known = self.table.view.named(report.sender.name());
+            let known = self.table.view.named(failed.sender.name());
             let stated = match known {
                 Some(_) => None,
-                None => from.and_then(|from| stated_entry(&report, from)),
+                None => from.and_then(|from| stated_entry(&failed.sender, from)),
             };
             let Some(entry) = known.or_else(|| stated.clone()) else {
-                tracing::info!(to = %report.sender, %reason, "cannot send a failure message: its receiver is not known");
+                tracing::info!(to = %failed.sender, %reason, "cannot send a failure message: its receiver is not known");
                 continue;
             };
             if entry.role == Role::Gateway {
@@ -151,7 +160,7 @@ impl Core {
                 receiver: registration_of(&entry),
             };
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
-            if !self.has_room_for_stranger(id, letter.len()) {
+            if !self.has_room_for_stranger(id, &entry.name, letter.len()) {
                 self.failure_limit.leave_out(now.instant);
                 continue;
             }
@@ -226,8 +235,7 @@ fn at_host(location: &Location, host: IpAddr) -> Option<Location> {
 }
 
 /// An agent that is not in the directory, with the locations that it states as its own.
-fn stated_entry(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
-    let agent = &report.sender;
+fn stated_entry(agent: &AgentId, from: LegacySource) -> Option<Arc<Entry>> {
     let addresses = agent.addresses().iter().map(|address| &**address);
     let locations = locations_given(addresses, from);
     if locations.is_empty() {

@@ -20,7 +20,7 @@ use super::{Core, MAX_DEADLINE, News, Now, own_lane, work};
 use crate::gate::{self, Link};
 use smallvec::smallvec;
 
-use crate::failure::sender_of;
+use crate::failure::{Failed, sender_of};
 use crate::stamp;
 
 /// Time after which a sender is told that its letter is in custody, unless its outcome is known
@@ -45,6 +45,10 @@ const MAX_UNFRAMED_PATTERNS: usize = 1;
 /// compile.
 const MAX_UNFRAMED_PATTERN: usize = 128;
 
+/// Maximum number of agents that one letter of a legacy peer stands for. The core takes 2 µs for the
+/// letter to each.
+const MAX_UNFRAMED_COPIES: usize = 1024;
+
 /// A letter of a legacy peer, parsed as far as the core needs it, with its receivers looked up.
 /// That takes time in proportion to the bytes of the letter, so it happens before the core is
 /// locked.
@@ -57,6 +61,8 @@ pub struct Unframed {
     receivers: Vec<(Arc<str>, Resolution)>,
     /// The name of the sender, and a location that it states as its own.
     sender: Option<(String, Location)>,
+    /// The parts that a message about its failure repeats; `None` if there is to be none.
+    failed: Option<Arc<Failed>>,
     /// The reason why the letter is refused, if it is.
     fault: Option<String>,
 }
@@ -74,7 +80,12 @@ impl Unframed {
         view: &V,
     ) -> Result<Self, DecodeError> {
         let mut names = stamp::receivers(&letter, MAX_UNFRAMED_RECEIVERS + 1)?;
-        let (sender, fault) = match (too_many(&names), Message::decode(letter.payload())) {
+        let message = Message::decode(letter.payload());
+        let failed = match &message {
+            Ok(message) => Failed::of_message(message, &letter),
+            Err(_) => Failed::of_envelope(&letter),
+        };
+        let (sender, mut fault) = match (too_many(&names), message) {
             (Some(fault), _) => {
                 names.truncate(1);
                 (None, Some(fault))
@@ -90,15 +101,31 @@ impl Unframed {
             };
             (name.into(), resolved.unwrap_or(Resolution::None))
         };
-        let receivers = names.into_iter().map(resolved).collect();
+        let mut receivers: Vec<_> = names.into_iter().map(resolved).collect();
+        if receivers.iter().map(|(_, it)| copies(it)).sum::<usize>() > MAX_UNFRAMED_COPIES {
+            receivers.truncate(1);
+            fault = Some(format!(
+                "the receivers of the letter are more than {MAX_UNFRAMED_COPIES} agents"
+            ));
+        }
         Ok(Self {
             letter,
             via,
             from,
             receivers,
             sender,
+            failed: failed.map(Arc::new),
             fault,
         })
+    }
+}
+
+/// Number of agents, present or missing, that a receiver stands for.
+fn copies(resolution: &Resolution) -> usize {
+    match resolution {
+        Resolution::Exact(_) | Resolution::None => 1,
+        Resolution::Multicast(entries) => entries.len(),
+        Resolution::Coalition { agents, missing } => agents.len() + missing.len(),
     }
 }
 
@@ -163,6 +190,7 @@ impl Core {
         };
         let mut upstream = Upstream {
             back: from.location.clone(),
+            remote: from.is_remote(),
             transfer: parcel.transfer,
             unanswered,
         };
@@ -363,9 +391,8 @@ impl Core {
     }
 
     /// Whether this lane has room for a letter whose sender cannot be held back.
-    pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
-        let bytes = self.table.held.saturating_add(len);
-        bytes <= self.table.config.custody_bytes && self.has_room(lane, len)
+    pub(super) fn has_room_for_stranger(&self, lane: LaneId, receiver: &str, len: usize) -> bool {
+        self.table.has_room(receiver, len) && self.has_room(lane, len)
     }
 
     /// Handles a legacy peer's letter for the agents of this host in its envelope. If its message
@@ -378,15 +405,18 @@ impl Core {
             from,
             receivers,
             sender: mut located,
+            failed,
             fault,
         } = unframed;
+        let target = failed.clone();
+        let target = target.map(|failed| FailureTarget::LegacyPeer { from, failed });
         self.failure_limit
             .credit(now.instant, from.address, letter.len());
         if let Some(fault) = fault {
             tracing::info!(from = %from.address, "refused a letter of a legacy peer: {fault}");
             for (receiver, _) in receivers {
                 let why = (FailureReason::Refused, fault.clone());
-                self.unframed_failed(&receiver, &letter, (via, from), why);
+                self.unframed_failed(&receiver, &letter, (via, target.as_ref()), why);
             }
             self.send_failures(now);
             return;
@@ -417,13 +447,13 @@ impl Core {
             for name in missing.into_iter().chain(none_here.then_some(receiver)) {
                 tracing::info!(receiver = %name, from = %from.address, "cannot deliver an unframed letter: no agent of this host has the name");
                 let why = (FailureReason::NoSuchAgent, String::new());
-                self.unframed_failed(&name, &letter, (via, from), why);
+                self.unframed_failed(&name, &letter, (via, target.as_ref()), why);
             }
             for entry in here {
                 work::steps(1);
                 if let Err(why) = self.admits(now, &entry.name, &letter, unproved) {
                     let why = (FailureReason::Refused, why);
-                    self.unframed_failed(&entry.name, &letter, (via, from), why);
+                    self.unframed_failed(&entry.name, &letter, (via, target.as_ref()), why);
                     continue;
                 }
                 if let Some(located) = located.take() {
@@ -453,23 +483,26 @@ impl Core {
                         letter: letter.clone(),
                     });
                 let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
-                if !self.has_room_for_stranger(lane, letter.len()) {
-                    self.table.undelivered.push_back(Undelivered {
-                        sender: FailureTarget::Remote { from: Some(from) },
-                        receiver: Arc::clone(&entry.name),
-                        letter: letter.clone(),
-                        reason: FailureReason::QueueFull,
-                        detail: String::new(),
-                    });
+                if !self.has_room_for_stranger(lane, &entry.name, letter.len()) {
+                    if let Some(sender) = target.clone() {
+                        self.table.undelivered.push_back(Undelivered {
+                            sender,
+                            receiver: Arc::clone(&entry.name),
+                            letter: letter.clone(),
+                            reason: FailureReason::QueueFull,
+                            detail: String::new(),
+                        });
+                    }
                     self.table
                         .notice(stream, sequence, &entry.name, || News::Settled {
-                            outcome: failed(FailureReason::QueueFull),
+                            outcome: failed_for(FailureReason::QueueFull),
                             sender: true,
                         });
                     continue;
                 }
                 let until = now.instant + deadline.min(MAX_DEADLINE);
-                let origin = Origin::LegacyPeer { from };
+                let failed = failed.clone();
+                let origin = Origin::LegacyPeer { from, failed };
                 let letter_of = (stream.receiver, sequence);
                 let letter = letter.clone();
                 let delivery = Delivery::new(now.instant, origin, letter, letter_of, until);
@@ -484,7 +517,7 @@ impl Core {
         &mut self,
         receiver: &Arc<str>,
         letter: &Letter,
-        (via, from): (Kind, LegacySource),
+        (via, target): (Kind, Option<&FailureTarget>),
         (reason, detail): (FailureReason, String),
     ) {
         let own = self.table.config.incarnation;
@@ -501,20 +534,22 @@ impl Core {
             });
         self.table
             .notice(stream, sequence, receiver, || News::Settled {
-                outcome: failed(reason),
+                outcome: failed_for(reason),
                 sender: true,
             });
-        self.table.undelivered.push_back(Undelivered {
-            sender: FailureTarget::Remote { from: Some(from) },
-            receiver: Arc::clone(receiver),
-            letter: letter.clone(),
-            reason,
-            detail,
-        });
+        if let Some(sender) = target.cloned() {
+            self.table.undelivered.push_back(Undelivered {
+                sender,
+                receiver: Arc::clone(receiver),
+                letter: letter.clone(),
+                reason,
+                detail,
+            });
+        }
     }
 }
 
-fn failed(reason: FailureReason) -> Outcome {
+fn failed_for(reason: FailureReason) -> Outcome {
     Outcome::Failed {
         reason,
         attempts: Vec::new(),

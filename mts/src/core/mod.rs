@@ -655,7 +655,9 @@ impl Core {
             ticket,
         } = arrival;
         work::steps(1);
-        if let Err(error) = self.principals.check_service(&from) {
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        let view = &*self.table.view;
+        if let Err(error) = self.principals.check_service(&from, is_letter, view) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, error.to_string()));
         }
         match std::mem::replace(&mut parcel.body, Body::Credit) {
@@ -707,7 +709,9 @@ impl Core {
             }
             Body::Credit => {
                 if let Some(lane) = self.lane_of(parcel.stream, &parcel.receiver) {
-                    self.with_lane(now, lane, |lane, table| lane.resume(now.instant, table));
+                    self.with_lane(now, lane, |lane, table| {
+                        lane.credited(now.instant, &from, table);
+                    });
                 }
                 self.send_failures(now);
                 Verdict::Now(Answer::Accepted)
@@ -716,9 +720,8 @@ impl Core {
                 let mut is_here = false;
                 if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(parcel.stream)) {
                     let letter = (parcel.sequence, parcel.after, parcel.transfer);
-                    let from = from.location.incarnation();
                     self.with_lane(now, *lane, |lane, table| {
-                        is_here = lane.handle_predecessor_note(now.instant, from, letter, table);
+                        is_here = lane.handle_predecessor_note(now.instant, &from, letter, table);
                     });
                 }
                 self.send_failures(now);

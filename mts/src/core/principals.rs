@@ -93,25 +93,29 @@ impl Principals {
             let is_claim = known.principal == Principal::Unproved;
             return renewed || is_claim || known.principal == principal;
         }
+        let listed = view.registered(incarnation);
+        let reach = listed.as_ref().map(|it| it.reach);
+        // An agent or a service of this host.
+        if reach == Some(Reach::Local) {
+            return false;
+        }
+        if listed.is_some_and(|it| it.role != Role::Agent) {
+            // A letter in its name, before it connected, does not keep it out.
+            return true;
+        }
         // The registration of an agent of another principal, which has written before.
         let of_others = |owner: &Option<Principal>| *owner != Some(principal);
         if self.senders.get(&incarnation).is_some_and(of_others) {
             return false;
         }
         // The registration of an agent that the directory lists at a gateway of another principal.
-        let Some(agent) = view.registered(incarnation) else {
+        let Some(Reach::Remote { gateway }) = reach else {
             return true;
         };
-        match agent.reach {
-            _ if agent.role != Role::Agent => true,
-            Reach::Local => false,
-            Reach::Remote { gateway } => {
-                let owner = self.services.get(&gateway).map(|it| it.principal);
-                // A claim without proof refuses no certificate.
-                let owner = owner.filter(|owner| *owner != Principal::Unproved);
-                owner.is_none_or(|owner| owner == principal)
-            }
-        }
+        let owner = self.services.get(&gateway).map(|it| it.principal);
+        // A claim without proof refuses no certificate.
+        let owner = owner.filter(|owner| *owner != Principal::Unproved);
+        owner.is_none_or(|owner| owner == principal)
     }
 
     /// Handles the end of a connection with this service.
@@ -136,16 +140,31 @@ impl Principals {
         }
     }
 
-    /// Checks whether the link proves the service that it names; called for every parcel.
-    pub(super) fn check_service(&self, from: &Hop) -> Result<(), PrincipalError> {
+    /// Checks whether the link proves the service that it names; called for every parcel. A link
+    /// with another host never proves a service that the directory lists on this one. A certificate
+    /// proves only a service that introduced itself with it; letters have their own check.
+    pub(super) fn check_service(
+        &self,
+        from: &Hop,
+        is_letter: bool,
+        view: &dyn View,
+    ) -> Result<(), PrincipalError> {
         // Processes of this user are trusted.
         if !from.is_remote() {
             return Ok(());
         }
-        let known = self.services.get(&from.location.incarnation());
-        match known {
-            Some(known) if known.principal != from.principal => Err(PrincipalError::Service),
-            _ => Ok(()),
+        let incarnation = from.location.incarnation();
+        let is_proved = match self.services.get(&incarnation) {
+            Some(known) => known.principal == from.principal,
+            None => {
+                let listed = view.registered(incarnation);
+                (is_letter || from.principal == Principal::Unproved)
+                    && listed.is_none_or(|it| it.reach != Reach::Local)
+            }
+        };
+        match is_proved {
+            true => Ok(()),
+            false => Err(PrincipalError::Service),
         }
     }
 
@@ -273,13 +292,19 @@ mod tests {
         principals.introduced(&peer("rover", ROVER), &no_agents());
         principals.introduced(&peer("crex", CREX), &no_agents());
         principals.introduced(&peer("rover", CREX), &no_agents());
-        assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
-        let other = principals.check_service(&hop(SERVICE, CREX));
+        assert_eq!(
+            principals.check_service(&hop(SERVICE, ROVER), true, &no_agents()),
+            Ok(())
+        );
+        let other = principals.check_service(&hop(SERVICE, CREX), true, &no_agents());
         assert_eq!(other, Err(PrincipalError::Service));
         // The end of the impostor's connection changes nothing.
         principals.parted(&peer("rover", CREX));
         principals.introduced(&peer("rover", CREX), &no_agents());
-        assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
+        assert_eq!(
+            principals.check_service(&hop(SERVICE, ROVER), true, &no_agents()),
+            Ok(())
+        );
     }
 
     #[test]
@@ -288,10 +313,13 @@ mod tests {
         principals.introduced(&peer("rover", ROVER), &no_agents());
         principals.parted(&peer("rover", ROVER));
         principals.introduced(&peer("crex", CREX), &no_agents());
-        let other = principals.check_service(&hop(SERVICE, CREX));
+        let other = principals.check_service(&hop(SERVICE, CREX), true, &no_agents());
         assert_eq!(other, Err(PrincipalError::Service));
         principals.introduced(&peer("rover", CREX), &no_agents());
-        assert_eq!(principals.check_service(&hop(SERVICE, CREX)), Ok(()));
+        assert_eq!(
+            principals.check_service(&hop(SERVICE, CREX), true, &no_agents()),
+            Ok(())
+        );
     }
 
     #[test]

@@ -131,7 +131,7 @@ mod tests {
     use fipa_transport::FailureReason;
 
     use super::*;
-    use crate::failure::Failure;
+    use crate::failure::{Failed, Failure};
     use crate::letter_for;
 
     const FIPA_SERVICES: &[u8] = include_bytes!("../../../acl/tests/vectors/failure_letter.bin");
@@ -173,7 +173,12 @@ mod tests {
             .unwrap();
         let letter = letter_for(&request, SystemTime::UNIX_EPOCH).unwrap();
         let detail = "said \"no\"";
-        let failure = Failure::of(&letter, "arm", FailureReason::Refused, detail).unwrap();
+        let failure = Failure {
+            letter: &Failed::of(&letter).unwrap(),
+            receiver: "arm",
+            reason: FailureReason::Refused,
+            detail,
+        };
         for (dialect, reason) in [
             (Dialect::Standard, "refused: said \"no\""),
             (

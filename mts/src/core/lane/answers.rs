@@ -123,6 +123,7 @@ impl Lane {
                 let delivery = &mut self.letters[index];
                 delivery.progress.busy = true;
                 delivery.progress.tried.clear();
+                self.busy_at = delivery.handed_at(&location);
                 delivery.custody_taken(table);
                 self.recovering = true;
                 self.pause_until(now + BUSY_PAUSE);

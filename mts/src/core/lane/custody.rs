@@ -7,7 +7,7 @@
 
 use std::time::{Duration, Instant};
 
-use fipa_transport::{Incarnation, TransportError, TransportErrorKind};
+use fipa_transport::{Hop, Incarnation, TransportError, TransportErrorKind};
 
 use super::super::attempts::{AttemptTable, Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, HoldDecision};
@@ -57,7 +57,7 @@ impl Lane {
     pub(crate) fn handle_predecessor_note(
         &mut self,
         now: Instant,
-        from: Incarnation,
+        from: &Hop,
         (sequence, after, transfer): (u64, u64, u64),
         table: &mut AttemptTable,
     ) -> bool {

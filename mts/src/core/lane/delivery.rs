@@ -51,7 +51,7 @@ pub(super) struct Progress {
     pub(super) attempts: Vec<Attempt>,
     /// Locations tried in this round.
     pub(super) tried: SmallVec<[Location; 1]>,
-    /// The services that the letter was handed to, and whether over a route within the host.
+    /// The services that the letter was handed to, and whether they are on this host.
     pub(super) handed: SmallVec<[(Incarnation, bool); 2]>,
     /// Whether an attempt may have delivered it. Never cleared.
     pub(super) uncertain: bool,
@@ -185,11 +185,12 @@ impl Delivery {
         });
     }
 
-    /// Records that reports of the service at this location count.
-    pub(super) fn handed_to(&mut self, location: &Location) {
+    /// Records that reports of the service at this location count. `local` is whether the receiver
+    /// is on this host, and with it the service: it may also be reached over the network.
+    pub(super) fn handed_to(&mut self, location: &Location, local: bool) {
         let service = location.incarnation();
         let handed = &mut self.progress.handed;
-        let hand_over = (service, location.kind().is_host_local());
+        let hand_over = (service, local || location.kind().is_host_local());
         if service.is_known() && !handed.contains(&hand_over) && handed.len() < MAX_HANDED {
             handed.push(hand_over);
         }
@@ -199,9 +200,13 @@ impl Delivery {
     /// the network, so a report from another host in its name does not count.
     pub(super) fn was_handed_to(&self, service: &Hop) -> bool {
         let mut handed = self.progress.handed.iter();
-        handed.any(|(incarnation, local)| {
-            *incarnation == service.location.incarnation() && !(*local && service.is_remote())
-        })
+        handed.any(|hand_over| is_of(*hand_over, service))
+    }
+
+    /// The service at this location that the letter was handed to, and whether it is on this host.
+    pub(super) fn handed_at(&self, location: &Location) -> Option<(Incarnation, bool)> {
+        let mut handed = self.progress.handed.iter().copied();
+        handed.find(|(incarnation, _)| *incarnation == location.incarnation())
     }
 
     /// The reason when every attempt failed because of the letter itself: it is too large, or the
@@ -267,9 +272,10 @@ impl Delivery {
         let Origin::Forwarded { upstreams } = &mut self.origin else {
             return;
         };
-        let service = upstream.back.incarnation();
+        let service = (upstream.back.incarnation(), upstream.remote);
         let mut known = upstreams.iter_mut();
-        if let Some(known) = known.find(|known| known.back.incarnation() == service) {
+        if let Some(known) = known.find(|known| (known.back.incarnation(), known.remote) == service)
+        {
             if upstream.transfer >= known.transfer {
                 *known = upstream;
             }
@@ -278,11 +284,13 @@ impl Delivery {
         }
     }
 
-    /// Whether this service handed the letter over, in this hand-over or a later one.
-    pub(super) fn came_from(&self, service: Incarnation, transfer: u64) -> bool {
+    /// Whether this service handed the letter over, in this hand-over or a later one. A link with
+    /// another host does not prove to be a service of this one.
+    pub(super) fn came_from(&self, service: &Hop, transfer: u64) -> bool {
         match &self.origin {
             Origin::Forwarded { upstreams } => upstreams.iter().any(|upstream| {
-                upstream.back.incarnation() == service && upstream.transfer >= transfer
+                is_of((upstream.back.incarnation(), !upstream.remote), service)
+                    && upstream.transfer >= transfer
             }),
             _ => false,
         }
@@ -296,4 +304,10 @@ impl Delivery {
         };
         upstreams.iter().map(|upstream| upstream.back.incarnation())
     }
+}
+
+/// Whether a link is one of this service, which is on this host if `local`: another host cannot
+/// prove to be it.
+pub(super) fn is_of((incarnation, local): (Incarnation, bool), link: &Hop) -> bool {
+    incarnation == link.location.incarnation() && !(local && link.is_remote())
 }

@@ -24,14 +24,14 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_sds::Entry;
+use fipa_sds::{Entry, Reach};
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, TransportError,
-    TransportErrorKind,
+    Attempt, Body, FailureReason, Hop, Incarnation, Location, Outcome, Parcel, Stream,
+    TransportError, TransportErrorKind,
 };
 
 pub(crate) use self::delivery::Delivery;
-use self::delivery::State;
+use self::delivery::{State, is_of};
 use super::attempts::{
     AttemptTable, FailureTarget, Origin, Purpose, Settlement, Undelivered, registration_of,
 };
@@ -112,6 +112,8 @@ pub(crate) struct Lane {
     busy: bool,
     /// Time at which it was last full.
     was_busy: Option<Instant>,
+    /// The service that gave that answer, and whether it is on this host: only its credit counts.
+    busy_at: Option<(Incarnation, bool)>,
     /// A registration that has moved, and the end of the wait for its successor.
     moving: Option<(Incarnation, Instant)>,
     /// A registration that left the directory, and the time of the last event of letters for it.
@@ -161,6 +163,7 @@ impl Lane {
             pauses: 0,
             busy: false,
             was_busy: None,
+            busy_at: None,
             moving: None,
             ended: None,
             ask_custodian: None,
@@ -228,7 +231,7 @@ impl Lane {
     pub(crate) fn admits(&self, sequence: u64, len: usize, table: &AttemptTable) -> bool {
         let config = &table.config;
         let held = table.held.saturating_add(len);
-        if self.has_room(len, table) && (held <= config.custody_bytes || table.held == 0) {
+        if self.has_room(len, table) && table.has_room(&self.receiver, len) {
             return true;
         }
         let highest = self.letters.back().map(|delivery| delivery.sequence);
@@ -280,7 +283,7 @@ impl Lane {
         delivery.position = self.pushed;
         self.pushed += 1;
         let len = delivery.letter.len();
-        table.held += len;
+        table.hold(&self.receiver, len);
         self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
@@ -358,7 +361,8 @@ impl Lane {
             }
             match table.choose(now, &entry, &self.letters[index].progress.tried) {
                 Some(route) if self.under_way == 0 || self.route.as_ref() == Some(&route) => {
-                    self.dispatch(now, index, route, table);
+                    let local = entry.reach == Reach::Local;
+                    self.dispatch(now, index, (route, local), table);
                     index += 1;
                 }
                 // A different route than that of earlier letters must wait until those have
@@ -392,7 +396,14 @@ impl Lane {
             .into_iter()
     }
 
-    fn dispatch(&mut self, now: Instant, index: usize, route: Location, table: &mut AttemptTable) {
+    /// Dispatches a letter on this route; `local` is whether its receiver is on this host.
+    fn dispatch(
+        &mut self,
+        now: Instant,
+        index: usize,
+        (route, local): (Location, bool),
+        table: &mut AttemptTable,
+    ) {
         let after = self.after(index);
         if let Some(tally) = self.tally_of(&route, table) {
             Tally::add(&tally.tried);
@@ -419,7 +430,7 @@ impl Lane {
             sequence: delivery.sequence,
         };
         table.dispatch(attempt, purpose, route.clone(), parcel);
-        delivery.handed_to(&route);
+        delivery.handed_to(&route, local);
         delivery.progress.tried.push(route.clone());
         delivery.progress.hold = None;
         delivery.progress.state = State::UnderWay {
@@ -584,6 +595,14 @@ impl Lane {
         }
     }
 
+    /// Handles a credit: the service that answered that it was full has room again. Credits of
+    /// others do not count, because each one has a letter dispatched again.
+    pub(crate) fn credited(&mut self, now: Instant, from: &Hop, table: &mut AttemptTable) {
+        if self.busy_at.is_some_and(|busy| is_of(busy, from)) {
+            self.resume(now, table);
+        }
+    }
+
     /// Continues after room was made, at the receiver or on the route to it.
     pub(crate) fn resume(&mut self, now: Instant, table: &mut AttemptTable) {
         self.paused_until = None;
@@ -641,9 +660,12 @@ impl Lane {
             false => reason,
         };
         let attempts = std::mem::take(&mut delivery.progress.attempts);
-        let sender = match delivery.origin {
+        let sender = match &delivery.origin {
             Origin::Local { .. } => Some(FailureTarget::Ours(self.sender)),
-            Origin::LegacyPeer { from } => Some(FailureTarget::Remote { from: Some(from) }),
+            Origin::LegacyPeer { from, failed } => {
+                let (from, failed) = (*from, failed.clone());
+                failed.map(|failed| FailureTarget::LegacyPeer { from, failed })
+            }
             Origin::Forwarded { .. } | Origin::FailureMessage => None,
         };
         if let Some(sender) = sender {
@@ -672,7 +694,7 @@ impl Lane {
             return;
         };
         let len = delivery.letter.len();
-        table.held -= len;
+        table.release(&self.receiver, len);
         self.bytes -= len;
         if self.letters.is_empty() {
             self.pushed = 0;
