@@ -230,6 +230,8 @@ struct Offer {
     options: OfferOptions,
     running: Vec<u64>,
     waiting: VecDeque<u64>,
+    /// The fence that was admitted last.
+    fence: Option<String>,
 }
 
 /// The goals of one client.
@@ -321,6 +323,7 @@ impl Executor {
             options,
             running: Vec::new(),
             waiting: VecDeque::new(),
+            fence: None,
         };
         self.offers.insert(name, offer);
         Ok(())
@@ -388,7 +391,10 @@ impl Executor {
             (None, Some(_)) => Err(Refusal::MissingFence),
             (Some(_), None) => Err(Refusal::UncheckedFence),
             (Some(fence), Some(gate)) => match gate(fence) {
-                true => Ok(()),
+                true => {
+                    offer.fence = Some(fence.clone());
+                    Ok(())
+                }
                 false => Err(Refusal::StaleFence(fence.clone())),
             },
         };
@@ -700,10 +706,14 @@ impl Executor {
             let is_new = record.accepted == now;
             if let (Some(fence), Some(gate), false) =
                 (&record.fence, &mut offer.options.gate, is_new)
-                && !gate(fence)
             {
-                self.end(now, goal, Err(Failure::StaleFence));
-                continue;
+                if !gate(fence) {
+                    let last = offer.fence.as_ref().unwrap_or(fence).clone();
+                    let failure = Failure::StaleFence(fence.clone(), last);
+                    self.end(now, goal, Err(failure));
+                    continue;
+                }
+                offer.fence = Some(fence.clone());
             }
             offer.running.push(goal);
             record.state = State::Running;

@@ -215,9 +215,14 @@ pub enum Failure {
     /// The robot does not offer the action any more.
     #[error("the action was withdrawn")]
     Withdrawn,
-    /// The fence of the goal was not admitted when the goal was to start.
-    #[error("the fence was not admitted when the goal was to start")]
-    StaleFence,
+    /// The fence of the goal was not admitted when the goal was to start: the fence, and the one that the
+    /// action admitted last, which is the same if the action knows no later one.
+    #[error(
+        "the fence {} was not admitted when the goal was to start; the last admitted fence is {}",
+        escape(.0),
+        escape(.1)
+    )]
+    StaleFence(String, String),
     /// The handler ended without a result.
     #[error("the handler of the action ended unexpectedly")]
     Ended,

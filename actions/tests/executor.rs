@@ -283,7 +283,7 @@ fn a_fence_is_checked_on_arrival_and_after_a_wait() {
     description.fenced = true;
     let options = OfferOptions {
         gate: Some(Box::new(move |fence| {
-            fence == "1.1@crane" && gate.load(Ordering::Relaxed)
+            fence == "1.2@crane" || fence == "1.1@crane" && gate.load(Ordering::Relaxed)
         })),
         ..OfferOptions::default()
     };
@@ -303,13 +303,46 @@ fn a_fence_is_checked_on_arrival_and_after_a_wait() {
     executor
         .request(0, 2, "rover", "b", fenced("1.1@crane"))
         .unwrap();
+    executor
+        .request(0, 3, "rover", "c", fenced("1.1@crane"))
+        .unwrap();
     valid.store(false, Ordering::Relaxed);
+    // No later fence is known.
     executor.ended(10, first, Ok(None));
-    let all = outputs(&mut executor);
+    let refused = |last: &str| {
+        let fence = "1.1@crane".to_owned();
+        Err(Failure::StaleFence(fence, last.to_owned()))
+    };
     assert_eq!(
-        all,
-        [finish(1, Ok(None)), finish(2, Err(Failure::StaleFence))]
+        outputs(&mut executor),
+        [
+            finish(1, Ok(None)),
+            finish(2, refused("1.1@crane")),
+            finish(3, refused("1.1@crane"))
+        ]
     );
+
+    // The next holder's goal is admitted while one of the last holder waits.
+    valid.store(true, Ordering::Relaxed);
+    executor
+        .request(20, 4, "rover", "d", fenced("1.1@crane"))
+        .unwrap();
+    let fourth = started(&mut executor);
+    executor
+        .request(20, 5, "rover", "e", fenced("1.1@crane"))
+        .unwrap();
+    executor
+        .request(20, 6, "sherpa", "f", fenced("1.2@crane"))
+        .unwrap();
+    valid.store(false, Ordering::Relaxed);
+    executor.ended(30, fourth, Ok(None));
+    let all = outputs(&mut executor);
+    let stale = finish(5, refused("1.2@crane"));
+    assert!(all.contains(&stale), "{all:?}");
+    let failure = refused("1.2@crane").unwrap_err().to_string();
+    assert!(failure.contains("1.1@crane") && failure.contains("1.2@crane"));
+    let has_started = all.iter().any(|output| matches!(output, Output::Start(_)));
+    assert!(has_started, "{all:?}");
 }
 
 #[test]

@@ -69,7 +69,10 @@ fn failures() -> Vec<Failure> {
         Failure::DeadlinePassed,
         Failure::Preempted,
         Failure::Withdrawn,
-        Failure::StaleFence,
+        Failure::StaleFence(
+            "1.1@cr \"a\" (ne)#bay".to_owned(),
+            "1.2@crane#bay".to_owned(),
+        ),
         Failure::Ended,
         Failure::Forgotten,
     ]
