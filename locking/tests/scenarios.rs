@@ -264,6 +264,35 @@ fn a_lock_at_a_legacy_owner_has_no_fence() {
     assert_eq!(agent.sent(), [to("agent1", "agent2_0", Act::Release)]);
 }
 
+/// The recorded race of `distributed_locking`: another agent has queued our request in the token before it reached
+/// the owner, which then knows the conversation of the request before only.
+#[test]
+fn the_token_returns_to_a_legacy_owner_in_the_conversation_in_which_it_came() {
+    let mut agent = Agent::new("agent2", Kind::SuzukiKasamiExtended);
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+    let conversation = |agent: &mut Agent| {
+        let sent = agent.sent();
+        let of = |act: &Act| matches!(act, Act::RequestToken { .. } | Act::Token(_));
+        let sent: Vec<_> = sent.into_iter().filter(|(.., act)| of(act)).collect();
+        assert_eq!(sent.len(), 1, "{sent:?}");
+        sent[0].1.clone()
+    };
+    let first = agent.lock(None);
+    let asked = conversation(&mut agent);
+    let token = || Act::Token(Token::default());
+    agent.receive("agent1", LEGACY, &asked, token());
+    agent.locks.release(0, first, &mut agent.out);
+    assert_eq!(conversation(&mut agent), asked);
+    let second = agent.lock(None);
+    assert_ne!(conversation(&mut agent), asked);
+    agent.receive("agent1", LEGACY, &asked, token());
+    assert!(agent.locks.is_held(0, second));
+    agent.locks.release(0, second, &mut agent.out);
+    assert_eq!(conversation(&mut agent), asked);
+}
+
 #[test]
 fn without_an_owner_a_claim_fails() {
     let mut agent = Agent::new("agent2", Kind::default());
