@@ -37,6 +37,8 @@ pub(crate) struct LockSlot(pub(crate) Mutex<Slot>);
 pub(crate) struct Slot {
     /// The options, unless they are the defaults.
     pub(crate) options: Option<(Kind, Options)>,
+    /// Whether legacy peers are asked whether they use locks.
+    pub(crate) legacy_peers: bool,
     pub(crate) running: Option<Running>,
     pub(crate) is_closed: bool,
 }

@@ -314,11 +314,12 @@ impl<A: Algorithm> Locks<A> {
             entry.current.is_some() || !entry.waiting.is_empty() || entry.gate == Gate::Closed
         });
         let within = if busy { 0 } else { self.options.retry };
-        let claim = self.lock(now, resource, Some(within), out);
+        let claim = self.claim(now, std::slice::from_ref(resource), Some(within), out);
         if busy {
+            // Before a message is sent.
             self.time_out(now, claim, out);
-            self.settle(now, out);
         }
+        self.settle(now, out);
         claim
     }
 
@@ -326,6 +327,19 @@ impl<A: Algorithm> Locks<A> {
     /// names, so that claims of several agents do not wait for each other. An empty list is acquired
     /// at once.
     pub fn lock_all(
+        &mut self,
+        now: Millis,
+        resources: &[Resource],
+        within: Option<Millis>,
+        out: &mut Actions,
+    ) -> ClaimId {
+        let id = self.claim(now, resources, within, out);
+        self.settle(now, out);
+        id
+    }
+
+    /// Adds a claim to those that wait for its first resource.
+    fn claim(
         &mut self,
         now: Millis,
         resources: &[Resource],
@@ -344,7 +358,6 @@ impl<A: Algorithm> Locks<A> {
         };
         self.claims.insert(id, claim);
         self.enqueue(id, out);
-        self.settle(now, out);
         id
     }
 
@@ -864,7 +877,11 @@ impl<A: Algorithm> Locks<A> {
                 None => discovering.then_some(Act::Query { claim: false }),
             };
             if let Some(act) = act {
-                let conversation = self.side_conversation("discover", now);
+                let kind = match act {
+                    Act::Owned => "announce",
+                    _ => "discover",
+                };
+                let conversation = self.side_conversation(kind, now);
                 self.send(peer.clone(), &resource, conversation, act, out);
             }
             self.at_algorithm(now, &resource, out, |algorithm, context, steps| {
@@ -1280,7 +1297,7 @@ impl<A: Algorithm> Locks<A> {
         out.push(Action::Event(Event::Owning {
             resource: resource.clone(),
         }));
-        let conversation = self.side_conversation("discover", now);
+        let conversation = self.side_conversation("announce", now);
         // Agents of `distributed_locking` accept no announcement, only answers.
         let members: Vec<_> = self
             .members

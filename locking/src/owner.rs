@@ -187,6 +187,15 @@ impl Owner {
         asked: Option<Millis>,
         out: &mut Vec<OwnerStep>,
     ) {
+        let mut queue = self.queue.iter_mut();
+        if let Some(waiter) =
+            queue.find(|waiter| waiter.peer == *from && waiter.conversation == *conversation)
+        {
+            // The report was repeated. One answer follows, to the last repetition.
+            waiter.asked = waiter.asked.max(asked);
+            self.handle_timeout(now, out);
+            return;
+        }
         self.handle_timeout(now, out);
         if let Some(live) = &mut self.live
             && live.holder == *from
@@ -217,9 +226,6 @@ impl Owner {
         self.proved(from, conversation);
         let known = self.queue.iter_mut().find(|waiter| waiter.peer == *from);
         match known {
-            Some(waiter) if waiter.conversation == *conversation => {
-                waiter.asked = waiter.asked.max(asked);
-            }
             Some(waiter) if conversation.is_not_after(&waiter.conversation) => return,
             Some(waiter) => {
                 waiter.conversation = conversation.clone();

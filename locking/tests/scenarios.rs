@@ -264,6 +264,35 @@ fn a_lock_at_a_legacy_owner_has_no_fence() {
     assert_eq!(agent.sent(), [to("agent1", "agent2_0", Act::Release)]);
 }
 
+/// The recorded race of `distributed_locking`: another agent has queued our request in the token before it reached
+/// the owner, which then knows the conversation of the request before only.
+#[test]
+fn the_token_returns_to_a_legacy_owner_in_the_conversation_in_which_it_came() {
+    let mut agent = Agent::new("agent2", Kind::SuzukiKasamiExtended);
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+    let conversation = |agent: &mut Agent| {
+        let sent = agent.sent();
+        let of = |act: &Act| matches!(act, Act::RequestToken { .. } | Act::Token(_));
+        let sent: Vec<_> = sent.into_iter().filter(|(.., act)| of(act)).collect();
+        assert_eq!(sent.len(), 1, "{sent:?}");
+        sent[0].1.clone()
+    };
+    let first = agent.lock(None);
+    let asked = conversation(&mut agent);
+    let token = || Act::Token(Token::default());
+    agent.receive("agent1", LEGACY, &asked, token());
+    agent.locks.release(0, first, &mut agent.out);
+    assert_eq!(conversation(&mut agent), asked);
+    let second = agent.lock(None);
+    assert_ne!(conversation(&mut agent), asked);
+    agent.receive("agent1", LEGACY, &asked, token());
+    assert!(agent.locks.is_held(0, second));
+    agent.locks.release(0, second, &mut agent.out);
+    assert_eq!(conversation(&mut agent), asked);
+}
+
 #[test]
 fn without_an_owner_a_claim_fails() {
     let mut agent = Agent::new("agent2", Kind::default());
@@ -346,6 +375,37 @@ fn try_lock_withdraws_after_one_round() {
     assert_eq!(agent.events(), [failed(second, 2)]);
     agent.pass(1_000);
     assert_eq!(agent.events(), [failed(first, 1)]);
+
+    // The owner of a live grant needs no round.
+    for kind in Kind::ALL {
+        let mut owner = Agent::owner("agent1", kind, &[("agent2", OWN)]);
+        owner.receive("agent2", OWN, "agent2_0", confirm(1));
+        owner.sent();
+        let now = owner.now;
+        let claim = owner.locks.try_lock(now, &bay(), &mut owner.out);
+        assert_eq!(owner.sent(), [], "{kind}");
+        let is_failed =
+            |event: &Event| matches!(event, Event::Failed { claim: of, .. } if *of == claim);
+        assert!(owner.events().iter().any(is_failed), "{kind}");
+    }
+}
+
+/// An answer to the repetition that came before the last one would cross it.
+#[test]
+fn a_repeated_report_that_waits_is_answered_once() {
+    let members = [("agent2", OWN), ("agent3", OWN)];
+    let mut owner = Agent::owner("agent1", Kind::default(), &members);
+    owner.receive("agent2", OWN, "agent2_0", confirm(1));
+    owner.receive("agent3", OWN, "agent3_0", confirm(1));
+    owner.sent();
+    // The lease has ended, and its timeout was not handled yet.
+    owner.now += Options::default().lease;
+    owner.receive("agent3", OWN, "agent3_0", confirm(2));
+    let asked = owner.sent().into_iter().map(|(to, _, act)| match act {
+        Act::Granted { asked, .. } => (to, asked),
+        other => panic!("{other:?}"),
+    });
+    assert_eq!(asked.collect::<Vec<_>>(), [("agent3".to_owned(), 2)]);
 }
 
 #[test]
@@ -675,4 +735,150 @@ fn legacy_agents_get_neither_repetitions_nor_announcements() {
     assert!(matches!(&owner.sent()[..], [(to, _, Act::Owned)] if to == "agent3"));
     owner.receive("agent2", LEGACY, "agent2_0", Act::Query { claim: false });
     assert_eq!(owner.sent(), [to("agent2", "agent2_0", Act::Owned)]);
+}
+
+/// Several agents, and messages that take 1 ms. Lost agents neither receive nor send.
+struct Group {
+    agents: Vec<Agent>,
+    lost: Vec<usize>,
+    now: Millis,
+}
+
+impl Group {
+    const NAMES: [&'static str; 4] = ["agent1", "agent2", "agent3", "agent4"];
+
+    /// The first agent owns the bay.
+    fn new(kind: Kind) -> Self {
+        let mut agents: Vec<_> = Self::NAMES.map(|name| Agent::new(name, kind)).into();
+        for (at, agent) in agents.iter_mut().enumerate() {
+            for other in Self::NAMES.iter().enumerate().filter(|(it, _)| *it != at) {
+                agent.locks.join(0, &peer(other.1), OWN, &mut agent.out);
+            }
+        }
+        let owner = &mut agents[0];
+        let state = OwnerState::first().next_life(Options::default().lease);
+        owner.locks.own(0, &bay(), &state, &mut owner.out);
+        let lost = Vec::new();
+        let mut group = Self {
+            agents,
+            lost,
+            now: 0,
+        };
+        group.pass_until(2_000, |_| false);
+        group
+    }
+
+    /// Passes time until the condition holds. Returns whether it did before `end`.
+    fn pass_until(&mut self, end: Millis, mut holds: impl FnMut(&mut Self) -> bool) -> bool {
+        while self.now < end {
+            if holds(self) {
+                return true;
+            }
+            // Messages that were sent before this millisecond arrive now.
+            let mut arriving = Vec::new();
+            for (at, agent) in self.agents.iter_mut().enumerate() {
+                agent.now = self.now;
+                agent.out.retain(|action| match action {
+                    Action::Send { to, message } => {
+                        arriving.push((at, to.clone(), message.clone()));
+                        false
+                    }
+                    Action::Event(_) => true,
+                });
+            }
+            for (from, to, message) in arriving {
+                let at = Self::NAMES.iter().position(|name| *name == to.name());
+                let at = at.unwrap();
+                if !self.lost.contains(&from) && !self.lost.contains(&at) {
+                    let from = peer(Self::NAMES[from]);
+                    let agent = &mut self.agents[at];
+                    agent
+                        .locks
+                        .handle(self.now, &from, &message, &mut agent.out);
+                }
+            }
+            for agent in &mut self.agents {
+                if agent
+                    .locks
+                    .poll_timeout()
+                    .is_some_and(|due| due <= self.now)
+                {
+                    agent.locks.handle_timeout(self.now, &mut agent.out);
+                }
+            }
+            let sends = |agent: &Agent| {
+                let mut actions = agent.out.iter();
+                actions.any(|action| matches!(action, Action::Send { .. }))
+            };
+            // Nothing happens before the next timeout, unless messages are under way.
+            let due = self.agents.iter().filter_map(|it| it.locks.poll_timeout());
+            self.now = match self.agents.iter().any(sends) {
+                true => self.now + 1,
+                false => due.min().unwrap_or(end).clamp(self.now + 1, end),
+            };
+        }
+        holds(self)
+    }
+
+    fn lock(&mut self, agent: usize) -> ClaimId {
+        self.agents[agent].now = self.now;
+        self.agents[agent].lock(None)
+    }
+
+    fn holds(&self, agent: usize, claim: ClaimId) -> bool {
+        self.agents[agent].locks.is_held(self.now, claim)
+    }
+}
+
+/// The bound of invariant 10, at all phases of a lease and of the probes: nothing proves the loss.
+#[test]
+fn a_lost_holder_or_waiter_delays_others_by_at_most_one_lease_and_one_probe_interval() {
+    let options = Options::default();
+    // Requests and reports after the end of the lease take some milliseconds.
+    let bound = options.lease + options.probe_interval + 20;
+    for kind in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+        for phase in (0..options.lease).step_by(701) {
+            for is_holder_lost in [true, false] {
+                let mut group = Group::new(kind);
+                let first = group.lock(1);
+                assert!(group.pass_until(10_000, |it| it.holds(1, first)), "{kind}");
+                let second = group.lock(2);
+                let begin = group.now;
+                group.pass_until(begin + phase / 2, |_| false);
+                let third = group.lock(3);
+                group.pass_until(begin + phase, |_| false);
+                let from = group.now;
+                if is_holder_lost {
+                    group.lost.push(1);
+                } else {
+                    // The holder leaves when its next waiter is lost.
+                    group.lost.push(2);
+                    let holder = &mut group.agents[1];
+                    holder.locks.release(from, first, &mut holder.out);
+                }
+                let next =
+                    |it: &mut Group| is_holder_lost && it.holds(2, second) || it.holds(3, third);
+                let end = from + bound;
+                assert!(
+                    group.pass_until(end, next),
+                    "{kind}, {phase} ms, holder: {is_holder_lost}"
+                );
+                if is_holder_lost {
+                    // The agent behind the next one is not delayed by the loss again.
+                    let (next, claim, other, waiting) = match group.holds(2, second) {
+                        true => (2, second, 3, third),
+                        false => (3, third, 2, second),
+                    };
+                    let now = group.now;
+                    let agent = &mut group.agents[next];
+                    agent.locks.release(now, claim, &mut agent.out);
+                    let end = now + 20;
+                    assert!(
+                        group.pass_until(end, |it| it.holds(other, waiting)),
+                        "{kind}, {phase} ms"
+                    );
+                }
+            }
+        }
+    }
 }

@@ -7,6 +7,7 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 #![expect(clippy::print_stderr, reason = "the log of a seed that is repeated")]
 
+mod protocols;
 mod world;
 
 use fipa_locking::Kind;
@@ -31,6 +32,7 @@ fn simulate(kind: Kind, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
             agents: 2 + (seed % 7) as usize,
             resources: 1 + (seed % 2) as usize,
             faults,
+            checked: false,
             claims: 6,
         };
         let mut world = World::new(setup, seed);
@@ -65,6 +67,28 @@ fn without_faults_every_claim_is_acquired() {
     }
 }
 
+/// All messages fit the protocols, at their senders and at their receivers, while agents crash, return and
+/// pause.
+#[test]
+fn the_messages_fit_the_protocols_that_agents_enforce() {
+    for kind in Kind::ALL {
+        for seed in seeds(15) {
+            let setup = Setup {
+                kind,
+                agents: 2 + (seed % 7) as usize,
+                resources: 1 + (seed % 2) as usize,
+                // Basic algorithms are for members that never crash.
+                faults: kind.is_extended(),
+                checked: true,
+                claims: 6,
+            };
+            if let Err(error) = World::new(setup, seed).run() {
+                panic!("{kind}, seed {seed}: {error}");
+            }
+        }
+    }
+}
+
 /// After a request has reached all members, each other agent enters at most once before it
 /// (Ricart-Agrawala). With a token, the agent that has entered or is about to receive the token can enter
 /// once more.
@@ -79,6 +103,7 @@ fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
                 agents: 3 + (seed % 6) as usize,
                 resources: 1,
                 faults: false,
+                checked: false,
                 claims: 10,
             };
             let mut world = World::new(setup, seed);
@@ -102,6 +127,7 @@ fn the_number_of_messages_is_the_minimum() {
                 agents,
                 resources: 1,
                 faults: false,
+                checked: true,
                 claims: 0,
             };
             let mut world = World::new(setup, 1);

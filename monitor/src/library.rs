@@ -15,8 +15,8 @@ macro_rules! standard {
     };
 }
 
-/// The files of the standard protocols. Each file contains the name of its protocol.
-const STANDARD: [(&str, &str); 13] = [
+/// The files of the standard protocols, and of those of locks. Each file contains the name of its protocol.
+const STANDARD: [(&str, &str); 19] = [
     standard!("request"),
     standard!("query"),
     standard!("request-when"),
@@ -30,6 +30,12 @@ const STANDARD: [(&str, &str); 13] = [
     standard!("recruiting"),
     standard!("cancel"),
     standard!("rock-query"),
+    standard!("dlm_discover"),
+    standard!("dlm_probe"),
+    standard!("ricart_agrawala"),
+    standard!("ricart_agrawala_extended"),
+    standard!("suzuki_kasami"),
+    standard!("suzuki_kasami_extended"),
 ];
 
 /// A set of protocols with distinct names.
@@ -45,7 +51,7 @@ impl Library {
         Self::default()
     }
 
-    /// Creates a library of the protocols of the FIPA standards.
+    /// Creates a library of the protocols of the FIPA standards, and of locks.
     #[must_use]
     pub fn standard() -> Self {
         let read = |(file, text): &(&str, &str)| Machine::read(file, text);
@@ -172,6 +178,10 @@ mod tests {
             ("fipa-brokering", &["brokering"]),
             ("fipa-recruiting", &["recruiting"]),
             ("fipa-cancel", &["cancel"]),
+            ("dlm_discover", &[]),
+            ("dlm_probe", &[]),
+            ("ricart_agrawala_extended", &[]),
+            ("suzuki_kasami", &[]),
         ] {
             let upper = name.to_uppercase();
             for called in aliases.iter().copied().chain([name, &upper]) {

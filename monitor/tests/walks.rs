@@ -86,7 +86,13 @@ const OWN: [(&str, &str); 4] = [
 ];
 
 fn library() -> Library {
-    let mut library = Library::standard();
+    let mut library = Library::empty();
+    // The answers of dlm_discover have any receivers, and no role but that of the initiator. The reference has
+    // no such protocol.
+    let standard = Library::standard();
+    for machine in standard.iter().filter(|it| it.name() != "dlm_discover") {
+        library.add(machine.clone()).unwrap();
+    }
     for (name, text) in OWN {
         library.add(Machine::read(name, text).unwrap()).unwrap();
     }

@@ -81,6 +81,10 @@ pub struct LockOptions {
     /// Time after which a request without an answer is repeated, and the round of
     /// [`Agent::try_lock`] (1 s).
     pub retry: Duration,
+    /// Whether agents of legacy platforms and static peers are asked whether they use locks (`false`).
+    /// Agents of the C++ library `distributed_locking` then take part from the start, otherwise from
+    /// their first message. Other legacy agents receive a `request` with the protocol `dlm_probe`.
+    pub legacy_peers: bool,
 }
 
 impl Default for LockOptions {
@@ -93,6 +97,7 @@ impl Default for LockOptions {
             probe_interval: Duration::from_millis(core.probe_interval),
             probe_timeout: Duration::from_millis(core.probe_timeout),
             retry: Duration::from_millis(core.retry),
+            legacy_peers: false,
         }
     }
 }

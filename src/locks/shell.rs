@@ -14,7 +14,7 @@ use fipa_locking::{
     LockMessage, Locks, Millis, Peer, Resource, codec,
 };
 use fipa_mts::letter_for;
-use fipa_sds::{Change, Entry, Role, Watch};
+use fipa_sds::{Change, Entry, Reach, Role, Watch};
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -22,6 +22,7 @@ use tokio::sync::{Notify, watch};
 use super::clock::{Timer, millis, now};
 use super::owned::{Holding, OwnerEvent};
 use super::{LockError, LockOptions, report};
+use crate::DirectoryView;
 use crate::agent::AgentCore;
 use crate::demultiplexer::ReaderKey;
 use crate::incoming::Incoming;
@@ -38,13 +39,15 @@ const UNREPEATED: Duration = Duration::from_secs(600);
 
 /// Sets the options of an agent's locks, before they are started.
 pub(super) fn set(core: &AgentCore, options: LockOptions) -> Result<(), LockError> {
-    let (kind, options) = (options.algorithm, options.core());
+    let (kind, legacy_peers) = (options.algorithm, options.legacy_peers);
+    let options = options.core();
     options.check()?;
     let mut slot = core.locks.0.lock();
     if slot.running.is_some() {
         return Err(LockError::Started);
     }
     slot.options = Some((kind, options));
+    slot.legacy_peers = legacy_peers;
     Ok(())
 }
 
@@ -73,6 +76,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
     let runtime = &endpoint.domain.inner.service.runtime;
     let timer = Timer::new(runtime).map_err(LockError::Timer)?;
     let (kind, mut options) = slot.options.unwrap_or_default();
+    let legacy_peers = slot.legacy_peers;
     // A later registration of the name begins its conversations with higher numbers.
     let time = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     options.first_conversation = millis(time.unwrap_or_default());
@@ -99,6 +103,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         partners: PartnerWatch::new(Arc::clone(core)),
         watched: HashSet::new(),
         greeted: HashSet::new(),
+        legacy_peers: legacy_peers.then(HashSet::new),
         core: Arc::clone(core),
         shared: Arc::clone(&shared),
         timer,
@@ -460,6 +465,8 @@ struct Task {
     watched: HashSet<Peer>,
     /// The registrations that were asked whether they use locks.
     greeted: HashSet<Incarnation>,
+    /// The names of legacy peers that were asked, if they are asked.
+    legacy_peers: Option<HashSet<Arc<str>>>,
     timer: Timer,
 }
 
@@ -564,15 +571,17 @@ impl Task {
                     return Some(peer);
                 }
                 let entry = directory.by_incarnation(proved)?;
-                (*entry.name == *name).then_some(proved)?
+                let by_gateway = entry.role == Role::Gateway && entry.reach == Reach::Local;
+                match *entry.name == *name {
+                    true => proved,
+                    // The gateway of this host hands over the letters of legacy peers as its own.
+                    false if by_gateway => legacy(directory, name)?,
+                    false => return None,
+                }
             }
             // A letter of this process, whose service has checked its sender.
             _ if incoming.via.is_none() => directory.lookup(name)?.incarnation,
-            // A letter of a legacy peer cannot come from an agent with a registration.
-            unknown => match directory.lookup(name) {
-                Some(entry) if entry.incarnation.is_known() => return None,
-                _ => unknown,
-            },
+            _ => legacy(directory, name)?,
         };
         Peer::new(name, registration.as_u64()).ok()
     }
@@ -602,6 +611,11 @@ impl Task {
                 Change::Joined(entry) | Change::Changed { after: entry, .. } => self.greet(entry),
                 Change::Left(entry) => {
                     self.greeted.remove(&entry.incarnation);
+                    if let (Some(legacy), false) =
+                        (&mut self.legacy_peers, entry.incarnation.is_known())
+                    {
+                        legacy.remove(&entry.name);
+                    }
                 }
                 _ => self.greet_all(),
             }
@@ -619,12 +633,16 @@ impl Task {
         let endpoint = &self.core.endpoint;
         let may_use_locks = entry.role == Role::Agent
             && !entry.is_platform_agent()
-            && entry.incarnation.is_known()
             && entry.incarnation != endpoint.incarnation;
-        if !may_use_locks || self.greeted.contains(&entry.incarnation) {
+        let is_first = may_use_locks
+            && match (entry.incarnation.is_known(), &mut self.legacy_peers) {
+                (true, _) => self.greeted.insert(entry.incarnation),
+                (false, Some(legacy)) => legacy.insert(Arc::clone(&entry.name)),
+                (false, None) => false,
+            };
+        if !is_first {
             return;
         }
-        self.greeted.insert(entry.incarnation);
         let Ok(peer) = Peer::new(&entry.name, entry.incarnation.as_u64()) else {
             return;
         };
@@ -638,6 +656,14 @@ impl Task {
             actions.push(Action::Send { to: peer, message });
         });
     }
+}
+
+/// Returns the registration of an agent of a legacy peer. A letter of a legacy peer cannot come from an agent
+/// that has one.
+fn legacy(directory: DirectoryView<'_>, name: &str) -> Option<Incarnation> {
+    let entry = directory.lookup(name);
+    let is_registered = entry.is_some_and(|entry| entry.incarnation.is_known());
+    (!is_registered).then_some(Incarnation::UNKNOWN)
 }
 
 /// Waits for the next change, without end if there is no watch.

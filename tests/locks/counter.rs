@@ -12,22 +12,32 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use fipa::locks::{Fence, OwnOptions, Owned};
+use fipa::locks::{Algorithm, Fence, LockOptions, OwnOptions, Owned};
 use fipa::{Agent, AgentId, Domain, Performative};
 use fipa_testbed::{ignored_test, send_signal, until};
 
 use super::support::{load, mark};
-use super::{agent, text, watched};
+use super::{options, text, watched};
 
-/// Environment variable of a worker: its name, then arguments of `--set`, separated by spaces.
+/// Environment variable of a worker: its name, then arguments of `--set`, one in a line.
 const WORKER: &str = "FIPA_LOCKS_WORKER";
 
 const WORKERS: usize = 3;
 
-/// Short, so that many leases end. Holders are stopped for longer.
-const LEASE: Duration = Duration::from_millis(600);
+/// Options with short probes: requests do not wait for members that were stopped or cut off.
+pub(super) fn hurried() -> LockOptions {
+    LockOptions {
+        probe_interval: Duration::from_millis(300),
+        probe_timeout: Duration::from_millis(600),
+        retry: Duration::from_millis(300),
+        ..options(Algorithm::default())
+    }
+}
 
-fn number(variable: &str) -> Option<u64> {
+/// Short, so that many leases end. Holders are stopped for longer.
+pub(super) const LEASE: Duration = Duration::from_millis(600);
+
+pub(super) fn number(variable: &str) -> Option<u64> {
     std::env::var(variable).ok()?.parse().ok()
 }
 
@@ -37,9 +47,9 @@ fn worker_entry() {
     let Ok(role) = std::env::var(WORKER) else {
         return;
     };
-    let mut words = role.split(' ').map(str::to_owned);
-    let name = words.next().unwrap();
-    let config = load(words);
+    let mut lines = role.lines().map(str::to_owned);
+    let name = lines.next().unwrap();
+    let config = load(lines);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -47,7 +57,8 @@ fn worker_entry() {
         .unwrap();
     runtime.block_on(async {
         let domain = Domain::open(&config).await.unwrap();
-        let worker = agent(&domain, &name).await;
+        let worker = domain.register(&name).await.unwrap();
+        worker.use_locks(hurried()).unwrap();
         loop {
             // Ends with the process.
             let _ = increment(&worker).await;
@@ -82,23 +93,23 @@ async fn increment(worker: &Agent) -> Result<(), Box<dyn std::error::Error>> {
     };
     let value: u64 = ask("read".to_owned()).await?.parse()?;
     // The test stops and kills workers here, too.
-    tokio::time::sleep(Duration::from_millis(fastrand::u64(..40))).await;
+    tokio::time::sleep(Duration::from_millis(fastrand::u64(..20))).await;
     ask((value + 1).to_string()).await?;
     Ok(())
 }
 
 /// The results of the owner.
 #[derive(Debug, Default)]
-struct Kept {
-    counter: u64,
-    admitted: u64,
-    refused: u64,
+pub(super) struct Kept {
+    pub(super) counter: u64,
+    pub(super) admitted: u64,
+    pub(super) refused: u64,
     fence: Option<Fence>,
-    grants: u64,
+    pub(super) grants: u64,
 }
 
 /// Reads and writes the counter, with the fence of the live grant only.
-async fn keep(keeper: &Agent, counter: &Owned, ends: &AtomicBool) -> Kept {
+pub(super) async fn keep(keeper: &Agent, counter: &Owned, ends: &AtomicBool) -> Kept {
     let mut kept = Kept::default();
     while !ends.load(Ordering::Relaxed) {
         let received = tokio::time::timeout(Duration::from_millis(50), keeper.receive()).await;
@@ -142,24 +153,24 @@ async fn keep(keeper: &Agent, counter: &Owned, ends: &AtomicBool) -> Kept {
     kept
 }
 
-struct Worker(Child);
+pub(super) struct Worker(Child);
 
 impl Worker {
-    fn start(name: &str, set: &[String]) -> Self {
+    pub(super) fn start(name: &str, set: &[String]) -> Self {
         let mut command: Command = ignored_test("counter::worker_entry");
         command
-            .env(WORKER, format!("{name} {}", set.join(" ")))
+            .env(WORKER, format!("{name}\n{}", set.join("\n")))
             .stdin(Stdio::null())
             .stdout(Stdio::null());
         Self(command.spawn().unwrap())
     }
 
-    fn signal(&self, signal: &str) {
+    pub(super) fn signal(&self, signal: &str) {
         send_signal(self.0.id(), signal);
     }
 
     /// Kills the process with SIGKILL.
-    fn end(&mut self) {
+    pub(super) fn end(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
@@ -184,7 +195,8 @@ async fn a_guarded_counter_loses_no_increment_when_holders_are_killed_and_stoppe
         ];
         let domain = Domain::open(&load(set.clone())).await.unwrap();
         let files = tempfile::tempdir().unwrap();
-        let keeper = Arc::new(agent(&domain, "keeper").await);
+        let keeper = Arc::new(domain.register("keeper").await.unwrap());
+        keeper.use_locks(hurried()).unwrap();
         let options = OwnOptions {
             lease: LEASE,
             state_dir: Some(files.path().to_owned()),

@@ -6,6 +6,8 @@ mod counter;
 #[path = "../../examples/lock.rs"]
 #[allow(dead_code, reason = "the test does not call `main`")]
 mod example;
+mod hosts;
+mod legacy;
 #[path = "../support/mod.rs"]
 mod support;
 

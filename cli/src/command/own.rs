@@ -68,6 +68,11 @@ pub(super) struct Group {
     #[arg(long, value_name = "NAME", default_value = "ricart_agrawala_extended",
           value_parser = algorithm)]
     algorithm: Algorithm,
+
+    /// Take part with agents of the C++ library distributed_locking: legacy peers are asked whether they
+    /// use locks
+    #[arg(long)]
+    legacy_peers: bool,
 }
 
 fn algorithm(text: &str) -> Result<Algorithm, String> {
@@ -82,6 +87,7 @@ impl Group {
     pub(super) fn apply(&self, agent: &Agent) -> Result<(), LockError> {
         agent.use_locks(LockOptions {
             algorithm: self.algorithm,
+            legacy_peers: self.legacy_peers,
             ..LockOptions::default()
         })
     }

@@ -18,7 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use super::{Algorithm, Context, Kind, Step};
-use crate::{Act, Conversation, Gate, Millis, Peer, Token};
+use crate::{Act, Conversation, Dialect, Gate, Millis, Peer, Token};
 
 /// Maximum number of a request: `distributed_locking` reads a 32-bit integer.
 const MAX_NUMBER: u64 = i32::MAX as u64;
@@ -41,6 +41,9 @@ pub struct SuzukiKasami {
     /// return is its report.
     leaving: Option<Conversation>,
     token: Option<Token>,
+    /// In the extended form, the conversation in which an owner of `distributed_locking` has sent the token. It
+    /// expects the return there, and uses that of an earlier request if the last one has not arrived.
+    arrived: Option<Conversation>,
     /// Newest generation.
     generation: u64,
     /// Version of the archive that a legacy agent wrote last.
@@ -238,7 +241,7 @@ impl SuzukiKasami {
             return;
         };
         token.generation = Some(self.generation);
-        let legacy = |peer: &Peer| context.dialect(peer) == crate::Dialect::Legacy;
+        let legacy = |peer: &Peer| context.dialect(peer) == Dialect::Legacy;
         let archive = context.members.keys().any(legacy) || legacy(&to);
         token.archive = archive.then(|| self.archive.unwrap_or(Token::ARCHIVE));
         let request = self.requests.get(to.shared_name());
@@ -333,6 +336,9 @@ impl SuzukiKasami {
             token.queue.retain(|name| name != me);
         }
         self.token = Some(token);
+        let owner = context.owner.filter(|owner| **owner != self.me);
+        let of_legacy = owner.is_some_and(|owner| context.dialect(owner) == Dialect::Legacy);
+        self.arrived = (self.extended && of_legacy).then(|| conversation.clone());
         if !returned {
             self.enter(out);
         }
@@ -359,6 +365,7 @@ impl Algorithm for SuzukiKasami {
             own: None,
             leaving: None,
             token: owns.then(Token::default),
+            arrived: None,
             generation: 0,
             archive: None,
             away: None,
@@ -385,7 +392,8 @@ impl Algorithm for SuzukiKasami {
 
     fn leave(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
         if let Some(own) = self.own.take() {
-            self.leaving = Some(own.conversation);
+            let arrived = self.arrived.take();
+            self.leaving = Some(arrived.unwrap_or(own.conversation));
             self.pass(context, out);
             self.leaving = None;
         }

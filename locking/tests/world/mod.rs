@@ -9,6 +9,8 @@ use fipa_locking::{
     Options, OwnerState, Peer, Resource,
 };
 
+use crate::protocols::Checked;
+
 const LEASE: Millis = 400;
 /// Time after which the faults end.
 const FAULTS_END: Millis = 20_000;
@@ -22,6 +24,8 @@ pub(crate) struct Setup {
     /// Resource `n` belongs to agent `n`.
     pub(crate) resources: usize,
     pub(crate) faults: bool,
+    /// Whether monitors check all messages. Then messages keep their order, and none is repeated by the network.
+    pub(crate) checked: bool,
     /// Claims of each agent.
     pub(crate) claims: u64,
 }
@@ -39,6 +43,8 @@ pub(crate) struct World {
     sequence: u64,
     /// Links that drop messages.
     cut: BTreeSet<(usize, usize)>,
+    /// Time of the last arrival of each link, if messages keep their order.
+    arrivals: BTreeMap<(Peer, Peer), Millis>,
     /// The last events, when one seed is repeated.
     log: Option<VecDeque<String>>,
     pub(crate) messages: u64,
@@ -55,6 +61,7 @@ struct Agent {
     rate: u64,
     offset: Millis,
     paused_until: Millis,
+    monitor: Option<Checked>,
     claim: Option<ActiveClaim>,
     claims_left: u64,
     /// Messages that arrived during a pause.
@@ -106,6 +113,9 @@ impl World {
                 rate: rng.u64(990..=1009),
                 offset: rng.u64(0..100_000),
                 paused_until: 0,
+                monitor: setup
+                    .checked
+                    .then(|| Checked::new(setup.kind, &peer(agent, 1))),
                 claim: None,
                 claims_left: setup.claims,
                 inbox: Vec::new(),
@@ -125,6 +135,7 @@ impl World {
             events: BTreeMap::new(),
             sequence: 0,
             cut: BTreeSet::new(),
+            arrivals: BTreeMap::new(),
             log: std::env::var_os("FIPA_LOCKS_SEED").map(|_| VecDeque::new()),
             messages: 0,
             acquired: 0,
@@ -238,6 +249,18 @@ impl World {
     fn send(&mut self, agent: usize, to: Peer, message: LockMessage) {
         self.messages += 1;
         let from = self.agents[agent].me.clone();
+        if let Some(monitor) = &mut self.agents[agent].monitor {
+            monitor.check(self.now, &from, &to, &message);
+            let faulty = self.setup.faults && self.now < FAULTS_END;
+            if faulty && self.rng.u8(..100) < 5 {
+                return;
+            }
+            let link = self.arrivals.entry((from.clone(), to.clone())).or_default();
+            *link = (*link).max(self.now + self.rng.u64(1..12));
+            let delay = *link - self.now;
+            self.at(delay, Occurrence::Arrive { to, from, message });
+            return;
+        }
         let receiver = self
             .agents
             .iter()
@@ -355,8 +378,10 @@ impl World {
         if self.agents[agent].locks.is_none() {
             return;
         }
-        if self.agents[agent].paused_until > self.now {
-            self.agents[agent].inbox.push((from, message));
+        let of = &mut self.agents[agent];
+        // Messages that arrive before the end of a pause is handled follow those of the pause.
+        if of.paused_until > self.now || !of.inbox.is_empty() {
+            of.inbox.push((from, message));
             return;
         }
         if let Some(history) = self.histories.get_mut(agent) {
@@ -364,6 +389,9 @@ impl World {
         }
         self.log(|| format!("agent{agent} from {from:?}: {message:?}"));
         self.reached(agent, &from, &message);
+        if let Some(monitor) = &mut self.agents[agent].monitor {
+            monitor.check(self.now, &from, to, &message);
+        }
         self.call(agent, |locks, now, out| {
             locks.handle(now, &from, &message, out)
         });
@@ -401,7 +429,7 @@ impl World {
                 self.at(pause, Occurrence::Resume(agent));
             }
             2 if alive => self.crash(agent),
-            3 | 4 => {
+            3 | 4 if !self.setup.checked => {
                 let other = self.rng.usize(..self.setup.agents);
                 self.cut.insert((agent, other));
                 let until = self.rng.u64(1..1_500);
@@ -441,7 +469,11 @@ impl World {
 
     fn come_back(&mut self, agent: usize) {
         let registration = self.agents[agent].me.registration() + 1;
-        self.agents[agent].me = peer(agent, registration);
+        let me = peer(agent, registration);
+        if self.setup.checked {
+            self.agents[agent].monitor = Some(Checked::new(self.setup.kind, &me));
+        }
+        self.agents[agent].me = me;
         if let Some(history) = self.histories.get_mut(agent) {
             history.owner_restarted(peer(agent, registration));
         }
