@@ -71,6 +71,8 @@ fn hard_among_liars(profile: &str) -> &'static [u64] {
         "everything_at_once_holds_up_no_stream" => &[507],
         "heavy_losses_break_no_promise" => &[499, 848, 866],
         "hosts_that_are_cut_off_break_no_promise" => &[384, 880],
+        // An agent comes to a host whose gateway has just died, and a liar writes in its name.
+        "moves_in_foul_weather_break_no_promise" => &[85],
         // Letters to liars fill the custody of gateways.
         "bytes_of_queues_and_lanes_are_bounded" => &[162],
         // Letters with the sequence 0 come to lanes in which letters fail.

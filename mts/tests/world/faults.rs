@@ -165,7 +165,7 @@ impl World {
         };
         let known = self.news_times(host);
         self.birth(host, gateway, &names, &known);
-        self.tell(&known, Vec::new());
+        self.tell(&known, Vec::new(), &[]);
         Ok(())
     }
 
@@ -177,7 +177,7 @@ impl World {
             false => Kind::Tcp,
         };
         let known = self.news_times(host);
-        self.tell(&known, Vec::new());
+        self.tell(&known, Vec::new(), &[]);
         self.registry.lock().readdress(host, kind, known);
         Ok(())
     }
@@ -225,16 +225,23 @@ impl World {
     }
 
     /// Tells the processes of each host at its time that the directory has changed, and which
-    /// entries have left it.
+    /// entries have left it. `ended` has registrations that have ended.
     pub(super) fn tell(
         &mut self,
         times: &[Instant],
         departed: Vec<Vec<(usize, Arc<fipa_sds::Entry>)>>,
+        ended: &[Incarnation],
     ) {
         let mut departed = departed.into_iter();
         for (host, time) in times.iter().enumerate() {
             let departed = departed.next().unwrap_or_default();
-            self.at(*time, Event::News { host, departed });
+            let ended = ended.to_vec();
+            let news = Event::News {
+                host,
+                departed,
+                ended,
+            };
+            self.at(*time, news);
             self.fault_until(*time + ENDED);
         }
     }

@@ -126,6 +126,7 @@ enum Event {
     News {
         host: usize,
         departed: Vec<(usize, Arc<Entry>)>,
+        ended: Vec<Incarnation>,
     },
     Readdress,
     CutOff,
@@ -542,7 +543,11 @@ impl World {
             Event::Reborn { process } => self.reborn(process),
             Event::Move => self.leave(),
             Event::Settle { name } => self.settle(name),
-            Event::News { host, departed } => self.news(host, &departed),
+            Event::News {
+                host,
+                departed,
+                ended,
+            } => self.news(host, departed, &ended),
             Event::Readdress => self.readdress(),
             Event::CutOff => {
                 self.cut_off();

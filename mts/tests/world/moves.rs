@@ -58,7 +58,7 @@ impl World {
         for life in lives {
             self.registry.lock().end(*life, &times);
         }
-        self.tell(&times, seen);
+        self.tell(&times, seen, lives);
     }
 
     /// The agent is registered in another process, under the same name.
@@ -89,17 +89,54 @@ impl World {
             known: known.clone(),
             left: Vec::new(),
         });
-        self.tell(&known, Vec::new());
+        self.tell(&known, Vec::new(), &[]);
         Ok(())
+    }
+
+    /// The entries that the processes of a host have seen since these gateways ended, until now.
+    fn came_and_left(
+        &self,
+        host: usize,
+        departed: &[(usize, Arc<Entry>)],
+        ended: &[Incarnation],
+    ) -> Vec<(usize, Arc<Entry>)> {
+        let mut late = Vec::new();
+        self.registry.lock().now = Some(self.now - Duration::from_nanos(1));
+        for at in 0..self.processes.len() {
+            let process = &self.processes[at];
+            if !process.alive || process.hostile || process.host != host {
+                continue;
+            }
+            let all = self.view(at).entries();
+            let left = all.iter().filter(|entry| match entry.reach {
+                Reach::Remote { gateway } => {
+                    ended.contains(&gateway) && entry.incarnation != gateway
+                }
+                Reach::Local => false,
+            });
+            let is_told = |entry: &Entry| {
+                departed
+                    .iter()
+                    .any(|(by, told)| *by == at && told.incarnation == entry.incarnation)
+            };
+            late.extend(
+                left.filter(|entry| !is_told(entry))
+                    .map(|it| (at, Arc::clone(it))),
+            );
+        }
+        self.registry.lock().now = Some(self.now);
+        late
     }
 
     pub(super) fn news(
         &mut self,
         host: usize,
-        departed: &[(usize, Arc<Entry>)],
+        mut departed: Vec<(usize, Arc<Entry>)>,
+        ended: &[Incarnation],
     ) -> Result<(), Breach> {
         let now = self.clocks();
-        for (at, entry) in departed {
+        departed.extend(self.came_and_left(host, &departed, ended));
+        for (at, entry) in &departed {
             self.processes[*at].core.handle_departure(now, entry);
         }
         for at in 0..self.processes.len() {
