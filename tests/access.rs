@@ -161,12 +161,12 @@ impl Sink for StoredConclusion {
     }
 }
 
-/// Sends a forged letter to an agent of a process over TCP, with the name and incarnation of the
-/// gateway. Returns the answer of that process.
-async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
+/// Sends a forged letter to an agent of a process over TCP, with the name of the gateway and this
+/// incarnation. Returns the answer of that process.
+async fn hand_over(gateway: &Gateway, incarnation: Incarnation, to: &Entry) -> Conclusion {
     let identity = Identity {
         name: gateway.name().to_owned(),
-        incarnation: gateway.incarnation(),
+        incarnation,
         domain: "any".to_owned(),
         host: "any".to_owned(),
     };
@@ -223,7 +223,13 @@ async fn a_forged_name_of_the_gateway_is_refused_over_tcp() {
     let strict = Domain::open(&rules).await.unwrap();
     let arm = strict.register("arm").await.unwrap();
     let entry = gateway.directory().lookup("arm").unwrap();
-    let refused = hand_over(&gateway, &entry).await;
+    // No other peer can introduce itself with the incarnation of the gateway.
+    let refused = hand_over(&gateway, gateway.incarnation(), &entry).await;
+    let Conclusion::NotSent(error) = &refused else {
+        panic!("{refused:?}")
+    };
+    assert_eq!(error.fault, TransportErrorKind::Refused, "{error}");
+    let refused = hand_over(&gateway, Incarnation::random(), &entry).await;
     let Conclusion::Answered(Answer::Failed { reason, detail }) = &refused else {
         panic!("{refused:?}")
     };

@@ -31,6 +31,14 @@ pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
     }
 }
 
+/// Refuses input without a byte that is not white space.
+pub(crate) fn check_not_empty(bytes: &[u8], path: &Path, help: &str) -> Result<(), Failure> {
+    match bytes.trim_ascii().is_empty() {
+        true => Err(Failure::failed("the input is empty", name(path), help)),
+        false => Ok(()),
+    }
+}
+
 /// The name of an input in error messages.
 pub(crate) fn name(path: &Path) -> String {
     if path == Path::new("-") {

@@ -148,12 +148,48 @@ fn the_envelope_sets_the_encoding_of_the_message() {
 }
 
 #[test]
+fn commands_that_read_say_that_the_input_is_empty_or_noise() {
+    let host = Host::new();
+    let commands: [(&[&str], i32); 7] = [
+        (&["encode"], 1),
+        (&["decode"], 1),
+        (&["content", "check"], 1),
+        (&["content", "to-json"], 1),
+        (&["content", "from-json"], 1),
+        (&["protocol", "replay", "-"], 1),
+        (&["protocol", "check", "-"], 1),
+    ];
+    for (command, code) in commands {
+        let said = host.run_with_input(command, b"").failed(code);
+        let (problem, help) = (said.starts_with("error: "), said.contains("\n help: "));
+        let is_named = said.contains("is empty") || said.contains("has no element");
+        assert!(problem && help && is_named, "{command:?}: {said}");
+        let said = host.run_with_input(command, b"noise {").failed(code);
+        let (problem, place) = (
+            said.starts_with("error: "),
+            said.contains("\nwhere: standard input"),
+        );
+        assert!(
+            problem && place && said.contains("\n help: "),
+            "{command:?}: {said}"
+        );
+        for of_a_library in ["EOF", "ident"] {
+            let first = said.lines().next().unwrap();
+            let is_json = first.contains("JSON");
+            assert!(
+                is_json || !first.contains(of_a_library),
+                "{command:?}: {said}"
+            );
+        }
+    }
+}
+
+#[test]
 fn errors_are_reported_with_their_place() {
     let host = Host::new();
     let failed = |input: &str| host.run_with_input(&["encode"], input.as_bytes()).failed(1);
     let output = failed("{\n \"performative\" }");
-    let start =
-        "error: invalid JSON: expected `:`\nwhere: standard input, line 2, column 17\n help: ";
+    let start = "error: the input is not JSON: expected `:`\nwhere: standard input, line 2, column 17\n help: ";
     assert!(output.starts_with(start), "{output}");
     let output =
         failed(r#"{ "message": { "performative": "inform", "receivers": [{ "name": 7 }] } }"#);

@@ -30,7 +30,7 @@ fn closing_removes_all_files() {
     got.arrived.lock().unwrap().clear();
     one.close();
     other.close();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
     one.close();
 }
 
@@ -144,7 +144,7 @@ fn wrong_configurations_and_open_directories_are_refused() {
     std::os::unix::fs::symlink(&private, &link).unwrap();
     let config = ShmConfig::new(&link, &domain.prefix, Incarnation::random());
     assert!(matches!(refused(config), ShmError::NotPrivate { .. }));
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -199,7 +199,7 @@ fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
     drop(stopped);
     let (next, _) = domain.listening();
     next.close();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -399,7 +399,7 @@ fn a_domain_whose_files_were_removed_is_joined_again() {
     two.close();
     assert!(!one.rejoin().unwrap(), "a closed transport stays closed");
     std::fs::remove_dir_all(domain.directory.path().join("away")).unwrap();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]

@@ -94,7 +94,7 @@ fn inside_a_full_file_system_ends_no_process() {
     let accepted = Some(Conclusion::Answered(Answer::Accepted));
     assert_eq!(sink.conclusion_of(one), accepted);
     drop((sender, receiver, _got));
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 fn from_env(name: &str) -> Option<u64> {

@@ -288,5 +288,5 @@ fn content_outlives_both_transports() {
     drop((sender, receiver));
     let elsewhere = std::thread::spawn(move || content == pattern(100_000));
     assert!(elsewhere.join().unwrap());
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }

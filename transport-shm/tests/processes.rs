@@ -205,7 +205,7 @@ fn shared_content_of_a_killed_sender_stays_while_it_is_read() {
         !maps.contains(&format!("{dead}."))
     });
     receiver.close();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -243,7 +243,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     sender.close();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -266,7 +266,7 @@ fn content_of_a_killed_sender_stays_readable() {
     }
     got.arrived.lock().unwrap().clear();
     receiver.close();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -301,7 +301,7 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
     receiver.close();
     drop((sender, receiver));
     cleanup_dead(&domain.config()).unwrap();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -327,7 +327,7 @@ fn cleanup_waits_until_the_last_letters_of_dead_processes_are_taken() {
     until("end of the connection", || connections() == 0);
     receiver.kill();
     cleanup_dead(&domain.config()).unwrap();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -364,7 +364,7 @@ fn close_waits_until_the_last_letters_are_taken() {
     });
     receiver.kill();
     cleanup_dead(&domain.config()).unwrap();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 #[test]
@@ -390,7 +390,7 @@ fn cleanup_dead_removes_the_files_of_killed_processes() {
     assert!(!domain.files().is_empty());
     let cleaned = cleanup_dead(&domain.config()).unwrap();
     assert_eq!((cleaned.alive, cleaned.removed, cleaned.failed), (0, 2, 0));
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 /// iceoryx2 leaves a connection like this if its creator is killed before it records its own end:
@@ -440,7 +440,7 @@ fn a_connection_without_ports_is_removed() {
     sender.close();
     receiver.close();
     drop((sender, receiver));
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }
 
 /// Cleans up with few free descriptors, of which another thread takes one now and then.
@@ -531,5 +531,5 @@ fn a_process_that_starts_later_cleans_up() {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     newcomer.close();
-    assert_eq!(domain.files(), Vec::<String>::new());
+    domain.until_removed();
 }

@@ -137,9 +137,11 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
         }
         Action::FromJson { file, to } => {
             let bytes = input::read(&file, LIMIT)?;
+            let help = "see `fipa content to-json --help` for the form";
+            input::check_not_empty(&bytes, &file, help)?;
             let content = json::to_content(&bytes).map_err(|error| {
-                let help = "see `fipa content to-json --help` for the form";
-                Failure::failed(escape(&error).into_owned(), input::name(&file), help)
+                let problem = format!("the input is no content as JSON: {}", escape(&error));
+                Failure::failed(problem, input::name(&file), help)
             })?;
             print(&Printer::new().dialect(to.into()), &content, &file)
         }
@@ -152,12 +154,12 @@ impl Source {
     }
 
     fn parse<'a>(&self, bytes: &'a [u8]) -> Result<Content<'a>, Failure> {
+        let help = "content is one or more expressions in parentheses, for example \
+                    ((action crex (dock)))";
+        input::check_not_empty(bytes, &self.file, help)?;
         // A text file ends with a newline, which belongs to no content.
-        Content::parse_in(self.dialect.into(), bytes).map_err(|error| {
-            let help = "content is one or more expressions in parentheses, for example \
-                        ((action crex (dock)))";
-            Failure::failed(error.to_string(), input::name(&self.file), help)
-        })
+        Content::parse_in(self.dialect.into(), bytes)
+            .map_err(|error| Failure::failed(error.to_string(), input::name(&self.file), help))
     }
 }
 

@@ -128,12 +128,16 @@ impl From<Target> for Dialect {
     }
 }
 
+const HELP_JSON: &str = "give one JSON document in the format of `fipa decode`, for example \
+    { \"performative\": \"request\", \"content\": \"lift\" }";
+
 /// Maximum input, in bytes: the largest content as base64, and 1 MiB for the other fields.
 const MAX_INPUT: u64 = Message::MAX_CONTENT / 3 * 4 + (1 << 20);
 
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     let file = &arguments.file;
     let text = input::read(file, MAX_INPUT)?;
+    input::check_not_empty(&text, file, HELP_JSON)?;
     let json: Value = serde_json::from_slice(&text).map_err(|error| invalid_json(&error, file))?;
     let document = document_from_json(&json).map_err(|error| invalid_document(&error, file))?;
     let bytes = encoded(document, &arguments)?;
@@ -234,11 +238,11 @@ fn invalid_json(error: &serde_json::Error, file: &Path) -> Failure {
     let problem = problem.strip_suffix(&format!(" at line {line} column {column}"));
     Failure::failed(
         format!(
-            "invalid JSON: {}",
+            "the input is not JSON: {}",
             problem.map_or_else(|| error.to_string(), str::to_owned)
         ),
         format!("{}, line {line}, column {column}", input::name(file)),
-        "give one JSON document in the format of `fipa decode`",
+        HELP_JSON,
     )
 }
 

@@ -84,6 +84,12 @@ impl TestDomain {
         lock
     }
 
+    /// Waits until no file of the domain remains. A thread that has just answered a letter may still own
+    /// the last part of an endpoint that was dropped.
+    pub(crate) fn until_removed(&self) {
+        fipa_testbed::until("all files are removed", || self.files().is_empty());
+    }
+
     /// All files of this domain, sorted.
     pub(crate) fn files(&self) -> Vec<String> {
         files(self.directory.path(), &self.prefix)

@@ -106,6 +106,7 @@ impl Replay {
         };
         let mut reader = Reader::new();
         let mut piece = vec![0; 64 * 1024];
+        let mut is_empty = true;
         loop {
             let read = match file.read(&mut piece) {
                 Ok(0) => break,
@@ -113,6 +114,7 @@ impl Replay {
                 Err(error) if error.kind() == std::io::ErrorKind::Interrupted => continue,
                 Err(error) => return Err(failed(format!("cannot read: {error}"))),
             };
+            is_empty = false;
             reader.push(piece.get(..read).unwrap_or_default());
             while let Some(recorded) = reader
                 .next_entry()
@@ -121,7 +123,10 @@ impl Replay {
                 self.letter(&recorded)?;
             }
         }
-        Ok(reader.is_complete())
+        match is_empty {
+            true => Err(failed("the input is empty".to_owned())),
+            false => Ok(reader.is_complete()),
+        }
     }
 
     fn letter(&mut self, recorded: &Recorded) -> Result<(), Failure> {
