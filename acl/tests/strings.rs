@@ -377,8 +377,8 @@ proptest! {
 
     #[test]
     fn representable_messages_are_encoded(message in representable().boxed()) {
-        let bytes = written(&message, Dialect::Standard).unwrap();
-        survives(&message, &bytes, Dialect::Standard);
+        let standard = written(&message, Dialect::Standard).unwrap();
+        survives(&message, &standard, Dialect::Standard);
         if matches!(message.performative(), Performative::Other(_)) {
             return Ok(());
         }
@@ -393,7 +393,8 @@ proptest! {
         if let Ok(bytes) = bytes {
             survives(&message, &bytes, Dialect::FipaServices);
         }
-        if format!("{message:?}").is_ascii() {
+        // JADE counts characters where the standard counts bytes.
+        if standard.is_ascii() {
             let bytes = written(&message, Dialect::Jade).unwrap();
             survives(&message, &bytes, Dialect::Jade);
         }

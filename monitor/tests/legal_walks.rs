@@ -497,7 +497,7 @@ fn no_legal_message_is_refused() {
     let steps = number("FIPA_WALK_STEPS").unwrap_or(5_000);
     let seeds = match number("FIPA_WALK_SEED") {
         Some(seed) => seed..seed + 1,
-        None => 0..number("FIPA_WALK_SEEDS").unwrap_or(20),
+        None => 0..number("FIPA_WALK_SEEDS").unwrap_or(30),
     };
     let library = Library::standard();
     let mut all = [0; 4];

@@ -122,7 +122,7 @@ fn guards_are_attributes_of_transitions_with_a_state_per_participant() {
         .flat_map(|state| state.transitions());
     assert_eq!(
         all.filter_map(|step| step.at_most()).collect::<Vec<_>>(),
-        [1]
+        [1, 1]
     );
     for (from, to, problem) in [
         (r#"f:when="all""#, r#"f:when="any""#, "expected all"),
