@@ -8,7 +8,8 @@ use std::path::PathBuf;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use common::Host;
+use common::{Host, Running};
+use fipa_testbed::until;
 use serde_json::{Value, json};
 
 #[test]
@@ -183,6 +184,69 @@ fn a_letter_to_an_unknown_receiver_fails() {
         .run(&["send", "--to", "unknown", "--json"])
         .failed_json();
     assert!(output.contains("that gateway "), "{output}");
+}
+
+/// Starts two gateways that know each other, and waits until the first lists the agent of the second.
+fn connected(here: &Host, there: &Host, agent: &str) -> (Running, Running) {
+    let far = there.start(&["up", "--json", "--set", "mts.name=crex"]);
+    let peer = format!(
+        "discovery.static={{ crex = [\"tcp://{}\"] }}",
+        far.tcp_address()
+    );
+    let near = here.start(&["up", "--json", "--set", &peer]);
+    until(&format!("{agent} is listed"), || listed(here, agent));
+    (near, far)
+}
+
+fn listed(host: &Host, agent: &str) -> bool {
+    let listed = host.run(&["agents", "--json"]).done_json();
+    let mut agents = listed["agents"].as_array().unwrap().iter();
+    agents.any(|entry| entry["name"] == agent)
+}
+
+#[test]
+fn an_agent_behind_a_killed_gateway_is_unreachable() {
+    let (here, there) = (Host::new(), Host::new());
+    let _echo = there.echo("arm_1");
+    let (_near, far) = connected(&here, &there, "arm_1");
+    let at = far.tcp_address();
+    far.signal("-KILL");
+    until("arm_1 has left the directory", || !listed(&here, "arm_1"));
+    let (json, output) = here
+        .run(&["send", "--to", "arm_1", "--content", "x", "--json"])
+        .failed_json();
+    let delivery = &json["deliveries"][0];
+    assert_eq!(delivery["reason"], "unreachable", "{json}");
+    let attempt = delivery["attempts"][0].to_string();
+    let why = "the connection with the gateway crex ended";
+    assert!(attempt.contains(&at) && attempt.contains(why), "{attempt}");
+    assert!(output.contains("fipa doctor"), "{output}");
+    // Other names do not exist.
+    let (json, _) = here
+        .run(&["send", "--to", "arm_2", "--content", "x", "--json"])
+        .failed_json();
+    assert_eq!(json["deliveries"][0]["reason"], "no such agent");
+}
+
+#[test]
+fn the_agent_of_a_command_on_another_host_does_not_stay_listed() {
+    let (here, there) = (Host::new(), Host::new());
+    let _far_echo = there.echo("arm_1");
+    let mut near_echo = here.echo("parrot");
+    let _gateways = connected(&here, &there, "arm_1");
+    until("parrot is listed", || listed(&there, "parrot"));
+    let sent = [
+        "send",
+        "--from",
+        "brief",
+        "--to",
+        "parrot",
+        "--content",
+        "x",
+    ];
+    there.run(&sent).done();
+    assert!(near_echo.line().contains("brief"));
+    until("brief is no longer listed", || !listed(&here, "brief"));
 }
 
 #[test]

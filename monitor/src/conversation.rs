@@ -913,7 +913,13 @@ enum Reply {
 fn in_reply(party: &Party, message: &PartyMessage<'_>) -> Result<Reply, Kind> {
     let other = side_index(message.side.opposite());
     let (asked, earlier) = (party.asked[other], &party.earlier[other]);
-    if !message.answers || [0, asked].contains(&message.in_reply_to) || asked == 0 {
+    // A message that crossed the `not-understood` answers the message before it.
+    let is_crossing = || {
+        let [before, ..] = earlier;
+        party.state == AFTER_NOT_UNDERSTOOD && short(message.in_reply_to) == *before
+    };
+    if !message.answers || [0, asked].contains(&message.in_reply_to) || asked == 0 || is_crossing()
+    {
         Ok(Reply::ToLast)
     } else if may_have_asked(earlier, message.in_reply_to) && !message.own {
         Ok(Reply::ToEarlier)

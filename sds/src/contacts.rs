@@ -29,6 +29,9 @@ impl ContactDirectory {
     pub const MAX_CONTACTS: usize = 1024;
     /// Time for which a contact is kept after its last letter.
     pub const MEMORY: Duration = Duration::from_secs(60);
+    /// Time for which a contact is kept if its gateway sends the agents of its host and this agent is
+    /// not among them: it has left.
+    pub const UNLISTED: Duration = Duration::from_secs(5);
 
     /// Creates an empty directory.
     #[must_use]
@@ -79,16 +82,28 @@ impl ContactDirectory {
         Ok(known.is_none_or(|(known, _)| known.incarnation != incarnation))
     }
 
-    /// Drops contacts older than [`MEMORY`](Self::MEMORY), and those that another back end `knows`.
-    pub fn forget(&self, now: Instant, knows: impl Fn(&Entry) -> bool) {
+    /// Drops contacts that `others`, the other back ends, know, and those that are older than
+    /// [`MEMORY`](Self::MEMORY), or than [`UNLISTED`](Self::UNLISTED) if `others` [speak
+    /// for](Directory::speaks_for) their gateway. Returns the time at which to call this again.
+    pub fn forget(&self, now: Instant, others: &dyn Directory) -> Option<Instant> {
+        let mut next: Option<Instant> = None;
         self.heard.lock().retain(|(entry, heard)| {
-            let old = now.saturating_duration_since(*heard) >= Self::MEMORY;
-            let stays = !old && !knows(entry);
-            if !stays {
-                self.table.release((), &entry.name, entry.incarnation);
+            // `others` may begin to speak for the gateway without a notification.
+            let (until, check) = match others.speaks_for(entry.mts.incarnation) {
+                true => (*heard + Self::UNLISTED, *heard + Self::UNLISTED),
+                false => (*heard + Self::MEMORY, now + Self::UNLISTED),
+            };
+            let stays = now < until && others.known(&entry.name).is_none();
+            let check = check.min(until);
+            match stays {
+                true => next = Some(next.map_or(check, |next| next.min(check))),
+                false => {
+                    self.table.release((), &entry.name, entry.incarnation);
+                }
             }
             stays
         });
+        next
     }
 }
 
@@ -105,6 +120,7 @@ impl Directory for ContactDirectory {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{Exchange, MergedDirectory, Present, StaticDirectory};
 
     fn location() -> Location {
         "tcp://192.0.2.1:7788#00000000000000aa".parse().unwrap()
@@ -135,9 +151,47 @@ mod tests {
             Ok(true)
         );
         assert!(contacts.by_incarnation(incarnation(1)).is_none());
-        contacts.forget(start, |_| false);
+        let end = start + ContactDirectory::MEMORY;
+        let soon = start + ContactDirectory::UNLISTED;
+        assert_eq!(contacts.forget(start, &nothing()), Some(soon));
+        let late = end.checked_sub(Duration::from_millis(1)).unwrap();
+        assert_eq!(contacts.forget(late, &nothing()), Some(end));
         assert!(contacts.lookup("arm").is_some());
-        contacts.forget(start + ContactDirectory::MEMORY, |_| false);
+        assert_eq!(contacts.forget(end, &nothing()), None);
+        assert!(contacts.lookup("arm").is_none());
+    }
+
+    fn nothing() -> MergedDirectory {
+        MergedDirectory::new(Vec::new())
+    }
+
+    #[test]
+    fn a_contact_that_its_gateway_does_not_list_is_dropped_early() {
+        let contacts = ContactDirectory::new();
+        let start = Instant::now();
+        let gateway = location().incarnation();
+        let mut exchange = Exchange::new(0);
+        let mts = Mts::new("arm-mts", gateway);
+        exchange.handle_neighbours(start, &[Present::unproved(mts, vec![location()])]);
+        let known = exchange.directory();
+        contacts
+            .heard(start, "arm", incarnation(1), location())
+            .unwrap();
+        let soon = start + ContactDirectory::UNLISTED;
+        assert!(contacts.forget(soon, &*known) > Some(soon));
+        assert!(contacts.lookup("arm").is_some());
+        let listed =
+            br#"{"version":1,"tell":{"full":{"version":0,"first":true,"last":true,"agents":[]}}}"#;
+        exchange.handle_letter(start, gateway, listed).unwrap();
+        assert_eq!(contacts.forget(start, &*known), Some(soon));
+        assert!(contacts.lookup("arm").is_some());
+        // Another letter shows that the agent is there.
+        contacts
+            .heard(soon, "arm", incarnation(1), location())
+            .unwrap();
+        let later = soon + ContactDirectory::UNLISTED;
+        assert_eq!(contacts.forget(soon, &*known), Some(later));
+        assert_eq!(contacts.forget(later, &*known), None);
         assert!(contacts.lookup("arm").is_none());
     }
 
@@ -151,7 +205,8 @@ mod tests {
         contacts
             .heard(now, "leg", incarnation(2), location())
             .unwrap();
-        contacts.forget(now, |entry| &*entry.name == "arm");
+        let known = StaticDirectory::new([("arm", vec![location()])]).unwrap();
+        contacts.forget(now, &known);
         assert!(contacts.lookup("arm").is_none());
         assert!(contacts.lookup("leg").is_some());
     }

@@ -95,6 +95,11 @@ impl Directory for MergedDirectory {
         entries
     }
 
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        let back_ends = self.back_ends.iter();
+        back_ends.flat_map(|one| one.lost_agents()).collect()
+    }
+
     fn generation(&self) -> u64 {
         // Each generation only grows, so the sum changes whenever one of them does.
         self.generations().fold(0, u64::wrapping_add)
@@ -166,6 +171,10 @@ impl View for Merged {
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
         Arc::clone(self.sorted.get_or_init(|| merged_entries(&self.views)))
+    }
+
+    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+        self.views.iter().find_map(|one| one.lost(name))
     }
 
     fn is_authority(&self, mts: Incarnation) -> bool {

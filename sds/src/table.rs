@@ -27,6 +27,10 @@ macro_rules! reads_its_table {
             self.$($field).+.entries()
         }
 
+        fn lost_agents(&self) -> Vec<Arc<Entry>> {
+            self.$($field).+.lost_agents()
+        }
+
         fn generation(&self) -> u64 {
             self.$($field).+.generation()
         }
@@ -107,6 +111,17 @@ impl<O: Clone + Eq + Hash> Table<O> {
         // Sorted without the lock.
         let holders = Arc::clone(&self.index.read().holders);
         holders.all()
+    }
+
+    pub(crate) fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.index.read().holders.lost_agents()
+    }
+
+    /// Replaces the [lost agents](crate::Directory::lost_agents). Watchers are not notified.
+    pub(crate) fn set_lost(&self, lost: impl IntoIterator<Item = Arc<Entry>>) {
+        let mut index = self.index.write();
+        Arc::make_mut(&mut index.holders).set_lost(lost);
+        self.touch();
     }
 
     /// Returns at most `most` pairs for names that more than one proved origin claims: the entry

@@ -21,6 +21,12 @@ pub trait View: Send + Sync {
     /// Returns all entries, sorted by name.
     fn all(&self) -> Arc<[Arc<Entry>]>;
 
+    /// Returns the last entry of a [lost agent](Directory::lost_agents) of this name.
+    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+        let _ = name;
+        None
+    }
+
     /// Whether the view is [authoritative](Directory::speaks_for) for the coalitions of this message
     /// transport service.
     fn is_authority(&self, mts: Incarnation) -> bool {
@@ -48,6 +54,12 @@ impl<D: Directory + ?Sized> View for D {
         self.entries()
     }
 
+    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+        self.lost_agents()
+            .into_iter()
+            .find(|lost| *lost.name == *name)
+    }
+
     fn is_authority(&self, mts: Incarnation) -> bool {
         self.speaks_for(mts)
     }
@@ -71,6 +83,8 @@ pub struct Snapshot {
     incarnations: HashTrieMapSync<Incarnation, ProvedEntry>,
     /// Entries whose registration belongs to an entry of another name; proved ones first.
     disputed: HashTrieMapSync<Incarnation, DisputedEntries>,
+    /// Lost agents, which are not among the entries above.
+    lost: HashTrieMapSync<Arc<str>, Arc<Entry>>,
     sorted: OnceLock<Arc<[Arc<Entry>]>>,
 }
 
@@ -89,6 +103,16 @@ impl Snapshot {
             snapshot.set(before.as_ref(), Some((Arc::clone(entry), false)));
         }
         snapshot
+    }
+
+    /// Replaces the lost agents.
+    pub(crate) fn set_lost(&mut self, lost: impl IntoIterator<Item = Arc<Entry>>) {
+        let lost = lost.into_iter();
+        self.lost = lost.map(|entry| (Arc::clone(&entry.name), entry)).collect();
+    }
+
+    pub(crate) fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.lost.values().cloned().collect()
     }
 
     /// Replaces the entry of a name.
@@ -184,6 +208,10 @@ impl View for Snapshot {
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         let (entry, _) = self.incarnations.get(&incarnation)?;
         Some(Arc::clone(entry))
+    }
+
+    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+        self.lost.get(name).cloned()
     }
 
     fn all(&self) -> Arc<[Arc<Entry>]> {

@@ -347,6 +347,53 @@ fn entries_leave_with_their_gateway() {
     assert!(directory.lookup("arm").is_none());
 }
 
+#[test]
+fn agents_of_a_gateway_that_falls_silent_are_lost_for_a_minute() {
+    let mut world = World::new(2, 4);
+    world.join(0, "arm");
+    world.join(0, "leg");
+    world.connect();
+    world.run(Duration::from_millis(300));
+    let directory = world.gateways[1].exchange.directory();
+    let lost = |name: &str| directory.view().lost(name);
+    let at = directory.lookup("arm").unwrap().locations.clone();
+    let disconnect = |world: &mut World| {
+        let now = world.now;
+        world.gateways[1].exchange.handle_neighbours(now, &[]);
+        assert!(lost("arm").is_none(), "a broken connection may return");
+        world.run(Exchange::MEMORY + Duration::from_millis(10));
+    };
+    disconnect(&mut world);
+    assert!(directory.lookup("arm").is_none());
+    assert_eq!(lost("arm").unwrap().locations, at);
+    assert!(lost("leg").is_some() && lost("wheel").is_none());
+    assert_eq!(directory.lost_agents().len(), 2);
+    world.run(Exchange::LOST);
+    assert!(directory.lost_agents().is_empty());
+
+    // An agent that left in the meantime does not exist after its gateway has returned.
+    world.connect();
+    world.run(Duration::from_secs(20));
+    disconnect(&mut world);
+    assert_eq!(directory.lost_agents().len(), 2);
+    world.leave(0, "leg");
+    world.connect();
+    world.run(Duration::from_secs(20));
+    assert!(directory.lookup("arm").is_some() && directory.lookup("leg").is_none());
+    assert!(directory.lost_agents().is_empty());
+
+    // A gateway that says goodbye leaves no lost agents.
+    let (_, content) = world.gateways[0].exchange.goodbye();
+    let now = world.now;
+    let receiver = &mut world.gateways[1].exchange;
+    receiver
+        .handle_letter(now, Incarnation::from_u64(1), &content)
+        .unwrap();
+    receiver.handle_neighbours(now, &[]);
+    world.run(Exchange::MEMORY * 2);
+    assert!(directory.lost_agents().is_empty());
+}
+
 /// A gateway that is killed and restarted has another incarnation at the same location: the entries
 /// of the old one are removed with the first letter of the new one.
 #[test]

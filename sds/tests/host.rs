@@ -10,6 +10,7 @@ use std::io::{BufRead as _, BufReader, Write as _};
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::Arc;
 
 use common::{conforms, next, registration};
 use fipa_sds::{
@@ -592,7 +593,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         reach: Reach::Local,
         role: Role::Agent,
     };
-    let denied = here.publish_remote(vec![entry.clone()]);
+    let denied = here.publish_remote(vec![entry.clone()], Vec::new());
     assert!(matches!(denied, Err(HostError::NoGateway)));
 
     let gateway = HostDirectory::open(HostConfig {
@@ -605,7 +606,9 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         .unwrap()
         .mts
         .incarnation;
-    gateway.publish_remote(vec![entry.clone()]).unwrap();
+    gateway
+        .publish_remote(vec![entry.clone()], Vec::new())
+        .unwrap();
     let found = here.lookup("camera").unwrap();
     let expected = Entry {
         source: Source::Mdns,
@@ -627,15 +630,32 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         name: "arm".into(),
         ..entry
     };
-    gateway.publish_remote(vec![impostor]).unwrap();
+    let lost = vec![Arc::new(expected.clone())];
+    gateway.publish_remote(vec![impostor], lost).unwrap();
     let third = open(&dir);
     assert_eq!(third.lookup("arm").unwrap().incarnation, local.incarnation);
     until_some_async("camera is withdrawn", || {
         here.lookup("camera").is_none().then_some(())
     })
     .await;
+    // Its gateway fell silent: the agent is no entry, but it is known.
+    for process in [&here, &third] {
+        process.refresh();
+        let lost = process.view().lost("camera").unwrap();
+        assert_eq!(&*lost.mts.name, "far-mts");
+        assert_eq!(lost.locations, expected.locations);
+        assert!(process.entries().iter().all(|it| *it.name != *"camera"));
+    }
     drop(gateway);
     assert!(third.lookup("arm").is_some());
+    until_some_async(
+        "lost agents end with the gateway that publishes them",
+        || {
+            third.refresh();
+            third.lost_agents().is_empty().then_some(())
+        },
+    )
+    .await;
 }
 
 #[tokio::test]
@@ -806,7 +826,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         reach: Reach::Local,
         role: Role::Agent,
     };
-    gateway.publish_remote(vec![contact]).unwrap();
+    gateway.publish_remote(vec![contact], Vec::new()).unwrap();
     assert_eq!(here.lookup("rover").unwrap().source, Source::Contact);
 
     let rover = here.register(registration("rover")).unwrap();
@@ -838,7 +858,7 @@ async fn changes_during_the_removal_of_the_directory_are_written_afterwards() {
         name: "far".into(),
         ..Entry::clone(&entry)
     };
-    gateway.publish_remote(vec![remote]).unwrap();
+    gateway.publish_remote(vec![remote], Vec::new()).unwrap();
     gateway.deregister("arm", arm.incarnation).unwrap();
     assert!(gateway.rejoin().unwrap());
     let newcomer = open(&dir);

@@ -179,7 +179,10 @@ fn contacts_conform() {
     let (now, contacts) = contacts();
     conforms(&contacts, Source::Contact);
     tells_departures(&contacts, || {
-        contacts.forget(now + ContactDirectory::MEMORY, |_| false)
+        contacts.forget(
+            now + ContactDirectory::MEMORY,
+            &MergedDirectory::new(Vec::new()),
+        );
     });
 }
 
@@ -205,7 +208,10 @@ fn merged_views_of_them_conform() {
     let only_heard = MergedDirectory::new(vec![heard.clone()]);
     conforms(&only_heard, Source::Contact);
     tells_departures(&only_heard, || {
-        heard.forget(now + ContactDirectory::MEMORY, |_| false)
+        heard.forget(
+            now + ContactDirectory::MEMORY,
+            &MergedDirectory::new(Vec::new()),
+        );
     });
     // A writable directory makes the view writable.
     let memory = Arc::new(MemoryDirectory::new(Mts::new("own", Incarnation::random())));

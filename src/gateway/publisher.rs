@@ -68,7 +68,10 @@ impl Publisher {
                     ..Entry::clone(entry)
                 },
             });
-        if let Err(error) = self.host.publish_remote(through_here.collect()) {
+        let published = self
+            .host
+            .publish_remote(through_here.collect(), self.known.lost_agents());
+        if let Err(error) = published {
             tracing::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
         }
     }
@@ -159,6 +162,7 @@ impl PublishTask {
         let publisher = Arc::clone(&self.publisher);
         let known = Arc::clone(&publisher.known);
         let (mut here, mut there) = (publisher.host.watch(), known.watch());
+        let mut heard = publisher.contacts.watch();
         let mut located = publisher.service.follow_locations();
         if publisher.network.is_some() && publisher.announced_locations().is_empty() {
             tracing::info!(
@@ -166,31 +170,34 @@ impl PublishTask {
                  mDNS until it has one; see transport.tcp.listen and `ip address`"
             );
         }
-        let mut forgetting = tokio::time::interval(ContactDirectory::MEMORY / 4);
         loop {
             if let Some(network) = &publisher.network {
                 self.announce(&**network);
             }
-            publisher
-                .contacts
-                .forget(Instant::now(), |entry| known.known(&entry.name).is_some());
+            let now = Instant::now();
+            let next = publisher.contacts.forget(now, &*known);
             publisher.publish();
+            // Lost agents end without a notification.
+            let longest = now + ContactDirectory::MEMORY / 4;
+            let next = next.map_or(longest, |next| next.min(longest));
             let goes_on = tokio::select! {
                 change = here.next() => change.is_some(),
                 change = there.next() => change.is_some(),
+                change = heard.next() => change.is_some(),
                 moved = located.changed() => {
                     if let Some(network) = &self.network {
                         network.interfaces_changed();
                     }
                     moved.is_ok()
                 }
-                _ = forgetting.tick() => true,
+                () = tokio::time::sleep_until(next.into()) => true,
             };
             if !goes_on {
                 return;
             }
             // Several pending changes are handled together.
-            while here.try_next().is_some() || there.try_next().is_some() {}
+            let mut more = || here.try_next().or_else(|| there.try_next());
+            while more().or_else(|| heard.try_next()).is_some() {}
         }
     }
 

@@ -238,6 +238,23 @@ fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
     }
 }
 
+#[test]
+fn messages_that_cross_a_not_understood_answer_the_message_before_it() {
+    let english = |text| say_in("fipa-auction-english", text);
+    let mut stage = Stage::observer();
+    stage.right(english("inform ann>ben").reply_with("opening"));
+    stage.right(english("cfp ann>ben").reply_with("price"));
+    let bid = english("propose ben>ann").in_reply_to("price");
+    stage.right(bid.reply_with("bid"));
+    stage.right(english("not-understood ben>ann").reply_with("what"));
+    // The auctioneer has received the bid only, so that ben leads until the end.
+    stage.right(english("accept-proposal ann>ben").in_reply_to("bid"));
+    stage.right(english("cfp ann>ben").reply_with("higher"));
+    stage.right(english("inform ann>ben"));
+    stage.right(english("request ann>ben"));
+    assert_eq!(stage.wrong(english("request ben>ann")).kind, Kind::Ended);
+}
+
 /// The monitors of all agents, and of this one.
 fn monitors(agent: &str) -> [Stage; 2] {
     [

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use fipa_acl::Letter;
 use fipa_sds::{Entry, View};
 use fipa_transport::{
-    Answer, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location, Outcome,
-    Parcel, Report, Signature, Stream, Ticket, TransportError, TransportErrorKind,
+    Answer, Attempt, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location,
+    Outcome, Parcel, Report, Signature, Stream, Ticket, TransportError, TransportErrorKind,
 };
 use smallvec::SmallVec;
 
@@ -277,6 +277,25 @@ impl AttemptTable {
             refreshing: VecDeque::new(),
             refreshes: 0,
         }
+    }
+
+    /// The reason for which a letter to an agent fails that the directory does not list. For a [lost
+    /// agent](fipa_sds::Directory::lost_agents), the attempt names the location of its gateway.
+    pub(super) fn absence(&self, name: &str) -> (FailureReason, Option<Attempt>) {
+        let Some(lost) = self.view.lost(name) else {
+            return (FailureReason::NoSuchAgent, None);
+        };
+        let why = format!(
+            "the connection with the gateway {} ended without a farewell, and has not been restored since",
+            lost.mts.name
+        );
+        let location = lost.locations.first();
+        let attempt = location.map(|location| Attempt {
+            via: location.kind(),
+            location: location.clone(),
+            error: TransportError::new(TransportErrorKind::Unreachable, why),
+        });
+        (FailureReason::Unreachable, attempt)
     }
 
     /// Requests a refresh of the directory, and returns its number.

@@ -54,8 +54,9 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::Letter;
 use fipa_sds::{Entry, Pattern, Resolution, Role, View};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Location, Outcome, Parcel, Report, Stream, TransportError, TransportErrorKind, Verdict,
+    Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
+    Introduction, Kind, Location, Outcome, Parcel, Report, Stream, TransportError,
+    TransportErrorKind, Verdict,
 };
 
 pub use attempts::Action;
@@ -365,8 +366,7 @@ impl Core {
                 Resolution::Coalition { agents, missing } => {
                     count += missing.len();
                     for member in missing {
-                        let reason = FailureReason::NoSuchAgent;
-                        self.undeliverable(send, sender, member, letter.clone(), reason);
+                        self.absent(send, sender, member, letter.clone());
                     }
                     if agents.is_empty() {
                         continue;
@@ -377,8 +377,7 @@ impl Core {
             };
             if entries.is_empty() {
                 count += 1;
-                let reason = FailureReason::NoSuchAgent;
-                self.undeliverable(send, sender, receiver, letter.clone(), reason);
+                self.absent(send, sender, receiver, letter.clone());
             }
             for entry in entries {
                 let registration = attempts::registration_of(&entry);
@@ -516,10 +515,27 @@ impl Core {
         letter: Letter,
         reason: FailureReason,
     ) {
-        let outcome = Outcome::Failed {
-            reason,
-            attempts: Vec::new(),
-        };
+        self.failed(send, sender, receiver, letter, (reason, None));
+    }
+
+    /// Fails a letter to an agent that the directory does not list.
+    fn absent(&mut self, send: SendId, sender: Incarnation, receiver: Arc<str>, letter: Letter) {
+        let absence = self.table.absence(&receiver);
+        self.failed(send, sender, receiver, letter, absence);
+    }
+
+    fn failed(
+        &mut self,
+        send: SendId,
+        sender: Incarnation,
+        receiver: Arc<str>,
+        letter: Letter,
+        (reason, attempt): (FailureReason, Option<Attempt>),
+    ) {
+        let detail = attempt.as_ref().map(ToString::to_string);
+        let detail = detail.unwrap_or_default();
+        let attempts = attempt.into_iter().collect();
+        let outcome = Outcome::Failed { reason, attempts };
         let sequence = self.sequence_of(sender);
         let stream = Stream {
             sender,
@@ -540,7 +556,7 @@ impl Core {
             receiver: Arc::clone(&receiver),
             letter,
             reason,
-            detail: String::new(),
+            detail,
         });
         self.table.actions.push_back(Action::Outcome {
             send,

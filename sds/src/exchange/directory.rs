@@ -192,6 +192,19 @@ impl ExchangeDirectory {
         any
     }
 
+    /// Replaces the [lost agents](Directory::lost_agents).
+    pub(super) fn set_lost(&self, lost: impl IntoIterator<Item = Arc<Entry>>) {
+        self.table.set_lost(lost);
+    }
+
+    /// Returns at most `most` agents of the gateway.
+    pub(super) fn agents_of(&self, gateway: Incarnation, most: usize) -> Vec<Arc<Entry>> {
+        let agents_of = self.agents_of.lock();
+        let entries = agents_of.get(&gateway).into_iter().flat_map(Agents::values);
+        let agents = entries.filter(|entry| entry.role == Role::Agent);
+        agents.take(most).cloned().collect()
+    }
+
     /// Removes the gateway's agents.
     pub(super) fn forget(&self, gateway: Incarnation) {
         let origin = self.origin(gateway);
@@ -223,6 +236,10 @@ impl View for ExchangeView {
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
         self.entries.all()
+    }
+
+    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+        self.entries.lost(name)
     }
 
     fn is_authority(&self, mts: Incarnation) -> bool {

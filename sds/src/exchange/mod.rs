@@ -48,7 +48,18 @@ pub struct Exchange {
     /// entries later.
     early: HashSet<Incarnation>,
     directory: Arc<ExchangeDirectory>,
+    /// The agents of neighbors that fell silent, the latest last.
+    lost: VecDeque<LostGateway>,
     random: u64,
+}
+
+/// The agents of a gateway that fell silent without a farewell.
+#[derive(Debug)]
+struct LostGateway {
+    mts: Mts,
+    agents: Vec<Arc<Entry>>,
+    /// Time at which they are forgotten.
+    until: Instant,
 }
 
 /// A gateway with an open connection.
@@ -154,6 +165,10 @@ impl Exchange {
     /// Time for which the agents of a disconnected neighbor are kept: a broken connection is
     /// usually restored.
     pub const MEMORY: Duration = Duration::from_secs(5);
+    /// Time for which agents are [lost](crate::Directory::lost_agents) after that.
+    pub const LOST: Duration = Duration::from_secs(60);
+    /// Maximum number of lost agents; further ones are forgotten at once.
+    pub const MAX_LOST: usize = 1024;
 
     /// Time for which changes are collected before they are sent.
     const GATHERING: Duration = Duration::from_millis(50);
@@ -179,6 +194,7 @@ impl Exchange {
             neighbors: HashMap::new(),
             early: HashSet::new(),
             directory: Arc::default(),
+            lost: VecDeque::new(),
             random: seed,
         }
     }
@@ -389,6 +405,10 @@ impl Exchange {
             }
             ExchangeMessage::Full(full) => {
                 neighbor.handle_full(now, full, &self.directory)?;
+                if neighbor.stored.is_some() {
+                    let returned = neighbor.mts.clone();
+                    self.forget_lost(|lost| lost.mts.name == returned.name);
+                }
                 self.end_replaced();
                 Ok(())
             }
@@ -446,19 +466,50 @@ impl Exchange {
         }
     }
 
-    /// Removes neighbors that have been disconnected for too long, with all their entries.
+    /// Removes neighbors that have been disconnected for too long, with all their entries. Their
+    /// agents are lost.
     pub fn handle_timeout(&mut self, now: Instant) {
-        let directory = &self.directory;
-        self.neighbors.retain(|incarnation, neighbor| {
-            let gone = neighbor
-                .gone
-                .is_some_and(|since| now >= since + Self::MEMORY);
-            if gone {
-                directory.forget(*incarnation);
-                directory.prove(*incarnation, &Mandate::Unproved);
-            }
-            !gone
+        self.forget_lost(|lost| now >= lost.until);
+        let silent = |neighbor: &Neighbor| neighbor.gone.is_some_and(|it| now >= it + Self::MEMORY);
+        let neighbors = self.neighbors.iter();
+        let silent = neighbors.filter(|(_, neighbor)| silent(neighbor));
+        let silent: Vec<Incarnation> = silent.map(|(gateway, _)| *gateway).collect();
+        for gateway in silent {
+            self.lose(now, gateway);
+            self.end(gateway);
+        }
+    }
+
+    /// Remembers the agents of a gateway that fell silent.
+    fn lose(&mut self, now: Instant, gateway: Incarnation) {
+        let Some(neighbor) = self.neighbors.get(&gateway) else {
+            return;
+        };
+        let known: usize = self.lost.iter().map(|lost| lost.agents.len()).sum();
+        let room = Self::MAX_LOST.saturating_sub(known);
+        let agents = self.directory.agents_of(gateway, room);
+        if agents.is_empty() {
+            return;
+        }
+        self.lost.push_back(LostGateway {
+            mts: neighbor.mts.clone(),
+            agents,
+            until: now + Self::LOST,
         });
+        self.show_lost();
+    }
+
+    fn forget_lost(&mut self, which: impl Fn(&LostGateway) -> bool) {
+        let before = self.lost.len();
+        self.lost.retain(|lost| !which(lost));
+        if self.lost.len() != before {
+            self.show_lost();
+        }
+    }
+
+    fn show_lost(&self) {
+        let lost = self.lost.iter().flat_map(|lost| &lost.agents);
+        self.directory.set_lost(lost.cloned());
     }
 
     /// Time of the next action.
@@ -469,7 +520,8 @@ impl Exchange {
             None if neighbor.under_way.is_some() => None,
             None => Some(neighbor.next_letter()),
         });
-        times.flatten().min()
+        let forgotten = self.lost.front().map(|lost| lost.until);
+        times.flatten().chain(forgotten).min()
     }
 
     /// Returns the next letter to send: the neighbor and the content. The caller reports its result

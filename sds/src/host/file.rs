@@ -7,7 +7,8 @@
 //! ```
 //! `registered` is in milliseconds since 1970, UTC. An entry of an agent on another host, which
 //! only a gateway writes, has a `remote` with the message transport service of the agent; the
-//! gateway is the `mts` of the file.
+//! gateway is the `mts` of the file. A gateway may also write `lost`: the last entries of agents of
+//! other hosts whose gateway fell silent.
 //!
 //! A process of the same user writes the file, which does not make it trustworthy: everything is
 //! checked, and a file with any error is rejected as a whole.
@@ -30,18 +31,31 @@ pub(super) type Entries = HashMap<Arc<str>, Arc<Entry>>;
 /// Maximum number of entries in one file.
 pub(super) const MAX_ENTRIES: usize = 65_536;
 
-pub(super) fn write<'a>(mts: &Mts, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<u8> {
+/// Entries read from a file.
+#[derive(Debug, Default)]
+pub(super) struct Read {
+    pub(super) entries: Entries,
+    /// The [lost agents](crate::Directory::lost_agents).
+    pub(super) lost: Vec<Arc<Entry>>,
+}
+
+pub(super) fn write<'a>(
+    mts: &Mts,
+    entries: impl Iterator<Item = &'a Arc<Entry>>,
+    lost: &[Arc<Entry>],
+) -> Vec<u8> {
     let written = Written {
         format: FORMAT.into(),
         version: VERSION,
         mts: mts.clone(),
         entries: entries.map(|entry| WrittenEntry::of(entry)).collect(),
+        lost: lost.iter().map(|entry| WrittenEntry::of(entry)).collect(),
     };
     // Serialization of text, numbers and lists cannot fail.
     serde_json::to_vec(&written).unwrap_or_default()
 }
 
-pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
+pub(super) fn read(bytes: &[u8]) -> Result<Read, FileError> {
     let written: Written = serde_json::from_slice(bytes).map_err(FileError::Json)?;
     if written.format != FORMAT {
         return Err(FileError::Format(written.format));
@@ -49,8 +63,9 @@ pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
     if written.version != VERSION {
         return Err(FileError::Version(written.version));
     }
-    if written.entries.len() > MAX_ENTRIES {
-        return Err(FileError::TooMany(written.entries.len()));
+    let count = written.entries.len() + written.lost.len();
+    if count > MAX_ENTRIES {
+        return Err(FileError::TooMany(count));
     }
     let mut entries = Entries::with_capacity(written.entries.len());
     for one in written.entries {
@@ -59,7 +74,12 @@ pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
             return Err(FileError::Twice(twice.name.clone()));
         }
     }
-    Ok(entries)
+    let lost = written.lost.into_iter();
+    let lost = lost.map(|one| one.into_entry(&written.mts).map(Arc::new));
+    Ok(Read {
+        entries,
+        lost: lost.collect::<Result<_, _>>()?,
+    })
 }
 
 /// Error of [`read`].
@@ -87,6 +107,8 @@ struct Written {
     version: u32,
     mts: Mts,
     entries: Vec<WrittenEntry>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    lost: Vec<WrittenEntry>,
 }
 
 #[derive(Serialize, Deserialize)]

@@ -1,5 +1,7 @@
 //! Entries files for the fuzz targets.
 
+use std::sync::Arc;
+
 use super::file;
 use super::host_dir::Name;
 use crate::{Entry, Mts, Reach, Source};
@@ -12,8 +14,9 @@ use crate::{Entry, Mts, Reach, Source};
 /// # Panics
 /// Panics when an accepted file exceeds a limit.
 pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
-    let entries = file::read(bytes).map_err(|error| fipa_acl::ErrorChain(&error).to_string())?;
-    assert!(entries.len() <= file::MAX_ENTRIES);
+    let read = file::read(bytes).map_err(|error| fipa_acl::ErrorChain(&error).to_string())?;
+    let file::Read { entries, lost } = read;
+    assert!(entries.len() + lost.len() <= file::MAX_ENTRIES);
     for (name, entry) in &entries {
         assert_eq!(*name, entry.name);
         entry
@@ -21,22 +24,23 @@ pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
             .expect("an accepted file is within the limits");
     }
     let mut own: Option<Mts> = None;
-    for entry in entries.values() {
+    for entry in entries.values().chain(&lost) {
         if entry.reach == Reach::Local {
             own = Some(entry.mts.clone());
         }
     }
-    let gateway = entries.values().find_map(|it| match it.reach {
+    let gateway = entries.values().chain(&lost).find_map(|it| match it.reach {
         Reach::Remote { gateway } => Some(Mts::new("mts", gateway)),
         Reach::Local => None,
     });
     let Some(mts) = own.or(gateway) else {
         return Ok(bytes.to_vec());
     };
-    let written = file::write(&mts, entries.values());
+    let written = file::write(&mts, entries.values(), &lost);
     let again = file::read(&written).expect("an accepted file can be written and read again");
-    let sorted = |entries: &file::Entries| {
-        let mut all: Vec<Entry> = entries.values().map(|it| (**it).clone()).collect();
+    let sorted = |entries: &file::Entries, lost: &[Arc<Entry>]| {
+        let all = entries.values().chain(lost);
+        let mut all: Vec<Entry> = all.map(|it| (**it).clone()).collect();
         for entry in &mut all {
             // The source of a local entry is not written.
             if entry.reach == Reach::Local {
@@ -46,7 +50,7 @@ pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
         all.sort_by(|one, other| one.name.cmp(&other.name));
         all
     };
-    assert_eq!(sorted(&again), sorted(&entries));
+    assert_eq!(sorted(&again.entries, &again.lost), sorted(&entries, &lost));
     Ok(written)
 }
 

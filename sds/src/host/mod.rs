@@ -116,9 +116,9 @@ impl HostDirectory {
             if let Name::Entries(id) = name
                 && host_dir.is_running(id).unwrap_or(false)
                 && let Ok(Some(bytes)) = host_dir.read_entries(id)
-                && let Ok(entries) = file::read(&bytes)
+                && let Ok(read) = file::read(&bytes)
             {
-                found.extend(entries.into_values());
+                found.extend(read.entries.into_values());
             }
         }
         found.sort_by(|a, b| a.name.cmp(&b.name));
@@ -128,29 +128,39 @@ impl HostDirectory {
     /// Replaces the agents of other hosts that this gateway publishes to the processes of this
     /// host, in which they appear as [`Reach::Remote`] through this gateway. Their locations are
     /// those at which the gateway accepts letters for them. This directory's own view does not
-    /// contain them.
+    /// contain them. Processes of this host see `lost` as their [lost
+    /// agents](Directory::lost_agents).
     ///
     /// # Errors
     /// Fails when this process is not a gateway, an entry is not valid, there are too many, or they
     /// cannot be written; nothing has changed then.
-    pub fn publish_remote(&self, entries: Vec<Entry>) -> Result<(), HostError> {
+    pub fn publish_remote(
+        &self,
+        entries: Vec<Entry>,
+        lost: Vec<Arc<Entry>>,
+    ) -> Result<(), HostError> {
         self.owner.check()?;
         if !self.config.gateway {
             return Err(HostError::NoGateway);
         }
+        let check = |entry: &Entry| {
+            let checked = entry.check();
+            checked.map_err(|source| HostError::Entry {
+                name: entry.name.clone(),
+                source,
+            })
+        };
+        lost.iter().try_for_each(|entry| check(entry))?;
         let mut published = std::collections::BTreeMap::new();
         for mut entry in entries {
             entry.reach = Reach::Remote {
                 gateway: self.config.mts.incarnation,
             };
-            let checked = entry.check();
-            checked.map_err(|source| HostError::Entry {
-                name: entry.name.clone(),
-                source,
-            })?;
+            check(&entry)?;
             published.insert(entry.name.clone(), Arc::new(entry));
         }
-        self.shared.publish(published.into_values().collect())
+        let published = published.into_values().collect();
+        self.shared.publish(published, lost)
     }
 
     /// Registers an agent like [`Directory::register`], unless the call is canceled before the

@@ -41,6 +41,8 @@ struct OwnEntries {
     /// Agents of other hosts that this gateway publishes. They are not in its own table, because it
     /// has them from other back ends.
     remote: Vec<Arc<Entry>>,
+    /// Lost agents of other hosts, which this gateway publishes.
+    lost: Vec<Arc<Entry>>,
 }
 
 /// The entries of the other processes.
@@ -64,6 +66,7 @@ impl OtherProcesses {
 struct Process {
     version: Option<Version>,
     entries: Entries,
+    lost: Vec<Arc<Entry>>,
 }
 
 impl Shared {
@@ -100,7 +103,7 @@ impl Shared {
             return Ok(true);
         }
         let host_dir = self.host_dir();
-        let nothing = own.agents.is_empty() && own.remote.is_empty();
+        let nothing = own.agents.is_empty() && own.remote.is_empty() && own.lost.is_empty();
         Ok(host_dir.is_there()? && (nothing || host_dir.version(host_dir.id())?.is_some()))
     }
 
@@ -250,25 +253,37 @@ impl Shared {
         if known.is_none() && !self.host_dir().is_running(id)? {
             return Ok(());
         }
-        let entries = self.read_file(id).unwrap_or_else(|error| {
+        let read = self.read_file(id).unwrap_or_else(|error| {
             // Treated as empty; the process's next file may be valid.
             let path = self.host_dir().path().join(Name::Entries(id).to_string());
             tracing::error!(path = %path.display(), error = %ErrorChain(&error), "entries file ignored");
-            Entries::new()
+            file::Read::default()
         });
         let process = others.processes.entry(id).or_default();
         // Taken before reading, so that a replacement in between causes another read.
         process.version = version;
-        let before = std::mem::replace(&mut process.entries, entries);
+        let before = std::mem::replace(&mut process.entries, read.entries);
+        let differs = process.lost != read.lost;
+        process.lost = read.lost;
         self.tell(id, &before, &process.entries);
+        if differs {
+            self.show_lost(others);
+        }
         Ok(())
     }
 
-    fn read_file(&self, id: Id) -> Result<Entries, ReadError> {
+    fn read_file(&self, id: Id) -> Result<file::Read, ReadError> {
         match self.host_dir().read_entries(id)? {
             Some(bytes) => Ok(file::read(&bytes)?),
-            None => Ok(Entries::new()),
+            None => Ok(file::Read::default()),
         }
+    }
+
+    /// Shows the lost agents that the gateways among the other processes publish.
+    fn show_lost(&self, others: &OtherProcesses) {
+        let processes = others.processes.values();
+        let lost = processes.flat_map(|process| &process.lost);
+        self.table.set_lost(lost.cloned());
     }
 
     fn tell(&self, id: Id, before: &Entries, after: &Entries) {
@@ -293,6 +308,9 @@ impl Shared {
     fn forget(&self, others: &mut OtherProcesses, id: Id) {
         if let Some(process) = others.processes.remove(&id) {
             self.tell(id, &process.entries, &Entries::new());
+            if !process.lost.is_empty() {
+                self.show_lost(others);
+            }
         }
     }
 
@@ -417,18 +435,23 @@ impl Shared {
         })
     }
 
-    /// Replaces the agents of other hosts that this gateway publishes.
-    pub(super) fn publish(&self, remote: Vec<Arc<Entry>>) -> Result<(), HostError> {
+    /// Replaces the agents of other hosts that this gateway publishes, and the lost ones.
+    pub(super) fn publish(
+        &self,
+        remote: Vec<Arc<Entry>>,
+        lost: Vec<Arc<Entry>>,
+    ) -> Result<(), HostError> {
         self.change(|guard, own| {
             if own.closed {
                 return Err(HostError::Closed);
             }
-            if own.remote == remote {
+            if own.remote == remote && own.lost == lost {
                 return Ok(());
             }
-            let before = std::mem::replace(&mut own.remote, remote);
+            let remote = std::mem::replace(&mut own.remote, remote);
+            let lost = std::mem::replace(&mut own.lost, lost);
             self.write_now_or_later(guard, own).map_err(|error| {
-                own.remote = before;
+                (own.remote, own.lost) = (remote, lost);
                 match error {
                     WriteError::Full(why) => HostError::Full(why),
                     WriteError::Host(error) => error,
@@ -474,13 +497,13 @@ impl Shared {
         // A name that is registered here is not also published as a remote agent.
         let remote = own.remote.iter();
         let remote = remote.filter(|entry| !own.agents.contains_key(&entry.name));
-        let count = own.agents.len() + own.remote.len();
+        let count = own.agents.len() + own.remote.len() + own.lost.len();
         if count > file::MAX_ENTRIES {
             let most = file::MAX_ENTRIES;
             let why = format!("this process has {count} entries; at most {most} are allowed");
             return Err(WriteError::Full(why));
         }
-        let bytes = file::write(&self.mts, own.agents.values().chain(remote));
+        let bytes = file::write(&self.mts, own.agents.values().chain(remote), &own.lost);
         if bytes.len() > MAX_ENTRIES_FILE {
             let len = bytes.len();
             let why = format!(

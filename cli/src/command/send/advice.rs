@@ -96,7 +96,9 @@ fn advice(reason: FailureReason, config: &Config) -> String {
                 .to_owned()
         }
         FailureReason::Unreachable => {
-            "see the attempts above; `fipa agents` shows the receiver's locations".to_owned()
+            "see the attempts above; `fipa agents` shows the receiver's locations, and `fipa doctor` \
+             checks the ports of known gateways"
+                .to_owned()
         }
         FailureReason::TooLarge => format!(
             "split the message, or increase transport.shm.max_letter (now {} bytes here) in the \

@@ -259,8 +259,11 @@ impl Lane {
         let registration = self.letters[index].registration;
         let progress = &mut self.letters[index].progress;
         let since = *progress.unknown_since.get_or_insert(now);
-        if is_custody || now >= since + MOVING_PATIENCE {
+        if is_custody {
             return self.fail(now, index, FailureReason::NoSuchAgent, table);
+        }
+        if now >= since + MOVING_PATIENCE {
+            return self.fail_absent(now, index, table);
         }
         progress.tried.clear();
         self.recovering = true;

@@ -589,7 +589,7 @@ impl Lane {
                 false
             }
             _ => {
-                self.fail(now, index, FailureReason::NoSuchAgent, table);
+                self.fail_absent(now, index, table);
                 true
             }
         }
@@ -680,6 +680,18 @@ impl Lane {
         }
         let outcome = Outcome::Failed { reason, attempts };
         self.settle(now, index, Settlement::Outcome(outcome), table);
+    }
+
+    /// Fails a letter to an agent that the directory no longer lists.
+    fn fail_absent(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
+        let (reason, attempt) = table.absence(&self.receiver);
+        if let Some(Attempt {
+            location, error, ..
+        }) = attempt
+        {
+            self.letters[index].failed_at(&location, error);
+        }
+        self.fail(now, index, reason, table);
     }
 
     /// Removes a letter from the lane, and reports its end to its origin.
