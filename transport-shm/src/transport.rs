@@ -81,10 +81,12 @@ impl ShmTransport {
     }
 
     /// Whether other processes can find the mailbox. False if another program has removed the
-    /// directory of the domain, or files in it or in `/dev/shm`.
+    /// directory of the domain, or files in it or in `/dev/shm`. True after the transport was closed,
+    /// which removes these files.
     #[must_use]
     pub fn is_there(&self) -> bool {
-        self.endpoint.load().is_there()
+        // The files are examined first, because closing sets the flag before it removes them.
+        self.endpoint.load().is_there() || self.closed.load(Ordering::SeqCst)
     }
 
     /// Joins the domain again if its files were removed. Returns whether that was necessary.

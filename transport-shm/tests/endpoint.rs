@@ -335,6 +335,21 @@ fn send_until_accepted(from: (&ShmTransport, &RecordingSink), to: &ShmTransport)
     });
 }
 
+/// The files that closing removes are not missing: a program does not report its own end as the work
+/// of another one.
+#[test]
+fn a_closed_transport_misses_no_files() {
+    let domain = TestDomain::new();
+    let (one, _sink) = domain.listening();
+    one.close();
+    until("the files are removed", || {
+        let files = std::fs::read_dir("/dev/shm").unwrap().flatten();
+        let mut names = files.map(|file| file.file_name().to_string_lossy().into_owned());
+        !names.any(|name| name.starts_with(&domain.prefix))
+    });
+    assert!(one.is_there() && !one.rejoin().unwrap());
+}
+
 #[test]
 fn a_domain_whose_files_were_removed_is_joined_again() {
     let domain = TestDomain::new();
