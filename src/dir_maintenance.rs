@@ -78,12 +78,13 @@ impl DirMaintenance {
                     continue;
                 }
             }
-            if self.is_there() {
+            let Some(missing) = self.missing() else {
                 problem = None;
                 continue;
-            }
+            };
             if problem.is_none() {
                 tracing::warn!(
+                    missing,
                     "another program removed files in {}; joining the domain again (exempt the \
                      directory from cleaning, or set FIPA_RUNTIME_DIR to another one)",
                     self.dir.path().display()
@@ -111,16 +112,23 @@ impl DirMaintenance {
         }
     }
 
-    /// Whether the files of this process still exist. A file that cannot be examined counts as
-    /// existing.
-    fn is_there(&self) -> bool {
-        let host = self.host.is_there().unwrap_or(true);
+    /// Returns which files of this process are missing, if any are. A file that cannot be examined
+    /// counts as existing.
+    fn missing(&self) -> Option<&'static str> {
+        if !self.dir.is_there() {
+            return Some("the directory of the domain");
+        }
+        if !self.host.is_there().unwrap_or(true) {
+            return Some("entries of agents");
+        }
         #[cfg(feature = "shm")]
-        let shm = self.shm().is_none_or(|shm| shm.is_there());
-        #[cfg(not(feature = "shm"))]
-        let shm = true;
-        let unix = self.unix().is_none_or(|unix| unix.is_there());
-        self.dir.is_there() && host && shm && unix
+        if self.shm().is_some_and(|shm| !shm.is_there()) {
+            return Some("shared memory");
+        }
+        if self.unix().is_some_and(|unix| !unix.is_there()) {
+            return Some("the Unix socket");
+        }
+        None
     }
 
     fn rejoin(&mut self) -> Result<(), RejoinError> {

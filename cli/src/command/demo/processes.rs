@@ -91,6 +91,15 @@ impl Process {
     pub(super) fn pid(&self) -> u32 {
         self.child.id().unwrap_or(0)
     }
+
+    /// Takes the orders away, and waits until the process has ended.
+    async fn end(&mut self) {
+        self.orders = None;
+        let ended = tokio::time::timeout(STEP_TIMEOUT, self.child.wait()).await;
+        if ended.is_err() {
+            let _ = self.child.kill().await;
+        }
+    }
 }
 
 /// All processes of the demo, and the runtime directory of their domains.
@@ -195,6 +204,16 @@ impl Processes {
             .map_err(|error| error.to_string())
     }
 
+    /// Ends one process in order.
+    pub(super) async fn end(&mut self, name: &str) -> Result<(), String> {
+        let mut process = self
+            .by_name
+            .remove(name)
+            .ok_or_else(|| format!("{name} is not running"))?;
+        process.end().await;
+        Ok(())
+    }
+
     /// The shared memory files of the demo's domains.
     pub(super) fn shared_memory(&self) -> Vec<PathBuf> {
         let mark = format!("fipa_demo-{}-", std::process::id());
@@ -219,10 +238,7 @@ impl Processes {
             process.orders = None;
         }
         for process in self.by_name.values_mut() {
-            let ended = tokio::time::timeout(STEP_TIMEOUT, process.child.wait()).await;
-            if ended.is_err() {
-                let _ = process.child.kill().await;
-            }
+            process.end().await;
         }
         self.by_name.clear();
         let left = self.files();
