@@ -12,7 +12,8 @@ use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
-    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Present,
+    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, OwnDfEntry,
+    Present,
 };
 use fipa_transport::{Incarnation, Location, TransportErrorKind};
 use parking_lot::Mutex;
@@ -66,6 +67,14 @@ impl Exchanging {
     /// Returns the directory of the agents that neighbors have sent.
     pub(super) fn directory(&self) -> Arc<ExchangeDirectory> {
         Arc::clone(&self.directory)
+    }
+
+    /// Sets the entries of the directory facilitator that are sent to the neighbors. Returns the names
+    /// of the agents whose entries are not sent, because there are too many or they are too large.
+    pub(super) fn send_df(&self, entries: Vec<OwnDfEntry>) -> Vec<Arc<str>> {
+        let others = self.core.lock().handle_own_df(Instant::now(), entries);
+        self.wake.notify_one();
+        others
     }
 
     /// Handles the content of a letter with [`EXCHANGE_ONTOLOGY`] from this gateway.
