@@ -250,6 +250,12 @@ impl Exchange {
         others
     }
 
+    /// Whether this gateway has DF entries to send.
+    #[must_use]
+    pub fn has_own_df(&self) -> bool {
+        !self.own.df.is_empty()
+    }
+
     /// Schedules letters to the neighbors that have all earlier entries.
     fn schedule_changes(&mut self, now: Instant) {
         let soon = now + Self::GATHERING + self.jitter();
