@@ -235,7 +235,10 @@ async fn services_of_agents_of_another_host_are_found_here_until_they_end() {
     assert_ne!(df.id(), facilitator.id());
     let service = ServiceDescription::new("lift-1", "lifting");
     let registered = facilitator.register_service(service).await.unwrap();
-    assert_eq!(next(&mut notifications).await, [registered.clone()]);
+    assert_eq!(
+        next(&mut notifications).await,
+        std::slice::from_ref(&registered)
+    );
     assert_eq!(df.search(&lifting()).await.unwrap(), [registered]);
     let towing = ServiceDescription::new("tow-1", "towing");
     let changed = facilitator.register_service(towing).await.unwrap();

@@ -35,7 +35,8 @@ pub struct LocalEntry {
 pub struct RemoteEntry {
     /// The name of the agent, which the description must have.
     pub name: Arc<str>,
-    /// A number of the caller that identifies the other host.
+    /// A number of the caller that identifies the other host, which owns the bounds that the entry uses
+    /// up.
     pub source: u64,
     /// The description; see [`LocalEntry::text`].
     pub text: Arc<str>,

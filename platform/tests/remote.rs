@@ -188,7 +188,8 @@ fn leases_are_told_by_the_clock_of_the_reader() {
         ..remote(1, "crane", &text, far)
     };
     let mut it = hosts.far;
-    it.df.handle_remote(far.after(0.0), &[entry.clone()]);
+    it.df
+        .handle_remote(far.after(0.0), std::slice::from_ref(&entry));
     let search = Function::search(&all_lifting(), &Constraints::all());
     let lease = |it: &mut Facilitator, seconds| {
         let answer = it.call(seconds, &local("rover"), &search).unwrap();
@@ -203,7 +204,8 @@ fn leases_are_told_by_the_clock_of_the_reader() {
         ends: far.after(90.0).at,
         ..entry.clone()
     };
-    it.df.handle_remote(far.after(10.0), &[renewed.clone()]);
+    it.df
+        .handle_remote(far.after(10.0), std::slice::from_ref(&renewed));
     assert_eq!(lease(&mut it, 60.0), at(90.0));
     it.df.handle_timeout(far.after(90.0).at);
     assert_eq!(it.df.remote_descriptions().count(), 0);
@@ -344,7 +346,7 @@ fn an_entry_of_this_facilitator_hides_that_of_another() {
     it.df
         .handle_remote(clock.after(0.0), &[of(1, &elsewhere, clock)]);
     subscribe(&mut it);
-    assert_eq!(next(&mut it, 0.0), [elsewhere.clone()]);
+    assert_eq!(next(&mut it, 0.0), std::slice::from_ref(&elsewhere));
     // The agent of the other host also registers here.
     let crane = asker("crane", OTHER);
     it.call(1.0, &crane, &Function::register(&lifting("crane")))

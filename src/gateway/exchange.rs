@@ -240,7 +240,7 @@ impl Greetings {
     const AT_ONCE: usize = 4;
     const PAUSE: Duration = Duration::from_secs(1);
     /// Time after which a gateway that has not become a neighbor is greeted again.
-    const AGAIN: Duration = Duration::from_secs(300);
+    const AGAIN: Duration = Duration::from_secs(1800);
     /// Number of neighbors from which on no gateway is greeted. Connections are left for letters.
     const NEIGHBOURS: usize = 128;
     /// Maximum number of gateways that are remembered.
@@ -575,17 +575,17 @@ mod tests {
         assert_eq!(next(2, &entries, &[5]), [10]);
         assert_eq!(next(3, &entries, &[5]), [0; 0]);
         // A gateway that did not become a neighbor, after a while.
-        assert_eq!(next(301, &entries, &[1, 2, 3, 5]), [4, 6, 7, 8]);
+        assert_eq!(next(1801, &entries, &[1, 2, 3, 5]), [4, 6, 7, 8]);
         // With many neighbors, none.
         let many: Vec<u64> = (100..100 + Greetings::NEIGHBOURS as u64).collect();
-        assert_eq!(next(900, &entries, &many), [0; 0]);
-        assert_eq!(next(900, &entries, &many[1..]), [1]);
+        assert_eq!(next(9000, &entries, &many), [0; 0]);
+        assert_eq!(next(9000, &entries, &many[1..]), [1]);
         // Any number of announced gateways takes bounded memory.
         let flood: Vec<_> = (1000..9000).map(df).collect();
         for seconds in 0..Greetings::AGAIN.as_secs() {
-            assert!(next(2000 + seconds, &flood, &[]).len() <= Greetings::AT_ONCE);
+            assert!(next(20_000 + seconds, &flood, &[]).len() <= Greetings::AT_ONCE);
         }
-        assert_eq!(next(2299, &flood, &[]), [0; 0]);
+        assert_eq!(next(21_799, &flood, &[]), [0; 0]);
     }
 
     #[test]

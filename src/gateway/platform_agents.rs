@@ -36,6 +36,11 @@ const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 /// updates of a directory may arrive in the wrong order.
 const CONTESTED: Duration = Duration::from_secs(1);
 
+// The exchange carries what the directory facilitator accepts.
+const _: () = assert!(Exchange::MAX_DF_ENTRY == limits::REMOTE_BYTES);
+const _: () = assert!(Exchange::MAX_TOTAL_DF_ENTRIES == limits::REMOTE_DESCRIPTIONS);
+const _: () = assert!(Exchange::MAX_DF_LEASE.as_secs() == limits::LEASE.as_secs());
+
 /// Maximum number of names that are tried.
 const TRIES: usize = 8;
 
@@ -168,7 +173,12 @@ impl PlatformAgents {
             .filter(is_listed)
             .map(|entry| RemoteEntry {
                 name: Arc::clone(&entry.name),
-                source: entry.gateway.as_u64(),
+                source: match entry.principal {
+                    Principal::Certificate([a, b, c, d, e, f, g, h, ..]) => {
+                        u64::from_le_bytes([a, b, c, d, e, f, g, h])
+                    }
+                    _ => entry.gateway.as_u64(),
+                },
                 text: Arc::clone(&entry.text),
                 ends: entry.ends,
                 has_lease: entry.has_lease,
@@ -411,6 +421,9 @@ impl Task {
 
     /// Reads the entries of other gateways soon, because they or their agents have changed.
     fn schedule_remote(&mut self) {
+        if self.kind != Kind::Df {
+            return;
+        }
         let now = Instant::now();
         let earliest = self.remote_read.map(|last| last + limits::REMOTE_PAUSE);
         let due = earliest.map_or(now, |earliest| earliest.max(now));

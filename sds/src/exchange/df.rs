@@ -37,6 +37,8 @@ pub struct DfEntry {
     pub incarnation: Incarnation,
     /// The gateway that sent the entry.
     pub gateway: Incarnation,
+    /// The identity that the links of the gateway prove.
+    pub principal: Principal,
     /// The description of the agent, as its gateway sent it. It may be malformed.
     pub text: Arc<str>,
     /// Whether the entry has a lease, which ends at `ends` or later.
@@ -78,7 +80,7 @@ impl DfEntry {
     /// too long or its lease has ended.
     pub(super) fn read(
         now: Instant,
-        gateway: Incarnation,
+        (gateway, principal): (Incarnation, Principal),
         (name, incarnation): (&Arc<str>, Incarnation),
         told: wire::DfEntry,
     ) -> Option<Arc<Self>> {
@@ -93,6 +95,7 @@ impl DfEntry {
             name: Arc::clone(name),
             incarnation,
             gateway,
+            principal,
             text: told.entry.into(),
             has_lease: left.is_some(),
             ends: now + lease,
@@ -269,7 +272,8 @@ mod tests {
             lease: None,
         };
         let agent = (&name, Incarnation::from_u64(1));
-        let entry = DfEntry::read(Instant::now(), Incarnation::from_u64(gateway), agent, told);
+        let of = (Incarnation::from_u64(gateway), Principal::Unproved);
+        let entry = DfEntry::read(Instant::now(), of, agent, told);
         (name, entry)
     }
 
@@ -352,7 +356,8 @@ mod tests {
         };
         let read = |told| {
             let agent = (&"a".into(), Incarnation::from_u64(1));
-            DfEntry::read(now, Incarnation::from_u64(2), agent, told)
+            let of = (Incarnation::from_u64(2), Principal::Unproved);
+            DfEntry::read(now, of, agent, told)
         };
         let received = |left| read(own(left).told(now)?);
         let second = Duration::from_secs(1);

@@ -895,8 +895,8 @@ impl Neighbor {
         let entry = self.entry(agent)?;
         let told = told.filter(|_| entry.role == Role::Agent);
         let df = told.and_then(|told| {
-            let of = (&entry.name, entry.incarnation);
-            DfEntry::read(now, self.mts.incarnation, of, told)
+            let of = (self.mts.incarnation, self.principal);
+            DfEntry::read(now, of, (&entry.name, entry.incarnation), told)
         });
         Some((entry, df))
     }
