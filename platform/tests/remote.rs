@@ -376,7 +376,7 @@ fn a_host_that_changes_its_descriptions_all_the_time_ends_no_subscription() {
     let honest = of(2, &lifting("crane"), clock);
     let pause = limits::REMOTE_PAUSE.as_secs_f64();
     let mut seen = Vec::new();
-    for round in 0..400 {
+    for round in 0..150 {
         let seconds = f64::from(round) * pause;
         let new = |number| {
             let mut large = lifting(&format!("a-{round}-{number}"));
@@ -473,7 +473,7 @@ fn a_search_with_the_most_comparisons_is_answered() {
         ..AgentDescription::default()
     };
     let search = Function::search(&template, &Constraints::all());
-    let mut times: Vec<Duration> = (0..11)
+    let mut times: Vec<Duration> = (0..3)
         .map(|_| {
             let began = std::time::Instant::now();
             let answer = it.call(0.0, &local("rover"), &search).unwrap();
@@ -484,6 +484,6 @@ fn a_search_with_the_most_comparisons_is_answered() {
     times.sort();
     println!(
         "search: {:?} to {:?}, median {:?}",
-        times[0], times[10], times[5]
+        times[0], times[2], times[1]
     );
 }
