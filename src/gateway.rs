@@ -198,6 +198,7 @@ impl Gateway {
             neighbours: Arc::clone(&self.neighbours),
             view: Arc::clone(&self.view),
             known: Arc::clone(&known),
+            exchange: Arc::clone(&self.exchange),
             has_keys: !config.security.keys.is_empty(),
         };
         self.tasks.extend(platform_agents.start(&config.platform));

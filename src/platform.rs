@@ -28,6 +28,10 @@
 //! registered, or until its lease ends. A description of an agent of another host has a lease of at most
 //! [`limits::LEASE`]; [`Df::modify`] renews it.
 //!
+//! Searches and subscriptions also return what agents of other hosts have registered with the directory
+//! facilitators of their own gateways, as far as those gateways are connected. A description with a `scope`
+//! other than `global` stays in its directory facilitator.
+//!
 //! Not in this module: the agents themselves (`fipa-platform`, and the gateway).
 
 use std::time::Duration;
@@ -156,19 +160,19 @@ impl<'a> Df<'a> {
             name: Some(self.own_name()),
             ..AgentDescription::default()
         };
-        match self.search(&own).await?.pop() {
-            Some(mut known) => {
-                known.services.retain(|other| other.name != service.name);
-                known.services.push(service);
-                // The lease begins again.
-                known.lease_time = None;
-                self.modify(known).await
-            }
-            None => {
-                let services = vec![service];
-                self.register(AgentDescription { services, ..own }).await
+        if let Some(mut known) = self.search(&own).await?.pop() {
+            known.services.retain(|other| other.name != service.name);
+            known.services.push(service.clone());
+            // The lease begins again.
+            known.lease_time = None;
+            match self.modify(known).await {
+                // That description is in the directory facilitator of another host.
+                Err(PlatformError::Rejected(Exception::NotRegistered)) => {}
+                result => return result,
             }
         }
+        let services = vec![service];
+        self.register(AgentDescription { services, ..own }).await
     }
 
     /// Registers a description of this agent. Its name, if it is missing, is that of this agent. Returns

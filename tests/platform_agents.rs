@@ -7,9 +7,9 @@ mod support;
 use std::time::{Duration, SystemTime};
 
 use fipa::platform::{
-    AgentDescription, AmsDescription, Exception, PlatformError, ServiceDescription, limits,
+    AgentDescription, AmsDescription, Df, Exception, PlatformError, ServiceDescription, limits,
 };
-use fipa::{AgentId, Config, Domain, Gateway, Kind, Performative, blocking};
+use fipa::{AgentId, Config, Domain, Gateway, Kind, Performative, Time, blocking};
 use fipa_testbed::until_async;
 
 /// Time limit of all waits, which a passing test does not reach.
@@ -44,6 +44,14 @@ async fn knows(domain: &Domain, name: &str) {
 fn lifting() -> AgentDescription {
     AgentDescription {
         services: vec![ServiceDescription::of_type("lifting")],
+        ..AgentDescription::default()
+    }
+}
+
+/// Returns a description with one service of this name.
+fn lifting_as(name: &str) -> AgentDescription {
+    AgentDescription {
+        services: vec![ServiceDescription::new(name, "lifting")],
         ..AgentDescription::default()
     }
 }
@@ -194,6 +202,189 @@ async fn an_agent_of_another_host_registers_itself_for_a_time() {
     near.close().await;
 }
 
+/// Waits until a search for lifting finds these agents.
+async fn finds(df: &Df<'_>, expected: &[&str]) {
+    let mut found = Vec::new();
+    let wait = async {
+        loop {
+            found = names(
+                df.search(&lifting())
+                    .await
+                    .unwrap()
+                    .iter()
+                    .map(|it| &it.name),
+            );
+            if found == expected {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    let ended = tokio::time::timeout(PATIENCE, wait).await;
+    assert!(ended.is_ok(), "{found:?} instead of {expected:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn services_of_agents_of_another_host_are_found_here_until_they_end() {
+    let [(near, at_home), (far, abroad)] = two_hosts(&[]).await;
+    let rover = at_home.register("rover").await.unwrap();
+    let crane = abroad.register("crane").await.unwrap();
+    let df = rover.df().unwrap();
+    let mut notifications = df.subscribe(&lifting()).await.unwrap();
+    let facilitator = crane.df().unwrap();
+    assert_ne!(df.id(), facilitator.id());
+    let service = ServiceDescription::new("lift-1", "lifting");
+    let registered = facilitator.register_service(service).await.unwrap();
+    assert_eq!(
+        next(&mut notifications).await,
+        std::slice::from_ref(&registered)
+    );
+    assert_eq!(df.search(&lifting()).await.unwrap(), [registered]);
+    let towing = ServiceDescription::new("tow-1", "towing");
+    let changed = facilitator.register_service(towing).await.unwrap();
+    assert_eq!(next(&mut notifications).await, [changed]);
+    // A lease ends there, too.
+    let ends = SystemTime::now() + Duration::from_secs(2);
+    let leased = AgentDescription {
+        lease_time: Some(Time::from_system_time(ends).unwrap()),
+        ..lifting_as("lift-2")
+    };
+    facilitator.modify(leased).await.unwrap();
+    let mut changed = next(&mut notifications).await;
+    if !changed[0].services.is_empty() {
+        assert!(changed[0].lease_time.is_some());
+        changed = next(&mut notifications).await;
+    }
+    assert_eq!(names(changed.iter().map(|it| &it.name)), ["crane"]);
+    assert!(changed[0].services.is_empty());
+    assert!(df.search(&lifting()).await.unwrap().is_empty());
+    // The agent ends.
+    facilitator
+        .register_service(ServiceDescription::new("lift-3", "lifting"))
+        .await
+        .unwrap();
+    assert_eq!(next(&mut notifications).await.len(), 1);
+    drop(crane);
+    let ended = next(&mut notifications).await;
+    assert!(ended[0].services.is_empty());
+    finds(&df, &[]).await;
+    // The gateway ends.
+    let arm = abroad.register("arm").await.unwrap();
+    arm.df()
+        .unwrap()
+        .register_service(ServiceDescription::new("lift-4", "lifting"))
+        .await
+        .unwrap();
+    assert_eq!(next(&mut notifications).await.len(), 1);
+    far.close().await;
+    let ended = next(&mut notifications).await;
+    assert_eq!(names(ended.iter().map(|it| &it.name)), ["arm"]);
+    assert!(ended[0].services.is_empty());
+    finds(&df, &[]).await;
+    for domain in [at_home, abroad] {
+        domain.close().await;
+    }
+    near.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_description_travels_from_the_gateway_of_its_agent_only() {
+    let [(near, at_home), (far, abroad)] = two_hosts(&[]).await;
+    let rover = at_home.register("rover").await.unwrap();
+    let crane = abroad.register("crane").await.unwrap();
+    knows(&at_home, "crane").await;
+    let own = crane.df().unwrap();
+    own.register_service(ServiceDescription::new("lift-1", "lifting"))
+        .await
+        .unwrap();
+    let df = rover.df().unwrap();
+    finds(&df, &["crane"]).await;
+    // The agent registers with the other host, too: that description hides the one that has travelled.
+    let there = crane.df_of(df.id().clone());
+    knows(&abroad, df.id().name()).await;
+    let here = there
+        .register_service(ServiceDescription::new("lift-2", "lifting"))
+        .await
+        .unwrap();
+    assert_eq!(here.services.len(), 1);
+    assert!(here.lease_time.is_some());
+    assert_eq!(df.search(&lifting()).await.unwrap(), [here]);
+    // It does not travel back, and the one of its own host stays as it is.
+    let at_own = own.search(&lifting()).await.unwrap();
+    assert_eq!(at_own.len(), 1);
+    assert_eq!(at_own[0].services[0].name.as_deref(), Some("lift-1"));
+    there.deregister().await.unwrap();
+    assert_eq!(df.search(&lifting()).await.unwrap(), at_own);
+    // A description for this host only, and one that is too large, stay.
+    for stays in [
+        AgentDescription {
+            scope: vec!["local".to_owned()],
+            ..lifting_as("lift-3")
+        },
+        AgentDescription {
+            languages: vec!["x".to_owned(); limits::REMOTE_PARTS],
+            ..lifting_as("lift-4")
+        },
+    ] {
+        own.modify(stays).await.unwrap();
+        finds(&df, &[]).await;
+        assert_eq!(own.search(&lifting()).await.unwrap().len(), 1);
+        let back = own.modify(lifting_as("lift-5")).await.unwrap();
+        finds(&df, &["crane"]).await;
+        assert_eq!(df.search(&lifting()).await.unwrap(), [back]);
+    }
+    for domain in [at_home, abroad] {
+        domain.close().await;
+    }
+    far.close().await;
+    near.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_agents_with_one_name_that_which_holds_it_is_found() {
+    let (one, at_one) = host(&config(&[])).await;
+    let (two, at_two) = host(&config(&[])).await;
+    // These two hosts do not know each other; a third one knows both.
+    let first = at_one.register("crane").await.unwrap();
+    let second = at_two.register("crane").await.unwrap();
+    for (agent, name) in [(&first, "lift-1"), (&second, "lift-2")] {
+        let df = agent.df().unwrap();
+        df.register_service(ServiceDescription::new(name, "lifting"))
+            .await
+            .unwrap();
+    }
+    let peers = [("one", &one), ("two", &two)].map(|(name, gateway)| {
+        let locations = gateway.locations();
+        let at = locations.iter().find(|it| it.kind() == Kind::Tcp).unwrap();
+        format!("{name} = [\"tcp://{}\"]", at.address())
+    });
+    let peers = format!("discovery.static={{ {} }}", peers.join(", "));
+    let (third, at_third) = host(&config(&[&*peers])).await;
+    let rover = at_third.register("rover").await.unwrap();
+    let df = rover.df().unwrap();
+    let service = |found: &[AgentDescription]| found[0].services[0].name.clone().unwrap();
+    until_async("both gateways", || third.neighbours().len() == 2).await;
+    finds(&df, &["crane"]).await;
+    let mut notifications = df.subscribe(&lifting()).await.unwrap();
+    let mut shown = service(&next(&mut notifications).await);
+    while shown != "lift-1" {
+        shown = service(&next(&mut notifications).await);
+    }
+    // The other agent gets the name.
+    drop(first);
+    let mut changed = next(&mut notifications).await;
+    if changed[0].services.is_empty() {
+        changed = next(&mut notifications).await;
+    }
+    assert_eq!(service(&changed), "lift-2");
+    for domain in [at_one, at_two, at_third] {
+        domain.close().await;
+    }
+    for gateway in [one, two, third] {
+        gateway.close().await;
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
     let same = format!("mts.name=robot-{}", std::process::id());
@@ -223,8 +414,12 @@ async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
     assert_eq!(own.unwrap().lease_time, None);
     assert_eq!(df.search(&lifting()).await.unwrap().len(), 1);
     let other = at_home.register("other").await.unwrap();
-    let other = other.df().unwrap().search(&lifting()).await.unwrap();
-    assert!(other.is_empty());
+    let facilitator = other.df().unwrap();
+    assert_ne!(facilitator.id(), df.id());
+    // Only the description of its own host is one that an agent can change.
+    let refused = facilitator.modify(lifting()).await;
+    assert!(refused.is_err(), "{refused:?}");
+    finds(&facilitator, &["rover"]).await;
     for domain in [at_home, abroad] {
         domain.close().await;
     }

@@ -5,6 +5,7 @@
 mod common;
 
 use common::{Host, Running};
+use fipa_testbed::{Network, enter, isolated};
 use serde_json::{Value, json};
 
 fn next_json(running: &mut Running) -> Value {
@@ -74,6 +75,88 @@ fn services_are_registered_found_and_watched() {
     assert_eq!(watching.signal("-INT"), (Some(0), String::new()));
     let unknown = host.run(&["df", "search", "--df", "df@nowhere"]).failed(1);
     assert!(unknown.contains("df@nowhere"), "{unknown}");
+}
+
+/// The services of a host are found on another host, and end there with their agent and with their
+/// gateway, whether these end or are killed.
+#[test]
+fn services_of_another_host_are_found_and_watched_until_they_end() {
+    let (near, far) = (Host::new(), Host::new());
+    let gateway = far.start(&["--set", "mts.name=far", "up", "--json"]);
+    let address = gateway.tcp_address();
+    let peer = format!("discovery.static={{ far = [\"tcp://{address}\"] }}");
+    let _gateway = near.start(&["--set", "mts.name=near", "--set", &peer, "up"]);
+    let mut watching = near.start(&["df", "watch", "--type", "lifting", "--json"]);
+    let crane =
+        |service: &str| far.start(&["df", "register", "crane", "lifting", "--service", service]);
+    let left = json!({ "event": "left", "name": "crane" });
+    for (service, signal) in [("lift-1", "-INT"), ("lift-2", "-KILL")] {
+        let crane = crane(service);
+        let changed = next_json(&mut watching);
+        assert_eq!(changed["agent"]["name"], "crane");
+        assert_eq!(changed["agent"]["services"][0]["name"], service);
+        let found = near.run(&["df", "search", "--type", "lifting", "--json"]);
+        let found = found.done_json();
+        assert_eq!(found["df"], "df@near");
+        assert_eq!(found["agents"], json!([changed["agent"]]));
+        crane.signal(signal);
+        assert_eq!(next_json(&mut watching), left);
+        let found = near.run(&["df", "search", "--json"]).done_json();
+        assert_eq!(found["agents"], json!([]));
+    }
+    let _crane = crane("lift-3");
+    assert_eq!(next_json(&mut watching)["event"], "changed");
+    gateway.signal("-KILL");
+    assert_eq!(next_json(&mut watching), left);
+    let found = near.run(&["df", "search", "--json"]).done_json();
+    assert_eq!(found["agents"], json!([]));
+}
+
+/// A gateway with services connects with gateways that it knows by mDNS only.
+#[test]
+fn services_of_a_host_found_by_mdns_are_found() {
+    isolated("inside_services_of_a_host_found_by_mdns_are_found", &[]);
+}
+
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_services_of_a_host_found_by_mdns_are_found() {
+    enter();
+    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+    let network = Network::new(2);
+    let start = |index: usize, name: &str| {
+        let (host, net) = (Host::new(), network.host(index));
+        let (name, listen) = (
+            format!("mts.name={name}"),
+            format!("transport.tcp.listen=[\"{}:0\"]", net.ipv4()),
+        );
+        let set = [
+            "--set",
+            "discovery.mdns=true",
+            "--set",
+            "security.insecure=true",
+            "--set",
+            &name,
+            "--set",
+            &listen,
+            "up",
+        ];
+        let gateway = net.enter(|| host.start(&set));
+        (host, gateway)
+    };
+    let (near, _near_gateway) = start(0, "near");
+    let (far, far_gateway) = start(1, "far");
+    let mut watching = network
+        .host(0)
+        .enter(|| near.start(&["df", "watch", "--json"]));
+    let _crane = network
+        .host(1)
+        .enter(|| far.start(&["df", "register", "crane", "lifting"]));
+    let changed = next_json(&mut watching);
+    assert_eq!(changed["agent"]["name"], "crane");
+    far_gateway.signal("-INT");
+    let expected = json!({ "event": "left", "name": "crane" });
+    assert_eq!(next_json(&mut watching), expected);
 }
 
 #[test]

@@ -2,12 +2,13 @@
 //!
 //! * A neighbor adds only entries of its own agents, within the limits.
 //! * A malicious neighbor neither changes nor blocks the entries of the honest one.
+//! * DF entries belong to agents that their gateway lists, and are within their bounds.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_sds::{Directory, Entry, Exchange, Mts, Present, Reach, Role, Source};
+use fipa_sds::{Directory, Entry, Exchange, Mts, OwnDfEntry, Present, Reach, Role, Source};
 use fipa_transport::{Incarnation, Location};
 
 use crate::input::Input;
@@ -41,6 +42,16 @@ fn agent(name: &str, incarnation: u64, gateway: Incarnation) -> Arc<Entry> {
     })
 }
 
+/// Returns the DF entry of an agent, whose text is its name.
+fn df(agent: &Entry) -> OwnDfEntry {
+    OwnDfEntry {
+        name: Arc::clone(&agent.name),
+        incarnation: agent.incarnation,
+        text: Arc::clone(&agent.name),
+        lease: None,
+    }
+}
+
 /// Decodes the bytes into letters and events of neighbors, and runs a gateway with them.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
@@ -54,6 +65,8 @@ pub fn play(bytes: &[u8]) {
     let arm = agent("arm", 101, OWN);
     here.handle_own(now, [&arm]);
     there.handle_own(now, [&rover, &lander]);
+    here.handle_own_df(now, vec![df(&arm)]);
+    there.handle_own_df(now, vec![df(&rover), df(&lander)]);
     let gateways = |with: &[Incarnation]| -> Vec<Present> {
         let all = with
             .iter()
@@ -101,6 +114,11 @@ pub fn play(bytes: &[u8]) {
             .iter()
             .any(|it| &*it.name == name && it.mts.incarnation.as_u64() < 3);
         assert!(honest, "{name} is missing from the directory");
+        let df = gateway.directory().df_entries();
+        let honest = df
+            .iter()
+            .any(|it| &*it.text == name && it.name == it.text && it.gateway.as_u64() < 3);
+        assert!(honest, "the DF entry of {name} is missing");
     }
 }
 
@@ -175,6 +193,14 @@ fn told(input: &mut Input<'_>) -> serde_json::Value {
     };
     let id = Incarnation::from_u64(input.number()).to_string();
     let mut agent = serde_json::json!({ "name": name, "id": id, "registered": input.number() });
+    if input.byte() & 1 == 0 {
+        let long = input.one_of(&[0, Exchange::MAX_DF_ENTRY, Exchange::MAX_DF_ENTRY + 1]);
+        let text = String::from_utf8_lossy(input.bytes(20)).into_owned() + &"x".repeat(long);
+        agent["df"] = serde_json::json!({ "entry": text });
+        if input.byte() & 1 == 0 {
+            agent["df"]["lease"] = input.number().into();
+        }
+    }
     if input.byte() & 3 == 0 {
         let members = input.one_of(&[vec!["a", "b"], vec![], vec!["a", "a"], vec!["rover"]]);
         agent["coalition"] = serde_json::json!({ "members": members, "leader": "a" });
@@ -184,6 +210,16 @@ fn told(input: &mut Input<'_>) -> serde_json::Value {
 
 /// Checks that every entry belongs to the gateway that sent it and is within the limits.
 fn check(here: &Exchange) {
+    let directory = here.directory();
+    let all = directory.df_entries();
+    assert!(all.len() <= Exchange::MAX_TOTAL_DF_ENTRIES / 2);
+    for df in &all {
+        assert!(df.text.len() <= Exchange::MAX_DF_ENTRY);
+        assert!(df.gateway != OWN);
+        let holder = directory.known(&df.name);
+        let holder = holder.expect("an agent with a DF entry is listed");
+        assert!(holder.mts.incarnation != df.gateway || holder.incarnation == df.incarnation);
+    }
     let known = here.directory().entries();
     assert!(known.len() <= Exchange::MAX_TOTAL);
     for entry in known.iter() {

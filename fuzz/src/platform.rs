@@ -3,14 +3,14 @@
 //!
 //! * Each message gets at most one answer, which goes to the agent that sent the message.
 //! * The description of the honest agent is changed by that agent only.
-//! * Subscriptions and descriptions stay within their bounds.
+//! * Subscriptions and descriptions stay within their bounds, also those from other hosts.
 
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_platform::{
     AgentDescription, Ams, AmsDescription, ApDescription, Asker, Constraints, Df, Function, Now,
-    ONTOLOGY, Platform, Resident, ServiceDescription, found, limits, subscription,
+    ONTOLOGY, Platform, RemoteEntry, Resident, ServiceDescription, found, limits, subscription,
 };
 
 use crate::input::Input;
@@ -89,6 +89,36 @@ fn content(input: &mut Input<'_>) -> Vec<u8> {
     content
 }
 
+/// Returns what the directory facilitators of other hosts sent: valid texts, some of them with other
+/// bytes, or any text.
+fn remote(input: &mut Input<'_>, now: Now) -> Vec<RemoteEntry> {
+    let one = |input: &mut Input<'_>| {
+        let name = input.one_of(&NAMES);
+        let text = match input.below(6) {
+            0 => input.long_bytes().to_vec(),
+            1 => b"(df-agent-description)".to_vec(),
+            _ => {
+                let mut text = description(name).to_term().to_string().into_bytes();
+                for _ in 0..input.below(3) {
+                    let place = usize::from(input.byte()) % (text.len() + 1);
+                    let (remove, insert) = (input.below(12), input.bytes(40));
+                    let end = (place + remove).min(text.len());
+                    drop(text.splice(place..end, insert.iter().copied()));
+                }
+                text
+            }
+        };
+        RemoteEntry {
+            name: name.into(),
+            source: u64::from(input.byte() % 3),
+            text: String::from_utf8_lossy(&text).into(),
+            ends: now.at + input.time().min(Duration::from_secs(3600)),
+            has_lease: input.below(2) == 0,
+        }
+    };
+    (0..input.below(4)).map(|_| one(input)).collect()
+}
+
 fn message(input: &mut Input<'_>, from: &Asker) -> Option<Message> {
     let act = match input.below(8) {
         0 => Performative::Subscribe,
@@ -133,7 +163,14 @@ pub fn play(bytes: &[u8]) {
         Some(Performative::Inform)
     );
     while !input.is_empty() {
-        match input.below(8) {
+        match input.below(9) {
+            8 => {
+                let entries = remote(&mut input, now);
+                df.handle_remote(now, &entries);
+                let known = df.remote_descriptions().count();
+                assert!(known <= entries.len());
+                drop(df.poll_local());
+            }
             0 => {
                 let passed = input.time().min(Duration::from_secs(7200));
                 now.at += passed;

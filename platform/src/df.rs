@@ -1,6 +1,6 @@
 //! The directory facilitator: the services of agents (FIPA00023 clause 4.1).
 
-use std::collections::{BTreeMap, BTreeSet, HashSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
@@ -10,6 +10,7 @@ use fipa_content::{Content, Dialect, Term, Wff};
 
 use crate::description::{Constraints, described};
 use crate::exception::Exception;
+use crate::remote::{self, LocalEntry, RemoteEntry};
 use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
 use crate::subscription::{Subscription, checked_template};
@@ -28,6 +29,16 @@ pub struct Df {
     leases: BTreeSet<(Instant, Arc<str>)>,
     /// Number of descriptions of each platform.
     platforms: BTreeMap<Platform, usize>,
+    /// Whether a description of an agent of this host has changed since the last
+    /// [`poll_local`](Self::poll_local).
+    is_local_changed: bool,
+    /// Number of registrations so far.
+    registered: u64,
+    /// The descriptions from the directory facilitators of other hosts. An entry of this directory
+    /// facilitator hides that of the same agent.
+    remote: BTreeMap<Arc<str>, Remote>,
+    /// The ends of the remote descriptions, the earliest first.
+    remote_ends: BTreeSet<(Instant, Arc<str>)>,
     subscriptions: BTreeMap<SubscriptionId, Subscription>,
     next_subscription: u64,
     /// The identifiers of the latest searches, the oldest first.
@@ -50,6 +61,18 @@ struct Entry {
     description: AgentDescription,
     /// The end of the lease; `None` for an agent of this host without a lease.
     ends: Option<Instant>,
+    /// The position in the order of registration.
+    position: u64,
+    /// The text for other hosts, of an agent of this host.
+    text: Option<Arc<str>>,
+}
+
+struct Remote {
+    source: u64,
+    text: Arc<str>,
+    /// `None` if the text is not valid.
+    description: Option<AgentDescription>,
+    ends: Instant,
 }
 
 const DESCRIPTION: &str = "df-agent-description";
@@ -63,6 +86,10 @@ impl Df {
             entries: BTreeMap::new(),
             leases: BTreeSet::new(),
             platforms: BTreeMap::new(),
+            is_local_changed: false,
+            registered: 0,
+            remote: BTreeMap::new(),
+            remote_ends: BTreeSet::new(),
             subscriptions: BTreeMap::new(),
             next_subscription: 0,
             search_ids: VecDeque::new(),
@@ -122,6 +149,101 @@ impl Df {
         self.notify(now);
     }
 
+    /// Returns the descriptions that agents of this host have registered for agents of all hosts, the
+    /// earliest registration first. Returns `None` if they have not changed since the last call.
+    ///
+    /// A description whose scope does not include `global` is not among them.
+    pub fn poll_local(&mut self) -> Option<Vec<LocalEntry>> {
+        if !std::mem::take(&mut self.is_local_changed) {
+            return None;
+        }
+        let local = self.entries.iter().filter(|(_, entry)| {
+            entry.platform == Platform::Host && remote::is_global(&entry.description)
+        });
+        let mut local: Vec<_> = local.collect();
+        local.sort_unstable_by_key(|(_, entry)| entry.position);
+        let entries = local.into_iter().map(|(name, entry)| LocalEntry {
+            name: Arc::clone(name),
+            registration: entry.registration,
+            text: entry.text.clone(),
+            lease: entry.ends,
+        });
+        Some(entries.collect())
+    }
+
+    /// Sets the descriptions from the directory facilitators of other hosts. Those that are missing end
+    /// at once. Returns whether a host has sent more than [`limits::REMOTE_CHANGES`] new descriptions:
+    /// the caller then calls again after [`limits::REMOTE_PAUSE`], and never earlier.
+    pub fn handle_remote(&mut self, now: Now, entries: &[RemoteEntry]) -> bool {
+        let named: BTreeMap<&str, &RemoteEntry> = entries
+            .iter()
+            .filter(|entry| entry.ends > now.at)
+            .map(|entry| (&*entry.name, entry))
+            .collect();
+        let gone = self.remote.iter().filter(|(name, known)| {
+            let entry = named.get(&***name);
+            entry.is_none_or(|entry| entry.source != known.source)
+        });
+        let gone: Vec<Arc<str>> = gone.map(|(name, _)| Arc::clone(name)).collect();
+        for name in gone {
+            self.set_remote(&name, None);
+        }
+        let mut changes: HashMap<u64, usize> = HashMap::new();
+        let mut has_more = false;
+        for entry in named.into_values() {
+            if let Some(known) = self.remote.get_mut(&entry.name)
+                && known.text == entry.text
+            {
+                if known.ends != entry.ends {
+                    let name = &entry.name;
+                    self.remote_ends.remove(&(known.ends, Arc::clone(name)));
+                    self.remote_ends.insert((entry.ends, Arc::clone(name)));
+                    known.ends = entry.ends;
+                    if let Some(description) = &mut known.description {
+                        description.lease_time = remote::lease_time(now, entry);
+                    }
+                }
+                continue;
+            }
+            let of_source = changes.entry(entry.source).or_default();
+            if *of_source >= limits::REMOTE_CHANGES {
+                has_more = true;
+                continue;
+            }
+            *of_source += 1;
+            let is_known = self.remote.contains_key(&entry.name);
+            if is_known || self.remote.len() < limits::REMOTE_DESCRIPTIONS {
+                let remote = Remote {
+                    source: entry.source,
+                    text: Arc::clone(&entry.text),
+                    description: remote::read(now, entry),
+                    ends: entry.ends,
+                };
+                self.set_remote(&entry.name, Some(remote));
+            }
+        }
+        self.expire(now.at);
+        self.notify(now.at);
+        has_more
+    }
+
+    /// Adds, replaces or removes a remote description.
+    fn set_remote(&mut self, name: &Arc<str>, remote: Option<Remote>) {
+        let before = self.remote.remove(name);
+        if let Some(before) = &before {
+            self.remote_ends.remove(&(before.ends, Arc::clone(name)));
+        }
+        if !self.entries.contains_key(name) {
+            let of = |remote: Option<&Remote>| remote.and_then(|it| it.description.clone());
+            let (before, after) = (of(before.as_ref()), of(remote.as_ref()));
+            self.changed(name, before.as_ref(), after.as_ref());
+        }
+        if let Some(remote) = remote {
+            self.remote_ends.insert((remote.ends, Arc::clone(name)));
+            self.remote.insert(Arc::clone(name), remote);
+        }
+    }
+
     /// Handles the outcome of a notification. A subscription whose notification was not delivered ends.
     pub fn handle_sent(&mut self, now: Instant, id: SubscriptionId, is_delivered: bool) {
         if !is_delivered {
@@ -135,12 +257,15 @@ impl Df {
     /// Returns the time of the next call of [`handle_timeout`](Self::handle_timeout).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        let leases = self.leases.first().map(|(ends, _)| *ends);
+        let leases = self.leases.first().into_iter();
+        let leases = leases
+            .chain(self.remote_ends.first())
+            .map(|(ends, _)| *ends);
         let waiting = self.subscriptions.values();
         let waiting = waiting
             .filter(|it| !it.is_under_way && !it.changed.is_empty())
             .map(|it| it.not_before);
-        leases.into_iter().chain(waiting).min()
+        leases.chain(waiting).min()
     }
 
     /// Returns the next message to be sent.
@@ -148,9 +273,15 @@ impl Df {
         self.answers.pop_front()
     }
 
-    /// Returns the descriptions, sorted by name.
+    /// Returns the descriptions that agents registered here, sorted by name.
     pub fn descriptions(&self) -> impl Iterator<Item = &AgentDescription> {
         self.entries.values().map(|entry| &entry.description)
+    }
+
+    /// Returns the valid descriptions from the directory facilitators of other hosts, sorted by name.
+    pub fn remote_descriptions(&self) -> impl Iterator<Item = &AgentDescription> {
+        let remote = self.remote.values();
+        remote.filter_map(|remote| remote.description.as_ref())
     }
 
     /// Returns the number of subscriptions.
@@ -198,11 +329,17 @@ impl Df {
                             .map_err(|_| Exception::InternalError("cannot answer".to_owned()))?
                     }
                 };
+                let text = match asker.platform {
+                    Platform::Host => remote::text(&description),
+                    _ => None,
+                };
                 let entry = Entry {
                     platform: asker.platform,
                     registration: asker.registration,
                     description,
                     ends,
+                    position: self.registered,
+                    text,
                 };
                 match &*request.function {
                     "register" => self.register(asker, entry)?,
@@ -248,16 +385,21 @@ impl Df {
             return Err(Exception::InternalError(words.to_owned()));
         }
         let name: Arc<str> = asker.id.name().into();
-        self.changed(&name, None, Some(&entry.description));
+        let hidden = self.remote_of(&name).cloned();
+        self.changed(&name, hidden.as_ref(), Some(&entry.description));
+        self.registered += 1;
         self.insert(name, entry);
         Ok(())
     }
 
-    fn modify(&mut self, asker: &Asker, entry: Entry) -> Result<(), Exception> {
+    fn modify(&mut self, asker: &Asker, mut entry: Entry) -> Result<(), Exception> {
         self.own_entry(asker)?;
         let name: Arc<str> = asker.id.name().into();
         let new = entry.description.clone();
         let old = self.take(&name).map(|(_, old)| old);
+        if let Some(old) = &old {
+            entry.position = old.position;
+        }
         self.insert(Arc::clone(&name), entry);
         self.changed(&name, old.as_ref().map(|old| &old.description), Some(&new));
         Ok(())
@@ -274,8 +416,14 @@ impl Df {
 
     fn remove(&mut self, name: &str) {
         if let Some((name, entry)) = self.take(name) {
-            self.changed(&name, Some(&entry.description), None);
+            let shown = self.remote_of(&name).cloned();
+            self.changed(&name, Some(&entry.description), shown.as_ref());
         }
+    }
+
+    /// Returns the description of an agent from the directory facilitator of another host.
+    fn remote_of(&self, name: &str) -> Option<&AgentDescription> {
+        self.remote.get(name)?.description.as_ref()
     }
 
     /// Adds an entry under a free name.
@@ -283,12 +431,14 @@ impl Df {
         let lease = entry.ends.map(|ends| (ends, Arc::clone(&name)));
         self.leases.extend(lease);
         *self.platforms.entry(entry.platform).or_default() += 1;
+        self.is_local_changed |= entry.platform == Platform::Host;
         self.entries.insert(name, entry);
     }
 
     /// Removes an entry, without a notification.
     fn take(&mut self, name: &str) -> Option<(Arc<str>, Entry)> {
         let (name, entry) = self.entries.remove_entry(name)?;
+        self.is_local_changed |= entry.platform == Platform::Host;
         if let Some(ends) = entry.ends {
             self.leases.remove(&(ends, Arc::clone(&name)));
         }
@@ -308,6 +458,35 @@ impl Df {
         {
             self.remove(&name);
         }
+        while self
+            .remote_ends
+            .first()
+            .is_some_and(|(ends, _)| *ends <= now)
+            && let Some((_, name)) = self.remote_ends.pop_first()
+        {
+            self.set_remote(&name, None);
+        }
+    }
+
+    /// Returns the descriptions from other hosts that match. Those of the hosts take turns, so that no
+    /// host fills an answer that is cut.
+    fn remote_matches(&self, template: &AgentDescription) -> Vec<&AgentDescription> {
+        let mut of_source: HashMap<u64, usize> = HashMap::new();
+        let mut matches: Vec<(usize, &AgentDescription)> = Vec::new();
+        for (name, remote) in &self.remote {
+            let Some(description) = &remote.description else {
+                continue;
+            };
+            // The sizes of templates and descriptions bound the comparisons of one pair.
+            let found = Comparisons::default().agent(template, description);
+            if found.unwrap_or(false) && !self.entries.contains_key(name) {
+                let turn = of_source.entry(remote.source).or_default();
+                matches.push((*turn, description));
+                *turn += 1;
+            }
+        }
+        matches.sort_by_key(|(turn, _)| *turn);
+        matches.into_iter().map(|(_, it)| it).collect()
     }
 
     /// Returns the texts of the matching descriptions.
@@ -348,7 +527,14 @@ impl Df {
             if comparisons.agent(template, &entry.description)?
                 && !found.add(&entry.description, dialect)
             {
-                break;
+                return Ok(found.texts);
+            }
+        }
+        if found.texts.len() < most {
+            for description in self.remote_matches(template) {
+                if found.texts.len() >= most || !found.add(description, dialect) {
+                    break;
+                }
             }
         }
         Ok(found.texts)
@@ -378,9 +564,18 @@ impl Df {
         let mut comparisons = Comparisons::default();
         for (name, entry) in &self.entries {
             match comparisons.agent(&subscription.template, &entry.description) {
-                Ok(true) => drop(subscription.changed.insert(Arc::clone(name))),
+                Ok(true) => subscription.changed.insert(name),
                 Ok(false) => {}
                 Err(_) => break,
+            }
+        }
+        for (name, remote) in &self.remote {
+            let matches = remote.description.as_ref().is_some_and(|description| {
+                let found = Comparisons::default().agent(&subscription.template, description);
+                found.unwrap_or(false)
+            });
+            if matches && !self.entries.contains_key(name) {
+                subscription.changed.insert(name);
             }
         }
         let id = SubscriptionId(self.next_subscription);
@@ -478,7 +673,7 @@ impl Df {
                 })
             };
             if matches(before) || matches(after) {
-                subscription.changed.insert(Arc::clone(name));
+                subscription.changed.insert(name);
                 if subscription.changed.len() > limits::CHANGES {
                     overrun.insert(*id);
                 }
@@ -503,8 +698,10 @@ impl Df {
                 && let Some(name) = subscription.changed.pop_first()
             {
                 let dialect = subscription.dialect();
-                let has_room = match self.entries.get(&name) {
-                    Some(entry) => found.add(&entry.description, dialect),
+                let own = self.entries.get(&name).map(|entry| &entry.description);
+                let remote = || self.remote.get(&name)?.description.as_ref();
+                let has_room = match own.or_else(remote) {
+                    Some(description) => found.add(description, dialect),
                     // A description without services reports the end of the registration, as in JADE.
                     None => match AgentId::new(&*name) {
                         Ok(agent) => {
@@ -518,7 +715,7 @@ impl Df {
                     },
                 };
                 if !has_room {
-                    subscription.changed.insert(name);
+                    subscription.changed.put_back(name);
                     break;
                 }
             }

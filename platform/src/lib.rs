@@ -55,12 +55,17 @@
 //! The caller states in [`Asker`] the agent and the platform that the connection of a letter proves.
 //! An agent registers, modifies and deregisters its own description only. Searches need no proof, subscriptions do.
 //!
+//! Descriptions of agents of a host travel to the directory facilitators of other hosts
+//! ([`Df::poll_local`], [`Df::handle_remote`]), so that searches there find them. The caller decides which
+//! gateway may speak for an agent.
+//!
 //! # Bounds
 //!
 //! | | in all | of a platform of another host |
 //! |---|---|---|
 //! | descriptions in the DF | [`limits::DESCRIPTIONS`] | [`limits::DESCRIPTIONS_OF_PLATFORM`] |
 //! | … of all other hosts | [`limits::FOREIGN_DESCRIPTIONS`] | |
+//! | … from the DFs of other hosts | [`limits::REMOTE_DESCRIPTIONS`] | the caller's bound |
 //! | subscriptions to the DF | [`limits::SUBSCRIPTIONS`] | [`limits::SUBSCRIPTIONS_OF_PLATFORM`] |
 //! | … of all other hosts | [`limits::FOREIGN_SUBSCRIPTIONS`] | |
 //! | agents of other hosts in the AMS | [`limits::FOREIGN_AGENTS`] | [`limits::FOREIGN_AGENTS_OF_PLATFORM`] |
@@ -77,6 +82,7 @@ mod description;
 mod df;
 mod exception;
 pub mod limits;
+mod remote;
 mod request;
 mod search;
 mod slots;
@@ -96,6 +102,7 @@ pub use description::{
 };
 pub use df::Df;
 pub use exception::Exception;
+pub use remote::{LocalEntry, RemoteEntry};
 pub use subscription::SubscriptionId;
 
 /// The ontology of agent management (FIPA00023). Its case is ignored on reading.

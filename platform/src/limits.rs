@@ -32,6 +32,20 @@ pub const FOREIGN_DESCRIPTIONS: usize = 2048;
 /// Maximum number of descriptions in the DF of agents of one platform of another host.
 pub const DESCRIPTIONS_OF_PLATFORM: usize = 256;
 
+/// Maximum length of the text of a description that travels to the directory facilitators of other
+/// hosts, in bytes. A longer one stays in the DF of its host.
+pub const REMOTE_BYTES: usize = 4 << 10;
+/// Maximum number of parts (see [`DESCRIPTION_PARTS`]) of a description that travels.
+pub const REMOTE_PARTS: usize = 64;
+/// Maximum number of descriptions from the directory facilitators of other hosts.
+pub const REMOTE_DESCRIPTIONS: usize = 2048;
+/// Maximum number of new descriptions that one call of
+/// [`Df::handle_remote`](crate::Df::handle_remote) takes from one host. So no host fills the
+/// notifications to a subscriber.
+pub const REMOTE_CHANGES: usize = 32;
+/// Minimum time between two such calls.
+pub const REMOTE_PAUSE: Duration = Duration::from_millis(250);
+
 /// Maximum number of subscriptions to the DF.
 pub const SUBSCRIPTIONS: usize = 512;
 /// Maximum number of subscriptions of agents of other hosts.
@@ -42,7 +56,7 @@ pub const SUBSCRIPTIONS_OF_PLATFORM: usize = 64;
 /// Maximum number of subscriptions of one agent.
 pub const SUBSCRIPTIONS_OF_AGENT: usize = 16;
 /// Maximum number of changed descriptions that wait for one subscriber. A subscription with more ends.
-pub const CHANGES: usize = 4096;
+pub const CHANGES: usize = DESCRIPTIONS + REMOTE_DESCRIPTIONS;
 /// Length of a notification, in bytes, from which on further changes wait for the next one.
 pub const NOTIFICATION_BYTES: usize = 64 << 10;
 /// Minimum time between two notifications of one subscription.

@@ -1,6 +1,6 @@
 //! Subscriptions to the directory facilitator (FIPA00035).
 
-use std::collections::BTreeSet;
+use std::collections::{HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -25,11 +25,49 @@ pub(crate) struct Subscription {
     query: Vec<u8>,
     pub(crate) template: AgentDescription,
     /// The agents whose descriptions have changed since the last notification.
-    pub(crate) changed: BTreeSet<Arc<str>>,
+    pub(crate) changed: Changed,
     /// Whether the outcome of a notification is awaited.
     pub(crate) is_under_way: bool,
     /// Earliest time of the next notification.
     pub(crate) not_before: Instant,
+}
+
+/// Agents in the order in which their descriptions changed, so that agents that change all the time do
+/// not hold back the others.
+#[derive(Debug, Default)]
+pub(crate) struct Changed {
+    order: VecDeque<Arc<str>>,
+    names: HashSet<Arc<str>>,
+}
+
+impl Changed {
+    /// Appends an agent, unless it is there.
+    pub(crate) fn insert(&mut self, name: &Arc<str>) {
+        if self.names.insert(Arc::clone(name)) {
+            self.order.push_back(Arc::clone(name));
+        }
+    }
+
+    /// Removes the first agent.
+    pub(crate) fn pop_first(&mut self) -> Option<Arc<str>> {
+        let first = self.order.pop_front()?;
+        self.names.remove(&first);
+        Some(first)
+    }
+
+    /// Puts back the first agent.
+    pub(crate) fn put_back(&mut self, name: Arc<str>) {
+        self.names.insert(Arc::clone(&name));
+        self.order.push_front(name);
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.order.len()
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.order.is_empty()
+    }
 }
 
 impl Subscription {
@@ -64,7 +102,7 @@ impl Subscription {
             message: without_content(message)?,
             query: text,
             template,
-            changed: BTreeSet::new(),
+            changed: Changed::default(),
             is_under_way: false,
             not_before: now,
         };

@@ -47,7 +47,9 @@ pub use coalition::{Members, MembersError};
 pub use contacts::ContactDirectory;
 pub use directory::{DeregisterError, Directory, RegisterError, Updated};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
-pub use exchange::{EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, Present};
+pub use exchange::{
+    DfEntry, EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, OwnDfEntry, Present,
+};
 pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, Withdrawal, probe};

@@ -4,12 +4,13 @@
 // The exception in clippy.toml for tests does not apply to functions that they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use fipa_sds::{
-    Change, Directory, Entry, Exchange, ExchangeError, Mts, Present, Reach, Role, Source,
+    Change, Directory, Entry, Exchange, ExchangeError, Mts, OwnDfEntry, Present, Reach, Role,
+    Source,
 };
 use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
@@ -20,6 +21,8 @@ struct Gateway {
     mts: Mts,
     exchange: Exchange,
     agents: BTreeMap<String, Arc<Entry>>,
+    /// The entries in its directory facilitator.
+    df: BTreeMap<String, OwnDfEntry>,
 }
 
 /// A letter in transit: it arrives when the link is connected, or expires.
@@ -55,6 +58,7 @@ impl World {
             mts: Mts::new("same-name-mts", Incarnation::from_u64(index as u64 + 1)),
             exchange: Exchange::new(seed ^ index as u64),
             agents: BTreeMap::new(),
+            df: BTreeMap::new(),
         });
         Self {
             now: Instant::now(),
@@ -125,6 +129,52 @@ impl World {
         gateway
             .exchange
             .handle_own(self.now, gateway.agents.values());
+    }
+
+    /// Registers an agent with the directory facilitator of its gateway, or changes its description.
+    fn describe(&mut self, index: usize, name: &str, text: &str, lease: Option<Duration>) {
+        let gateway = &mut self.gateways[index];
+        let entry = OwnDfEntry {
+            name: name.into(),
+            incarnation: gateway.agents[name].incarnation,
+            text: text.into(),
+            lease: lease.map(|left| self.now + left),
+        };
+        gateway.df.insert(name.to_owned(), entry);
+        self.update_df(index);
+    }
+
+    fn update_df(&mut self, index: usize) {
+        let gateway = &mut self.gateways[index];
+        let all = gateway.df.values().cloned().collect();
+        let others = gateway.exchange.handle_own_df(self.now, all);
+        assert!(others.is_empty(), "{others:?}");
+    }
+
+    /// Returns the gateway, the agent and the text of each DF entry that a gateway has received.
+    fn df_entries(&self, index: usize) -> BTreeSet<(usize, String, String)> {
+        let entries = self.gateways[index].exchange.directory().df_entries();
+        let entries = entries.iter().map(|entry| {
+            let gateway = usize::try_from(entry.gateway.as_u64() - 1).unwrap();
+            (gateway, entry.name.to_string(), entry.text.to_string())
+        });
+        entries.collect()
+    }
+
+    /// Returns the DF entries of present agents of the connected gateways.
+    fn expected_df(&self, index: usize) -> BTreeSet<(usize, String, String)> {
+        let others = 0..self.gateways.len();
+        let others = others.filter(|other| self.connected(index, *other));
+        others
+            .flat_map(|other| {
+                let gateway = &self.gateways[other];
+                let present = gateway.df.values().filter(|entry| {
+                    let agent = gateway.agents.get(&*entry.name);
+                    agent.is_some_and(|agent| agent.incarnation == entry.incarnation)
+                });
+                present.map(move |entry| (other, entry.name.to_string(), entry.text.to_string()))
+            })
+            .collect()
     }
 
     fn leave(&mut self, index: usize, name: &str) {
@@ -203,9 +253,12 @@ impl World {
         self.letters = waiting;
     }
 
-    /// Whether every gateway has exactly the agents of its connected gateways.
+    /// Whether every gateway has exactly the agents of its connected gateways, and their DF entries.
     fn agrees(&self) -> bool {
         (0..self.gateways.len()).all(|index| {
+            if self.df_entries(index) != self.expected_df(index) {
+                return false;
+            }
             let expected = (0..self.gateways.len())
                 .filter(|other| self.connected(index, *other))
                 .flat_map(|other| self.gateways[other].agents.values())
@@ -260,6 +313,101 @@ fn neighbors_receive_each_others_agents() {
         watch.try_next(),
         Some(Change::Left(_) | Change::Changed { .. })
     ));
+}
+
+#[test]
+fn df_entries_travel_with_their_agents() {
+    let mut world = World::new(3, 11);
+    for name in ["crane", "arm", "rover"] {
+        world.join(0, name);
+    }
+    world.describe(0, "crane", "lifting", None);
+    world.connect();
+    world.describe(0, "arm", "gripping", Some(Duration::from_secs(7200)));
+    world.run(Duration::from_millis(300));
+    assert!(world.agrees());
+    assert_eq!(world.df_entries(1).len(), 2);
+    // A change of the description, and its end.
+    world.describe(0, "crane", "towing", None);
+    world.gateways[0].df.remove("arm");
+    world.update_df(0);
+    world.run(Duration::from_millis(300));
+    assert!(world.agrees());
+    assert_eq!(
+        world.df_entries(2),
+        [(0, "crane".to_owned(), "towing".to_owned())].into()
+    );
+    // The entry belongs to a registration.
+    world.join(0, "crane");
+    world.run(Duration::from_millis(300));
+    assert!(world.df_entries(1).is_empty());
+    world.describe(0, "crane", "again", None);
+    world.describe(0, "rover", "driving", None);
+    world.run(Duration::from_millis(300));
+    world.leave(0, "rover");
+    world.run(Duration::from_millis(300));
+    assert!(world.agrees());
+    assert_eq!(world.df_entries(1).len(), 1);
+    // It ends with the connection, and is there again with it.
+    world.cut = vec![(0, 1)];
+    world.connect();
+    world.run(Exchange::MEMORY + Duration::from_secs(1));
+    assert!(world.agrees());
+    assert!(world.df_entries(1).is_empty());
+    world.cut.clear();
+    world.connect();
+    world.run(Duration::from_secs(3));
+    assert!(world.agrees());
+    assert_eq!(world.df_entries(1).len(), 1);
+    let (_, goodbye) = world.gateways[0].exchange.goodbye();
+    let from = world.gateways[0].mts.incarnation;
+    let now = world.now;
+    let neighbor = &mut world.gateways[1].exchange;
+    neighbor.handle_letter(now, from, &goodbye).unwrap();
+    assert!(world.df_entries(1).is_empty());
+}
+
+#[test]
+fn df_entries_are_renewed_before_they_end() {
+    let mut world = World::new(2, 12);
+    for (name, lease) in [("crane", None), ("arm", Some(100_000)), ("rover", Some(50))] {
+        world.join(0, name);
+        world.describe(0, name, name, lease.map(Duration::from_secs));
+    }
+    world.connect();
+    let hour = Exchange::MAX_DF_LEASE;
+    for _ in 0..50 {
+        world.run(hour / 10);
+        for entry in world.gateways[1].exchange.directory().df_entries() {
+            let left = entry.ends.saturating_duration_since(world.now);
+            match &*entry.name {
+                // Its lease is not renewed; the directory facilitator there removes it.
+                "rover" => assert!(left.is_zero()),
+                name => {
+                    assert!(left > hour / 2 && left <= hour, "{name}: {left:?}");
+                    assert_eq!(entry.has_lease, name == "arm");
+                }
+            }
+        }
+    }
+    assert!(world.sent < 4000, "{} letters", world.sent);
+}
+
+#[test]
+fn large_df_entries_take_several_letters() {
+    let mut world = World::new(2, 13);
+    let count = Exchange::MAX_DF_BYTES / Exchange::MAX_DF_ENTRY;
+    for number in 0..count {
+        let name = format!("agent_{number}");
+        world.join(0, &name);
+        // Each character takes six in a letter.
+        let text = "\u{1}".repeat(Exchange::MAX_DF_ENTRY);
+        world.describe(0, &name, &text, None);
+    }
+    world.connect();
+    world.run(Duration::from_secs(2));
+    assert!(world.agrees());
+    assert_eq!(world.df_entries(1).len(), count);
 }
 
 #[test]
@@ -548,6 +696,10 @@ fn after_every_healing_all_agree_within_ten_seconds() {
                 let name = format!("agent_{}", world.random.usize(0..20));
                 if world.random.bool() {
                     world.join(index, &name);
+                    if world.random.bool() {
+                        let text = format!("{index} {name} {round}");
+                        world.describe(index, &name, &text, None);
+                    }
                 } else {
                     world.leave(index, &name);
                 }
@@ -679,6 +831,128 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
     assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
 }
 
+/// Returns a letter with all agents: their names, and the values of their key `df`.
+fn full_with_df(agents: &[(String, String)]) -> String {
+    let agents: Vec<String> = agents
+        .iter()
+        .enumerate()
+        .map(|(number, (name, df))| {
+            format!(
+                r#"{{"name":"{name}","id":"{:016x}","registered":1,"df":{df}}}"#,
+                number + 100
+            )
+        })
+        .collect();
+    format!(
+        r#"{{"version":1,"tell":{{"full":{{"version":1,"first":true,"last":true,"agents":[{}]}}}}}}"#,
+        agents.join(",")
+    )
+}
+
+#[test]
+fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
+    let mut exchange = with_neighbour();
+    let many: Vec<(String, String)> = (0..9000)
+        .map(|number| (format!("a{number}"), r#"{"entry":"lifting"}"#.to_owned()))
+        .collect();
+    told(&mut exchange, &full_with_df(&many)).unwrap();
+    let directory = exchange.directory();
+    assert_eq!(directory.entries().len(), 9000);
+    assert_eq!(directory.df_entries().len(), Exchange::MAX_DF_ENTRIES);
+    // In changes, too.
+    for from in 1..100 {
+        let agents: Vec<String> = (0..90)
+            .map(|number| {
+                let name = from * 90 + number;
+                format!(
+                    r#"{{"name":"a{name}","id":"{:016x}","registered":1,"df":{{"entry":"{}"}}}}"#,
+                    name + 100,
+                    "x".repeat(Exchange::MAX_DF_ENTRY)
+                )
+            })
+            .collect();
+        let changes = format!(
+            r#"{{"version":1,"tell":{{"changes":{{"from":{from},"to":{},"agents":[{}]}}}}}}"#,
+            from + 1,
+            agents.join(",")
+        );
+        told(&mut exchange, &changes).unwrap();
+        let entries = directory.df_entries();
+        assert!(entries.len() <= Exchange::MAX_DF_ENTRIES);
+        let bytes: usize = entries.iter().map(|entry| entry.text.len()).sum();
+        assert!(bytes <= Exchange::MAX_DF_BYTES, "{bytes}");
+    }
+    // 100,000 entries are more agents than a neighbor may have: what is stored stays.
+    let before = directory.df_entries().len();
+    let mut refused = 0;
+    for part in 0..12 {
+        let agents: Vec<_> = (0..9000)
+            .map(|number| (format!("{part}.{number}"), r#"{"entry":""}"#.to_owned()))
+            .collect();
+        let letter = full_with_df(&agents)
+            .replace(r#""first":true"#, &format!(r#""first":{}"#, part == 0))
+            .replace(r#""last":true"#, &format!(r#""last":{}"#, part == 11));
+        match told(&mut exchange, &letter) {
+            Ok(()) => {}
+            Err(ExchangeError::TooMany) => refused += 1,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    assert!(refused > 0);
+    assert_eq!(directory.df_entries().len(), before);
+    assert!(!directory.df_entries().is_empty());
+    exchange.handle_neighbours(Instant::now(), &[]);
+    exchange.handle_timeout(Instant::now() + Exchange::MEMORY);
+    assert!(directory.df_entries().is_empty());
+}
+
+#[test]
+fn df_entries_that_are_too_long_or_of_others_are_ignored() {
+    let mts = Mts::new("hostile", Incarnation::from_u64(7));
+    let mut exchange = Exchange::new(0);
+    let certified = Present {
+        mandate: Mandate::Certified((1..5).map(|number| format!("own_{number}")).collect()),
+        principal: Principal::Certificate([7; 32]),
+        ..Present::unproved(mts, vec![location(6)])
+    };
+    exchange.handle_neighbours(Instant::now(), &[certified]);
+    let df = |text: &str| format!(r#"{{"entry":"{text}"}}"#);
+    let agents = [
+        ("own_1".to_owned(), df("lifting")),
+        (
+            "own_2".to_owned(),
+            df(&"x".repeat(Exchange::MAX_DF_ENTRY + 1)),
+        ),
+        ("own_3".to_owned(), r#"{"entry":"","lease":0}"#.to_owned()),
+        (
+            "own_4".to_owned(),
+            format!(r#"{{"entry":"","lease":{}}}"#, u64::MAX),
+        ),
+        // Its certificate does not name this agent.
+        ("crane".to_owned(), df("lifting")),
+    ];
+    let now = Instant::now();
+    told(&mut exchange, &full_with_df(&agents)).unwrap();
+    let directory = exchange.directory();
+    assert_eq!(directory.entries().len(), 4);
+    let mut entries = directory.df_entries();
+    entries.sort_by(|one, other| one.name.cmp(&other.name));
+    let names: Vec<&str> = entries.iter().map(|entry| &*entry.name).collect();
+    assert_eq!(names, ["own_1", "own_4"]);
+    for entry in entries {
+        assert_eq!(entry.gateway, Incarnation::from_u64(7));
+        assert!(entry.ends <= now + Exchange::MAX_DF_LEASE + Duration::from_secs(60));
+    }
+    // A coalition has none.
+    let coalition = full_with_df(&[("own_1".to_owned(), df("x"))]).replace(
+        r#""df""#,
+        r#""coalition":{"members":["own_2"],"leader":"own_2"},"df""#,
+    );
+    told(&mut exchange, &coalition).unwrap();
+    assert_eq!(directory.entries().len(), 1);
+    assert!(directory.df_entries().is_empty());
+}
+
 /// Three gateways with certificates, and a fourth one that sends false entries: names, registrations
 /// and addresses of the others, and the incarnations of their gateways.
 struct Besieged {
@@ -726,7 +1000,12 @@ impl Besieged {
         match self.world.random.u32(..12) {
             0 => {
                 let (at, number) = (self.honest(), self.world.next);
-                self.world.join(at, &format!("agent_{number}"));
+                let name = format!("agent_{number}");
+                self.world.join(at, &name);
+                if number % 2 == 0 {
+                    self.world
+                        .describe(at, &name, &format!("{at} {name}"), None);
+                }
             }
             1 => {
                 let at = self.honest();
@@ -847,6 +1126,13 @@ impl Besieged {
             "id": id.unwrap_or_else(|| Incarnation::from_u64(random.u64(1 << 40..))).to_string(),
             "registered": 1,
         });
+        if random.bool() {
+            let long = random.usize(..2) * (Exchange::MAX_DF_ENTRY + random.usize(..2));
+            entry["df"] = serde_json::json!({ "entry": format!("liar{}", "x".repeat(long)) });
+            if random.bool() {
+                entry["df"]["lease"] = random.u64(..).into();
+            }
+        }
         if random.u32(..8) == 0 {
             entry["coalition"] = serde_json::json!({ "members": ["liar_0"], "leader": "liar_0" });
         }
@@ -881,6 +1167,13 @@ impl Besieged {
                     );
                 }
             }
+            // A DF entry is that of the gateway that sent it.
+            for (gateway, name, text) in world.df_entries(at) {
+                match gateway == self.liar {
+                    true => assert!(text.starts_with("liar"), "{text}"),
+                    false => assert_eq!(text, format!("{gateway} {name}")),
+                }
+            }
             // The directory of its host has its own incarnation.
             let others = world.gateways[..self.liar].iter().enumerate();
             let others = others.filter(|(other, _)| *other != at);
@@ -896,13 +1189,16 @@ impl Besieged {
         }
     }
 
-    /// In the end, every honest gateway has the agents of the others.
+    /// In the end, every honest gateway has the agents of the others, and their DF entries.
     fn finish(&mut self) {
         for _ in 0..40 {
             self.pass(Duration::from_millis(500));
         }
         for at in 0..self.liar {
             let known = self.world.gateways[at].exchange.directory();
+            let mut entries = self.world.df_entries(at);
+            entries.retain(|(gateway, ..)| *gateway != self.liar);
+            assert_eq!(entries, self.world.expected_df(at), "{at}");
             for owner in (0..self.liar).filter(|owner| *owner != at) {
                 for agent in self.world.gateways[owner].agents.values() {
                     let holder = known.known(&agent.name);

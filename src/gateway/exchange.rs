@@ -12,7 +12,8 @@ use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
-    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Present,
+    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, OwnDfEntry,
+    Present,
 };
 use fipa_transport::{Incarnation, Location, TransportErrorKind};
 use parking_lot::Mutex;
@@ -68,6 +69,14 @@ impl Exchanging {
         Arc::clone(&self.directory)
     }
 
+    /// Sets the entries of the directory facilitator that are sent to the neighbors. Returns the names
+    /// of the agents whose entries are not sent, because there are too many or they are too large.
+    pub(super) fn send_df(&self, entries: Vec<OwnDfEntry>) -> Vec<Arc<str>> {
+        let others = self.core.lock().handle_own_df(Instant::now(), entries);
+        self.wake.notify_one();
+        others
+    }
+
     /// Handles the content of a letter with [`EXCHANGE_ONTOLOGY`] from this gateway.
     pub(super) fn received(&self, from: Incarnation, content: &[u8]) {
         let taken = self
@@ -88,6 +97,7 @@ impl Exchanging {
     pub(super) async fn run(self: Arc<Self>, means: Means, known: Arc<MergedDirectory>) {
         let (mut host, mut there) = (means.service.host.watch(), known.watch());
         let (mut conflicts, mut disputes) = (NameConflicts::default(), Disputes::default());
+        let mut greetings = Greetings::default();
         let mut sent: JoinSet<(Incarnation, bool)> = JoinSet::new();
         let mut own_changed = true;
         loop {
@@ -98,8 +108,12 @@ impl Exchanging {
                 conflicts.report(&means, &contested);
             }
             disputes.report(&means, Instant::now(), &self.directory.contested());
+            if self.core.lock().has_own_df() {
+                greetings.send(&means, Instant::now());
+            }
             let due = [
                 self.work(&means, &mut sent),
+                greetings.due,
                 conflicts.due(),
                 disputes.due(),
             ];
@@ -206,6 +220,87 @@ impl Exchanging {
         }
         // A neighbor that does not receive the goodbye detects the end of the connection.
         while sent.join_next().await.is_some() {}
+    }
+}
+
+/// Greetings to gateways that the network announces. Gateways become neighbors when letters pass between
+/// them; a gateway with DF entries connects with the others before that.
+#[derive(Default)]
+struct Greetings {
+    /// The greeted gateways, and the times.
+    greeted: HashMap<Incarnation, Instant>,
+    /// Earliest time of the next greetings.
+    not_before: Option<Instant>,
+    /// The time at which further gateways are greeted, if there are any.
+    due: Option<Instant>,
+}
+
+impl Greetings {
+    /// Maximum number of gateways that are greeted at once, and the time until the next ones.
+    const AT_ONCE: usize = 4;
+    const PAUSE: Duration = Duration::from_secs(1);
+    /// Time after which a gateway that has not become a neighbor is greeted again.
+    const AGAIN: Duration = Duration::from_secs(1800);
+    /// Number of neighbors from which on no gateway is greeted. Connections are left for letters.
+    const NEIGHBOURS: usize = 128;
+    /// Maximum number of gateways that are remembered.
+    const REMEMBERED: usize = 1024;
+
+    /// Greets announced gateways that have a directory facilitator and are not neighbors.
+    fn send(&mut self, means: &Means, now: Instant) {
+        if self.not_before.is_some_and(|earliest| earliest > now) {
+            return;
+        }
+        let Some(network) = &means.network else {
+            return;
+        };
+        let entries = Arc::clone(network).directory().entries();
+        let neighbours = means.neighbours.all();
+        let neighbours: HashSet<Incarnation> =
+            neighbours.iter().map(|it| it.entry.incarnation).collect();
+        let next = self.next(now, &entries, &neighbours);
+        let oldest = self.greeted.values().min();
+        self.not_before = (!next.is_empty()).then(|| now + Self::PAUSE);
+        self.due = self.not_before.or(oldest.map(|at| *at + Self::AGAIN));
+        for entry in next {
+            let mut kinds = HashSet::new();
+            let locations = entry.locations.iter().filter(|location| {
+                let kind = location.kind();
+                means.service.uses(kind) && kinds.insert(kind)
+            });
+            let name = &entry.mts.name;
+            let greetings = locations.map(|location| (Arc::clone(name), location.clone()));
+            means.service.mts.greet(greetings.collect());
+        }
+    }
+
+    /// Returns the directory facilitators of the gateways to greet now.
+    fn next(
+        &mut self,
+        now: Instant,
+        entries: &[Arc<Entry>],
+        neighbours: &HashSet<Incarnation>,
+    ) -> Vec<Arc<Entry>> {
+        self.greeted.retain(|_, at| now < *at + Self::AGAIN);
+        let room = Self::NEIGHBOURS.saturating_sub(neighbours.len());
+        let room = room.min(Self::REMEMBERED.saturating_sub(self.greeted.len()));
+        let mut next = Vec::new();
+        for entry in entries {
+            let gateway = entry.mts.incarnation;
+            if next.len() >= room.min(Self::AT_ONCE) {
+                break;
+            }
+            if entry.agent_type == Entry::DF_TYPE
+                && entry.is_platform_agent()
+                && gateway.is_known()
+                && !neighbours.contains(&gateway)
+                && !self.greeted.contains_key(&gateway)
+            {
+                self.greeted.insert(gateway, now);
+                next.push(Arc::clone(entry));
+            }
+        }
+        next
     }
 }
 
@@ -456,6 +551,41 @@ mod tests {
             reach: fipa_sds::Reach::Remote { gateway },
             role: fipa_sds::Role::Agent,
         })
+    }
+
+    #[test]
+    fn announced_gateways_with_a_directory_facilitator_are_greeted_a_few_at_once() {
+        let (mut greetings, begun) = (Greetings::default(), Instant::now());
+        let df = |gateway: u64| {
+            let mut entry = agent(&format!("df@{gateway:03}"), 1000 + gateway, gateway);
+            Arc::make_mut(&mut entry).agent_type = Entry::DF_TYPE.to_owned();
+            entry
+        };
+        let mut entries: Vec<_> = (1..=10).map(df).collect();
+        entries.push(agent("rover", 7, 11));
+        let mut next = |seconds, entries: &[_], neighbours: &[u64]| {
+            let known = neighbours.iter().copied().map(Incarnation::from_u64);
+            let now = begun + Duration::from_secs(seconds);
+            let next = greetings.next(now, entries, &known.collect());
+            let gateways = next.iter().map(|entry| entry.mts.incarnation.as_u64());
+            gateways.collect::<Vec<u64>>()
+        };
+        assert_eq!(next(0, &entries, &[]), [1, 2, 3, 4]);
+        assert_eq!(next(1, &entries, &[5]), [6, 7, 8, 9]);
+        assert_eq!(next(2, &entries, &[5]), [10]);
+        assert_eq!(next(3, &entries, &[5]), [0; 0]);
+        // A gateway that did not become a neighbor, after a while.
+        assert_eq!(next(1801, &entries, &[1, 2, 3, 5]), [4, 6, 7, 8]);
+        // With many neighbors, none.
+        let many: Vec<u64> = (100..100 + Greetings::NEIGHBOURS as u64).collect();
+        assert_eq!(next(9000, &entries, &many), [0; 0]);
+        assert_eq!(next(9000, &entries, &many[1..]), [1]);
+        // Any number of announced gateways takes bounded memory.
+        let flood: Vec<_> = (1000..9000).map(df).collect();
+        for seconds in 0..Greetings::AGAIN.as_secs() {
+            assert!(next(20_000 + seconds, &flood, &[]).len() <= Greetings::AT_ONCE);
+        }
+        assert_eq!(next(21_799, &flood, &[]), [0; 0]);
     }
 
     #[test]

@@ -1,8 +1,10 @@
 //! The platform agents of the gateway: the agent management system and the directory facilitator
 //! (FIPA00023). This module is the I/O around [`fipa_platform`].
 //!
-//! Each of the two is an agent of this host with a name, a queue and a directory entry of its own.
+//! Each of the two is an agent of this host with a name, a queue and a directory entry of its own. The
+//! descriptions in the directory facilitators of gateways travel with the exchange of their directories.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -11,12 +13,17 @@ use fipa_content::Dialect;
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Sending, letter_for};
 use fipa_platform::{
-    Ams, Answer, ApDescription, Asker, Df, Now, Platform, Resident, SubscriptionId,
+    Ams, Answer, ApDescription, Asker, Df, LocalEntry, Now, Platform, RemoteEntry, Resident,
+    SubscriptionId, limits,
 };
-use fipa_sds::{Directory, Entry, MergedDirectory, Reach, RegisterError, Registration, Role};
+use fipa_sds::{
+    DfEntry, Directory, Entry, Exchange, MergedDirectory, OwnDfEntry, Reach, RegisterError,
+    Registration, Role,
+};
 use fipa_transport::{Incarnation, Location, Principal};
 use tokio::task::{JoinHandle, JoinSet};
 
+use super::exchange::Exchanging;
 use super::neighbours::Neighbours;
 use super::publisher::other_holder;
 use crate::config;
@@ -29,6 +36,11 @@ const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 /// updates of a directory may arrive in the wrong order.
 const CONTESTED: Duration = Duration::from_secs(1);
 
+// The exchange carries what the directory facilitator accepts.
+const _: () = assert!(Exchange::MAX_DF_ENTRY == limits::REMOTE_BYTES);
+const _: () = assert!(Exchange::MAX_TOTAL_DF_ENTRIES == limits::REMOTE_DESCRIPTIONS);
+const _: () = assert!(Exchange::MAX_DF_LEASE.as_secs() == limits::LEASE.as_secs());
+
 /// Maximum number of names that are tried.
 const TRIES: usize = 8;
 
@@ -40,6 +52,7 @@ pub(super) struct PlatformAgents {
     pub(super) view: Arc<dyn Directory>,
     /// The agents of other hosts.
     pub(super) known: Arc<MergedDirectory>,
+    pub(super) exchange: Arc<Exchanging>,
     /// Whether `security.keys` is set.
     pub(super) has_keys: bool,
 }
@@ -143,6 +156,61 @@ impl PlatformAgents {
         }
     }
 
+    /// Returns the entries of the directory facilitators of other gateways. An entry counts only while
+    /// the directory shows its agent, at the gateway that sent the entry.
+    fn remote_entries(&self) -> Vec<RemoteEntry> {
+        let is_listed = |entry: &Arc<DfEntry>| {
+            let is_here = |own: Arc<Entry>| own.reach == Reach::Local;
+            let holder = self.known.known(&entry.name);
+            !self.service.host.known(&entry.name).is_some_and(is_here)
+                && holder.is_some_and(|holder| {
+                    holder.incarnation == entry.incarnation
+                        && holder.mts.incarnation == entry.gateway
+                })
+        };
+        let entries = self.exchange.directory().df_entries().into_iter();
+        entries
+            .filter(is_listed)
+            .map(|entry| RemoteEntry {
+                name: Arc::clone(&entry.name),
+                source: match entry.principal {
+                    Principal::Certificate([a, b, c, d, e, f, g, h, ..]) => {
+                        u64::from_le_bytes([a, b, c, d, e, f, g, h])
+                    }
+                    _ => entry.gateway.as_u64(),
+                },
+                text: Arc::clone(&entry.text),
+                ends: entry.ends,
+                has_lease: entry.has_lease,
+            })
+            .collect()
+    }
+
+    /// Sends the entries of the directory facilitator to other gateways. Returns the agents whose
+    /// entries stay here.
+    fn send_df(&self, local: Vec<LocalEntry>) -> HashSet<(Arc<str>, u64)> {
+        let all: Vec<(Arc<str>, u64)> = local
+            .iter()
+            .map(|entry| (Arc::clone(&entry.name), entry.registration))
+            .collect();
+        let mut staying: HashSet<Arc<str>> = local
+            .iter()
+            .filter(|entry| entry.text.is_none())
+            .map(|entry| Arc::clone(&entry.name))
+            .collect();
+        let entries = local.into_iter().filter_map(|entry| {
+            Some(OwnDfEntry {
+                name: entry.name,
+                incarnation: Incarnation::from_u64(entry.registration),
+                text: entry.text?,
+                lease: entry.lease,
+            })
+        });
+        staying.extend(self.exchange.send_df(entries.collect()));
+        let all = all.into_iter();
+        all.filter(|(name, _)| staying.contains(name)).collect()
+    }
+
     /// Sends a message of an agent of this gateway.
     fn send(&self, from: Incarnation, answer: &Answer) -> Option<Sending> {
         let letter = letter_for(&answer.message, SystemTime::now());
@@ -209,6 +277,11 @@ struct Task {
     contested: Option<Instant>,
     /// The notifications under way.
     sent: JoinSet<(SubscriptionId, bool)>,
+    /// The agents that are too many or too large for the directory facilitators of other hosts.
+    staying: HashSet<(Arc<str>, u64)>,
+    /// Time of the last and of the next reading of the entries of other gateways.
+    remote_read: Option<Instant>,
+    remote_due: Option<Instant>,
 }
 
 impl Task {
@@ -229,6 +302,9 @@ impl Task {
             incarnation,
             contested: None,
             sent: JoinSet::new(),
+            staying: HashSet::new(),
+            remote_read: None,
+            remote_due: None,
         })
     }
 
@@ -237,10 +313,14 @@ impl Task {
         let service = Arc::clone(&self.means.service);
         let (mut here, mut there) = (service.host.watch(), self.means.known.watch());
         let mut locations = service.follow_locations();
+        let exchanged = self.means.exchange.directory();
+        let is_df = self.kind == Kind::Df;
         loop {
             self.send_answers();
+            self.send_df();
             let contested = self.contested.map(|since| since + CONTESTED);
-            let due = [self.poll_timeout(), contested].into_iter().flatten().min();
+            let due = [self.poll_timeout(), contested, self.remote_due];
+            let due = due.into_iter().flatten().min();
             let due = due.map(tokio::time::Instant::from_std);
             tokio::select! {
                 received = service.mts.receive(self.incarnation) => match received {
@@ -254,6 +334,7 @@ impl Task {
                     // Several pending changes are handled together.
                     while here.try_next().is_some() {}
                     self.handle_departures();
+                    self.schedule_remote();
                 }
                 change = there.next() => {
                     if change.is_none() {
@@ -261,7 +342,9 @@ impl Task {
                     }
                     while there.try_next().is_some() {}
                     self.check_name();
+                    self.schedule_remote();
                 }
+                () = exchanged.df_changed(), if is_df => self.schedule_remote(),
                 moved = locations.changed() => {
                     if moved.is_err() {
                         return;
@@ -331,6 +414,58 @@ impl Task {
             Core::Df(df) => df.handle_timeout(now),
         }
         self.check_name();
+        if self.remote_due.is_some_and(|due| due <= now) {
+            self.read_remote();
+        }
+    }
+
+    /// Reads the entries of other gateways soon, because they or their agents have changed.
+    fn schedule_remote(&mut self) {
+        if self.kind != Kind::Df {
+            return;
+        }
+        let now = Instant::now();
+        let earliest = self.remote_read.map(|last| last + limits::REMOTE_PAUSE);
+        let due = earliest.map_or(now, |earliest| earliest.max(now));
+        self.remote_due.get_or_insert(due);
+    }
+
+    fn read_remote(&mut self) {
+        let now = Now {
+            at: Instant::now(),
+            wall: SystemTime::now(),
+        };
+        (self.remote_read, self.remote_due) = (Some(now.at), None);
+        if let Core::Df(df) = &mut self.core
+            && df.handle_remote(now, &self.means.remote_entries())
+        {
+            self.remote_due = Some(now.at + limits::REMOTE_PAUSE);
+        }
+    }
+
+    /// Sends the entries of agents of this host to other gateways after a change.
+    fn send_df(&mut self) {
+        let Core::Df(df) = &mut self.core else {
+            return;
+        };
+        let Some(local) = df.poll_local() else {
+            return;
+        };
+        let staying = self.means.send_df(local);
+        for (agent, _) in staying.difference(&self.staying) {
+            tracing::warn!(
+                %agent,
+                "the services of an agent are not told to other hosts: at most {} descriptions of {} \
+                 bytes and {} parts, and {} bytes together, travel; agents of other hosts find them \
+                 with `fipa df search --df {}`",
+                Exchange::MAX_DF_ENTRIES,
+                Exchange::MAX_DF_ENTRY,
+                limits::REMOTE_PARTS,
+                Exchange::MAX_DF_BYTES,
+                self.name
+            );
+        }
+        self.staying = staying;
     }
 
     fn send_answers(&mut self) {

@@ -17,7 +17,8 @@ use crate::report::Failure;
 /// Register, find and watch services of agents
 ///
 /// Services are listed by the directory facilitator (DF) of a gateway (FIPA00023). Agents of this host and
-/// of others use it by FIPA messages. Without --df, that of this host is used.
+/// of others use it by FIPA messages. Without --df, that of this host is used. It also lists the services
+/// that agents of connected hosts have registered with their own gateways.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:

@@ -4,9 +4,11 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
-use fipa_transport::{Incarnation, Location, Mandate};
+use fipa_transport::{Incarnation, Location, Mandate, Principal};
 use parking_lot::Mutex;
+use tokio::sync::Notify;
 
+use super::df::{DfEntries, DfEntry, ReceivedDf};
 use super::{Agents, Exchange, ExchangeError};
 use crate::table::Table;
 use crate::{Directory, Entry, Role, Subscriber, View};
@@ -22,6 +24,9 @@ pub struct ExchangeDirectory {
     mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
     /// Agents of each gateway. The lock is held while the table is updated.
     agents_of: Mutex<HashMap<Incarnation, Agents>>,
+    /// DF entries of these agents. Locked after `agents_of`.
+    df: Mutex<ReceivedDf>,
+    df_changed: Notify,
 }
 
 impl Default for ExchangeDirectory {
@@ -30,6 +35,8 @@ impl Default for ExchangeDirectory {
             table: Table::proved_by(|origin| origin.is_proved),
             mandates: ArcSwap::default(),
             agents_of: Mutex::default(),
+            df: Mutex::default(),
+            df_changed: Notify::new(),
         }
     }
 }
@@ -53,6 +60,28 @@ impl ExchangeDirectory {
     #[must_use]
     pub fn contested(&self) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         self.table.contested(Self::MAX_CONTESTED)
+    }
+
+    /// Returns the entries of agents in the directory facilitators of the neighbors, in no particular
+    /// order. At most [`Exchange::MAX_TOTAL_DF_ENTRIES`].
+    ///
+    /// Another agent may hold the name of an entry: it counts only while the directory shows the
+    /// registration of the entry under this name.
+    #[must_use]
+    pub fn df_entries(&self) -> Vec<Arc<DfEntry>> {
+        self.df.lock().all()
+    }
+
+    /// Waits for a change of [`df_entries`](Self::df_entries). Only one task may wait.
+    pub async fn df_changed(&self) {
+        self.df_changed.notified().await;
+    }
+
+    /// Changes the DF entries, and notifies the waiting task.
+    fn update_df(&self, update: impl FnOnce(&mut ReceivedDf) -> bool) {
+        if update(&mut self.df.lock()) {
+            self.df_changed.notify_one();
+        }
     }
 
     /// Whether any link with a neighbor is certified.
@@ -87,11 +116,12 @@ impl ExchangeDirectory {
         }
     }
 
-    /// Replaces all agents of the gateway.
+    /// Replaces all agents of the gateway, and their DF entries.
     pub(super) fn replace(
         &self,
-        gateway: Incarnation,
+        (gateway, principal): (Incarnation, Principal),
         entries: Agents,
+        df: DfEntries,
     ) -> Result<(), ExchangeError> {
         let origin = self.origin(gateway);
         let mut agents_of = self.agents_of.lock();
@@ -114,14 +144,15 @@ impl ExchangeDirectory {
         let here = here.map(|(name, entry)| (origin, Arc::clone(name), Some(Arc::clone(entry))));
         let updates: Vec<Update> = left.chain(here).collect();
         self.table.update(updates);
+        self.update_df(|all| all.replace(gateway, principal, df));
         Ok(())
     }
 
-    /// Adds or updates some agents of the gateway, and removes others.
+    /// Adds or updates some agents of the gateway with their DF entries, and removes others.
     pub(super) fn change(
         &self,
-        gateway: Incarnation,
-        joined: Vec<Arc<Entry>>,
+        (gateway, principal): (Incarnation, Principal),
+        joined: Vec<(Arc<Entry>, Option<Arc<DfEntry>>)>,
         left: Vec<String>,
     ) -> Result<(), ExchangeError> {
         let origin = self.origin(gateway);
@@ -134,12 +165,15 @@ impl ExchangeDirectory {
         });
         let mut after = of_gateway.clone();
         let mut updates: Vec<Update> = Vec::new();
+        let mut df = Vec::new();
         for name in left {
             if let Some((name, _)) = after.remove_entry(name.as_str()) {
+                df.push((Arc::clone(&name), None));
                 updates.push((origin, name, None));
             }
         }
-        for entry in joined {
+        for (entry, of_entry) in joined {
+            df.push((Arc::clone(&entry.name), of_entry));
             after.insert(Arc::clone(&entry.name), Arc::clone(&entry));
             updates.push((origin, Arc::clone(&entry.name), Some(entry)));
         }
@@ -149,6 +183,7 @@ impl ExchangeDirectory {
         }
         *of_gateway = after;
         self.table.update(updates);
+        self.update_df(|all| all.change(gateway, principal, df));
         Ok(())
     }
 
@@ -187,6 +222,10 @@ impl ExchangeDirectory {
             agents.remove(name);
         }
         let any = !known.is_empty();
+        if any {
+            // The connection that proved them has ended.
+            self.update_df(|all| all.forget(gateway));
+        }
         let updates: Vec<Update> = known.into_iter().map(|name| (origin, name, None)).collect();
         self.table.update(updates);
         any
@@ -210,6 +249,7 @@ impl ExchangeDirectory {
         let origin = self.origin(gateway);
         let mut agents_of = self.agents_of.lock();
         let removed = agents_of.remove(&gateway);
+        self.update_df(|all| all.forget(gateway));
         if removed.is_some() {
             self.table.touch();
         }

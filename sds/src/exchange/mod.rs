@@ -12,10 +12,15 @@
 //! to each neighbor, and changes in the meantime go into the next, so that hundreds of agents that
 //! start at once make a few letters.
 //!
+//! An agent's entry in the directory facilitator (DF) of its gateway travels with its directory entry,
+//! so that a search there needs no letter to other gateways.
+//!
 //! A neighbor may be hostile. It can send only agents of its own that are reached through itself
 //! and, if its link has a certificate, that this certificate names. The number of its agents is
-//! bounded, and malformed letters are rejected.
+//! bounded, and malformed letters are rejected. DF entries are bounded, too; those beyond the bounds are
+//! ignored.
 
+mod df;
 mod directory;
 mod wire;
 
@@ -27,6 +32,8 @@ use std::time::{Duration, Instant};
 use fipa_acl::{ErrorChain, escape};
 use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
+use df::DfEntries;
+pub use df::{DfEntry, OwnDfEntry};
 pub use directory::ExchangeDirectory;
 use wire::{Changes, ExchangeMessage, Full};
 
@@ -93,7 +100,11 @@ impl Present {
 #[derive(Debug, Default)]
 struct LocalAgents {
     agents: Agents,
-    /// Number of changes of `agents` so far.
+    /// DF entries of some of the agents.
+    df: BTreeMap<Arc<str>, OwnDfEntry>,
+    /// The time at which all DF entries are sent again, if there are any.
+    renew: Option<Instant>,
+    /// Number of changes of `agents` and `df` so far.
     version: u64,
     /// Names that changed, the latest last; the last one belongs to `version`. Coalitions that
     /// changed together are adjacent.
@@ -151,6 +162,7 @@ enum SyncState {
 struct Staged {
     version: u64,
     entries: Agents,
+    df: DfEntries,
 }
 
 impl Exchange {
@@ -162,6 +174,20 @@ impl Exchange {
     pub const MAX_NEIGHBOURS: usize = 256;
     /// Maximum length of a letter's content, in bytes.
     pub const MAX_CONTENT: usize = 1024 * 1024;
+    /// Maximum length of a DF entry, in bytes. A longer one is not sent.
+    pub const MAX_DF_ENTRY: usize = 4096;
+    /// Maximum number of DF entries of one neighbor, or of all neighbors with one certificate. This
+    /// gateway sends no more either.
+    pub const MAX_DF_ENTRIES: usize = 256;
+    /// Maximum length of these entries together, in bytes.
+    pub const MAX_DF_BYTES: usize = 128 * 1024;
+    /// Maximum number of DF entries of all neighbors. Neighbors without certificates have at most half
+    /// of them.
+    pub const MAX_TOTAL_DF_ENTRIES: usize = 2048;
+    /// Maximum length of these entries together, in bytes.
+    pub const MAX_TOTAL_DF_BYTES: usize = 1024 * 1024;
+    /// Time after which a received DF entry ends unless the neighbor sends it again.
+    pub const MAX_DF_LEASE: Duration = Duration::from_secs(3600);
     /// Time for which the agents of a disconnected neighbor are kept: a broken connection is
     /// usually restored.
     pub const MEMORY: Duration = Duration::from_secs(5);
@@ -176,6 +202,8 @@ impl Exchange {
     const JITTER: Duration = Duration::from_millis(50);
     /// Interval at which a letter is sent without changes.
     const ALIVE: Duration = Duration::from_secs(15);
+    /// Interval at which all DF entries are sent again, because they end at the neighbors otherwise.
+    const DF_RENEWAL: Duration = Duration::from_secs(1200);
     /// Backoff after a letter that did not arrive, and minimum time between two requests.
     const FIRST_PAUSE: Duration = Duration::from_secs(1);
     const LONGEST_PAUSE: Duration = Duration::from_secs(30);
@@ -217,10 +245,35 @@ impl Exchange {
             .take(Self::MAX_AGENTS)
             .map(|entry| (Arc::clone(&entry.name), Arc::clone(entry)))
             .collect();
-        let changed = self.own.replace(agents);
-        if !changed {
-            return;
+        if self.own.replace(agents) {
+            self.schedule_changes(now);
         }
+    }
+
+    /// Sets the DF entries to send: those of agents of this host, which travel with the agents. Returns
+    /// the names of the agents whose entries are not sent, because they exceed the bounds for one
+    /// entry or for this gateway. Earlier entries of the list precede later ones.
+    pub fn handle_own_df(&mut self, now: Instant, entries: Vec<OwnDfEntry>) -> Vec<Arc<str>> {
+        let (entries, others) = df::bounded(entries);
+        let renew = match entries.is_empty() {
+            true => None,
+            false => self.own.renew.or(Some(now + Self::DF_RENEWAL)),
+        };
+        self.own.renew = renew;
+        if self.own.replace_df(entries) {
+            self.schedule_changes(now);
+        }
+        others
+    }
+
+    /// Whether this gateway has DF entries to send.
+    #[must_use]
+    pub fn has_own_df(&self) -> bool {
+        !self.own.df.is_empty()
+    }
+
+    /// Schedules letters to the neighbors that have all earlier entries.
+    fn schedule_changes(&mut self, now: Instant) {
         let soon = now + Self::GATHERING + self.jitter();
         for neighbor in self.neighbors.values_mut() {
             if matches!(neighbor.state, SyncState::All { .. }) && neighbor.failures == 0 {
@@ -467,8 +520,13 @@ impl Exchange {
     }
 
     /// Removes neighbors that have been disconnected for too long, with all their entries. Their
-    /// agents are lost.
+    /// agents are lost. Renews the DF entries of this gateway.
     pub fn handle_timeout(&mut self, now: Instant) {
+        if self.own.renew.is_some_and(|renew| renew <= now) {
+            self.own.renew = Some(now + Self::DF_RENEWAL);
+            self.own.renew_df();
+            self.schedule_changes(now);
+        }
         self.forget_lost(|lost| now >= lost.until);
         let silent = |neighbor: &Neighbor| neighbor.gone.is_some_and(|it| now >= it + Self::MEMORY);
         let neighbors = self.neighbors.iter();
@@ -521,7 +579,8 @@ impl Exchange {
             None => Some(neighbor.next_letter()),
         });
         let forgotten = self.lost.front().map(|lost| lost.until);
-        times.flatten().chain(forgotten).min()
+        let own = self.own.renew.into_iter().chain(forgotten);
+        times.flatten().chain(own).min()
     }
 
     /// Returns the next letter to send: the neighbor and the content. The caller reports its result
@@ -538,7 +597,7 @@ impl Exchange {
             neighbor.under_way = Some(neighbor.state.clone());
             return Some((*incarnation, wire::encode(&ExchangeMessage::Again)));
         }
-        let (told, state) = self.own.next(&neighbor.state);
+        let (told, state) = self.own.next(&neighbor.state, now);
         if matches!(&told, ExchangeMessage::Full(full) if full.first) {
             neighbor.told = Some(now);
         }
@@ -595,22 +654,80 @@ impl LocalAgents {
         any
     }
 
+    /// Replaces the DF entries; returns whether an entry of a present agent changed.
+    fn replace_df(&mut self, entries: BTreeMap<Arc<str>, OwnDfEntry>) -> bool {
+        let before = std::mem::replace(&mut self.df, entries);
+        let left = before.keys().filter(|name| !self.df.contains_key(*name));
+        let differs = |(name, entry): &(&Arc<str>, &OwnDfEntry)| before.get(*name) != Some(*entry);
+        let other = self.df.iter().filter(differs).map(|(name, _)| name);
+        let changed: Vec<Arc<str>> = left.chain(other).cloned().collect();
+        self.log_df(changed)
+    }
+
+    /// Sends all DF entries again.
+    fn renew_df(&mut self) {
+        let names = self.df.keys().cloned().collect();
+        self.log_df(names);
+    }
+
+    /// Logs changes of the DF entries of these agents. An agent that is not present has its entry in
+    /// the letter with which it appears.
+    fn log_df(&mut self, mut names: Vec<Arc<str>>) -> bool {
+        names.retain(|name| self.agents.contains_key(name));
+        self.version += names.len() as u64;
+        self.log.extend(names.iter().map(|name| Logged {
+            name: Arc::clone(name),
+            with_previous: false,
+        }));
+        let surplus = self.log.len().saturating_sub(Exchange::LOG);
+        self.log.drain(..surplus);
+        !names.is_empty()
+    }
+
+    /// Returns the DF entry of this registration.
+    fn df_of(&self, entry: &Entry) -> Option<&OwnDfEntry> {
+        let own = self.df.get(&entry.name);
+        own.filter(|own| own.incarnation == entry.incarnation && entry.role == Role::Agent)
+    }
+
+    /// Returns an agent as part of a letter.
+    fn told(&self, entry: &Arc<Entry>, now: Instant) -> wire::Agent {
+        let df = self.df_of(entry).and_then(|own| own.told(now));
+        wire::Agent::of(entry, df)
+    }
+
+    /// Returns the length of an agent in a letter, approximately.
+    fn weight(&self, entry: &Entry) -> usize {
+        weight(entry) + self.df_of(entry).map_or(0, OwnDfEntry::weight)
+    }
+
+    /// Returns as many entries as fit one letter, at least one.
+    fn batch<'a>(&self, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<&'a Arc<Entry>> {
+        let mut bytes = 0;
+        let fits = |entry: &&Arc<Entry>| {
+            let had_room = bytes <= Exchange::BATCH_BYTES;
+            bytes += self.weight(entry);
+            had_room
+        };
+        entries.take(Exchange::BATCH).take_while(fits).collect()
+    }
+
     /// Returns the next message for a neighbor in this state, and its state after receipt.
-    fn next(&self, knows: &SyncState) -> (ExchangeMessage, SyncState) {
+    fn next(&self, knows: &SyncState, now: Instant) -> (ExchangeMessage, SyncState) {
         match knows {
             SyncState::All { version } => {
                 let behind = self.version - version;
                 match usize::try_from(behind) {
-                    Ok(behind) if behind <= self.log.len() => self.changes(*version, behind),
-                    _ => self.part(None, self.version),
+                    Ok(behind) if behind <= self.log.len() => self.changes(*version, behind, now),
+                    _ => self.part(None, self.version, now),
                 }
             }
             SyncState::Some { upto, version } => {
                 // Start again if more has changed since the first part than the log holds.
                 let behind = usize::try_from(self.version - version).unwrap_or(usize::MAX);
                 match upto {
-                    Some(_) if behind <= self.log.len() => self.part(upto.as_ref(), *version),
-                    _ => self.part(None, self.version),
+                    Some(_) if behind <= self.log.len() => self.part(upto.as_ref(), *version, now),
+                    _ => self.part(None, self.version, now),
                 }
             }
         }
@@ -618,13 +735,18 @@ impl LocalAgents {
 
     /// Builds the part of all entries after that name. Changes since the first part are sent after
     /// the last part.
-    fn part(&self, upto: Option<&Arc<str>>, version: u64) -> (ExchangeMessage, SyncState) {
+    fn part(
+        &self,
+        upto: Option<&Arc<str>>,
+        version: u64,
+        now: Instant,
+    ) -> (ExchangeMessage, SyncState) {
         let from = upto.map_or(Bound::Unbounded, |name| Bound::Excluded(Arc::clone(name)));
         let rest = self
             .agents
             .range((from, Bound::Unbounded))
             .map(|(_, entry)| entry);
-        let batch = batch(rest);
+        let batch = self.batch(rest);
         let last = batch.last().is_none_or(|entry| {
             let behind = (Bound::Excluded(Arc::clone(&entry.name)), Bound::Unbounded);
             self.agents.range(behind).next().is_none()
@@ -640,12 +762,15 @@ impl LocalAgents {
             version,
             first: upto.is_none(),
             last,
-            agents: batch.into_iter().map(wire::Agent::of).collect(),
+            agents: batch
+                .into_iter()
+                .map(|entry| self.told(entry, now))
+                .collect(),
         };
         (ExchangeMessage::Full(full), state)
     }
 
-    fn changes(&self, version: u64, behind: usize) -> (ExchangeMessage, SyncState) {
+    fn changes(&self, version: u64, behind: usize, now: Instant) -> (ExchangeMessage, SyncState) {
         let start = self.log.len().saturating_sub(behind);
         let mut names = BTreeSet::new();
         let (mut bytes, mut taken) = (0, 0);
@@ -663,7 +788,7 @@ impl LocalAgents {
                 bytes += self
                     .agents
                     .get(name)
-                    .map_or(name.len(), |entry| weight(entry));
+                    .map_or(name.len(), |entry| self.weight(entry));
             }
             taken += 1;
         }
@@ -674,7 +799,7 @@ impl LocalAgents {
             agents: names
                 .iter()
                 .filter_map(|name| self.agents.get(name))
-                .map(wire::Agent::of)
+                .map(|entry| self.told(entry, now))
                 .collect(),
             left: names
                 .iter()
@@ -687,17 +812,6 @@ impl LocalAgents {
             SyncState::All { version: to },
         )
     }
-}
-
-/// As many entries as fit one letter, at least one.
-fn batch<'a>(entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<&'a Arc<Entry>> {
-    let mut bytes = 0;
-    let fits = |entry: &&Arc<Entry>| {
-        let had_room = bytes <= Exchange::BATCH_BYTES;
-        bytes += weight(entry);
-        had_room
-    };
-    entries.take(Exchange::BATCH).take_while(fits).collect()
 }
 
 fn weight(entry: &Entry) -> usize {
@@ -770,6 +884,7 @@ impl Neighbor {
             _ if full.first => Staged {
                 version: full.version,
                 entries: BTreeMap::new(),
+                df: BTreeMap::new(),
             },
             Some(staged) if staged.version == full.version => staged,
             _ => {
@@ -777,18 +892,25 @@ impl Neighbor {
                 return Ok(());
             }
         };
-        for entry in full
-            .agents
-            .into_iter()
-            .filter_map(|agent| self.entry(agent))
-        {
+        for agent in full.agents {
+            let Some((entry, df)) = self.read(now, agent) else {
+                continue;
+            };
+            // The directory applies the other bounds.
+            match df {
+                Some(df) if staged.df.len() < Exchange::MAX_DF_ENTRIES => {
+                    staged.df.insert(Arc::clone(&entry.name), df);
+                }
+                _ => drop(staged.df.remove(&entry.name)),
+            }
             staged.entries.insert(Arc::clone(&entry.name), entry);
         }
         if staged.entries.len() > Exchange::MAX_AGENTS {
             return Err(ExchangeError::TooMany);
         }
         if full.last {
-            directory.replace(self.mts.incarnation, staged.entries)?;
+            let of = (self.mts.incarnation, self.principal);
+            directory.replace(of, staged.entries, staged.df)?;
             self.stored = Some(full.version);
             self.ask = None;
         } else {
@@ -808,10 +930,27 @@ impl Neighbor {
             return Ok(());
         }
         let agents = changes.agents.into_iter();
-        let joined = agents.filter_map(|agent| self.entry(agent)).collect();
-        directory.change(self.mts.incarnation, joined, changes.left)?;
+        let joined = agents.filter_map(|agent| self.read(now, agent)).collect();
+        let of = (self.mts.incarnation, self.principal);
+        directory.change(of, joined, changes.left)?;
         self.stored = Some(changes.to);
         Ok(())
+    }
+
+    /// Reads an agent of this neighbor, and its DF entry.
+    fn read(
+        &self,
+        now: Instant,
+        mut agent: wire::Agent,
+    ) -> Option<(Arc<Entry>, Option<Arc<DfEntry>>)> {
+        let told = agent.df.take();
+        let entry = self.entry(agent)?;
+        let told = told.filter(|_| entry.role == Role::Agent);
+        let df = told.and_then(|told| {
+            let of = (self.mts.incarnation, self.principal);
+            DfEntry::read(now, of, (&entry.name, entry.incarnation), told)
+        });
+        Some((entry, df))
     }
 
     /// Builds the entry of an agent of this neighbor; its locations are always those of the

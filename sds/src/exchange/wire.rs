@@ -6,7 +6,9 @@
 //! { "version": 1, "tell": { "full": { "version": 7, "first": true, "last": false, "agents": [agent] } } }
 //! { "version": 1, "tell": { "changes": { "from": 7, "to": 9, "agents": [agent], "left": [name] } } }
 //! agent = { "name", "type", "id", "description", "registered": milliseconds since 1970, UTC,
-//!           "coalition": { "members": [name], "leader": name }, for a coalition }
+//!           "coalition": { "members": [name], "leader": name }, for a coalition
+//!           "df": { "entry": text, "lease": remaining milliseconds }, for an agent with an entry
+//!                 in the directory facilitator of the gateway; "lease" is left out without one }
 //! ```
 //!
 //! The agents' location is not part of the format: it is that of the gateway that sent the letter.
@@ -74,10 +76,22 @@ pub(super) struct Agent {
     pub(super) registered: u64,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) coalition: Option<Members>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) df: Option<DfEntry>,
+}
+
+/// The entry of an agent in the directory facilitator of its gateway.
+#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct DfEntry {
+    /// The description of the agent in FIPA-SL, without its lease.
+    pub(super) entry: String,
+    /// Milliseconds until the lease ends.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) lease: Option<u64>,
 }
 
 impl Agent {
-    pub(super) fn of(entry: &Arc<Entry>) -> Self {
+    pub(super) fn of(entry: &Arc<Entry>, df: Option<DfEntry>) -> Self {
         Self {
             name: entry.name.to_string(),
             incarnation: entry.incarnation,
@@ -88,6 +102,7 @@ impl Agent {
                 Role::Coalition(members) => Some(members.clone()),
                 _ => None,
             },
+            df,
         }
     }
 }
@@ -105,5 +120,79 @@ pub(super) fn decode(content: &[u8]) -> Result<ExchangeMessage, serde_json::Erro
         other => Err(serde_json::Error::custom(format!(
             "version {other} is not supported"
         ))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::Incarnation;
+
+    use super::*;
+    use crate::{Mts, Registration, Source};
+
+    const LETTER: &str = concat!(
+        r#"{"version":1,"tell":{"full":{"version":3,"first":true,"last":true,"agents":["#,
+        r#"{"name":"crane","id":"0000000000000007","type":"arm","registered":1000,"#,
+        r#""df":{"entry":"(df-agent-description :languages (set \"a\\n\"))","lease":60000}},"#,
+        r#"{"name":"rover","id":"0000000000000008","registered":1000,"df":{"entry":""}}]}}}"#
+    );
+
+    fn agent(name: &str, number: u64, agent_type: &str, df: DfEntry) -> Agent {
+        let mts = Mts::new("mts", Incarnation::from_u64(1));
+        let registration = Registration {
+            agent_type: agent_type.to_owned(),
+            registered: crate::entry::time_of_millis(1000),
+            ..Registration::new(name, Incarnation::from_u64(number), Vec::new())
+        };
+        let entry = registration.into_entry(&mts, Source::Host).unwrap();
+        Agent::of(&Arc::new(entry), Some(df))
+    }
+
+    #[test]
+    fn a_letter_with_df_entries_has_these_bytes() {
+        let of = |entry: &str, lease| DfEntry {
+            entry: entry.to_owned(),
+            lease,
+        };
+        let text = r#"(df-agent-description :languages (set "a\n"))"#;
+        let told = ExchangeMessage::Full(Full {
+            version: 3,
+            first: true,
+            last: true,
+            agents: vec![
+                agent("crane", 7, "arm", of(text, Some(60_000))),
+                agent("rover", 8, "", of("", None)),
+            ],
+        });
+        assert_eq!(String::from_utf8(encode(&told)).unwrap(), LETTER);
+        let ExchangeMessage::Full(read) = decode(LETTER.as_bytes()).unwrap() else {
+            panic!("another letter");
+        };
+        assert_eq!(read.agents[0].df, Some(of(text, Some(60_000))));
+        assert_eq!(read.agents[1].df, Some(of("", None)));
+    }
+
+    #[test]
+    fn a_letter_that_is_cut_off_is_malformed() {
+        for length in 0..LETTER.len() {
+            assert!(decode(&LETTER.as_bytes()[..length]).is_err(), "{length}");
+        }
+    }
+
+    #[test]
+    fn df_entries_of_other_types_are_malformed_and_further_keys_are_ignored() {
+        let letter = |df: &str| LETTER.replace(r#"{"entry":""}"#, df);
+        for df in [
+            r#""text""#,
+            "{}",
+            r#"{"entry":7}"#,
+            r#"{"entry":"","lease":-1}"#,
+            r#"{"entry":"","lease":1.5}"#,
+            r#"{"entry":"","lease":18446744073709551616}"#,
+        ] {
+            assert!(decode(letter(df).as_bytes()).is_err(), "{df}");
+        }
+        let more = letter(r#"{"entry":"x","lease":null,"later":[1]}"#);
+        assert!(decode(more.as_bytes()).is_ok());
     }
 }
