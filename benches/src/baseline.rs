@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::error::BenchError;
+use crate::locks;
 use crate::measure::{Row, name_of};
 use crate::part::{Fill, Wait};
 use crate::report;
@@ -23,13 +24,23 @@ const NEGLIGIBLE: f64 = 0.05;
 #[derive(Debug)]
 pub struct Baseline(HashMap<Key, Ratios>);
 
-/// Identifies a path with one kind of letter.
+/// Identifies a row.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Deserialize)]
-struct Key {
-    path: String,
-    wait: Wait,
-    size: usize,
-    fill: Fill,
+#[serde(untagged)]
+enum Key {
+    /// A path with one kind of letter.
+    Path {
+        path: String,
+        wait: Wait,
+        size: usize,
+        fill: Fill,
+    },
+    /// A group of agents that shares a resource.
+    Locks {
+        algorithm: String,
+        agents: usize,
+        hosts: usize,
+    },
 }
 
 /// Ratios to the limit, each with the middle half of the rounds.
@@ -97,7 +108,7 @@ impl Baseline {
             compared: 0,
         };
         for row in rows {
-            let key = Key {
+            let key = Key::Path {
                 path: row.path.clone(),
                 wait: row.wait,
                 size: row.size,
@@ -123,6 +134,29 @@ impl Baseline {
                 before.round_trip_ratio.zip(before.round_trip_ratio_spread),
                 row.round_trip_ratio.zip(row.round_trip_ratio_spread),
             );
+        }
+        changes
+    }
+
+    /// Compares the groups that both results have.
+    pub(crate) fn compare_locks(&self, rows: &[locks::Row]) -> Changes {
+        let mut changes = Changes {
+            changes: Vec::new(),
+            compared: 0,
+        };
+        for row in rows {
+            let key = Key::Locks {
+                algorithm: row.algorithm.to_owned(),
+                agents: row.agents,
+                hosts: row.hosts,
+            };
+            if let Some(before) = self.0.get(&key) {
+                changes.add(
+                    row.name(),
+                    before.ratio.zip(before.ratio_spread),
+                    Some((row.ratio, row.ratio_spread)),
+                );
+            }
         }
         changes
     }

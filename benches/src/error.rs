@@ -12,6 +12,9 @@ pub enum BenchError {
     /// A size of content outside of 1 byte to [`Effort::MAX_SIZE`](crate::Effort::MAX_SIZE).
     #[error("content of {0} bytes cannot be measured")]
     Size(u64),
+    /// A number of agents outside of 2 to [`Locks::MAX_AGENTS`](crate::Locks::MAX_AGENTS).
+    #[error("locks of {0} agents cannot be measured")]
+    Agents(usize),
     /// The directory and the processes of the measurement could not be prepared.
     #[error("cannot prepare the measurement: {0}")]
     Prepare(String),

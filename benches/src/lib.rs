@@ -10,6 +10,7 @@
 //! * [`Baseline`] is an earlier result, and [`Changes`] are the differences from it.
 //! * [`Paper`] repeats the evaluation of the C++ libraries: lengths and times of all encodings.
 //! * [`Peers`] measures conversations with an agent of JADE, beside those of another JADE platform.
+//! * [`Locks`] measures locks, beside the same letters sent by hand.
 //! * [`Machine`] describes the machine that was measured.
 //!
 //! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
@@ -18,6 +19,7 @@ mod bars;
 mod baseline;
 mod comparison;
 mod error;
+mod locks;
 mod machine;
 mod many;
 mod measure;
@@ -32,6 +34,7 @@ mod stage;
 pub use baseline::{Baseline, Changes};
 pub use comparison::{Comparison, Measurement, Program, Selection};
 pub use error::{BenchError, PartError};
+pub use locks::{Locks, LocksReport};
 pub use machine::Machine;
 pub use measure::Effort;
 pub use paper::Paper;

@@ -134,6 +134,33 @@ fn memory() -> u64 {
     kibibytes.unwrap_or(0) * 1024
 }
 
+/// Memory of a process that it shares with no other process, in bytes.
+pub(super) fn private_memory(pid: u32) -> Result<u64, String> {
+    let file = format!("/proc/{pid}/smaps_rollup");
+    let text = fs::read_to_string(&file).map_err(|error| format!("{file}: {error}"))?;
+    let kibibytes = |name| number_in(&text, name).unwrap_or(0);
+    Ok((kibibytes("Private_Clean:") + kibibytes("Private_Dirty:")) * 1024)
+}
+
+/// Number of times that threads of a process have waited and were woken.
+pub(super) fn wakeups(pid: u32) -> Result<u64, String> {
+    let directory = format!("/proc/{pid}/task");
+    let threads = fs::read_dir(&directory).map_err(|error| format!("{directory}: {error}"))?;
+    // A thread may end meanwhile.
+    let texts = threads
+        .flatten()
+        .filter_map(|thread| fs::read_to_string(thread.path().join("status")).ok());
+    Ok(texts
+        .filter_map(|text| number_in(&text, "voluntary_ctxt_switches:"))
+        .sum())
+}
+
+/// The number in the line that begins with this name.
+fn number_in(text: &str, name: &str) -> Option<u64> {
+    let value = text.lines().find_map(|line| line.strip_prefix(name))?;
+    value.split_whitespace().next()?.parse().ok()
+}
+
 /// Accumulated time of all processors, in clock ticks.
 #[derive(Debug, Clone, Copy)]
 struct Jiffies {

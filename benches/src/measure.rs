@@ -72,7 +72,7 @@ fn checked(sizes: impl IntoIterator<Item = u64>) -> Result<Vec<usize>, BenchErro
 }
 
 /// Minimum and maximum number of letters in a turn.
-const LEAST: usize = 8;
+pub(super) const LEAST: usize = 8;
 const MOST: usize = 2000;
 /// Letters at the beginning of a turn that do not count: they wake sleeping processes.
 pub(super) const WARMING: usize = 3;
@@ -282,7 +282,12 @@ async fn cell(
 }
 
 fn letters_for(turn: &Turn, time: Duration) -> usize {
-    let typical = median(&times(&turn.began, &turn.ended)).max(1.0);
+    count_for(median(&times(&turn.began, &turn.ended)), time)
+}
+
+/// Number of repetitions of this length, in nanoseconds, that fill a turn.
+pub(super) fn count_for(typical: f64, time: Duration) -> usize {
+    let typical = typical.max(1.0);
     let fit = time.as_nanos() as f64 / typical;
     (fit as usize).clamp(LEAST, MOST)
 }
@@ -385,7 +390,7 @@ fn rate_ratio(cell: &Cell, other: &Cell) -> Option<f64> {
 }
 
 /// Lower and upper quartile.
-fn spread(ratios: &[f64]) -> [f64; 2] {
+pub(super) fn spread(ratios: &[f64]) -> [f64; 2] {
     [0.25, 0.75].map(|at| quantile(ratios, at))
 }
 

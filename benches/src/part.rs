@@ -7,9 +7,11 @@
 mod agent;
 mod iceoryx;
 mod letters;
+mod locks;
 mod orders;
 mod relay;
 mod socket;
+mod watcher;
 mod wire;
 
 use std::time::Duration;
@@ -23,7 +25,8 @@ use serde::{Deserialize, Serialize};
 use crate::error::PartError;
 use crate::machine;
 
-pub(super) use self::orders::{End, Event, Fill, Letters, Order, Spread};
+pub(super) use self::locks::{BY_HAND, Variant};
+pub(super) use self::orders::{By, End, Event, Fill, Letters, LockStep, Order, Spread};
 pub(super) use self::wire::Wire;
 
 /// Time in which a part ends by itself after its orders have ended.
@@ -37,6 +40,10 @@ pub(super) enum Part {
     Agent { end: End, name: String },
     /// A number of receiving agents; their address is a pattern.
     Crowd { count: usize },
+    /// An agent that uses locks, and one that sends the same letters by hand.
+    Locks(LockAgents),
+    /// Counts the letters of the configured domain on this host.
+    Watcher,
     /// The gateway of the configured domain.
     Gateway,
     /// The shared memory transport alone.
@@ -58,8 +65,36 @@ impl Part {
             | Self::Iceoryx { end, .. }
             | Self::Socket { end, .. } => Some(*end),
             Self::Crowd { .. } => Some(End::Receiver),
-            Self::Gateway | Self::Relay { .. } => None,
+            // More agents than processors take part.
+            Self::Locks(_) | Self::Watcher | Self::Gateway | Self::Relay { .. } => None,
         }
+    }
+}
+
+/// The agents of all processes of a group that shares resources.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct LockAgents {
+    pub(super) variant: Variant,
+    /// Number of processes.
+    pub(super) count: usize,
+    /// Index of this process. The process with index [`OWNER`](Self::OWNER) owns the resource.
+    pub(super) index: usize,
+    /// The beginning of all names.
+    pub(super) prefix: String,
+}
+
+impl LockAgents {
+    /// Index of the owner of the resource that is measured.
+    pub(super) const OWNER: usize = 1;
+
+    /// The name of the agent that uses locks.
+    pub(super) fn locks(&self, index: usize) -> String {
+        format!("{}-l{index}", self.prefix)
+    }
+
+    /// The name of the agent that sends letters by hand.
+    pub(super) fn by_hand(&self, index: usize) -> String {
+        format!("{}-h{index}", self.prefix)
     }
 }
 
@@ -131,6 +166,8 @@ fn play_part(part: Part, config: &Config) -> Result<(), String> {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             agent::Agent::play(config, &names, "one-.*")
         }
+        Part::Locks(agents) => locks::play(config, agents),
+        Part::Watcher => watcher::play(config),
         Part::Gateway => agent::gateway(config),
         Part::Letters { end } => letters::play(config, end),
         Part::Iceoryx { end, wait } => iceoryx::play(config, end, wait.into()),

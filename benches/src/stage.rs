@@ -154,6 +154,7 @@ impl Stage {
         let program = command.as_std().get_program().to_owned();
         let mut child = command
             .env("FIPA_RUNTIME_DIR", &self.place)
+            .env("FIPA_STATE_DIR", self.place.join("state"))
             .env_remove("FIPA_CONFIG")
             .env_remove("HOME")
             .current_dir("/")
@@ -212,6 +213,23 @@ impl Stage {
             Ok(event) => Ok(event),
             Err(error) => Err(format!("{name} sent {line:?}: {error}")),
         }
+    }
+
+    /// Ends one process.
+    pub(super) async fn end(&mut self, who: ProcessIndex) -> Result<(), String> {
+        let process = self.process(who)?;
+        process.orders = None;
+        let ended = process.child.wait().await;
+        ended
+            .map(drop)
+            .map_err(|error| format!("{}: {error}", process.name))
+    }
+
+    /// The identifier of a running process.
+    pub(super) fn pid(&mut self, who: ProcessIndex) -> Result<u32, String> {
+        let process = self.process(who)?;
+        let pid = process.child.id();
+        pid.ok_or_else(|| format!("{} has ended", process.name))
     }
 
     fn process(&mut self, who: ProcessIndex) -> Result<&mut Process, String> {

@@ -113,16 +113,15 @@ fn every_route_is_measured_with_its_limit() {
     assert_eq!(processes(pid), 0);
 }
 
-#[test]
-fn an_interrupted_measurement_leaves_no_files_and_processes() {
-    let mut child = bench(&["shm"])
+/// Interrupts a measurement when it has started this number of processes.
+fn interrupt(part: &str, started: usize) {
+    let mut child = bench(&[part])
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
     let pid = child.id();
-    // The processes of raw iceoryx2 start late.
-    while processes(pid) < 6 {
+    while processes(pid) < started {
         assert!(
             child.try_wait().unwrap().is_none(),
             "the command ended early"
@@ -137,6 +136,82 @@ fn an_interrupted_measurement_leaves_no_files_and_processes() {
     assert_eq!(child.wait().unwrap().code(), Some(1));
     assert_eq!(files(pid), Vec::<String>::new());
     assert_eq!(processes(pid), 0);
+}
+
+#[test]
+fn an_interrupted_measurement_leaves_no_files_and_processes() {
+    // The processes of raw iceoryx2 start late.
+    interrupt("shm", 6);
+    interrupt("locks", 2);
+}
+
+#[test]
+fn locks_need_the_letters_of_their_algorithm() {
+    let picture = tempfile::tempdir().unwrap();
+    let picture = picture.path().join("locks.svg");
+    let child = bench(&["locks", "--quick", "--json", "--agents", "8", "--svg"])
+        .arg(&picture)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    let output = child.wait_with_output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["notes"], serde_json::json!([]), "{report:#}");
+    let rows = report["rows"].as_array().unwrap();
+    for hosts in [1, 2] {
+        for (algorithm, letters) in [
+            ("ricart_agrawala_extended", 2.0 * 7.0 + 3.0),
+            ("suzuki_kasami_extended", 8.0 + 3.0),
+            ("suzuki_kasami", 3.0),
+        ] {
+            let mut rows = rows.iter();
+            let row = rows.find(|row| row["algorithm"] == algorithm && row["hosts"] == hosts);
+            let row = row.unwrap();
+            for counted in ["letters_needed", "letters", "letters_by_hand"] {
+                assert_eq!(number(&row[counted]), letters, "{row:#}");
+            }
+            for measured in ["locks_us", "by_hand_us", "ratio", "cpu_us", "cpu_ratio"] {
+                assert!(number(&row[measured]) > 0.0, "{row:#}");
+            }
+        }
+    }
+    let hand_overs = report["hand_overs"].as_array().unwrap();
+    assert_eq!(hand_overs.len(), 4);
+    for hand_over in hand_overs {
+        for measured in [
+            "locks_us",
+            "by_hand_us",
+            "letter_us",
+            "ratio",
+            "letter_ratio",
+        ] {
+            assert!(number(&hand_over[measured]) > 0.0, "{hand_over:#}");
+        }
+    }
+    let resources = &report["resources"];
+    assert_eq!(number(&resources["agents"]), 8.0);
+    assert!(number(&resources["held"]["private_bytes"]) > 0.0);
+    let drawn = std::fs::read_to_string(&picture).unwrap();
+    assert!(drawn.starts_with("<svg") && drawn.contains("suzuki_kasami_extended, 8 agents"));
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
+}
+
+#[test]
+fn locks_of_a_wrong_number_of_agents_are_refused() {
+    for (arguments, expected) in [
+        (["locks", "--agents", "1"], "locks of 1 agents"),
+        (["shm", "--agents", "2"], "only for `fipa bench locks`"),
+    ] {
+        let output = bench(&arguments).output().unwrap();
+        assert!(!output.status.success());
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(errors.contains(expected), "{errors}");
+    }
 }
 
 /// A baseline with this ratio in all rows of a path, and no spread.

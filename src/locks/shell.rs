@@ -129,6 +129,10 @@ struct State {
     owned: HashMap<Resource, OwnedState>,
     /// Members that the task does not watch yet.
     joined: Vec<Peer>,
+    /// Time at which the timer of the task expires. It is not after the next timeout of the core. A timeout
+    /// that moves to a later time leaves the timer as it is: most timeouts are those of letters that are
+    /// answered at once, and each change would wake the task.
+    armed: Option<Millis>,
     is_closed: bool,
 }
 
@@ -165,8 +169,15 @@ impl State {
             claims: HashMap::new(),
             owned: HashMap::new(),
             joined: Vec::new(),
+            armed: None,
             is_closed: false,
         }
+    }
+
+    /// Whether the core has a timeout before the timer expires.
+    fn is_due_earlier(&self) -> bool {
+        let due = self.core.poll_timeout();
+        due.is_some_and(|due| self.armed.is_none_or(|armed| due < armed))
     }
 
     fn perform(&mut self, actions: Vec<Action>) {
@@ -251,12 +262,11 @@ impl Shared {
     ) -> T {
         let mut actions = Vec::new();
         let mut state = self.state.lock();
-        let due = state.core.poll_timeout();
         let result = change(&mut state, now(), &mut actions);
         state.perform(actions);
-        let is_changed = state.core.poll_timeout() != due || !state.joined.is_empty();
+        let is_task_needed = state.is_due_earlier() || !state.joined.is_empty();
         drop(state);
-        if is_changed {
+        if is_task_needed {
             self.changed.notify_one();
         }
         self.flush(core);
@@ -483,10 +493,13 @@ impl Task {
 
     async fn serve(&mut self) -> std::io::Result<()> {
         loop {
-            let (due, joined, is_closed) = {
+            let (armed, joined, is_closed) = {
                 let mut state = self.shared.state.lock();
                 let joined = std::mem::take(&mut state.joined);
-                (state.core.poll_timeout(), joined, state.is_closed)
+                if state.is_due_earlier() {
+                    state.armed = state.core.poll_timeout();
+                }
+                (state.armed, joined, state.is_closed)
             };
             if is_closed {
                 return Ok(());
@@ -497,7 +510,7 @@ impl Task {
                     self.watched.insert(peer);
                 }
             }
-            self.timer.set(due)?;
+            self.timer.set(armed)?;
             let (core, changes) = (&self.core, self.changes.as_mut());
             tokio::select! {
                 received = core.demultiplexer.next_served(&core.endpoint, &self.messages) => {
@@ -510,6 +523,7 @@ impl Task {
                 expired = self.timer.expired() => {
                     expired?;
                     self.shared.act(&self.core, |state, now, actions| {
+                        state.armed = None;
                         state.core.handle_timeout(now, actions);
                     });
                 }

@@ -32,10 +32,10 @@ pub(super) struct Agent {
 
 type Sending = Pin<Box<dyn Future<Output = Result<Deliveries, SendError>> + Send>>;
 
-/// An agent and its runtime. The agent is absent while a task uses it.
-struct Running {
-    agent: Option<Agent>,
-    runtime: Runtime,
+/// The agents of a process and their runtime. The agents are absent while a task uses them.
+pub(super) struct Running<A> {
+    pub(super) agent: Option<A>,
+    pub(super) runtime: Runtime,
 }
 
 impl Agent {
@@ -212,14 +212,14 @@ impl Agent {
     }
 }
 
-impl Running {
-    /// Runs work with the agent in a task.
-    fn run<T: Send + 'static, F>(
+impl<A: Send + 'static> Running<A> {
+    /// Runs work with the agents in a task.
+    pub(super) fn run<T: Send + 'static, F>(
         &mut self,
-        work: impl FnOnce(Agent) -> F + Send + 'static,
+        work: impl FnOnce(A) -> F + Send + 'static,
     ) -> Result<T, String>
     where
-        F: Future<Output = (Agent, T)> + Send + 'static,
+        F: Future<Output = (A, T)> + Send + 'static,
     {
         let agent = self.agent.take().ok_or("the agent is not available")?;
         let task = self.runtime.spawn(async move { work(agent).await });
@@ -229,7 +229,7 @@ impl Running {
     }
 }
 
-impl Peer for Running {
+impl Peer for Running<Agent> {
     /// The runtime runs meanwhile, so the agent answers at any time.
     fn next_order(&mut self) -> Option<String> {
         self.run(|mut agent| async move {
@@ -300,12 +300,12 @@ pub(super) fn gateway(config: &Config) -> Result<(), String> {
     Ok(())
 }
 
-fn runtime() -> Result<Runtime, String> {
+pub(super) fn runtime() -> Result<Runtime, String> {
     let runtime = Builder::new_current_thread().enable_all().build();
     runtime.map_err(|error| format!("cannot start the runtime: {error}"))
 }
 
-fn orders() -> Lines<BufReader<Stdin>> {
+pub(super) fn orders() -> Lines<BufReader<Stdin>> {
     BufReader::new(tokio::io::stdin()).lines()
 }
 

@@ -4,6 +4,7 @@
 //! The file uses nothing of `fipa`: programs that measure another middleware include it
 //! (`comparison/zenoh`).
 
+use std::collections::BTreeMap;
 use std::io::Write as _;
 
 use rustix::time::{ClockId, clock_gettime};
@@ -63,6 +64,44 @@ pub(crate) enum Spread {
     Copies,
 }
 
+/// Origin of the letters of a step of a lock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum By {
+    /// The calls of locks.
+    Locks,
+    /// The application sends the same letters itself.
+    Hand,
+    /// The application sends one letter in place of all letters.
+    Letter,
+}
+
+/// A step of an agent that uses locks.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(tag = "step", rename_all = "snake_case")]
+pub(crate) enum LockStep {
+    /// Wait until the directory lists the other agents.
+    Find,
+    /// Begin to own these resources.
+    Own { resources: Vec<String> },
+    /// Acquire and release a resource, this number of times in a row.
+    Cycle {
+        by: By,
+        resource: String,
+        count: usize,
+    },
+    /// Hold a resource in turn with the agent of this index, each this number of times.
+    TakeTurns {
+        by: By,
+        resource: String,
+        other: usize,
+        begins: bool,
+        count: usize,
+    },
+    /// Acquire these resources and keep them.
+    Hold { resources: Vec<String> },
+}
+
 /// An order to a part.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case")]
@@ -77,6 +116,11 @@ pub(crate) enum Order {
     Spread { what: Spread, letters: Letters },
     /// Report the processor time of this process.
     Cpu,
+    /// Execute a step of an agent that uses locks.
+    Lock(LockStep),
+    /// Report the letters since the last such order. Waits before until no more letters of the protocol
+    /// `quiet` pass.
+    CountLetters { quiet: Option<String> },
 }
 
 /// An event of a part. Times are nanoseconds of the clock that all processes share.
@@ -99,6 +143,18 @@ pub(crate) enum Event {
     },
     /// Processor time used so far.
     Cpu { ns: u64 },
+    /// A step without times is complete.
+    Done,
+    /// Times at which the agent got a resource, and at which it released it.
+    TookTurns {
+        acquired: Vec<u64>,
+        released: Vec<u64>,
+    },
+    /// Letters of the agents of this host by protocol, and records of letters that were lost.
+    Letters {
+        by_protocol: BTreeMap<String, u64>,
+        lost: u64,
+    },
     /// An order failed.
     Failed { what: String },
 }
@@ -143,6 +199,15 @@ pub(crate) trait Peer {
     fn spread(&mut self, _what: Spread, _letters: &Letters) -> Result<Sent, String> {
         Err("this part sends to one receiver only".to_owned())
     }
+
+    /// Executes a step of an agent that uses locks.
+    fn lock(&mut self, _step: LockStep) -> Result<Event, String> {
+        Err("this part uses no locks".to_owned())
+    }
+
+    fn count_letters(&mut self, _quiet: Option<String>) -> Result<Event, String> {
+        Err("this part counts no letters".to_owned())
+    }
 }
 
 /// Executes orders until they end.
@@ -171,6 +236,8 @@ fn follow(peer: &mut impl Peer, line: &str) -> Result<Event, String> {
         Order::Send(letters) => sent(peer.send(&letters)?, before),
         Order::Spread { what, letters } => sent(peer.spread(what, &letters)?, before),
         Order::Cpu => Event::Cpu { ns: before },
+        Order::Lock(step) => peer.lock(step)?,
+        Order::CountLetters { quiet } => peer.count_letters(quiet)?,
     })
 }
 

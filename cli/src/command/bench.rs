@@ -7,8 +7,8 @@ use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
 use fipa::{AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
 use fipa_bench::{
-    Baseline, BenchError, Comparison, Effort, Machine, Measurement, Paper, Peers, Program,
-    Selection,
+    Baseline, BenchError, Changes, Comparison, Effort, Locks, LocksReport, Machine, Measurement,
+    Paper, Peers, Program, Selection,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -25,6 +25,10 @@ use crate::{membership, output};
 /// of bare quinn. All traffic stays on this machine, and no
 /// files are left.
 ///
+/// `locks` measures an acquisition and release without contention, of groups of agents on one host and
+/// through the gateways of two hosts, beside the same letters sent by hand between the same processes;
+/// the hand-over from a holder to the next waiter; and the memory and idle load of 1,000 resources.
+///
 /// On a busy machine the times are unreliable; the ratios are less affected.
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -36,6 +40,8 @@ Examples:
   fipa bench --json > before.json; fipa bench --baseline before.json
   fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench paper --dir docs
+  fipa bench locks --quick
+  fipa bench locks --agents 2,16 --json | jq '.rows[] | {algorithm, agents, hosts, letters, ratio}'
   fipa bench peers --jade http://127.0.0.1:7777/acc --jade-asker http://127.0.0.1:7776/acc")]
 pub(crate) struct Arguments {
     /// Part to measure [default: shm and net]
@@ -44,7 +50,7 @@ pub(crate) struct Arguments {
     /// Print JSON instead of a table
     #[arg(long)]
     json: bool,
-    /// Also draw latency over content size to this file
+    /// Also draw the times to this file: latency over content size, or those of `locks`
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
     /// Compare with the JSON output of an earlier run
@@ -56,7 +62,7 @@ pub(crate) struct Arguments {
     /// Take fewer samples: a few seconds, with a larger spread
     #[arg(long)]
     quick: bool,
-    /// Content sizes; not used by `paper`
+    /// Content sizes; not used by `paper` and `locks`
     #[arg(
         long,
         value_delimiter = ',',
@@ -65,6 +71,9 @@ pub(crate) struct Arguments {
         default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
     sizes: Vec<ByteSize>,
+    /// Numbers of agents that share a resource, for `locks` [default: 2,8,32; with --quick 2,8]
+    #[arg(long, value_delimiter = ',', value_name = "N")]
+    agents: Vec<usize>,
     /// Directory for the tables and drawings of `paper` [default: docs]
     #[arg(long, value_name = "DIRECTORY")]
     dir: Option<PathBuf>,
@@ -107,6 +116,8 @@ enum What {
     Paper,
     /// Conversations with an agent of a JADE platform, beside those of another JADE platform
     Peers,
+    /// Locks of up to 32 agents, beside the same letters sent by hand
+    Locks,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -119,6 +130,13 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         });
     }
     match (arguments.what, &arguments.jade) {
+        (what, _) if what != Some(What::Locks) && !arguments.agents.is_empty() => {
+            return Err(Failure::wrong_usage(
+                "--agents is only for `fipa bench locks`",
+                "--agents",
+                "omit --agents, or measure `locks`",
+            ));
+        }
         (Some(What::Paper), _) => return measure_paper(&arguments),
         (Some(What::Peers), Some(jade)) => return measure_peers(&arguments, jade, &config),
         (Some(What::Peers), None) => {
@@ -147,6 +165,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     // Read first: a wrong file is reported before the measurement.
     let baseline = arguments.baseline.as_deref().map(Baseline::read);
     let baseline = baseline.transpose().map_err(failed)?;
+    if arguments.what == Some(What::Locks) {
+        return measure_locks(&arguments, baseline);
+    }
     let mut comparison = Comparison::new(
         config.mts.transports.clone(),
         effort(&arguments)?,
@@ -159,25 +180,53 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     };
     comparison.zenoh = arguments.zenoh.as_deref().map(program).transpose()?;
     let measurement = membership::run(measure(comparison))?;
-    for note in measurement.notes() {
+    report(
+        &arguments,
+        baseline,
+        Measured {
+            notes: measurement.notes(),
+            svg: &|| measurement.to_svg(),
+            compare: &|baseline| measurement.compare(baseline),
+            json: &|| measurement.to_json(),
+            text: &|| measurement.to_text(),
+        },
+    )
+}
+
+/// A result with rows that can be drawn and compared.
+struct Measured<'a> {
+    notes: &'a [String],
+    svg: &'a dyn Fn() -> Result<String, BenchError>,
+    compare: &'a dyn Fn(&Baseline) -> Changes,
+    json: &'a dyn Fn() -> serde_json::Value,
+    text: &'a dyn Fn() -> String,
+}
+
+/// Writes a result, and the changes since an earlier one.
+fn report(
+    arguments: &Arguments,
+    baseline: Option<Baseline>,
+    measured: Measured<'_>,
+) -> Result<(), Failure> {
+    for note in measured.notes {
         tracing::info!("{note}");
     }
     if let Some(file) = &arguments.svg {
-        let drawn = measurement.to_svg().and_then(|picture| {
+        let drawn = (measured.svg)().and_then(|picture| {
             let path = file.clone();
             std::fs::write(file, picture).map_err(|source| BenchError::Write { path, source })
         });
         drawn.map_err(failed)?;
     }
-    let changes = baseline.map(|baseline| measurement.compare(&baseline));
+    let changes = baseline.map(|baseline| (measured.compare)(&baseline));
     if arguments.json {
-        let mut report = measurement.to_json();
+        let mut report = (measured.json)();
         if let (Some(report), Some(changes)) = (report.as_object_mut(), &changes) {
             report.insert("changes".to_owned(), changes.to_json());
         }
         output::json(&report)?;
     } else {
-        output::text(&measurement.to_text())?;
+        output::text(&(measured.text)())?;
         if let Some(changes) = &changes {
             output::text(&format!("\n{changes}"))?;
         }
@@ -186,11 +235,53 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         Some(changes) if changes.compared() == 0 => Err(Failure::failed(
             "the runs have no measurement in common",
             "--baseline",
-            "use a baseline with the same part, sizes and transports",
+            "use a baseline with the same part, sizes, agents and transports",
         )),
         Some(changes) if changes.is_slower() => Err(Failure::already_reported()),
         _ => Ok(()),
     }
+}
+
+/// Measures locks.
+fn measure_locks(arguments: &Arguments, baseline: Option<Baseline>) -> Result<(), Failure> {
+    if arguments.zenoh.is_some() {
+        return Err(Failure::wrong_usage(
+            "`fipa bench locks` measures locks, and zenoh has none",
+            "--zenoh",
+            "omit --zenoh or `locks`",
+        ));
+    }
+    let mut locks = match arguments.quick {
+        true => Locks::quick(this_program()?),
+        false => Locks::full(this_program()?),
+    };
+    if !arguments.agents.is_empty() {
+        locks.agents.clone_from(&arguments.agents);
+    }
+    let measured: LocksReport = membership::run(async {
+        let machine = observe().await;
+        let progress = progress(locks.steps());
+        let measured = locks.run(machine, |step| advance(&progress, step)).await;
+        progress.finish_and_clear();
+        measured.map_err(|error| match error {
+            BenchError::Agents(_) => {
+                let advice = format!("use 2 to {} agents", Locks::MAX_AGENTS);
+                Failure::wrong_usage(error.to_string(), "--agents", advice)
+            }
+            other => failed(other),
+        })
+    })?;
+    report(
+        arguments,
+        baseline,
+        Measured {
+            notes: measured.notes(),
+            svg: &|| measured.to_svg(),
+            compare: &|baseline| measured.compare(baseline),
+            json: &|| measured.to_json(),
+            text: &|| measured.to_text(),
+        },
+    )
 }
 
 async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {
