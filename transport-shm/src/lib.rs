@@ -19,7 +19,7 @@
 //! | `presence` | liveness FIFO, doorbell and status page of a process |
 //! | `peers` | the other processes that an endpoint has open |
 //! | `combiner` | work that one thread does for all |
-//! | `memory`, `storage`, `variant` | free-space checks and page allocation; the files of iceoryx2 with allocated pages; the iceoryx2 service variant that uses them |
+//! | `memory`, `storage`, `sync_policy`, `variant` | free-space checks and page allocation; the files of iceoryx2 with allocated pages; the lock of its ports; the iceoryx2 service variant that uses them |
 //! | `domain_files` | the files of a domain, their creation and cleanup |
 //! | `errors` | mapping of iceoryx2 errors to transport errors |
 //! | `fork` | detection of forked children |
@@ -58,6 +58,7 @@ mod presence;
 pub mod raw;
 mod segment;
 mod storage;
+mod sync_policy;
 mod transport;
 mod variant;
 
