@@ -32,7 +32,9 @@
 //! Processes of one domain run as one user, so each of them can already read and end the others.
 //! Even so, no memory that another process can still change is parsed: headers, names and envelopes
 //! are copied into private memory first. Only content is read in place; two reads of it give the
-//! same bytes only if the sender is honest.
+//! same bytes only if the sender is honest. A process whose announcements are wrong makes another one
+//! poll more slowly; its own parcels may then be found late, and those of others by the next wake-up
+//! or the next poll without work.
 
 mod combiner;
 mod config;

@@ -30,6 +30,7 @@ use crate::layout::{
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
 use crate::pool::Pool;
+use crate::presence::Announcements;
 use crate::storage;
 
 /// Length in bytes of the chunks of the first memory segment, headers included.
@@ -67,6 +68,8 @@ pub(crate) struct Outbox {
     loans: AtomicUsize,
     retired: AtomicBool,
     token: AtomicU64,
+    /// Where parcels for the mailbox are announced.
+    announcements: Announcements,
     budget: Arc<Budget>,
     pool: Arc<Pool>,
     tally: Arc<Tally>,
@@ -142,6 +145,7 @@ pub(crate) struct Opening<'a> {
     pub(crate) node: &'a Node<Svc>,
     pub(crate) service: &'a ServiceName,
     pub(crate) own: Incarnation,
+    pub(crate) announcements: Announcements,
     /// Number of unanswered parcels of all outboxes.
     pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) max_loans: usize,
@@ -207,6 +211,7 @@ impl Outbox {
             loans: AtomicUsize::new(0),
             retired: AtomicBool::new(false),
             token: AtomicU64::new(start),
+            announcements: opening.announcements,
             budget: opening.budget,
             pool: opening.pool,
             tally: opening.tally,
@@ -312,7 +317,11 @@ impl Outbox {
         // SAFETY: every byte of the payload is initialized: by `write`, or by the kernel or an
         // earlier request, because it is memory of a shared mapping.
         let filled = unsafe { request.assume_init() };
-        let pending = filled.send().map_err(send_error)?;
+        let pending = {
+            let _announced = self.announcements.announce();
+            filled.send()
+        };
+        let pending = pending.map_err(send_error)?;
         if pending.number_of_server_connections() == 0 {
             return Err(self.not_delivered(&pending));
         }
@@ -410,7 +419,11 @@ impl Outbox {
         // SAFETY: front, content and tail are written. The rest was initialized by the kernel or an
         // earlier request, because it is memory of a shared mapping.
         let filled: InitRequest = unsafe { request.assume_init() };
-        match filled.send() {
+        let sent = {
+            let _announced = self.announcements.announce();
+            filled.send()
+        };
+        match sent {
             Ok(pending) if pending.number_of_server_connections() > 0 => {
                 loan.sent(pending);
                 loan.queued.store(true, Ordering::Relaxed);
