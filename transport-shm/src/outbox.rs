@@ -1,6 +1,6 @@
 //! The sending side of another process's mailbox.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::ops::Range;
 use std::os::fd::OwnedFd;
 use std::ptr::NonNull;
@@ -80,7 +80,8 @@ pub(crate) struct Outbox {
 #[derive(Debug, Default)]
 struct State {
     queue: VecDeque<Sent>,
-    loans: HashMap<usize, Weak<Loan>>,
+    /// The registered loans by the addresses of their contents; at most `max_loans` exist.
+    loans: Vec<(usize, Weak<Loan>)>,
     segment: Segment,
 }
 
@@ -273,7 +274,7 @@ impl Outbox {
         // gets the wake-up looks for answers only if the count is not 0. It then waits for the lock
         // held here.
         let unanswered = self.waiting.increment();
-        if let Some(loan) = self.loan_of(&mut state, content) {
+        if let Some(loan) = self.loan_of(&state, content) {
             let fits = loan.has_room(front, tail) && loan.segment == state.segment.number;
             match fits
                 .then(|| self.ready_loan(&state, &loan))
@@ -370,12 +371,13 @@ impl Outbox {
     }
 
     /// The loan whose content this is.
-    fn loan_of(&self, state: &mut State, content: &Bytes) -> Option<Arc<Loan>> {
-        if content.is_empty() || state.loans.is_empty() {
+    fn loan_of(&self, state: &State, content: &Bytes) -> Option<Arc<Loan>> {
+        if content.is_empty() {
             return None;
         }
-        let loan = state.loans.get(&(content.as_ptr() as usize))?.upgrade()?;
-        loan.is(content).then_some(loan)
+        let address = content.as_ptr() as usize;
+        let mut loans = state.loans.iter().filter(|(one, _)| *one == address);
+        loans.find_map(|(_, loan)| loan.upgrade().filter(|loan| loan.is(content)))
     }
 
     /// Takes the request out of a loan if iceoryx2 will accept it now.
@@ -388,7 +390,7 @@ impl Outbox {
             loan.upgrade()
                 .is_some_and(|loan| loan.is_kept_after_sending())
         };
-        let active = state.queue.len() + state.loans.values().filter(|loan| kept(loan)).count();
+        let active = state.queue.len() + state.loans.iter().filter(|(_, loan)| kept(loan)).count();
         if active >= self.window {
             return Err(window_full(self.window));
         }
@@ -478,8 +480,8 @@ impl Outbox {
     /// Makes the content of this loan recognizable.
     pub(crate) fn register(&self, loan: &Arc<Loan>) {
         let mut state = self.state.lock();
-        state.loans.retain(|_, loan| loan.strong_count() > 0);
-        state.loans.insert(loan.address(), Arc::downgrade(loan));
+        state.loans.retain(|(_, loan)| loan.strong_count() > 0);
+        state.loans.push((loan.address(), Arc::downgrade(loan)));
     }
 
     pub(crate) fn owner(&self) -> Owner {
