@@ -121,9 +121,14 @@ impl Endpoint {
             node.map_err(|e| failed("cannot create a node", crate::errors::words(&e), shortage))?;
         domain.restrict_permissions()?;
         let peer_segments = Arc::new(PeerSegments::new(domain.clone()));
-        let wakeup = (doorbell.clone(), presence.polls());
         let (inbox, shortage) = storage::with_shortage(|| {
-            Inbox::create(&config, &node, wakeup, tally.clone(), peer_segments.clone())
+            Inbox::create(
+                &config,
+                &node,
+                &presence,
+                tally.clone(),
+                peer_segments.clone(),
+            )
         });
         let inbox =
             inbox.map_err(|reason| failed("cannot create the mailbox", reason, shortage))?;
@@ -222,20 +227,22 @@ impl Endpoint {
             return false;
         };
         let mut found = false;
-        for _ in 0..MAX_ROUNDS {
+        for round in 0..MAX_ROUNDS {
             let polling = presence.begin_polling();
             // Several times, so that the page states "polling" most of the time in a caller's loop.
-            found |= (0..POLLS_PER_ROUND).any(|_| self.work());
+            // A round after the first one has a reason to look into the mailbox.
+            found |= (0..POLLS_PER_ROUND).any(|poll| self.work(round > 0 && poll == 0));
             self.wait_for_answered();
             drop(polling);
             // Work that arrived meanwhile is done in the next round, in which the page states
-            // "polling" again.
-            if !self.has_work() {
+            // "polling" again. Without work there is time to look for parcels that were not
+            // announced, so a faulty peer cannot hide parcels of others.
+            if !self.has_work(!found) {
                 self.wake_answered();
                 return found;
             }
         }
-        found |= self.work();
+        found |= self.work(true);
         self.wake_answered();
         found
     }
@@ -249,7 +256,7 @@ impl Endpoint {
         self.pool.trim_if_waiting();
         // A thread that polls does the work.
         if !polling_elsewhere {
-            self.work();
+            self.work(true);
             self.wake_answered();
         }
     }
@@ -266,7 +273,8 @@ impl Endpoint {
                 return;
             }
             drop((peers, answered));
-            if began.get_or_insert_with(Instant::now).elapsed() > POLL_GRACE || self.has_work() {
+            let waited = began.get_or_insert_with(Instant::now).elapsed();
+            if waited > POLL_GRACE || self.has_work(false) {
                 return;
             }
         }
@@ -274,16 +282,24 @@ impl Endpoint {
 
     /// Wakes the answered senders that are not polling.
     fn wake_answered(self: &Arc<Self>) {
-        let answered = std::mem::take(&mut *self.answered.lock());
-        for sender in answered {
+        let mut answered = self.answered.lock();
+        if answered.is_empty() {
+            // Keeps its memory for the next letter.
+            return;
+        }
+        let senders = std::mem::take(&mut *answered);
+        drop(answered);
+        for sender in senders {
             self.wake(sender);
         }
     }
 
     /// Whether `work` would find something. False if another thread works, which then looks again.
-    fn has_work(&self) -> bool {
+    fn has_work(&self, unannounced: bool) -> bool {
         self.inbox.has_any(|inbox| {
-            inbox.as_ref().is_some_and(Inbox::has_parcels)
+            inbox
+                .as_ref()
+                .is_some_and(|inbox| inbox.has_parcels(unannounced))
                 || self.waits_for_answers()
                     && self.peers.read().values().any(|peer| peer.has_answer())
         })
@@ -293,17 +309,18 @@ impl Endpoint {
         self.waiting.load(Ordering::SeqCst) > 0
     }
 
-    /// Takes parcels from the mailbox and collects answers. Returns whether there was any. If
-    /// another thread works, that one makes another pass instead.
-    pub(crate) fn work(self: &Arc<Self>) -> bool {
+    /// Takes parcels from the mailbox and collects answers. Returns whether there was any. Looks
+    /// into the mailbox if a parcel was announced, or with `unannounced` in any case. If another
+    /// thread works, that one makes another pass instead.
+    pub(crate) fn work(self: &Arc<Self>, unannounced: bool) -> bool {
         self.inbox.work(|inbox| match (inbox, self.sink.get()) {
-            (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink),
+            (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink, unannounced),
             _ => false,
         })
     }
 
-    fn work_once(self: &Arc<Self>, inbox: &mut Inbox, sink: &dyn Sink) -> bool {
-        let mut found = inbox.drain(sink, &self.answered);
+    fn work_once(self: &Arc<Self>, inbox: &mut Inbox, sink: &dyn Sink, unannounced: bool) -> bool {
+        let mut found = inbox.drain(sink, &self.answered, unannounced);
         if self.ended.swap(false, Ordering::SeqCst) || self.waits_for_answers() {
             let mut concluded = Vec::new();
             let mut ended = Vec::new();
@@ -498,6 +515,7 @@ impl Endpoint {
             node,
             service: &service,
             own: self.config.incarnation,
+            announcements: peer.announcements(),
             waiting: self.waiting.clone(),
             max_loans: self.config.max_loans,
             budget: self.budget.clone(),
@@ -596,7 +614,7 @@ impl Endpoint {
             count(&self.tally.peers_gone);
         }
         // Takes its last letters and answers.
-        self.work();
+        self.work(true);
         self.wake_answered();
         self.peer_segments.forget(incarnation);
         self.start_cleanup();

@@ -19,7 +19,7 @@ use crate::counters::{Tally, count};
 use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
 use crate::memory::MappedPtr;
 use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
-use crate::presence::{Doorbell, PollCounter};
+use crate::presence::{Announcements, Doorbell, PollCounter, Presence};
 use crate::segment::ContentReference;
 use crate::storage;
 
@@ -50,6 +50,9 @@ pub(crate) struct Inbox {
     server: MailServer,
     service_hash: String,
     borrows: Arc<BorrowLimits>,
+    announcements: Announcements,
+    /// Number of announced parcels that were taken or never arrived.
+    accounted: u64,
     polls: PollCounter,
     tally: Arc<Tally>,
     max_letter: usize,
@@ -69,7 +72,7 @@ impl Inbox {
     pub(crate) fn create(
         config: &ShmConfig,
         node: &Node<Svc>,
-        (doorbell, polls): (Arc<Doorbell>, PollCounter),
+        presence: &Presence,
         tally: Arc<Tally>,
         peer_segments: Arc<PeerSegments>,
     ) -> Result<Self, String> {
@@ -110,11 +113,13 @@ impl Inbox {
                 total: config.max_borrowed,
                 held: Mutex::default(),
                 waiting: AtomicBool::new(false),
-                doorbell,
+                doorbell: presence.doorbell().clone(),
                 tally: tally.clone(),
                 peer_segments,
             }),
-            polls,
+            announcements: presence.announcements(),
+            accounted: 0,
+            polls: presence.polls(),
             tally,
             max_letter: config.max_letter,
             copy_below: config.copy_below,
@@ -125,10 +130,21 @@ impl Inbox {
     }
 
     /// Takes the parcels in the mailbox and answers them. Returns whether there was any, and adds
-    /// their senders to `answered`.
-    pub(crate) fn drain(&mut self, sink: &dyn Sink, answered: &Mutex<Vec<Incarnation>>) -> bool {
+    /// their senders to `answered`. Looks for parcels that were announced, and with `unannounced`
+    /// at least once.
+    pub(crate) fn drain(
+        &mut self,
+        sink: &dyn Sink,
+        answered: &Mutex<Vec<Incarnation>>,
+        unannounced: bool,
+    ) -> bool {
         for done in 0..BATCH {
-            match self.server.receive() {
+            let is_forced = unannounced && done == 0;
+            if !is_forced && self.announcements.announced() == self.accounted {
+                self.polls.increment();
+                return done > 0;
+            }
+            match self.receive() {
                 Ok(Some(active)) => {
                     if let Some(sender) = self.take(active, sink) {
                         let mut answered = answered.lock();
@@ -158,9 +174,31 @@ impl Inbox {
         true
     }
 
-    /// Whether the mailbox probably contains a parcel.
-    pub(crate) fn has_parcels(&self) -> bool {
-        self.server.has_requests().unwrap_or(false)
+    /// Receives a request, or finds that the mailbox is empty.
+    fn receive(&mut self) -> Result<Option<Active>, ReceiveError> {
+        let mut received = self.server.receive()?;
+        if received.is_none()
+            && let Some(settled) = self.announcements.settled()
+            && settled != self.accounted
+        {
+            // Requests that were sent in between are found now. If there is none, the rest of the
+            // announced parcels never arrive.
+            received = self.server.receive()?;
+            if received.is_none() {
+                self.accounted = settled;
+            }
+        }
+        if received.is_some() {
+            self.accounted = self.accounted.wrapping_add(1);
+        }
+        Ok(received)
+    }
+
+    /// Whether the mailbox probably contains a parcel: one that was announced, or with
+    /// `unannounced` any.
+    pub(crate) fn has_parcels(&self, unannounced: bool) -> bool {
+        (unannounced || self.announcements.announced() != self.accounted)
+            && self.server.has_requests().unwrap_or(false)
     }
 
     fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
@@ -274,9 +312,9 @@ impl Inbox {
             ];
             let mut front = Bytes::from(around.concat());
             let tail = front.split_off(offsets.content - offsets.start);
-            let (content, held) = self.borrow_content(NonNull::from(content), active);
-            let parcel = parcel.parcel_of_pieces(front, content, tail);
-            (parcel, RequestOwner::Shared(held))
+            let content = self.borrow_content(NonNull::from(content), active);
+            let parcel = parcel.parcel_of_pieces(front, content.clone(), tail);
+            (parcel, RequestOwner::Content(content))
         } else {
             let body = Bytes::copy_from_slice(&payload[offsets.start..offsets.end]);
             (parcel.parcel(body), RequestOwner::Unshared(active))
@@ -332,22 +370,14 @@ impl Inbox {
 
     /// Hands out content in place. It must lie in the payload of `active`, and
     /// [`Self::try_begin_borrow`] must have returned true for it.
-    fn borrow_content(
-        &self,
-        content: NonNull<[u8]>,
-        active: Active,
-    ) -> (Bytes, Arc<BorrowedRequest>) {
+    fn borrow_content(&self, content: NonNull<[u8]>, active: Active) -> Bytes {
         count(&self.tally.in_place);
-        let held = Arc::new(BorrowedRequest {
-            sender: active.origin().value(),
-            active: Mutex::new(Some(active)),
-            borrows: self.borrows.clone(),
-        });
-        let bytes = Bytes::from_owner(BorrowedContent {
+        Bytes::from_owner(BorrowedContent {
             bytes: MappedPtr(content),
-            _held: held.clone(),
-        });
-        (bytes, held)
+            sender: active.origin().value(),
+            active: Some(active),
+            borrows: self.borrows.clone(),
+        })
     }
 }
 
@@ -355,42 +385,40 @@ fn debug(error: impl std::fmt::Debug) -> String {
     crate::errors::words(&error)
 }
 
-/// The owner of a request: this function alone, or together with the handed-out content.
+/// The owner of a request: this function alone, or the handed-out content.
 #[expect(dead_code, reason = "owned until it is dropped")]
 enum RequestOwner {
     Unshared(Active),
-    Shared(Arc<BorrowedRequest>),
+    /// The content owns the request.
+    Content(Bytes),
 }
 
-/// A request whose content is read in place.
-struct BorrowedRequest {
-    active: Mutex<Option<Active>>,
+/// Content in the payload of a sender's request, which is read in place.
+struct BorrowedContent {
+    bytes: MappedPtr<[u8]>,
+    /// `Some` until this is dropped.
+    active: Option<Active>,
     sender: u128,
     borrows: Arc<BorrowLimits>,
 }
 
-impl Drop for BorrowedRequest {
+impl Drop for BorrowedContent {
     fn drop(&mut self) {
+        let active = self.active.take();
         if !self.borrows.peer_segments.owner().is_this() {
             // In a forked child, a release would take the memory from the parent.
-            std::mem::forget(self.active.get_mut().take());
+            std::mem::forget(active);
             return;
         }
         // The memory first, then the count: a slot that counts as free must be free.
-        drop(self.active.get_mut().take());
+        drop(active);
         self.borrows.end(self.sender);
     }
 }
 
-/// Content in the payload of a sender's request.
-struct BorrowedContent {
-    bytes: MappedPtr<[u8]>,
-    _held: Arc<BorrowedRequest>,
-}
-
 impl AsRef<[u8]> for BorrowedContent {
     fn as_ref(&self) -> &[u8] {
-        // SAFETY: the range is in the payload of the request in `_held`, which stays mapped as long
+        // SAFETY: the range is in the payload of the request in `active`, which stays mapped as long
         // as that exists: the server keeps the connection of an ended sender while content is held
         // there, and `BorrowLimits::begin` bounds the number of such connections below the number
         // that it keeps. An honest sender does not write there after sending; see the crate's

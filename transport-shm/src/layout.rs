@@ -28,8 +28,8 @@ pub(crate) type UninitAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 /// Alignment of contents in bytes.
 pub(crate) const ALIGNMENT: usize = 8;
 
-/// Version of this layout. iceoryx2 refuses other versions, because their types have other names.
-const VERSION: u32 = 3;
+/// Version of this layout and of the status page. iceoryx2 refuses other versions, because their types have other names.
+const VERSION: u32 = 4;
 
 /// The user header of every request.
 ///
@@ -37,7 +37,7 @@ const VERSION: u32 = 3;
 /// parcel's body. The body omits the content if that is in a segment.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("fipa-mail-header-3")]
+#[type_name("fipa-mail-header-4")]
 pub(crate) struct Header {
     version: u32,
     start: u32,

@@ -19,7 +19,7 @@
 //! | `presence` | liveness FIFO, doorbell and status page of a process |
 //! | `peers` | the other processes that an endpoint has open |
 //! | `combiner` | work that one thread does for all |
-//! | `memory`, `storage`, `variant` | free-space checks and page allocation; the files of iceoryx2 with allocated pages; the iceoryx2 service variant that uses them |
+//! | `memory`, `storage`, `sync_policy`, `variant` | free-space checks and page allocation; the files of iceoryx2 with allocated pages; the lock of its ports; the iceoryx2 service variant that uses them |
 //! | `domain_files` | the files of a domain, their creation and cleanup |
 //! | `errors` | mapping of iceoryx2 errors to transport errors |
 //! | `fork` | detection of forked children |
@@ -32,7 +32,9 @@
 //! Processes of one domain run as one user, so each of them can already read and end the others.
 //! Even so, no memory that another process can still change is parsed: headers, names and envelopes
 //! are copied into private memory first. Only content is read in place; two reads of it give the
-//! same bytes only if the sender is honest.
+//! same bytes only if the sender is honest. A process whose announcements are wrong makes another one
+//! poll more slowly; its own parcels may then be found late, and those of others by the next wake-up
+//! or the next poll without work.
 
 mod combiner;
 mod config;
@@ -58,6 +60,7 @@ mod presence;
 pub mod raw;
 mod segment;
 mod storage;
+mod sync_policy;
 mod transport;
 mod variant;
 

@@ -1,6 +1,6 @@
 //! The sending side of another process's mailbox.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::ops::Range;
 use std::os::fd::OwnedFd;
 use std::ptr::NonNull;
@@ -30,6 +30,7 @@ use crate::layout::{
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
 use crate::pool::Pool;
+use crate::presence::Announcements;
 use crate::storage;
 
 /// Length in bytes of the chunks of the first memory segment, headers included.
@@ -67,6 +68,8 @@ pub(crate) struct Outbox {
     loans: AtomicUsize,
     retired: AtomicBool,
     token: AtomicU64,
+    /// Where parcels for the mailbox are announced.
+    announcements: Announcements,
     budget: Arc<Budget>,
     pool: Arc<Pool>,
     tally: Arc<Tally>,
@@ -77,7 +80,8 @@ pub(crate) struct Outbox {
 #[derive(Debug, Default)]
 struct State {
     queue: VecDeque<Sent>,
-    loans: HashMap<usize, Weak<Loan>>,
+    /// The registered loans by the addresses of their contents; at most `max_loans` exist.
+    loans: Vec<(usize, Weak<Loan>)>,
     segment: Segment,
 }
 
@@ -142,6 +146,7 @@ pub(crate) struct Opening<'a> {
     pub(crate) node: &'a Node<Svc>,
     pub(crate) service: &'a ServiceName,
     pub(crate) own: Incarnation,
+    pub(crate) announcements: Announcements,
     /// Number of unanswered parcels of all outboxes.
     pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) max_loans: usize,
@@ -207,6 +212,7 @@ impl Outbox {
             loans: AtomicUsize::new(0),
             retired: AtomicBool::new(false),
             token: AtomicU64::new(start),
+            announcements: opening.announcements,
             budget: opening.budget,
             pool: opening.pool,
             tally: opening.tally,
@@ -268,7 +274,7 @@ impl Outbox {
         // gets the wake-up looks for answers only if the count is not 0. It then waits for the lock
         // held here.
         let unanswered = self.waiting.increment();
-        if let Some(loan) = self.loan_of(&mut state, content) {
+        if let Some(loan) = self.loan_of(&state, content) {
             let fits = loan.has_room(front, tail) && loan.segment == state.segment.number;
             match fits
                 .then(|| self.ready_loan(&state, &loan))
@@ -312,7 +318,11 @@ impl Outbox {
         // SAFETY: every byte of the payload is initialized: by `write`, or by the kernel or an
         // earlier request, because it is memory of a shared mapping.
         let filled = unsafe { request.assume_init() };
-        let pending = filled.send().map_err(send_error)?;
+        let pending = {
+            let _announced = self.announcements.announce();
+            filled.send()
+        };
+        let pending = pending.map_err(send_error)?;
         if pending.number_of_server_connections() == 0 {
             return Err(self.not_delivered(&pending));
         }
@@ -361,12 +371,13 @@ impl Outbox {
     }
 
     /// The loan whose content this is.
-    fn loan_of(&self, state: &mut State, content: &Bytes) -> Option<Arc<Loan>> {
-        if content.is_empty() || state.loans.is_empty() {
+    fn loan_of(&self, state: &State, content: &Bytes) -> Option<Arc<Loan>> {
+        if content.is_empty() {
             return None;
         }
-        let loan = state.loans.get(&(content.as_ptr() as usize))?.upgrade()?;
-        loan.is(content).then_some(loan)
+        let address = content.as_ptr() as usize;
+        let mut loans = state.loans.iter().filter(|(one, _)| *one == address);
+        loans.find_map(|(_, loan)| loan.upgrade().filter(|loan| loan.is(content)))
     }
 
     /// Takes the request out of a loan if iceoryx2 will accept it now.
@@ -379,7 +390,7 @@ impl Outbox {
             loan.upgrade()
                 .is_some_and(|loan| loan.is_kept_after_sending())
         };
-        let active = state.queue.len() + state.loans.values().filter(|loan| kept(loan)).count();
+        let active = state.queue.len() + state.loans.iter().filter(|(_, loan)| kept(loan)).count();
         if active >= self.window {
             return Err(window_full(self.window));
         }
@@ -410,7 +421,11 @@ impl Outbox {
         // SAFETY: front, content and tail are written. The rest was initialized by the kernel or an
         // earlier request, because it is memory of a shared mapping.
         let filled: InitRequest = unsafe { request.assume_init() };
-        match filled.send() {
+        let sent = {
+            let _announced = self.announcements.announce();
+            filled.send()
+        };
+        match sent {
             Ok(pending) if pending.number_of_server_connections() > 0 => {
                 loan.sent(pending);
                 loan.queued.store(true, Ordering::Relaxed);
@@ -465,8 +480,8 @@ impl Outbox {
     /// Makes the content of this loan recognizable.
     pub(crate) fn register(&self, loan: &Arc<Loan>) {
         let mut state = self.state.lock();
-        state.loans.retain(|_, loan| loan.strong_count() > 0);
-        state.loans.insert(loan.address(), Arc::downgrade(loan));
+        state.loans.retain(|(_, loan)| loan.strong_count() > 0);
+        state.loans.push((loan.address(), Arc::downgrade(loan)));
     }
 
     pub(crate) fn owner(&self) -> Owner {

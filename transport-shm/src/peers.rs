@@ -14,7 +14,7 @@ use tokio::task::AbortHandle;
 
 use crate::errors::{closed, opening, retired};
 use crate::outbox::{MemoryLock, Outbox, Posted};
-use crate::presence::{PeerProcess, SharedFd, has_ended};
+use crate::presence::{Announcements, PeerProcess, SharedFd, has_ended};
 
 /// A value that the count of polls does not reach.
 const NEVER: u64 = u64::MAX;
@@ -51,6 +51,11 @@ impl Peer {
 
     pub(crate) fn incarnation(&self) -> Incarnation {
         self.incarnation
+    }
+
+    /// The announcements of parcels for the process.
+    pub(crate) fn announcements(&self) -> Announcements {
+        self.process.announcements()
     }
 
     /// Whether the process will poll without being rung at.

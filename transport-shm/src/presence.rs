@@ -9,7 +9,8 @@
 //! * The status page (`.page` in `/dev/shm`). It states whether the process is polling, so that no
 //!   peer needs to ring, and counts how often the process has cleared its doorbell.
 //!   [`Presence::begin_polling`] and [`PeerProcess::is_awake`] describe the protocol between the
-//!   page and the doorbell.
+//!   page and the doorbell. Peers announce their parcels there ([`Announcements`]), so that a poll
+//!   of an empty mailbox is one load.
 //!
 //! A process that sends content to several receivers also has segments (see `segment`).
 
@@ -204,7 +205,7 @@ impl Presence {
             own,
             owner: Owner::this(),
             doorbell: Arc::new(Doorbell(doorbell)),
-            page: Arc::new(StatusPage::map(&page, ProtFlags::READ | ProtFlags::WRITE)?),
+            page: Arc::new(StatusPage::map(&page)?),
             _locked: page,
             _live,
         })
@@ -217,6 +218,11 @@ impl Presence {
     /// The counter of completed polls.
     pub(crate) fn polls(&self) -> PollCounter {
         PollCounter(self.page.clone())
+    }
+
+    /// The announcements of parcels for this process.
+    pub(crate) fn announcements(&self) -> Announcements {
+        Announcements(self.page.clone())
     }
 
     /// Announces to other processes, until the guard is dropped, that this process polls and needs
@@ -257,6 +263,55 @@ impl PollCounter {
         let polls = &self.0.words().polls;
         let before = polls.load(Ordering::Relaxed);
         polls.store(before.wrapping_add(1), Ordering::Release);
+    }
+}
+
+/// The announcements of parcels for one mailbox, which its process and all peers share.
+///
+/// A peer announces a parcel *before* it puts it into the mailbox, and afterwards counts the
+/// announcement as settled. So as long as the mailbox's process has taken as many parcels as were
+/// announced, its mailbox is empty, and the process need not visit the slots of all possible
+/// connections to know that. An announced parcel may also never arrive, because sending failed or
+/// the parcel was abandoned. Therefore the process corrects its account when all announcements are
+/// settled and the mailbox is empty ([`settled`](Self::settled)).
+///
+/// A peer that is killed between the two steps leaves an announcement that is never settled. Each
+/// poll of the mailbox then visits all slots.
+#[derive(Debug, Clone)]
+pub(crate) struct Announcements(Arc<StatusPage>);
+
+impl Announcements {
+    /// Announces a parcel. The announcement is settled when the guard is dropped, after sending.
+    pub(crate) fn announce(&self) -> Announcement<'_> {
+        let words = self.0.words();
+        // Before the fence in `PeerProcess::is_awake`: a peer that sees a polling process has
+        // announced its parcel to that process's last check.
+        words.announced.fetch_add(1, Ordering::SeqCst);
+        Announcement(&words.settled)
+    }
+
+    /// Number of announced parcels.
+    pub(crate) fn announced(&self) -> u64 {
+        self.0.words().announced.load(Ordering::Acquire)
+    }
+
+    /// Number of announced parcels if all of them are in the mailbox, were taken, or will never
+    /// arrive. `None` if a peer may be about to put one there.
+    pub(crate) fn settled(&self) -> Option<u64> {
+        // This load comes first and acquires each counted step, so the other load includes the
+        // announcements of these steps. If the counts are equal, there was no other announcement.
+        let settled = self.0.words().settled.load(Ordering::Acquire);
+        let announced = self.announced();
+        (announced == settled).then_some(announced)
+    }
+}
+
+/// An announcement of a parcel, which is settled when this is dropped.
+pub(crate) struct Announcement<'a>(&'a AtomicU64);
+
+impl Drop for Announcement<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_add(1, Ordering::Release);
     }
 }
 
@@ -342,7 +397,7 @@ impl<T: AsFd> AsRawFd for SharedFd<T> {
 pub(crate) struct PeerProcess {
     live: Arc<OwnedFd>,
     doorbell: File,
-    page: StatusPage,
+    page: Arc<StatusPage>,
     /// Value of the page's `wakeups` when this process last rang; [`NO_WAKEUP_COUNT`] before that.
     wakeups_at_ring: AtomicU64,
     /// Whether the process was polling at the last check.
@@ -359,7 +414,10 @@ impl PeerProcess {
         if has_ended(&live) {
             return Err(ErrorKind::NotFound.into());
         }
-        let (page, found) = open_owned(&paths.status_page(of), File::options().read(true))?;
+        let (page, found) = open_owned(
+            &paths.status_page(of),
+            File::options().read(true).write(true),
+        )?;
         if found.len() < PAGE as u64 {
             return Err(io::Error::new(
                 ErrorKind::InvalidData,
@@ -369,7 +427,7 @@ impl PeerProcess {
         Ok(Self {
             live: Arc::new(live.into()),
             doorbell: open_doorbell(&paths.doorbell(of))?,
-            page: StatusPage::map(&page, ProtFlags::READ)?,
+            page: Arc::new(StatusPage::map(&page)?),
             wakeups_at_ring: AtomicU64::new(NO_WAKEUP_COUNT),
             polled_at_last_check: AtomicBool::new(false),
         })
@@ -378,7 +436,12 @@ impl PeerProcess {
     /// Number of times the process has polled its mailbox until it was empty; 0 if it does not
     /// listen yet.
     pub(crate) fn polls(&self) -> u64 {
-        load(&self.page.words().polls)
+        self.page.words().polls.load(Ordering::Acquire)
+    }
+
+    /// The announcements of parcels for the process.
+    pub(crate) fn announcements(&self) -> Announcements {
+        Announcements(self.page.clone())
     }
 
     /// The liveness FIFO, which becomes readable when the process ends.
@@ -396,8 +459,7 @@ impl PeerProcess {
     pub(crate) fn is_awake(&self) -> bool {
         fence(Ordering::SeqCst);
         let words = self.page.words();
-        // Only relaxed loads are allowed on memory that is mapped for reading. The fence provides
-        // the order that `begin_polling` and `count_wakeup` rely on.
+        // The fence provides the order that `begin_polling` and `count_wakeup` rely on.
         if words.pollers.load(Ordering::Relaxed) != 0 {
             self.polled_at_last_check.store(true, Ordering::Relaxed);
             return true;
@@ -423,7 +485,7 @@ impl PeerProcess {
                 }
             }
         }
-        let wakeups = load(&self.page.words().wakeups);
+        let wakeups = self.page.words().wakeups.load(Ordering::Acquire);
         ring(&self.doorbell);
         self.wakeups_at_ring.store(wakeups, Ordering::Relaxed);
         true
@@ -500,7 +562,7 @@ fn ring(mut doorbell: &File) {
     let _ = doorbell.write(&[1]);
 }
 
-/// The status page. Written by its process, read by others.
+/// The status page. Peers write only the announcements, and the process writes all other words.
 #[derive(Debug)]
 #[repr(C)]
 struct StatusWords {
@@ -512,14 +574,15 @@ struct StatusWords {
     _apart: [u64; 6],
     /// Number of times the process has found its mailbox empty, or emptied it.
     polls: AtomicU64,
-}
-
-/// Loads a counter of another process, with acquire order. Only relaxed loads are allowed on memory
-/// that is mapped for reading, so the fence provides the order.
-fn load(count: &AtomicU64) -> u64 {
-    let count = count.load(Ordering::Relaxed);
-    fence(Ordering::Acquire);
-    count
+    /// Keeps apart what the process and its peers write, also from processors that load two cache
+    /// lines at once.
+    _apart_from_announced: [u64; 23],
+    /// Number of parcels that peers have announced.
+    announced: AtomicU64,
+    /// Keeps `announced`, which the process polls, in a cache line of its own.
+    _apart_from_settled: [u64; 15],
+    /// Number of announced parcels that are in the mailbox, were in it, or never will be.
+    settled: AtomicU64,
 }
 
 /// A mapped status page.
@@ -527,18 +590,16 @@ fn load(count: &AtomicU64) -> u64 {
 struct StatusPage(Mapping);
 
 impl StatusPage {
-    fn map(file: &File, protection: ProtFlags) -> io::Result<Self> {
-        Mapping::new(file, PAGE, protection).map(Self)
+    fn map(file: &File) -> io::Result<Self> {
+        Mapping::new(file, PAGE, ProtFlags::READ | ProtFlags::WRITE).map(Self)
     }
 
     fn words(&self) -> &StatusWords {
         // SAFETY: the mapping exists as long as self, is aligned to a page and longer than
-        // `StatusWords`, of which every bit pattern is valid. Every process accesses these words
-        // atomically. Peers map the page for reading and only load, relaxed, which Rust allows on
-        // read-only memory for words of at most 8 bytes on 64-bit targets. The pages exist: the
-        // process that creates the file writes them first, and `PeerProcess::open` checks the
-        // length and the owner. No process of the domain shortens the file, and other users have no
-        // access to it.
+        // `StatusWords`, of which every bit pattern is valid. Every process maps the page for
+        // reading and writing and accesses these words atomically. The page exists: the process that
+        // creates the file writes it first, and `PeerProcess::open` checks the length and the
+        // owner. No process of the domain shortens the file, and other users have no access to it.
         unsafe { self.0.start().cast::<StatusWords>().as_ref() }
     }
 }
@@ -550,6 +611,50 @@ mod tests {
     use std::os::unix::fs::symlink;
 
     use super::*;
+
+    /// The announcements for a process, as the process and as a peer see them.
+    fn announcements() -> (Announcements, Announcements) {
+        let file = tempfile::tempfile().unwrap();
+        file.set_len(PAGE as u64).unwrap();
+        let map = || Announcements(Arc::new(StatusPage::map(&file).unwrap()));
+        (map(), map())
+    }
+
+    #[test]
+    fn announcements_are_settled_when_no_peer_is_about_to_send() {
+        let (own, peer) = announcements();
+        assert_eq!((own.announced(), own.settled()), (0, Some(0)));
+        let first = peer.announce();
+        let second = peer.announce();
+        assert_eq!((own.announced(), own.settled()), (2, None));
+        drop(second);
+        assert_eq!(own.settled(), None, "the first parcel may still arrive");
+        drop(first);
+        assert_eq!(own.settled(), Some(2));
+    }
+
+    #[test]
+    fn settled_announcements_have_been_sent() {
+        let (own, peer) = announcements();
+        let sent = AtomicU64::new(0);
+        std::thread::scope(|scope| {
+            for _ in 0..2 {
+                scope.spawn(|| {
+                    for _ in 0..10_000 {
+                        let _announced = peer.announce();
+                        sent.fetch_add(1, Ordering::Relaxed);
+                    }
+                });
+            }
+            while own.announced() < 20_000 {
+                if let Some(settled) = own.settled() {
+                    let sent = sent.load(Ordering::Relaxed);
+                    assert!(sent >= settled, "{sent} of {settled} parcels");
+                }
+            }
+        });
+        assert_eq!(own.settled(), Some(20_000));
+    }
 
     #[test]
     fn a_process_that_cannot_be_examined_counts_as_alive() {

@@ -11,16 +11,16 @@ use iceoryx2_cal::shared_memory::common::details::{AllocatorDetails, Memory};
 use iceoryx2_cal::shm_allocator::bump_allocator::BumpAllocator;
 use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
 use iceoryx2_cal::zero_copy_connection::common::details::{Connection, SharedManagementData};
-use iceoryx2_cal::{
-    arc_sync_policy, bag, event, hash, monitoring, reactor, serialize, static_storage,
-};
+use iceoryx2_cal::{bag, event, hash, monitoring, reactor, serialize, static_storage};
 
 use crate::storage::Storage;
+use crate::sync_policy::Locked;
 
 /// Memory of payloads.
 type Payloads<A> = Memory<A, Storage<AllocatorDetails<A>, true>>;
 
-/// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use.
+/// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use, and that its
+/// lock is cheaper.
 #[derive(Debug, Clone)]
 pub(crate) struct Svc {}
 
@@ -38,8 +38,7 @@ impl Service for Svc {
     type Event = event::recommended::Ipc;
     type Monitoring = monitoring::recommended::Ipc;
     type Reactor = reactor::recommended::Ipc;
-    type ArcThreadSafetyPolicy<T: Send + Debug + Abandonable> =
-        arc_sync_policy::mutex_protected::MutexProtected<T>;
+    type ArcThreadSafetyPolicy<T: Send + Debug + Abandonable> = Locked<T>;
     type BlackboardMgmt<T: Send + Sync + Debug + ZeroCopySend + 'static> = Storage<T, false>;
     type BlackboardPayload = Payloads<BumpAllocator>;
     type UniqueId = iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;

@@ -8,13 +8,13 @@ use std::fs::File;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{RecordingSink, TestDomain, attempt, parcel};
+use common::{RecordingSink, TestDomain, attempt, open, parcel};
 use fipa_testbed::until;
-use fipa_transport::{Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
+use fipa_transport::{Abandoned, Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 
 #[test]
@@ -90,6 +90,36 @@ fn a_full_window_is_an_error() {
     }
     let refused = sender.dispatch(attempt(), &receiver.location(), parcel(Bytes::new()));
     assert_eq!(refused.unwrap_err().fault, TransportErrorKind::Congested);
+}
+
+#[test]
+fn an_abandoned_parcel_does_not_hide_later_ones() {
+    let domain = TestDomain::new();
+    let (sender, sink) = domain.listening();
+    // Does not listen yet, so it takes nothing.
+    let receiver = domain.endpoint();
+    open(&sender, &receiver.location());
+    let dispatch = || {
+        let attempt = attempt();
+        let sent = sender.dispatch(attempt, &receiver.location(), parcel(Bytes::new()));
+        sent.unwrap();
+        attempt
+    };
+    let abandoned = [dispatch(), dispatch(), dispatch()][1];
+    assert_eq!(sender.abandon(abandoned), Abandoned::Unconfirmed);
+    let got = Arc::new(RecordingSink::default());
+    receiver.listen(got.clone()).unwrap();
+    until("answers", || sink.conclusions() == 2);
+    // Three parcels were announced and two taken.
+    for number in 3..20 {
+        dispatch();
+        until("answer", || {
+            receiver.drive();
+            sender.drive();
+            sink.conclusions() == number
+        });
+    }
+    assert_eq!(got.arrivals(), 19);
 }
 
 #[test]

@@ -74,11 +74,18 @@ impl FromStr for Incarnation {
     type Err = IncarnationError;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let digits_only = text.len() == 16 && text.bytes().all(|b| b.is_ascii_hexdigit());
-        match u64::from_str_radix(text, 16) {
-            Ok(number) if digits_only => Ok(Self(number)),
-            _ => Err(IncarnationError(text.chars().take(40).collect())),
-        }
+        // Each letter over shared memory parses an incarnation; this takes a third of the instructions
+        // of `from_str_radix`.
+        let digits = |text: &str| {
+            text.bytes().try_fold(0u64, |number, byte| {
+                let digit = char::from(byte).to_digit(16)?;
+                Some((number << 4) | u64::from(digit))
+            })
+        };
+        let number = Some(text).filter(|text| text.len() == 16).and_then(digits);
+        number
+            .map(Self)
+            .ok_or_else(|| IncarnationError(text.chars().take(40).collect()))
     }
 }
 
