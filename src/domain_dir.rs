@@ -114,7 +114,8 @@ impl DomainDir {
         let named = std::env::var_os(VARIABLE).filter(|value| !value.is_empty());
         let is_named = named.is_some();
         let base = match named {
-            Some(base) => PathBuf::from(base),
+            // A relative path would name another directory in each working directory.
+            Some(base) => std::path::absolute(&base).unwrap_or_else(|_| PathBuf::from(base)),
             None => PathBuf::from(format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw())),
         };
         Self {

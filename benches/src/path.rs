@@ -171,14 +171,12 @@ impl BenchPath {
                     settings.push("security.peer_letters=0".to_owned());
                     settings.push("security.peer_bytes=0".to_owned());
                 }
-                for (number, domain) in hosts.into_iter().enumerate() {
+                let with_keys = |number| {
                     let mut settings = settings.clone();
-                    settings.push(format!("mts.name={}", Stage::domain(&domain)));
                     settings.extend(keys.get(number).cloned());
-                    let (who, _) = stage.start(&Part::Gateway, &domain, &settings).await?;
-                    between.push(who);
-                }
-                // Other measurements on this machine may announce their agents.
+                    settings
+                };
+                between = stage.start_gateways(&hosts, with_keys).await?;
                 let (from, to) = agents(["-a", "-b"].map(|end| Stage::domain(&own(end))));
                 let (receiver, name) = stage.start(&to, &own("2"), &settings).await?;
                 let (sender, _) = stage.start(&from, &own("1"), &settings).await?;

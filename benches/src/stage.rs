@@ -111,8 +111,8 @@ impl Stage {
             .args(&self.program.arguments)
             .args(["--part", &described])
             .args(["--set", &format!("domain={}", Self::domain(domain))])
-            // No packet leaves this machine.
-            .args(["--set", "discovery.interfaces=lo"])
+            // Gateways of other programs on this machine are not found.
+            .args(["--set", "discovery.mdns=false"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
             .args(["--set", "transport.udp.listen=127.0.0.1:0"])
             .args(["--set", "transport.quic.listen=127.0.0.1:0"]);
@@ -123,6 +123,28 @@ impl Stage {
             command.args(["--set", setting]);
         }
         self.spawn(command, format!("{part:?} in {domain}")).await
+    }
+
+    /// Starts the gateways of these domains; each later one connects with the first one. Each has
+    /// the settings that `settings_of` returns for its number.
+    pub(super) async fn start_gateways(
+        &mut self,
+        domains: &[String],
+        settings_of: impl Fn(usize) -> Vec<String>,
+    ) -> Result<Vec<ProcessIndex>, String> {
+        let mut gateways = Vec::new();
+        let mut first: Option<String> = None;
+        for (number, domain) in domains.iter().enumerate() {
+            let mut settings = settings_of(number);
+            settings.push(format!("mts.name={}", Self::domain(domain)));
+            if let Some(first) = &first {
+                settings.push(format!("discovery.static={{ first = [\"{first}\"] }}"));
+            }
+            let (gateway, address) = self.start(&Part::Gateway, domain, &settings).await?;
+            gateways.push(gateway);
+            first.get_or_insert(address);
+        }
+        Ok(gateways)
     }
 
     /// Starts an end that uses zenoh. Its threads are not pinned.

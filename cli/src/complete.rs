@@ -7,15 +7,21 @@ use std::ffi::{OsStr, OsString};
 use std::path::PathBuf;
 
 use clap_complete::CompleteEnv;
-use clap_complete::engine::{ArgValueCompleter, CompletionCandidate};
+use clap_complete::engine::{
+    ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter as _,
+};
 use fipa::Domain;
 use fipa::config::{Effective, Sources, Value};
+use fipa::monitor::Library;
 use fipa_acl::is_unprintable;
 
 use crate::options;
 
 /// The variable with which a shell asks for completions.
 pub(crate) const VARIABLE: &str = "FIPA_COMPLETE";
+
+/// Beginning of the directory's name of a resource.
+const RESOURCE: &str = "lock:";
 
 /// Tables whose keys the user chooses.
 const TABLES: [&str; 4] = [
@@ -35,17 +41,48 @@ pub(crate) fn answer() {
 /// Completes the name of an agent of the domain.
 pub(crate) fn agents() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
-        let current = current.to_string_lossy();
-        let names = Effective::load(&sources(words()))
-            .ok()
-            .and_then(|effective| Domain::names(effective.config()).ok());
-        let names = names.unwrap_or_default().into_iter();
-        names
-            // A name with unprintable characters could change the terminal.
-            .filter(|name| name.starts_with(&*current) && !name.contains(is_unprintable))
-            .map(CompletionCandidate::new)
-            .collect()
+        let names = names().into_iter();
+        beginning(current, names.filter(|name| !name.starts_with(RESOURCE)))
     })
+}
+
+/// Completes the name of a resource that an agent of the domain owns.
+pub(crate) fn resources() -> ArgValueCompleter {
+    ArgValueCompleter::new(|current: &OsStr| {
+        let names = names().into_iter();
+        let resources = names.filter_map(|name| name.strip_prefix(RESOURCE).map(str::to_owned));
+        beginning(current, resources)
+    })
+}
+
+/// Completes the name of a built-in protocol, and with `files` also the path of a file.
+pub(crate) fn protocols(files: bool) -> ArgValueCompleter {
+    ArgValueCompleter::new(move |current: &OsStr| {
+        let library = Library::standard();
+        let names = library.iter().map(|machine| machine.name().to_owned());
+        let mut found = beginning(current, names);
+        if files {
+            found.extend(PathCompleter::any().complete(current));
+        }
+        found
+    })
+}
+
+/// The names in the directory of the domain.
+fn names() -> Vec<String> {
+    let effective = Effective::load(&sources(words())).ok();
+    let names = effective.and_then(|effective| Domain::names(effective.config()).ok());
+    names.unwrap_or_default()
+}
+
+/// Of these names, those that begin with the incomplete word.
+fn beginning(current: &OsStr, names: impl Iterator<Item = String>) -> Vec<CompletionCandidate> {
+    let current = current.to_string_lossy();
+    names
+        // A name with unprintable characters could change the terminal.
+        .filter(|name| name.starts_with(&*current) && !name.contains(is_unprintable))
+        .map(CompletionCandidate::new)
+        .collect()
 }
 
 /// Completes a key of the configuration, for `--set`.

@@ -81,13 +81,21 @@ fn bash_completes_commands_agents_and_keys() {
         completed(&host, &["fipa", "send", "--to", "arm"]),
         ["arm_1", "arm_2"]
     );
-    assert_eq!(completed(&host, &["fipa", "routes", "cr"]), ["crane"]);
+    for command in ["routes", "ping", "request", "subscribe", "do", "actions"] {
+        let words = ["fipa", command, "cr"];
+        assert_eq!(completed(&host, &words), ["crane"], "{command}");
+    }
+    let shown = completed(&host, &["fipa", "protocol", "show", "fipa-iter"]);
+    assert_eq!(shown, ["fipa-iterated-contract-net"]);
     // The domain on the command line precedes the variable.
     let elsewhere = ["fipa", "--set", "domain=other", "agents", "cr"];
     assert_eq!(completed(&host, &elsewhere), Vec::<String>::new());
     let mut after = Vec::new();
     files(&host.path("run"), &mut after);
     assert_eq!(before, after, "a completion joins no domain");
+
+    let _bay = host.start(&["own", "bay", "--volatile"]);
+    assert_eq!(completed(&host, &["fipa", "lock", "b"]), ["bay"]);
 }
 
 #[test]

@@ -37,6 +37,9 @@ pub enum ActionError {
     /// The result is not a value of the requested type.
     #[error("the result is of another type")]
     Result(#[from] DeserializeError),
+    /// The answer is none of the ontology of actions: the agent probably offers no actions.
+    #[error("the agent's answer is none of the ontology {ONTOLOGY}; it probably offers no actions")]
+    Answer(#[source] LanguageError),
     /// A message cannot be written or read.
     #[error(transparent)]
     Language(#[from] LanguageError),
@@ -104,7 +107,9 @@ impl<'a> Robot<'a> {
     pub async fn actions(&self) -> Result<Vec<ActionDescription>, ActionError> {
         match self.query(&Ask::Actions).await? {
             Answer::Actions(all) => Ok(all),
-            _ => Err(LanguageError::Form("a list of actions").into()),
+            _ => Err(ActionError::Answer(LanguageError::Form(
+                "a list of actions",
+            ))),
         }
     }
 
@@ -115,7 +120,7 @@ impl<'a> Robot<'a> {
     pub async fn status(&self) -> Result<Vec<GoalStatus>, ActionError> {
         match self.query(&Ask::Status).await? {
             Answer::Status(all) => Ok(all),
-            _ => Err(LanguageError::Form("a list of goals").into()),
+            _ => Err(ActionError::Answer(LanguageError::Form("a list of goals"))),
         }
     }
 
@@ -217,7 +222,8 @@ fn read(
     message: &Message,
 ) -> Result<Answer, ActionError> {
     let content = message.content().map_or(&[][..], |content| content);
-    Ok(language.read_answer(ask, content)?)
+    let answer = language.read_answer(ask, content);
+    answer.map_err(ActionError::Answer)
 }
 
 /// A goal that the robot has accepted; see [`Robot::invoke`]. Dropping it does not cancel the goal; the
@@ -364,7 +370,7 @@ impl StatusUpdates {
         let message = self.subscription.next().await?;
         match read(self.language, &self.ask, &message)? {
             Answer::Status(all) => Ok(all),
-            _ => Err(LanguageError::Form("a list of goals").into()),
+            _ => Err(ActionError::Answer(LanguageError::Form("a list of goals"))),
         }
     }
 

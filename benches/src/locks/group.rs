@@ -81,13 +81,14 @@ impl Group {
             "security.peer_letters=0".to_owned(),
             "security.peer_bytes=0".to_owned(),
         ];
-        let mut gateways = Vec::new();
-        for domain in domains.iter().filter(|_| shape.hosts > 1) {
-            let mut settings = settings.to_vec();
-            settings.push(format!("mts.name={}", Stage::domain(domain)));
-            let (gateway, _) = stage.start(&Part::Gateway, domain, &settings).await?;
-            gateways.push(gateway);
-        }
+        let gateways = match shape.hosts {
+            1 => Vec::new(),
+            _ => {
+                stage
+                    .start_gateways(&domains, |_| settings.to_vec())
+                    .await?
+            }
+        };
         let mut agents = Vec::new();
         let hosts = domains.iter().cycle().take(shape.agents);
         for (index, domain) in hosts.enumerate() {

@@ -273,7 +273,7 @@ impl Peer for Running<Agent> {
     }
 }
 
-/// A gateway, which answers only with its processor time.
+/// A gateway. Its address is that of its network transport; it answers only with its processor time.
 struct Forwarding {
     orders: Lines<BufReader<Stdin>>,
     runtime: Runtime,
@@ -291,9 +291,14 @@ pub(super) fn gateway(config: &Config) -> Result<(), String> {
     let gateway = runtime
         .block_on(Gateway::open(config))
         .map_err(chain_text)?;
+    let locations = gateway.locations();
+    let mut remote = locations.iter().filter(|it| !it.kind().is_host_local());
+    let address = remote
+        .next()
+        .map(|it| format!("{}://{}", it.kind(), it.address()));
     let orders = runtime.block_on(async { orders() });
     let mut forwarding = Forwarding { orders, runtime };
-    execute_orders(&mut forwarding, String::new());
+    execute_orders(&mut forwarding, address.unwrap_or_default());
     let runtime = forwarding.runtime;
     runtime.block_on(gateway.close());
     runtime.shutdown_background();

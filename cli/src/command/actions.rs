@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 use tokio::task::JoinSet;
 
 use super::df::asking;
+use crate::complete;
 use crate::membership;
 use crate::options::Global;
 use crate::output;
@@ -38,6 +39,7 @@ JSON:
       \"fraction\", \"note\" } ] } ]")]
 pub(crate) struct Arguments {
     /// Name of the robot [default: all agents of this host]
+    #[arg(add = complete::agents())]
     robot: Option<AgentId>,
 
     /// List the goals that run or wait
@@ -157,7 +159,8 @@ pub(super) fn failed(error: &ActionError, robot: &AgentId, config: &Config) -> F
         ActionError::Failed(_) => {
             "the robot reports the reason; send the goal again when it is gone"
         }
-        ActionError::Dialogue(DialogueError::TimedOut | DialogueError::NotUnderstood(_)) => {
+        ActionError::Answer(_)
+        | ActionError::Dialogue(DialogueError::TimedOut | DialogueError::NotUnderstood(_)) => {
             "the agent may offer no actions; `fipa actions` lists the agents that do"
         }
         _ => {

@@ -17,6 +17,7 @@ use serde_json::json;
 
 use super::actions::failed;
 use super::df::asking;
+use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
@@ -50,6 +51,7 @@ JSON, one object on a line:
   { \"event\": \"done\", \"result\": value in SL or null }")]
 pub(crate) struct Arguments {
     /// Name of the robot
+    #[arg(add = complete::agents())]
     robot: AgentId,
 
     /// Name of the action

@@ -14,6 +14,7 @@ use tokio::process::{Child, Command};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::own::Group;
+use crate::complete;
 use crate::membership;
 use crate::options::{self, Global};
 use crate::report::{self, Failure};
@@ -58,6 +59,7 @@ Exit codes:
   else that of the command; 128 + the signal if a signal ended it")]
 pub(crate) struct Arguments {
     /// Name of the resource
+    #[arg(add = complete::resources())]
     resource: String,
 
     /// Maximum wait for the lock, for example 10s [default: no limit]

@@ -8,7 +8,7 @@ use fipa::{Agent, Config, ErrorChain, Incarnation, RegisterOptions};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
-use crate::membership;
+use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
@@ -57,7 +57,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    membership::run(async {
+    let listing = async {
         let domain = membership::join(&config).await?;
         let name = format!("fipa-locks-{}", Incarnation::random());
         let options = RegisterOptions {
@@ -69,7 +69,18 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         drop(agent);
         domain.close().await;
         listed
-    })
+    };
+    if !arguments.watch {
+        return membership::run(listing);
+    }
+    // A signal is the normal end. Dropping the future leaves the domain in order.
+    options::block_on(async {
+        let mut stop = Stop::listen()?;
+        tokio::select! {
+            listed = listing => listed,
+            () = stop.requested() => Ok(()),
+        }
+    })?
 }
 
 async fn list(agent: &Agent, arguments: &Arguments, config: &Config) -> Result<(), Failure> {

@@ -11,6 +11,7 @@ use fipa_acl::escape;
 use serde_json::json;
 use tokio::time::MissedTickBehavior;
 
+use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output::{self, Reader};
@@ -38,6 +39,7 @@ JSON, one object on each line:
     delivered }                              at the end")]
 pub(crate) struct Arguments {
     /// Name of the agent
+    #[arg(add = complete::agents())]
     name: AgentId,
 
     /// End after this number of pings [default: until Ctrl-C]

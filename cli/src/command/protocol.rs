@@ -14,6 +14,7 @@ use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, 
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
+use crate::complete;
 use crate::input;
 use crate::options::Global;
 use crate::output;
@@ -70,6 +71,7 @@ JSON:
                   \"timeout\": { \"after\": \"reply-by\" or a duration, \"target\" } or null } ] }")]
     Show {
         /// Name of a protocol, or an SCXML file
+        #[arg(add = complete::protocols(true))]
         protocol: String,
         /// Print JSON
         #[arg(long)]
@@ -83,6 +85,7 @@ Examples:
   fipa protocol export fipa-contract-net --output my.scxml")]
     Export {
         /// Name of a protocol
+        #[arg(add = complete::protocols(false))]
         protocol: String,
         /// Write the file to this path instead of standard output
         #[arg(short, long, value_name = "FILE")]
@@ -124,6 +127,7 @@ Examples:
   fipa protocol draw my.scxml --format mermaid")]
     Draw {
         /// Name of a protocol, or an SCXML file
+        #[arg(add = complete::protocols(true))]
         protocol: String,
         /// Output format
         #[arg(long, value_enum, default_value_t = Format::Svg)]

@@ -13,6 +13,7 @@ use fipa_acl::escape;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
+use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
@@ -39,6 +40,7 @@ JSON:
                  `fipa decode` prints it; absent without one }")]
 pub(crate) struct Arguments {
     /// Name of the agent
+    #[arg(add = complete::agents())]
     name: AgentId,
 
     /// Content of the request

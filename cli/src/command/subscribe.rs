@@ -9,6 +9,7 @@ use fipa_acl::escape;
 use serde_json::json;
 
 use super::request::{CANCEL_WITHIN, Opening, failed, line, unless_stopped};
+use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output::{self, Reader};
@@ -31,6 +32,7 @@ JSON, one object on each line:
   { \"notification\": the message as `fipa decode` prints it }")]
 pub(crate) struct Arguments {
     /// Name of the agent
+    #[arg(add = complete::agents())]
     name: AgentId,
 
     /// Content of the subscription: for an agent of this project, the topic of the publisher
