@@ -11,7 +11,7 @@ use parking_lot::Mutex;
 use super::Fixture;
 use crate::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Ticket, Transport, Verdict,
+    Parcel, Sink, Stream, Ticket, Transport, TransportErrorKind, Verdict,
 };
 
 /// Timeout after which the suite considers a transport broken.
@@ -172,6 +172,24 @@ pub(super) fn concluded(
     until(endpoints, "the conclusion of an attempt", || {
         sender.conclusion(attempt)
     })
+}
+
+/// Whether a parcel was accepted. One that had to wait for memory may find no room afterwards.
+pub(super) fn is_accepted(
+    endpoints: &[&TestEndpoint],
+    sender: &TestEndpoint,
+    attempt: u64,
+) -> bool {
+    match concluded(endpoints, sender, attempt) {
+        Conclusion::NotSent(error) => {
+            assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
+            false
+        }
+        conclusion => {
+            assert_eq!(conclusion, accepted());
+            true
+        }
+    }
 }
 
 pub(super) fn accepted() -> Conclusion {
