@@ -23,7 +23,6 @@ const WATCHDOG: Duration = Duration::from_secs(120);
 /// Measures in namespaces of its own, and prints the results.
 pub(crate) fn measure() {
     fipa_testbed::enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let started = Instant::now();
     let robots: Vec<Robot> = network.hosts().iter().map(Robot::start).collect();

@@ -31,7 +31,6 @@ const SECOND: &str = "camera";
 #[ignore = "is run by the other test in a network namespace"]
 fn inside_avahi_lists_the_agents() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let avahi = Avahi::start(network.host(1));
     network.host(0).enter(|| agents_come_and_go(&avahi));
@@ -94,7 +93,6 @@ fn a_letter_to_a_legacy_peer_waits_until_the_peer_can_find_its_sender() {
 #[ignore = "is run by the other test in a network namespace"]
 fn inside_a_letter_to_a_legacy_peer_waits() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let avahi = Avahi::start(network.host(1));
     let peer = network

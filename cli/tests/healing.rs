@@ -23,7 +23,6 @@ fn processes_agree_after_every_link_repair() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_processes_agree_after_every_link_repair() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let seed = std::env::var("FIPA_LINKS_SEED").ok();
     let seed = seed.map_or(3, |seed| seed.parse().unwrap());
     println!("FIPA_LINKS_SEED={seed}");

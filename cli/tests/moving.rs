@@ -262,7 +262,6 @@ fn two_hosts(transports: &[&str], discovery: &Discovery) -> (Network, Vec<Robot>
 }
 
 fn prepare(network: &Network) {
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     for host in network.hosts() {
         let ipv6_off = || std::fs::write("/proc/sys/net/ipv6/conf/all/disable_ipv6", "1");
         host.enter(ipv6_off).unwrap();

@@ -21,7 +21,6 @@ fn the_doctor_reports_multicast_faults_of_the_network() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_the_doctor_reports_multicast_faults_of_the_network() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let (here, there) = (network.host(0), network.host(1));
 

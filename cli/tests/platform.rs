@@ -122,7 +122,6 @@ fn services_of_a_host_found_by_mdns_are_found() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_services_of_a_host_found_by_mdns_are_found() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let start = |index: usize, name: &str| {
         let (host, net) = (Host::new(), network.host(index));

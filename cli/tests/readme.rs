@@ -77,7 +77,6 @@ fn two_hosts_are_secured_in_under_ten_commands() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_two_hosts_are_secured() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     // `scp` copies to the home of the other user.
     let homes = fipa_testbed::directory();
     let bin = homes.join("bin");

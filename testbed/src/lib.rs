@@ -98,8 +98,8 @@ pub fn isolated(name: &str, tools: &[&str]) {
     assert!(status.success(), "{name} failed; see above");
 }
 
-/// Prepares the namespaces that [`isolated`] has created: mounts an empty `/run` and an empty
-/// [`directory`], and sets the loopback interface up.
+/// Prepares the namespaces that [`isolated`] has created: mounts an empty `/run`, an empty `/dev/shm` and
+/// an empty [`directory`], and sets the loopback interface up.
 ///
 /// # Panics
 /// Outside of these namespaces.
@@ -107,6 +107,7 @@ pub fn enter() {
     let directory = directory();
     run("mount -t tmpfs tmpfs /run");
     // Files of killed processes vanish with the namespace.
+    run("mount -t tmpfs tmpfs /dev/shm");
     let directory = directory.to_str().unwrap();
     run(&format!("mount -t tmpfs -o mode=0700 tmpfs {directory}"));
     run("ip link set lo up");

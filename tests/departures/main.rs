@@ -243,6 +243,16 @@ struct TwoHosts {
     there: Vec<String>,
 }
 
+impl Drop for TwoHosts {
+    /// Removes the files of the other host: all of its processes are killed.
+    fn drop(&mut self) {
+        self.far.kill();
+        let there = support::load(self.there.clone());
+        let opened = std::thread::spawn(move || fipa::blocking::Domain::open(&there).is_ok());
+        assert!(opened.join().unwrap_or(false), "files are left");
+    }
+}
+
 impl TwoHosts {
     async fn start(set: &[&str]) -> Self {
         let there = host(set);

@@ -114,7 +114,6 @@ impl Fleet {
     /// Three hosts whose gateways know each other by address, and whose agents know each other.
     pub(crate) fn new(plan: &Plan) -> Self {
         // Files of killed processes vanish with the test.
-        fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
         if plan.has_keys() {
             make_keys(3);
         }

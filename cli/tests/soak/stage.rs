@@ -170,7 +170,6 @@ pub(crate) struct Stage {
 
 impl Stage {
     pub(crate) fn new(seed: u64) -> Self {
-        fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
         let mut random = Rng::with_seed(seed);
         let order = ORDERS[random.usize(..ORDERS.len())];
         let mdns = random.bool();
