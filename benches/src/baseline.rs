@@ -66,7 +66,7 @@ struct BaselineRow {
 }
 
 /// The differences between a result and an earlier one.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Changes {
     changes: Vec<Change>,
     /// Number of ratios that were compared.
@@ -103,10 +103,7 @@ impl Baseline {
 
     /// Compares the rows that both results have.
     pub(crate) fn compare(&self, rows: &[Row]) -> Changes {
-        let mut changes = Changes {
-            changes: Vec::new(),
-            compared: 0,
-        };
+        let mut changes = Changes::default();
         for row in rows {
             let key = Key::Path {
                 path: row.path.clone(),
@@ -140,10 +137,7 @@ impl Baseline {
 
     /// Compares the groups that both results have.
     pub(crate) fn compare_locks(&self, rows: &[locks::Row]) -> Changes {
-        let mut changes = Changes {
-            changes: Vec::new(),
-            compared: 0,
-        };
+        let mut changes = Changes::default();
         for row in rows {
             let key = Key::Locks {
                 algorithm: row.algorithm.to_owned(),
@@ -242,10 +236,7 @@ mod tests {
     use super::*;
 
     fn changed(before: (f64, [f64; 2]), after: (f64, [f64; 2])) -> Vec<Change> {
-        let mut changes = Changes {
-            changes: Vec::new(),
-            compared: 0,
-        };
+        let mut changes = Changes::default();
         changes.add("ratio".to_owned(), Some(before), Some(after));
         assert_eq!(changes.compared, 1);
         changes.changes
@@ -262,10 +253,7 @@ mod tests {
 
     #[test]
     fn a_ratio_that_one_result_lacks_is_not_compared() {
-        let mut changes = Changes {
-            changes: Vec::new(),
-            compared: 0,
-        };
+        let mut changes = Changes::default();
         changes.add("ratio".to_owned(), None, Some((2.0, [1.0, 3.0])));
         assert_eq!(changes.compared(), 0);
     }

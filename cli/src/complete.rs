@@ -12,6 +12,7 @@ use clap_complete::engine::{
 };
 use fipa::Domain;
 use fipa::config::{Effective, Sources, Value};
+use fipa::locks::ENTRY_PREFIX;
 use fipa::monitor::Library;
 use fipa_acl::is_unprintable;
 
@@ -19,9 +20,6 @@ use crate::options;
 
 /// The variable with which a shell asks for completions.
 pub(crate) const VARIABLE: &str = "FIPA_COMPLETE";
-
-/// Beginning of the directory's name of a resource.
-const RESOURCE: &str = "lock:";
 
 /// Tables whose keys the user chooses.
 const TABLES: [&str; 4] = [
@@ -42,7 +40,10 @@ pub(crate) fn answer() {
 pub(crate) fn agents() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         let names = names().into_iter();
-        beginning(current, names.filter(|name| !name.starts_with(RESOURCE)))
+        beginning(
+            current,
+            names.filter(|name| !name.starts_with(ENTRY_PREFIX)),
+        )
     })
 }
 
@@ -50,7 +51,7 @@ pub(crate) fn agents() -> ArgValueCompleter {
 pub(crate) fn resources() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         let names = names().into_iter();
-        let resources = names.filter_map(|name| name.strip_prefix(RESOURCE).map(str::to_owned));
+        let resources = names.filter_map(|name| name.strip_prefix(ENTRY_PREFIX).map(str::to_owned));
         beginning(current, resources)
     })
 }

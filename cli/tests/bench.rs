@@ -47,11 +47,12 @@ fn number(value: &Value) -> f64 {
         .unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
-#[test]
-fn every_route_is_measured_with_its_limit() {
-    let picture = tempfile::tempdir().unwrap();
-    let picture = picture.path().join("latency.svg");
-    let child = bench(&["--quick", "--json", "--sizes", "100B,20KiB", "--svg"])
+/// Runs a quick measurement. Returns its process, its report and its drawing.
+fn measured_and_drawn(arguments: &[&str]) -> (u32, Value, String) {
+    let directory = tempfile::tempdir().unwrap();
+    let picture = directory.path().join("measured.svg");
+    let child = bench(arguments)
+        .args(["--quick", "--json", "--svg"])
         .arg(&picture)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -61,7 +62,13 @@ fn every_route_is_measured_with_its_limit() {
     let output = child.wait_with_output().unwrap();
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{errors}");
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let report = serde_json::from_slice(&output.stdout).unwrap();
+    (pid, report, std::fs::read_to_string(&picture).unwrap())
+}
+
+#[test]
+fn every_route_is_measured_with_its_limit() {
+    let (pid, report, drawn) = measured_and_drawn(&["--sizes", "100B,20KiB"]);
     assert!(number(&report["machine"]["cores"]) >= 1.0);
     let rows = report["rows"].as_array().unwrap();
     for row in rows {
@@ -107,7 +114,6 @@ fn every_route_is_measured_with_its_limit() {
             "{report:#}"
         );
     }
-    let drawn = std::fs::read_to_string(&picture).unwrap();
     assert!(drawn.starts_with("<svg") && drawn.contains("raw iceoryx2"));
     assert_eq!(files(pid), Vec::<String>::new());
     assert_eq!(processes(pid), 0);
@@ -147,19 +153,7 @@ fn an_interrupted_measurement_leaves_no_files_and_processes() {
 
 #[test]
 fn locks_need_the_letters_of_their_algorithm() {
-    let picture = tempfile::tempdir().unwrap();
-    let picture = picture.path().join("locks.svg");
-    let child = bench(&["locks", "--quick", "--json", "--agents", "8", "--svg"])
-        .arg(&picture)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let pid = child.id();
-    let output = child.wait_with_output().unwrap();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{errors}");
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let (pid, report, drawn) = measured_and_drawn(&["locks", "--agents", "8"]);
     assert_eq!(report["notes"], serde_json::json!([]), "{report:#}");
     let rows = report["rows"].as_array().unwrap();
     for hosts in [1, 2] {
@@ -195,7 +189,6 @@ fn locks_need_the_letters_of_their_algorithm() {
     let resources = &report["resources"];
     assert_eq!(number(&resources["agents"]), 8.0);
     assert!(number(&resources["held"]["private_bytes"]) > 0.0);
-    let drawn = std::fs::read_to_string(&picture).unwrap();
     assert!(drawn.starts_with("<svg") && drawn.contains("suzuki_kasami_extended, 8 agents"));
     assert_eq!(files(pid), Vec::<String>::new());
     assert_eq!(processes(pid), 0);

@@ -88,13 +88,14 @@ impl ContactDirectory {
     pub fn forget(&self, now: Instant, others: &dyn Directory) -> Option<Instant> {
         let mut next: Option<Instant> = None;
         self.heard.lock().retain(|(entry, heard)| {
-            // `others` may begin to speak for the gateway without a notification.
-            let (until, check) = match others.speaks_for(entry.mts.incarnation) {
-                true => (*heard + Self::UNLISTED, *heard + Self::UNLISTED),
-                false => (*heard + Self::MEMORY, now + Self::UNLISTED),
+            let memory = match others.speaks_for(entry.mts.incarnation) {
+                true => Self::UNLISTED,
+                false => Self::MEMORY,
             };
+            let until = *heard + memory;
             let stays = now < until && others.known(&entry.name).is_none();
-            let check = check.min(until);
+            // `others` may begin to speak for the gateway without a notification.
+            let check = until.min(now + Self::UNLISTED);
             match stays {
                 true => next = Some(next.map_or(check, |next| next.min(check))),
                 false => {

@@ -185,6 +185,15 @@ impl World {
             .handle_own(self.now, gateway.agents.values());
     }
 
+    /// Passes the goodbye of the first gateway to the second one. Returns its receivers.
+    fn say_goodbye(&mut self) -> Vec<Incarnation> {
+        let (to, goodbye) = self.gateways[0].exchange.goodbye();
+        let from = self.gateways[0].mts.incarnation;
+        let receiver = &mut self.gateways[1].exchange;
+        receiver.handle_letter(self.now, from, &goodbye).unwrap();
+        to
+    }
+
     /// Advances the time.
     fn run(&mut self, time: Duration) {
         self.step();
@@ -359,11 +368,7 @@ fn df_entries_travel_with_their_agents() {
     world.run(Duration::from_secs(3));
     assert!(world.agrees());
     assert_eq!(world.df_entries(1).len(), 1);
-    let (_, goodbye) = world.gateways[0].exchange.goodbye();
-    let from = world.gateways[0].mts.incarnation;
-    let now = world.now;
-    let neighbor = &mut world.gateways[1].exchange;
-    neighbor.handle_letter(now, from, &goodbye).unwrap();
+    world.say_goodbye();
     assert!(world.df_entries(1).is_empty());
 }
 
@@ -485,13 +490,7 @@ fn entries_leave_with_their_gateway() {
     world.run(Duration::from_secs(20));
     assert!(world.agrees());
     // A goodbye removes the agents at once.
-    let (to, content) = world.gateways[0].exchange.goodbye();
-    assert_eq!(to, [Incarnation::from_u64(2)]);
-    let now = world.now;
-    let receiver = &mut world.gateways[1].exchange;
-    receiver
-        .handle_letter(now, Incarnation::from_u64(1), &content)
-        .unwrap();
+    assert_eq!(world.say_goodbye(), [Incarnation::from_u64(2)]);
     assert!(directory.lookup("arm").is_none());
 }
 
@@ -531,13 +530,9 @@ fn agents_of_a_gateway_that_falls_silent_are_lost_for_a_minute() {
     assert!(directory.lost_agents().is_empty());
 
     // A gateway that says goodbye leaves no lost agents.
-    let (_, content) = world.gateways[0].exchange.goodbye();
+    world.say_goodbye();
     let now = world.now;
-    let receiver = &mut world.gateways[1].exchange;
-    receiver
-        .handle_letter(now, Incarnation::from_u64(1), &content)
-        .unwrap();
-    receiver.handle_neighbours(now, &[]);
+    world.gateways[1].exchange.handle_neighbours(now, &[]);
     world.run(Exchange::MEMORY * 2);
     assert!(directory.lost_agents().is_empty());
 }

@@ -61,7 +61,7 @@ use crate::agent::Agent;
 pub use self::error::{LockError, OwnError};
 pub use self::lock::Lock;
 pub use self::message::{AdmitError, FENCE, fences_of, with_fences};
-pub use self::owned::{OwnOptions, Owned, OwnerEvent};
+pub use self::owned::{ENTRY_PREFIX, OwnOptions, Owned, OwnerEvent};
 pub use self::report::ResourceStatus;
 pub use self::state_file::StateFileError;
 

@@ -19,8 +19,9 @@ use crate::{Coalition, DirectoryView, RegisterOptions, background};
 /// Type of the directory's entry of an owned resource.
 pub(super) const TYPE: &str = "fipa-lock";
 
-/// Beginning of the name of the directory's entry of an owned resource.
-const PREFIX: &str = "lock:";
+/// Beginning of the name of the directory's entry of an owned resource; the name of the resource
+/// follows.
+pub const ENTRY_PREFIX: &str = "lock:";
 
 /// The options of [`Agent::own`](crate::Agent::own).
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -316,7 +317,7 @@ fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Resul
 }
 
 fn entry_name(resource: &Resource) -> String {
-    format!("{PREFIX}{resource}")
+    format!("{ENTRY_PREFIX}{resource}")
 }
 
 fn listed_members(entry: &Entry) -> Option<&Arc<str>> {
@@ -332,7 +333,7 @@ pub(super) fn listed(
     directory: DirectoryView<'_>,
     entry: &Entry,
 ) -> Option<(Resource, Arc<Entry>)> {
-    let resource = entry.name.strip_prefix(PREFIX)?;
+    let resource = entry.name.strip_prefix(ENTRY_PREFIX)?;
     if entry.agent_type != TYPE {
         return None;
     }

@@ -28,7 +28,8 @@ pub(crate) type UninitAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 /// Alignment of contents in bytes.
 pub(crate) const ALIGNMENT: usize = 8;
 
-/// Version of this layout and of the status page. iceoryx2 refuses other versions, because their types have other names.
+/// Version of this layout and of the status page. iceoryx2 refuses other versions, because their
+/// types have other names.
 const VERSION: u32 = 4;
 
 /// The user header of every request.

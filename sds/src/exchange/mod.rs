@@ -459,8 +459,8 @@ impl Exchange {
             ExchangeMessage::Full(full) => {
                 neighbor.handle_full(now, full, &self.directory)?;
                 if neighbor.stored.is_some() {
-                    let returned = neighbor.mts.clone();
-                    self.forget_lost(|lost| lost.mts.name == returned.name);
+                    let returned = Arc::clone(&neighbor.mts.name);
+                    self.forget_lost(|lost| lost.mts.name == returned);
                 }
                 self.end_replaced();
                 Ok(())

@@ -193,10 +193,7 @@ impl Processes {
 
     /// Kills a process with SIGKILL and waits for its end.
     pub(super) async fn kill(&mut self, name: &str) -> Result<(), String> {
-        let mut process = self
-            .by_name
-            .remove(name)
-            .ok_or_else(|| format!("{name} is not running"))?;
+        let mut process = self.take(name)?;
         process
             .child
             .kill()
@@ -206,12 +203,13 @@ impl Processes {
 
     /// Ends one process in order.
     pub(super) async fn end(&mut self, name: &str) -> Result<(), String> {
-        let mut process = self
-            .by_name
-            .remove(name)
-            .ok_or_else(|| format!("{name} is not running"))?;
-        process.end().await;
+        self.take(name)?.end().await;
         Ok(())
+    }
+
+    fn take(&mut self, name: &str) -> Result<Process, String> {
+        let process = self.by_name.remove(name);
+        process.ok_or_else(|| format!("{name} is not running"))
     }
 
     /// The shared memory files of the demo's domains.
