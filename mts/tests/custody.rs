@@ -342,6 +342,50 @@ fn a_gateway_answers_which_letters_it_has() {
     assert_eq!(asked(&mut gateway, 5, 5, 70), without);
 }
 
+/// Brings a gateway into the state in which an attempt may have delivered the letter in its custody, and in
+/// which its directory no longer has the receiver.
+fn with_absent_receiver() -> Service {
+    let mut gateway = Service::new(true);
+    gateway.arrive(0, 5, 70);
+    let (attempt, _) = gateway.dispatched().unwrap();
+    gateway.directory.deregister("arm", ARM).unwrap();
+    let now = gateway.at(10);
+    gateway.core.handle_directory_change(now);
+    let broken = TransportError::new(TransportErrorKind::Broken, "");
+    gateway.conclude(20, attempt, Conclusion::Unconfirmed(broken));
+    gateway
+}
+
+#[test]
+fn a_letter_that_may_have_arrived_is_sent_again_when_its_receiver_returns() {
+    let mut gateway = with_absent_receiver();
+    assert_eq!(gateway.wait_for_dispatch(20, 900), None);
+    let arm = Registration::new("arm", ARM, vec![shm(NEXT)]);
+    gateway.directory.register(arm).unwrap();
+    let now = gateway.at(910);
+    gateway.core.handle_directory_change(now);
+    let (ms, attempt, again) = gateway.wait_for_dispatch(910, 10_000).unwrap();
+    assert_eq!(again.sequence, 5);
+    gateway.answer(ms, attempt, Answer::Accepted);
+    let (_, report) = gateway.dispatched().unwrap();
+    let is_delivered = matches!(
+        &report.body,
+        Body::Report(Report::Settled(Outcome::Delivered { .. }))
+    );
+    assert!(is_delivered, "{report:?}");
+}
+
+#[test]
+fn a_letter_that_may_have_arrived_waits_one_second_for_its_receiver() {
+    let mut gateway = with_absent_receiver();
+    let (ms, _, report) = gateway.wait_for_dispatch(20, 10_000).unwrap();
+    assert!((1_000..1_100).contains(&ms), "{ms} ms");
+    let Body::Report(Report::Settled(Outcome::Failed { reason, .. })) = report.body else {
+        panic!("{report:?}");
+    };
+    assert_eq!(reason, FailureReason::Unconfirmed);
+}
+
 #[test]
 fn a_report_that_is_refused_hides_no_lost_letter() {
     let mut gateway = Service::new(true);

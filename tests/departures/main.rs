@@ -1,7 +1,8 @@
 //! Partners that leave or die, and hosts that become silent, during a conversation. The partners are
 //! processes of their own, which the tests kill with SIGKILL or stop with SIGSTOP.
 //!
-//! Every call has a patience of one minute. A call that waits for it fails the test with another error.
+//! Every call has a patience of one minute, its own or that of `patient`. A call that waits for it fails the
+//! test with another error.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -24,6 +25,12 @@ const PATIENCE: Duration = Duration::from_secs(60);
 #[ignore = "started by the other tests"]
 fn process_entry() {
     process::run();
+}
+
+/// Waits for a result of a call that has no patience of its own.
+async fn patient<T>(call: impl Future<Output = T>) -> T {
+    let ended = tokio::time::timeout(PATIENCE, call).await;
+    ended.expect("the call has not ended")
 }
 
 /// Returns the settings of a host that no other test uses.
@@ -74,7 +81,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
         .subscribe(ask(Performative::Subscribe), PATIENCE)
         .await;
     let mut charge = charge.unwrap();
-    assert_eq!(text(&charge.next().await.unwrap()), "first");
+    assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
     let proxy = rover.brokering(ask(Performative::Proxy), PATIENCE).await;
     let mut proxied = proxy.unwrap();
     let arms = [AgentId::new("arm").unwrap()];
@@ -102,7 +109,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
         (bids, Instant::now(), auction)
     });
     let notified = tokio::spawn(async move {
-        let notified = charge.next().await;
+        let notified = patient(charge.next()).await;
         (notified, Instant::now(), charge)
     });
     let answered = tokio::spawn(async move {
@@ -141,7 +148,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     gone(&notified, "arm");
     times.push(("subscription", at));
     // A later call ends at once, too.
-    gone(&charge.next().await, "arm");
+    gone(&patient(charge.next()).await, "arm");
     let (answered, at) = answered.await.unwrap();
     gone(&answered, "arm");
     times.push(("proxied", at));
@@ -183,12 +190,11 @@ async fn a_participant_learns_that_its_initiator_was_killed() {
     let domain = Domain::open(&support::load(host.clone())).await.unwrap();
     let rover = domain.register("rover").await.unwrap();
     let mut starter = Process::start("starter", &host);
-    let first = rover.receive().await.unwrap().into_message();
+    let first = patient(rover.receive()).await.unwrap().into_message();
     let mut task = rover.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     starter.kill();
-    let cancelled = tokio::time::timeout(PATIENCE, task.cancelled()).await;
-    gone(&cancelled.unwrap(), "starter");
+    gone(&patient(task.cancelled()).await, "starter");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -202,7 +208,7 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let mut request = rover.request(request, PATIENCE).await.unwrap();
-        let first = arm.receive().await.unwrap().into_message();
+        let first = patient(arm.receive()).await.unwrap().into_message();
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         assert!(request.agreed().await.unwrap());
@@ -227,7 +233,7 @@ async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let request = rover.request(request, PATIENCE).await.unwrap();
-        let first = arm.receive().await.unwrap().into_message();
+        let first = patient(arm.receive()).await.unwrap().into_message();
         let done = arm.reply(&first, Performative::Inform).content("done");
         arm.send(done.build().unwrap()).await.unwrap();
         drop(arm);
@@ -290,8 +296,8 @@ async fn a_killed_partner_on_another_host_ends_the_call() {
     assert!(request.agreed().await.unwrap());
     let charge = to(&rover, Performative::Subscribe, "arm");
     let mut charge = rover.subscribe(charge, PATIENCE).await.unwrap();
-    assert_eq!(text(&charge.next().await.unwrap()), "first");
-    let waiting = tokio::spawn(async move { charge.next().await });
+    assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
+    let waiting = tokio::spawn(async move { patient(charge.next()).await });
     let mut partners = rover.watch_partners();
     partners.add("arm");
     arm.kill();
@@ -299,9 +305,9 @@ async fn a_killed_partner_on_another_host_ends_the_call() {
     gone(&request.result().await, "arm");
     println!("request: {:?} after the kill", killed.elapsed());
     gone(&waiting.await.unwrap(), "arm");
-    let event = tokio::time::timeout(PATIENCE, partners.next()).await;
+    let event = patient(partners.next()).await;
     let agent = "arm".to_owned();
-    assert_eq!(event.unwrap(), PartnerEvent::Gone { agent });
+    assert_eq!(event, PartnerEvent::Gone { agent });
     // The letters about the agent never reach the application.
     drop(partners);
     assert!(rover.try_receive().unwrap().is_none());
@@ -321,16 +327,16 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     let short = rover.request(short, Duration::from_secs(5)).await.unwrap();
     let charge = to(&rover, Performative::Subscribe, "arm");
     let mut charge = rover.subscribe(charge, PATIENCE).await.unwrap();
-    assert_eq!(text(&charge.next().await.unwrap()), "first");
+    assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
 
     hosts.far.signal(Signal::STOP);
     let result = tokio::spawn(request.result());
     let impatient = tokio::spawn(short.result());
-    assert!(reachability.changed().await);
+    assert!(patient(reachability.changed()).await);
     let silent = reachability.unreachable();
     assert_eq!(silent[0].agent, "arm");
     assert!(silent[0].since <= Instant::now());
-    let silence = charge.next().await;
+    let silence = patient(charge.next()).await;
     let is_silence =
         matches!(&silence, Err(DialogueError::Unreachable { agent, .. }) if agent == "arm");
     assert!(is_silence, "{silence:?}");
@@ -341,9 +347,9 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     assert!(!result.is_finished());
 
     hosts.far.signal(Signal::CONT);
-    assert!(reachability.changed().await);
+    assert!(patient(reachability.changed()).await);
     assert!(reachability.unreachable().is_empty());
     arm.finish();
     assert_eq!(text(&result.await.unwrap().unwrap()), "done");
-    assert_eq!(text(&charge.next().await.unwrap()), "second");
+    assert_eq!(text(&patient(charge.next()).await.unwrap()), "second");
 }

@@ -55,6 +55,9 @@ const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
 const HOP_MARGIN: Duration = Duration::from_millis(100);
 /// Time for which a letter waits for the new registration of a receiver that has moved.
 const MOVING_PATIENCE: Duration = Duration::from_secs(2);
+/// Time for which a custodian waits for the receiver of a letter to return to its directory, if an attempt may
+/// have delivered the letter.
+const ABSENT_PATIENCE: Duration = Duration::from_secs(1);
 /// Time for which letters that were handed over for an ended registration are waited for.
 const ENDED_PATIENCE: Duration = Duration::from_secs(2);
 /// Time for which a letter that is too large for the receiver's current kinds of transport waits
@@ -433,6 +436,7 @@ impl Lane {
         delivery.handed_to(&route, local);
         delivery.progress.tried.push(route.clone());
         delivery.progress.hold = None;
+        delivery.progress.absent_since = None;
         delivery.progress.state = State::UnderWay {
             attempt,
             location: route.clone(),
@@ -563,6 +567,9 @@ impl Lane {
         let delivery = &self.letters[index];
         let registration = delivery.registration;
         if !rules::may_move(delivery.progress.uncertain) {
+            if self.may_return(now, index, table) {
+                return false;
+            }
             self.fail(now, index, FailureReason::Unconfirmed, table);
             return true;
         }
@@ -593,6 +600,22 @@ impl Lane {
                 true
             }
         }
+    }
+
+    /// Whether a letter in custody waits for its receiver to return to the directory. After a broken connection
+    /// this service may know less than the sender's: the receiver was known from its letters only, for example.
+    /// A registration that has a successor does not return.
+    fn may_return(&mut self, now: Instant, index: usize, table: &AttemptTable) -> bool {
+        let is_custody = self.is_custody();
+        let has_successor = table.view.named(&self.receiver).is_some();
+        let delivery = &mut self.letters[index];
+        if !is_custody || has_successor || table.departed.contains(now, delivery.registration) {
+            return false;
+        }
+        let since = *delivery.progress.absent_since.get_or_insert(now);
+        let until = since + ABSENT_PATIENCE;
+        self.due_at(until);
+        now < until
     }
 
     /// Handles a credit: the service that answered that it was full has room again. Credits of
