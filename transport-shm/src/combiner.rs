@@ -1,8 +1,8 @@
 //! Work that one thread performs on behalf of all threads that request it meanwhile.
+//!
+//! `tests/interleavings.rs` compiles this file with the atomics and locks of loom.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-
-use parking_lot::{Mutex, MutexGuard};
+use crate::sync::{AtomicBool, Mutex, MutexGuard, Ordering};
 
 /// A value that one thread at a time works on, without waiting for other threads.
 ///
@@ -66,58 +66,5 @@ impl<T> Combiner<T> {
     fn end(&self, work: MutexGuard<'_, T>) -> bool {
         drop(work);
         self.wanted.swap(false, Ordering::AcqRel)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Lets another thread call `work` at this moment.
-    fn request_from_another_thread(combiner: &Combiner<u32>) {
-        std::thread::scope(|scope| {
-            let other = scope.spawn(|| combiner.work(|_| panic!("two threads at a time")));
-            assert!(!other.join().unwrap());
-        });
-    }
-
-    #[test]
-    fn a_request_during_work_causes_another_pass() {
-        let combiner = Combiner::new(0);
-        combiner.work(|times| {
-            *times += 1;
-            if *times == 1 {
-                request_from_another_thread(&combiner);
-            }
-            false
-        });
-        assert_eq!(*combiner.lock(), 2);
-    }
-
-    #[test]
-    fn a_request_during_a_check_is_reported() {
-        let combiner = Combiner::new(0);
-        let found = combiner.has_any(|_| {
-            request_from_another_thread(&combiner);
-            // This check came before the request.
-            false
-        });
-        assert!(found, "another thread has requested a pass since");
-        assert!(!combiner.has_any(|_| false));
-        assert!(combiner.has_any(|_| true));
-    }
-
-    #[test]
-    fn a_check_during_work_causes_another_pass() {
-        let combiner = Combiner::new(0);
-        combiner.work(|times| {
-            *times += 1;
-            if *times == 1 {
-                let check = || combiner.has_any(|_| panic!("two threads at a time"));
-                std::thread::scope(|scope| assert!(!scope.spawn(check).join().unwrap()));
-            }
-            false
-        });
-        assert_eq!(*combiner.lock(), 2);
     }
 }

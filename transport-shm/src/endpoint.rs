@@ -228,7 +228,7 @@ impl Endpoint {
         };
         let mut found = false;
         for round in 0..MAX_ROUNDS {
-            let polling = presence.begin_polling();
+            let polling = presence.page().words().begin_polling();
             // Several times, so that the page states "polling" most of the time in a caller's loop.
             // A round after the first one has a reason to look into the mailbox.
             found |= (0..POLLS_PER_ROUND).any(|poll| self.work(round > 0 && poll == 0));
@@ -250,8 +250,9 @@ impl Endpoint {
     /// Works after a wake-up. The caller has cleared the doorbell.
     pub(crate) fn work_after_wakeup(self: &Arc<Self>) {
         let polling_elsewhere = self.presence.read().as_ref().is_some_and(|presence| {
-            presence.count_wakeup();
-            presence.is_polling()
+            let words = presence.page().words();
+            words.count_wakeup();
+            words.is_polling()
         });
         self.pool.trim_if_waiting();
         // A thread that polls does the work.
@@ -515,7 +516,7 @@ impl Endpoint {
             node,
             service: &service,
             own: self.config.incarnation,
-            announcements: peer.announcements(),
+            page: Arc::clone(peer.page()),
             waiting: self.waiting.clone(),
             max_loans: self.config.max_loans,
             budget: self.budget.clone(),

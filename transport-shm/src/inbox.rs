@@ -19,9 +19,10 @@ use crate::counters::{Tally, count};
 use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
 use crate::memory::MappedPtr;
 use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
-use crate::presence::{Announcements, Doorbell, PollCounter, Presence};
+use crate::presence::{Doorbell, Presence, StatusPage};
 use crate::segment::ContentReference;
 use crate::storage;
+use crate::wakeup::Account;
 
 /// Maximum number of parcels that are taken before other work gets a turn.
 const BATCH: usize = 64;
@@ -50,10 +51,8 @@ pub(crate) struct Inbox {
     server: MailServer,
     service_hash: String,
     borrows: Arc<BorrowLimits>,
-    announcements: Announcements,
-    /// Number of announced parcels that were taken or never arrived.
-    accounted: u64,
-    polls: PollCounter,
+    page: Arc<StatusPage>,
+    account: Account,
     tally: Arc<Tally>,
     max_letter: usize,
     copy_below: usize,
@@ -117,9 +116,8 @@ impl Inbox {
                 tally: tally.clone(),
                 peer_segments,
             }),
-            announcements: presence.announcements(),
-            accounted: 0,
-            polls: presence.polls(),
+            page: Arc::clone(presence.page()),
+            account: Account::default(),
             tally,
             max_letter: config.max_letter,
             copy_below: config.copy_below,
@@ -140,8 +138,8 @@ impl Inbox {
     ) -> bool {
         for done in 0..BATCH {
             let is_forced = unannounced && done == 0;
-            if !is_forced && self.announcements.announced() == self.accounted {
-                self.polls.increment();
+            if !is_forced && !self.account.is_open(self.page.words()) {
+                self.page.words().count_poll();
                 return done > 0;
             }
             match self.receive() {
@@ -154,7 +152,7 @@ impl Inbox {
                     }
                 }
                 Ok(None) => {
-                    self.polls.increment();
+                    self.page.words().count_poll();
                     return done > 0;
                 }
                 Err(ReceiveError::ExceedsMaxBorrows) => {
@@ -176,28 +174,19 @@ impl Inbox {
 
     /// Receives a request, or finds that the mailbox is empty.
     fn receive(&mut self) -> Result<Option<Active>, ReceiveError> {
-        let mut received = self.server.receive()?;
-        if received.is_none()
-            && let Some(settled) = self.announcements.settled()
-            && settled != self.accounted
-        {
-            // Requests that were sent in between are found now. If there is none, the rest of the
-            // announced parcels never arrive.
-            received = self.server.receive()?;
-            if received.is_none() {
-                self.accounted = settled;
-            }
-        }
-        if received.is_some() {
-            self.accounted = self.accounted.wrapping_add(1);
-        }
-        Ok(received)
+        let Self {
+            account,
+            page,
+            server,
+            ..
+        } = self;
+        account.take(page.words(), || server.receive())
     }
 
     /// Whether the mailbox probably contains a parcel: one that was announced, or with
     /// `unannounced` any.
     pub(crate) fn has_parcels(&self, unannounced: bool) -> bool {
-        (unannounced || self.announcements.announced() != self.accounted)
+        (unannounced || self.account.must_look(self.page.words()))
             && self.server.has_requests().unwrap_or(false)
     }
 

@@ -60,9 +60,11 @@ mod presence;
 pub mod raw;
 mod segment;
 mod storage;
+mod sync;
 mod sync_policy;
 mod transport;
 mod variant;
+mod wakeup;
 
 pub use config::{ShmConfig, ShmError};
 pub use counters::ShmCounters;

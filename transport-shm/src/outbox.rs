@@ -30,7 +30,7 @@ use crate::layout::{
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
 use crate::pool::Pool;
-use crate::presence::Announcements;
+use crate::presence::StatusPage;
 use crate::storage;
 
 /// Length in bytes of the chunks of the first memory segment, headers included.
@@ -68,8 +68,8 @@ pub(crate) struct Outbox {
     loans: AtomicUsize,
     retired: AtomicBool,
     token: AtomicU64,
-    /// Where parcels for the mailbox are announced.
-    announcements: Announcements,
+    /// The status page of the mailbox's process, on which parcels are announced.
+    page: Arc<StatusPage>,
     budget: Arc<Budget>,
     pool: Arc<Pool>,
     tally: Arc<Tally>,
@@ -146,7 +146,7 @@ pub(crate) struct Opening<'a> {
     pub(crate) node: &'a Node<Svc>,
     pub(crate) service: &'a ServiceName,
     pub(crate) own: Incarnation,
-    pub(crate) announcements: Announcements,
+    pub(crate) page: Arc<StatusPage>,
     /// Number of unanswered parcels of all outboxes.
     pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) max_loans: usize,
@@ -212,7 +212,7 @@ impl Outbox {
             loans: AtomicUsize::new(0),
             retired: AtomicBool::new(false),
             token: AtomicU64::new(start),
-            announcements: opening.announcements,
+            page: opening.page,
             budget: opening.budget,
             pool: opening.pool,
             tally: opening.tally,
@@ -319,7 +319,7 @@ impl Outbox {
         // earlier request, because it is memory of a shared mapping.
         let filled = unsafe { request.assume_init() };
         let pending = {
-            let _announced = self.announcements.announce();
+            let _announced = self.page.words().announce();
             filled.send()
         };
         let pending = pending.map_err(send_error)?;
@@ -422,7 +422,7 @@ impl Outbox {
         // earlier request, because it is memory of a shared mapping.
         let filled: InitRequest = unsafe { request.assume_init() };
         let sent = {
-            let _announced = self.announcements.announce();
+            let _announced = self.page.words().announce();
             filled.send()
         };
         match sent {

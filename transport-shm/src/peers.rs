@@ -14,7 +14,7 @@ use tokio::task::AbortHandle;
 
 use crate::errors::{closed, opening, retired};
 use crate::outbox::{MemoryLock, Outbox, Posted};
-use crate::presence::{Announcements, PeerProcess, SharedFd, has_ended};
+use crate::presence::{PeerProcess, SharedFd, StatusPage, has_ended};
 
 /// A value that the count of polls does not reach.
 const NEVER: u64 = u64::MAX;
@@ -53,9 +53,9 @@ impl Peer {
         self.incarnation
     }
 
-    /// The announcements of parcels for the process.
-    pub(crate) fn announcements(&self) -> Announcements {
-        self.process.announcements()
+    /// The status page of the process.
+    pub(crate) fn page(&self) -> &Arc<StatusPage> {
+        self.process.page()
     }
 
     /// Whether the process will poll without being rung at.
@@ -290,7 +290,7 @@ impl Peer {
         let abandoned = outbox.is_some_and(|outbox| outbox.abandon(attempt));
         abandoned.then(|| {
             self.abandoned_at
-                .store(self.process.polls(), Ordering::Relaxed);
+                .store(self.process.page().words().polls(), Ordering::Relaxed);
             Abandoned::Unconfirmed
         })
     }
@@ -310,7 +310,13 @@ impl Peer {
         let waiting = line.outbox.as_ref().is_some_and(|it| it.waiting() > 0);
         drop(line);
         let abandoned_at = self.abandoned_at.load(Ordering::Relaxed);
-        let polled_since = self.process.polls().wrapping_sub(abandoned_at) >= 2;
+        let polled_since = self
+            .process
+            .page()
+            .words()
+            .polls()
+            .wrapping_sub(abandoned_at)
+            >= 2;
         let abandoned = abandoned_at != NEVER && !polled_since;
         let ended = self.ended.load(Ordering::SeqCst);
         (!ended && (waiting || abandoned)).then_some(&self.process)

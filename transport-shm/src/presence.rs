@@ -7,10 +7,8 @@
 //! * The doorbell (`.bell`), a FIFO that the process reads. A byte makes the process check its
 //!   mailbox and its answers.
 //! * The status page (`.page` in `/dev/shm`). It states whether the process is polling, so that no
-//!   peer needs to ring, and counts how often the process has cleared its doorbell.
-//!   [`Presence::begin_polling`] and [`PeerProcess::is_awake`] describe the protocol between the
-//!   page and the doorbell. Peers announce their parcels there ([`Announcements`]), so that a poll
-//!   of an empty mailbox is one load.
+//!   peer needs to ring, and counts how often the process has cleared its doorbell. Peers announce their
+//!   parcels there, so that a poll of an empty mailbox is one load. The module `wakeup` has the rules.
 //!
 //! A process that sends content to several receivers also has segments (see `segment`).
 
@@ -20,7 +18,6 @@ use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
@@ -34,6 +31,7 @@ use crate::domain_files::files_in;
 use crate::fork::Owner;
 use crate::memory::{Mapping, PAGE, SHM, open_owned};
 use crate::segment;
+use crate::wakeup::{RingState, StatusWords};
 
 /// Mode of a file that only its owner may access.
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
@@ -215,113 +213,9 @@ impl Presence {
         &self.doorbell
     }
 
-    /// The counter of completed polls.
-    pub(crate) fn polls(&self) -> PollCounter {
-        PollCounter(self.page.clone())
-    }
-
-    /// The announcements of parcels for this process.
-    pub(crate) fn announcements(&self) -> Announcements {
-        Announcements(self.page.clone())
-    }
-
-    /// Announces to other processes, until the guard is dropped, that this process polls and needs
-    /// no wake-up. The caller must poll once more after dropping the guard.
-    ///
-    /// A peer that has put something into the mailbox reads the page afterwards, and rings if no
-    /// thread polls ([`PeerProcess::is_awake`]). A sequentially consistent fence stands between the
-    /// peer's write and its read, and between the guard's write and the next poll here. So either
-    /// the peer sees that no thread polls, and rings, or the poll after the drop finds the parcel.
-    pub(crate) fn begin_polling(&self) -> PollGuard<'_> {
-        let pollers = &self.page.words().pollers;
-        pollers.fetch_add(1, Ordering::SeqCst);
-        PollGuard(pollers)
-    }
-
-    /// Whether a thread of this process polls. If so, that thread polls once more.
-    pub(crate) fn is_polling(&self) -> bool {
-        self.page.words().pollers.load(Ordering::SeqCst) != 0
-    }
-
-    /// Counts that the doorbell has been cleared. The caller polls afterwards.
-    pub(crate) fn count_wakeup(&self) {
-        self.page.words().wakeups.fetch_add(1, Ordering::SeqCst);
-        // A peer that has read the previous count stored its parcel before that, so the poll that
-        // follows finds it.
-        fence(Ordering::SeqCst);
-    }
-}
-
-/// The number of completed polls of the mailbox, which other processes can read. Incremented by one
-/// thread at a time.
-#[derive(Debug)]
-pub(crate) struct PollCounter(Arc<StatusPage>);
-
-impl PollCounter {
-    /// Counts a poll that found the mailbox empty at its end.
-    pub(crate) fn increment(&self) {
-        let polls = &self.0.words().polls;
-        let before = polls.load(Ordering::Relaxed);
-        polls.store(before.wrapping_add(1), Ordering::Release);
-    }
-}
-
-/// The announcements of parcels for one mailbox, which its process and all peers share.
-///
-/// A peer announces a parcel *before* it puts it into the mailbox, and afterwards counts the
-/// announcement as settled. So as long as the mailbox's process has taken as many parcels as were
-/// announced, its mailbox is empty, and the process need not visit the slots of all possible
-/// connections to know that. An announced parcel may also never arrive, because sending failed or
-/// the parcel was abandoned. Therefore the process corrects its account when all announcements are
-/// settled and the mailbox is empty ([`settled`](Self::settled)).
-///
-/// A peer that is killed between the two steps leaves an announcement that is never settled. Each
-/// poll of the mailbox then visits all slots.
-#[derive(Debug, Clone)]
-pub(crate) struct Announcements(Arc<StatusPage>);
-
-impl Announcements {
-    /// Announces a parcel. The announcement is settled when the guard is dropped, after sending.
-    pub(crate) fn announce(&self) -> Announcement<'_> {
-        let words = self.0.words();
-        // Before the fence in `PeerProcess::is_awake`: a peer that sees a polling process has
-        // announced its parcel to that process's last check.
-        words.announced.fetch_add(1, Ordering::SeqCst);
-        Announcement(&words.settled)
-    }
-
-    /// Number of announced parcels.
-    pub(crate) fn announced(&self) -> u64 {
-        self.0.words().announced.load(Ordering::Acquire)
-    }
-
-    /// Number of announced parcels if all of them are in the mailbox, were taken, or will never
-    /// arrive. `None` if a peer may be about to put one there.
-    pub(crate) fn settled(&self) -> Option<u64> {
-        // This load comes first and acquires each counted step, so the other load includes the
-        // announcements of these steps. If the counts are equal, there was no other announcement.
-        let settled = self.0.words().settled.load(Ordering::Acquire);
-        let announced = self.announced();
-        (announced == settled).then_some(announced)
-    }
-}
-
-/// An announcement of a parcel, which is settled when this is dropped.
-pub(crate) struct Announcement<'a>(&'a AtomicU64);
-
-impl Drop for Announcement<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_add(1, Ordering::Release);
-    }
-}
-
-/// Marks that a thread of this process polls.
-pub(crate) struct PollGuard<'a>(&'a AtomicU32);
-
-impl Drop for PollGuard<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::SeqCst);
-        fence(Ordering::SeqCst);
+    /// The status page.
+    pub(crate) fn page(&self) -> &Arc<StatusPage> {
+        &self.page
     }
 }
 
@@ -398,14 +292,8 @@ pub(crate) struct PeerProcess {
     live: Arc<OwnedFd>,
     doorbell: File,
     page: Arc<StatusPage>,
-    /// Value of the page's `wakeups` when this process last rang; [`NO_WAKEUP_COUNT`] before that.
-    wakeups_at_ring: AtomicU64,
-    /// Whether the process was polling at the last check.
-    polled_at_last_check: AtomicBool,
+    rings: RingState,
 }
-
-/// A value that `wakeups` does not reach.
-const NO_WAKEUP_COUNT: u64 = u64::MAX;
 
 impl PeerProcess {
     /// Opens the files of a process. The error is `NotFound` if the process does not run.
@@ -428,20 +316,13 @@ impl PeerProcess {
             live: Arc::new(live.into()),
             doorbell: open_doorbell(&paths.doorbell(of))?,
             page: Arc::new(StatusPage::map(&page)?),
-            wakeups_at_ring: AtomicU64::new(NO_WAKEUP_COUNT),
-            polled_at_last_check: AtomicBool::new(false),
+            rings: RingState::new(),
         })
     }
 
-    /// Number of times the process has polled its mailbox until it was empty; 0 if it does not
-    /// listen yet.
-    pub(crate) fn polls(&self) -> u64 {
-        self.page.words().polls.load(Ordering::Acquire)
-    }
-
-    /// The announcements of parcels for the process.
-    pub(crate) fn announcements(&self) -> Announcements {
-        Announcements(self.page.clone())
+    /// The status page.
+    pub(crate) fn page(&self) -> &Arc<StatusPage> {
+        &self.page
     }
 
     /// The liveness FIFO, which becomes readable when the process ends.
@@ -449,46 +330,29 @@ impl PeerProcess {
         &self.live
     }
 
-    /// Whether the process will poll without being rung at: because it is polling, or because this
-    /// process has rung and the wake-up is still pending.
-    ///
-    /// The latter holds while `wakeups` is the same as before this process rang. The peer
-    /// increments it between clearing its doorbell and polling, so a poll is still to come. Rings
-    /// of other processes do not count, so a process that is killed before it rings causes no
-    /// missed wake-up.
+    /// Whether the process will poll without being rung at; see [`RingState::is_awake`].
     pub(crate) fn is_awake(&self) -> bool {
-        fence(Ordering::SeqCst);
-        let words = self.page.words();
-        // The fence provides the order that `begin_polling` and `count_wakeup` rely on.
-        if words.pollers.load(Ordering::Relaxed) != 0 {
-            self.polled_at_last_check.store(true, Ordering::Relaxed);
-            return true;
-        }
-        self.wakeups_at_ring.load(Ordering::Relaxed) == words.wakeups.load(Ordering::Relaxed)
+        self.rings.is_awake(self.page.words())
     }
 
     /// Whether the process was polling at the last check.
     pub(crate) fn was_polling(&self) -> bool {
-        self.polled_at_last_check.load(Ordering::Relaxed)
+        self.rings.was_polling()
     }
 
     /// Rings the doorbell unless the process is awake. Returns whether it rang.
     pub(crate) fn wake(&self) -> bool {
-        if self.is_awake() {
-            return false;
-        }
-        if self.polled_at_last_check.swap(false, Ordering::Relaxed) {
+        let becomes_awake = || {
             let began = Instant::now();
             while began.elapsed() < POLL_GRACE {
                 if (0..POLLS_PER_CLOCK_READ).any(|_| self.is_awake()) {
-                    return false;
+                    return true;
                 }
             }
-        }
-        let wakeups = self.page.words().wakeups.load(Ordering::Acquire);
-        ring(&self.doorbell);
-        self.wakeups_at_ring.store(wakeups, Ordering::Relaxed);
-        true
+            false
+        };
+        let ring = || ring(&self.doorbell);
+        self.rings.wake(self.page.words(), becomes_awake, ring)
     }
 }
 
@@ -510,7 +374,7 @@ pub(crate) fn wait_for_polls<'a>(
     at: impl Iterator<Item = &'a PeerProcess>,
     stop: impl Fn() -> bool,
 ) {
-    let mut waited_for: Vec<_> = at.map(|one| (one.polls(), one)).collect();
+    let mut waited_for: Vec<_> = at.map(|one| (one.page.words().polls(), one)).collect();
     let began = Instant::now();
     loop {
         let waited = began.elapsed();
@@ -519,7 +383,7 @@ pub(crate) fn wait_for_polls<'a>(
                 0 => START_TIMEOUT,
                 _ => POLL_TIMEOUT,
             };
-            let has_polled = one.polls().wrapping_sub(*before) >= 2;
+            let has_polled = one.page.words().polls().wrapping_sub(*before) >= 2;
             !has_polled && waited < patience && !has_ended(one.live.as_ref())
         });
         if waited_for.is_empty() || stop() {
@@ -562,39 +426,17 @@ fn ring(mut doorbell: &File) {
     let _ = doorbell.write(&[1]);
 }
 
-/// The status page. Peers write only the announcements, and the process writes all other words.
-#[derive(Debug)]
-#[repr(C)]
-struct StatusWords {
-    /// Number of threads of the process that poll.
-    pollers: AtomicU32,
-    /// Number of times the process has cleared its doorbell before it polled.
-    wakeups: AtomicU64,
-    /// Keeps `polls`, which changes often, in a cache line of its own.
-    _apart: [u64; 6],
-    /// Number of times the process has found its mailbox empty, or emptied it.
-    polls: AtomicU64,
-    /// Keeps apart what the process and its peers write, also from processors that load two cache
-    /// lines at once.
-    _apart_from_announced: [u64; 23],
-    /// Number of parcels that peers have announced.
-    announced: AtomicU64,
-    /// Keeps `announced`, which the process polls, in a cache line of its own.
-    _apart_from_settled: [u64; 15],
-    /// Number of announced parcels that are in the mailbox, were in it, or never will be.
-    settled: AtomicU64,
-}
-
 /// A mapped status page.
 #[derive(Debug)]
-struct StatusPage(Mapping);
+pub(crate) struct StatusPage(Mapping);
 
 impl StatusPage {
     fn map(file: &File) -> io::Result<Self> {
         Mapping::new(file, PAGE, ProtFlags::READ | ProtFlags::WRITE).map(Self)
     }
 
-    fn words(&self) -> &StatusWords {
+    /// The words that processes share.
+    pub(crate) fn words(&self) -> &StatusWords {
         // SAFETY: the mapping exists as long as self, is aligned to a page and longer than
         // `StatusWords`, of which every bit pattern is valid. Every process maps the page for
         // reading and writing and accesses these words atomically. The page exists: the process that
@@ -611,50 +453,6 @@ mod tests {
     use std::os::unix::fs::symlink;
 
     use super::*;
-
-    /// The announcements for a process, as the process and as a peer see them.
-    fn announcements() -> (Announcements, Announcements) {
-        let file = tempfile::tempfile().unwrap();
-        file.set_len(PAGE as u64).unwrap();
-        let map = || Announcements(Arc::new(StatusPage::map(&file).unwrap()));
-        (map(), map())
-    }
-
-    #[test]
-    fn announcements_are_settled_when_no_peer_is_about_to_send() {
-        let (own, peer) = announcements();
-        assert_eq!((own.announced(), own.settled()), (0, Some(0)));
-        let first = peer.announce();
-        let second = peer.announce();
-        assert_eq!((own.announced(), own.settled()), (2, None));
-        drop(second);
-        assert_eq!(own.settled(), None, "the first parcel may still arrive");
-        drop(first);
-        assert_eq!(own.settled(), Some(2));
-    }
-
-    #[test]
-    fn settled_announcements_have_been_sent() {
-        let (own, peer) = announcements();
-        let sent = AtomicU64::new(0);
-        std::thread::scope(|scope| {
-            for _ in 0..2 {
-                scope.spawn(|| {
-                    for _ in 0..10_000 {
-                        let _announced = peer.announce();
-                        sent.fetch_add(1, Ordering::Relaxed);
-                    }
-                });
-            }
-            while own.announced() < 20_000 {
-                if let Some(settled) = own.settled() {
-                    let sent = sent.load(Ordering::Relaxed);
-                    assert!(sent >= settled, "{sent} of {settled} parcels");
-                }
-            }
-        });
-        assert_eq!(own.settled(), Some(20_000));
-    }
 
     #[test]
     fn a_process_that_cannot_be_examined_counts_as_alive() {
