@@ -56,7 +56,7 @@ fn main() {
         Some(asked) => {
             let path = PATHS.iter().find(|(name, _)| *name == asked);
             let (_, run) = path.unwrap_or_else(|| panic!("unknown path {asked}"));
-            let names = Crowd::names();
+            let names = Crowd::names(1_000);
             let mut crowd = Crowd::new(&names);
             run(&mut crowd, names.get(..LETTERS).unwrap());
         }

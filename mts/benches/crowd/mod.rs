@@ -1,4 +1,4 @@
-//! A delivery core among 1,000 peers with 10,000 agents, one letter at a time.
+//! A delivery core among peers with ten agents each, one letter at a time.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,8 +11,8 @@ use fipa_transport::{
     Ticket, Verdict,
 };
 
-const PEERS: usize = 1_000;
-const AGENTS: usize = 10_000;
+/// Number of agents of each peer.
+const AGENTS: usize = 10;
 /// Incarnation of the service.
 const HERE: Incarnation = Incarnation::from_u64(0x4e5e);
 /// Incarnation of the agent that sends and receives here.
@@ -31,9 +31,11 @@ pub(crate) struct Crowd {
 }
 
 impl Crowd {
-    /// Names of the agents.
-    pub(crate) fn names() -> Vec<Arc<str>> {
-        (0..AGENTS).map(|n| format!("arm_{n}").into()).collect()
+    /// Names of the agents of this many peers.
+    pub(crate) fn names(peers: usize) -> Vec<Arc<str>> {
+        (0..peers * AGENTS)
+            .map(|n| format!("arm_{n}").into())
+            .collect()
     }
 
     /// A core whose directory has the agents of these names.
@@ -138,7 +140,7 @@ impl Crowd {
 /// A directory with every agent at one of the peers.
 fn directory(names: &[Arc<str>]) -> Arc<MemoryDirectory> {
     let directory = MemoryDirectory::new(Mts::new("here-mts", HERE));
-    let peers: Vec<Location> = (0..PEERS).map(peer).collect();
+    let peers: Vec<Location> = (0..names.len() / AGENTS).map(peer).collect();
     for (n, (name, location)) in names.iter().zip(peers.iter().cycle()).enumerate() {
         let locations = vec![location.clone()];
         let agent = Registration::new(Arc::clone(name), agent(n), locations);
