@@ -8,7 +8,7 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa::routes::{self, Standing};
+use fipa::routes::{self, RouteState, Standing};
 use fipa::{
     Agent, Config, Deliveries, Domain, ErrorChain, FailureReason, Gateway, Kind, OpenError,
     Outcome, Performative, Query, TransportErrorKind,
@@ -470,4 +470,40 @@ async fn letters_in_transit_when_the_gateway_ends_have_an_outcome() {
     let mut rest = numbers(&arm, delivered.saturating_sub(50)).await;
     rest.splice(0..0, first);
     assert!(rest.is_sorted_by(|a, b| a < b), "{rest:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_in_the_custody_of_a_gateway_that_ends_has_an_outcome_at_once() {
+    let here = Host::new(&["mts.deadline=1h"]);
+    let there = Host::new(&["mts.queue=1"]);
+    let (near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
+    known(&at_home, arm.name()).await;
+    let first = rover.send(inform(&rover, arm.name(), "1")).await.unwrap();
+    via(&first);
+    // The queue of the receiver is full, and no task reads it.
+    let gateway = near.incarnation();
+    let taken = |ways: &[RouteState]| {
+        let to_near = ways.iter();
+        let to_near = to_near.filter(|way| way.location.incarnation() == gateway);
+        to_near.map(|way| way.taken).sum::<u64>()
+    };
+    let before = taken(&at_home.routes(&Query::all()).ways);
+    let second = rover.send(inform(&rover, arm.name(), "2"));
+    let custody = async {
+        while taken(&at_home.routes(&Query::all()).ways) == before {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    let ending = async {
+        custody.await;
+        near.close().await;
+    };
+    let (second, ()) = tokio::join!(second, ending);
+    let second = second.unwrap();
+    assert_eq!(reason(&second), FailureReason::Unconfirmed);
+    // The gateway has reported, so no timeout has ended the wait for it.
+    assert!(!second.to_string().contains("has not reported"), "{second}");
 }
