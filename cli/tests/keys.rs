@@ -228,7 +228,7 @@ fn the_doctor_of_both_hosts_says_which_one_has_keys() {
     let plain = Host::new();
     let peer = format!("discovery.static={{ rover = [{address:?}] }}");
     let theirs = plain.start(&["up", "--set", &peer]);
-    let none = "the peer requires keys and this host has none";
+    let none = "set security.keys here";
     finds(&plain, "static peers", &["rover", none]);
     let none = "it has no keys, but this gateway has";
     finds(&keyed.host, "refused connections", &["127.0.0.1", none]);

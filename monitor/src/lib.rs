@@ -40,6 +40,7 @@ pub mod scxml;
 mod table;
 mod verdict;
 
+pub use act::near_standard;
 pub use clock::Now;
 pub use header::Header;
 pub use library::{Library, LibraryError, LibraryFull};
