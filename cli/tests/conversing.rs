@@ -305,6 +305,21 @@ fn commands_that_continue_have_limits() {
 }
 
 #[test]
+fn the_help_for_an_unknown_receiver_names_a_similar_one() {
+    let host = Host::new();
+    let _listen = host.start(&["listen", "arm_1"]);
+    for (to, help) in [
+        ("arm1", "did you mean \"arm_1\"?"),
+        ("Arm_2", "did you mean \"arm_1\"?"),
+        ("arm_*", "regular expressions: \"arm_.*\""),
+        ("lifter", "no gateway is running"),
+    ] {
+        let (_, error) = host.run(&["send", "--to", to]).failed_text();
+        assert!(error.contains(help), "{to}: {error}");
+    }
+}
+
+#[test]
 fn a_misspelled_performative_or_protocol_is_sent_with_a_warning() {
     let host = Host::new();
     let _listen = host.start(&["listen", "arm_1"]);

@@ -47,7 +47,7 @@ pub use library::{Library, LibraryError, LibraryFull};
 pub use limits::Limits;
 pub use machine::{After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition};
 pub use monitor::{Event, Monitor};
-pub use policy::{History, Policy};
+pub use policy::{History, Policy, one_edit_apart};
 pub use verdict::{
     Accepted, Expected, ReplyMismatch, Unchecked, Verdict, Violation, ViolationKind,
 };
