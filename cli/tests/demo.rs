@@ -54,7 +54,9 @@ fn every_step_passes() {
     ]);
     let _rover = host.echo("rover");
     let _camera = host.echo("crex_camera");
-    let child = demo(&["--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut command = demo(&["--json"]);
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    let child = command.spawn().unwrap();
     let pid = child.id();
     let output = child.wait_with_output().unwrap();
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -63,6 +65,7 @@ fn every_step_passes() {
         assert_eq!(step["ok"], true, "{step:#}");
     }
     assert!(output.status.success());
+    assert_eq!(String::from_utf8_lossy(&output.stderr), "");
     assert_eq!(steps.len(), 12);
     let via: Vec<&Value> = steps.iter().map(|step| &step["via"]).collect();
     assert_eq!((via[1], via[2]), (&"shm".into(), &"tcp".into()));
