@@ -111,6 +111,8 @@ impl Domain {
                 // Connections within this host need no proof of identity.
                 #[cfg(feature = "secure")]
                 security: None,
+                #[cfg(feature = "net")]
+                refusals: fipa_transport_net::Refusals::default(),
                 view: &|host, _| Ok(host),
             },
             cancellation,

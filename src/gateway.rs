@@ -27,6 +27,7 @@ use fipa_sds::{
     Role as EntryRole, StaticDirectory,
 };
 use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind};
+use fipa_transport_net::Refusals;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
@@ -94,6 +95,7 @@ impl Gateway {
         let contacts = Arc::new(KnownPeers::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
         let made = Mutex::new(None);
+        let refusals = Refusals::default();
         let service = Service::start(
             config,
             Role {
@@ -102,6 +104,7 @@ impl Gateway {
                 contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
                 #[cfg(feature = "secure")]
                 security: guard.as_ref().map(Guard::security),
+                refusals: refusals.clone(),
                 view: &|host, mts| {
                     contacts.neighbours.name_own(&mts.name);
                     let network = network(config, mts)?;
@@ -164,7 +167,7 @@ impl Gateway {
             Arc::clone(&gateway.neighbours),
         );
         gateway.tasks.push(tokio::spawn(follow));
-        gateway.open_for_letters(config, known, contacts)?;
+        gateway.open_for_letters(config, known, contacts, refusals)?;
         #[cfg(feature = "secure")]
         gateway
             .tasks
@@ -179,6 +182,7 @@ impl Gateway {
         config: &Config,
         known: Arc<MergedDirectory>,
         contacts: Arc<KnownPeers>,
+        refusals: Refusals,
     ) -> Result<(), OpenError> {
         let means = self.means()?;
         let gateway_agent = GatewayAgent {
@@ -190,6 +194,7 @@ impl Gateway {
             contacts,
             notices: Mutex::default(),
             configuration: Arc::clone(&self.configuration),
+            refusals,
             questions: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));

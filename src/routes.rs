@@ -6,6 +6,7 @@
 //! an `inform` in the language `json` whose content is a [`Report`].
 
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -45,6 +46,11 @@ pub struct Report {
     pub peers: Vec<StaticPeer>,
     /// The gateways with an open connection; empty unless the service is a gateway.
     pub neighbours: Vec<Connected>,
+    /// The connections that the service has refused because only one side has keys, or because a side
+    /// does not trust the other, the latest first; empty unless the service is a gateway. Of each address
+    /// the latest, of at most 16 addresses.
+    #[serde(default)]
+    pub refused: Vec<RefusedConnection>,
     /// The configuration with which the service runs, as TOML text by key; empty unless the service is a
     /// gateway. See [`Config::values`](crate::Config::values).
     #[serde(default)]
@@ -82,6 +88,18 @@ pub struct Connected {
     /// The security of its connections.
     #[serde(default)]
     pub security: LinkSecurity,
+}
+
+/// A connection that a gateway has refused because of keys.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct RefusedConnection {
+    /// The address of the peer.
+    pub from: IpAddr,
+    /// The reason, and the remedy.
+    pub why: String,
+    /// Seconds since the refusal.
+    pub seconds: u64,
 }
 
 /// The security of the connections with a gateway. All connections with one gateway have the same.
@@ -188,6 +206,17 @@ impl From<fipa_mts::core::PeerState> for StaticPeer {
             answers: state.answers,
             failures: failures.map(|(at, why)| (at, why.to_string())).collect(),
             asked_again_in: state.asked_again_in.map(millis),
+        }
+    }
+}
+
+#[cfg(feature = "net")]
+impl From<fipa_transport_net::Refusal> for RefusedConnection {
+    fn from(refusal: fipa_transport_net::Refusal) -> Self {
+        Self {
+            from: refusal.from,
+            seconds: refusal.at.elapsed().as_secs(),
+            why: refusal.why,
         }
     }
 }

@@ -58,6 +58,9 @@ pub(crate) struct Role<'a> {
     /// The proofs of identity that peers must give.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<fipa_transport_net::secure::Security>,
+    /// Receives the TCP connections that are refused because of keys.
+    #[cfg(feature = "net")]
+    pub(crate) refusals: fipa_transport_net::Refusals,
     /// Creates the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
 }
@@ -179,6 +182,7 @@ impl Service {
             ways: self.mts.ways(),
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
             neighbours: Vec::new(),
+            refused: Vec::new(),
             configuration: BTreeMap::new(),
         }
     }
@@ -416,6 +420,7 @@ fn tcp(
     );
     tcp.limits = stream_limits(config);
     tcp.processes = config.transport.tcp.processes;
+    tcp.refusals = role.refusals.clone();
     #[cfg(feature = "secure")]
     {
         tcp.security = role.security.clone();

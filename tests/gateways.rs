@@ -8,7 +8,7 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa::routes::{self, Standing};
+use fipa::routes::{self, RouteState, Standing};
 use fipa::{
     Agent, Config, Deliveries, Domain, ErrorChain, FailureReason, Gateway, Kind, OpenError,
     Outcome, Performative, Query, TransportErrorKind,
@@ -470,4 +470,66 @@ async fn letters_in_transit_when_the_gateway_ends_have_an_outcome() {
     let mut rest = numbers(&arm, delivered.saturating_sub(50)).await;
     rest.splice(0..0, first);
     assert!(rest.is_sorted_by(|a, b| a < b), "{rest:?}");
+}
+
+/// Ends the gateway of the sender's host or of the receiver's, while both have a letter in custody, and
+/// returns the reason of its failure.
+async fn ends_with_custody(near_ends: bool) -> FailureReason {
+    let here = Host::new(&["mts.deadline=1h"]);
+    let there = Host::new(&["mts.queue=1"]);
+    let (near, at_home) = here.start().await;
+    let (far, abroad) = there.start().await;
+    let rover = at_home.register(&here.name("rover")).await.unwrap();
+    let arm = abroad.register(&there.name("arm")).await.unwrap();
+    let asker = abroad.register(&there.name("asker")).await.unwrap();
+    known(&at_home, arm.name()).await;
+    let entry = abroad.directory().lookup(far.name()).unwrap();
+    let (ends, _continues) = match near_ends {
+        true => (near, far),
+        false => (far, near),
+    };
+    let first = rover.send(inform(&rover, arm.name(), "1")).await.unwrap();
+    via(&first);
+    // The queue of the receiver is full, and no task reads it.
+    let second = rover.send(inform(&rover, arm.name(), "2"));
+    let ending = async {
+        let patience = Duration::from_secs(60);
+        let is_refused = |ways: &[RouteState]| {
+            let mut local = ways
+                .iter()
+                .filter(|way| way.location.kind().is_host_local());
+            local.any(|way| way.turned_back > 0)
+        };
+        loop {
+            let report = routes::of_gateway(&asker, &entry, None, patience).await;
+            if is_refused(&report.unwrap().ways) {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        ends.close().await;
+    };
+    let ended = async { tokio::join!(second, ending) };
+    // Without an outcome, the sender would wait for its deadline of an hour.
+    let watchdog = Duration::from_secs(60);
+    let (second, ()) = tokio::time::timeout(watchdog, ended).await.unwrap();
+    reason(&second.unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_in_the_custody_of_its_own_gateway_that_ends_has_an_outcome_at_once() {
+    assert_eq!(ends_with_custody(true).await, FailureReason::Unconfirmed);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_in_the_custody_of_the_other_gateway_that_ends_has_an_outcome_at_once() {
+    let reason = ends_with_custody(false).await;
+    // An attempt of that gateway may have been under way.
+    assert!(
+        matches!(
+            reason,
+            FailureReason::NoSuchAgent | FailureReason::Unconfirmed
+        ),
+        "{reason}"
+    );
 }

@@ -20,6 +20,8 @@ const ENDING: Duration = Duration::from_millis(300);
 
 /// Beginning of the name of a measurement's directory; the process identifier follows.
 const DIRECTORY: &str = "fipa-bench-";
+/// Directory of shared memory.
+const SHARED_MEMORY_DIR: &str = "/dev/shm";
 /// Beginning of the names of a measurement's files in shared memory; the process identifier follows.
 const SHARED_MEMORY: &str = "fipa_bench-";
 
@@ -50,7 +52,7 @@ struct Process {
 impl Stage {
     pub(super) fn new(program: Program, zenoh: Option<PathBuf>) -> Result<Self, String> {
         remove_leftovers();
-        let place = std::env::temp_dir().join(format!("{DIRECTORY}{}", std::process::id()));
+        let place = base().join(format!("{DIRECTORY}{}", std::process::id()));
         let mut private = std::fs::DirBuilder::new();
         std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
         let made = private.create(&place);
@@ -262,7 +264,7 @@ impl Stage {
     /// Files of the measurement in shared memory.
     fn shared_memory() -> impl Iterator<Item = PathBuf> {
         let mark = format!("{SHARED_MEMORY}{}-", std::process::id());
-        let files = std::fs::read_dir("/dev/shm");
+        let files = std::fs::read_dir(SHARED_MEMORY_DIR);
         let files = files.into_iter().flatten().flatten();
         let ours = files.filter(move |file| file.file_name().to_string_lossy().starts_with(&mark));
         ours.map(|file| file.path())
@@ -271,14 +273,17 @@ impl Stage {
 
 impl Drop for Stage {
     fn drop(&mut self) {
-        for process in &mut self.processes {
-            process.orders = None;
-        }
-        let until = Instant::now() + ENDING;
-        let zenoh = self.zenoh.is_some();
-        for process in self.processes.iter_mut().filter(|_| zenoh) {
-            while matches!(process.child.try_wait(), Ok(None)) && Instant::now() < until {
-                std::thread::sleep(Duration::from_millis(1));
+        // Other processes are killed while they still wait for orders: dozens of orderly ends at once would
+        // take the processors from this one, which removes all files anyway.
+        if self.zenoh.is_some() {
+            for process in &mut self.processes {
+                process.orders = None;
+            }
+            let until = Instant::now() + ENDING;
+            for process in &mut self.processes {
+                while matches!(process.child.try_wait(), Ok(None)) && Instant::now() < until {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
             }
         }
         for process in &mut self.processes {
@@ -293,6 +298,16 @@ impl Drop for Stage {
             let _ = std::fs::remove_file(file);
         }
         remove(&self.place);
+    }
+}
+
+/// The parent of the directories of measurements: in memory, because on a busy disk the removal of some
+/// hundred files takes most of a second.
+fn base() -> PathBuf {
+    let memory = Path::new(SHARED_MEMORY_DIR);
+    match memory.is_dir() {
+        true => memory.to_owned(),
+        false => std::env::temp_dir(),
     }
 }
 
@@ -314,10 +329,10 @@ fn remove_leftovers() {
         });
         named.collect::<Vec<_>>()
     };
-    for directory in left(&std::env::temp_dir(), DIRECTORY) {
+    for directory in left(&base(), DIRECTORY) {
         remove(&directory);
     }
-    for file in left(Path::new("/dev/shm"), SHARED_MEMORY) {
+    for file in left(Path::new(SHARED_MEMORY_DIR), SHARED_MEMORY) {
         if let Err(error) = std::fs::remove_file(&file) {
             tracing::warn!(%error, file = %file.display(), "could not be removed");
         }

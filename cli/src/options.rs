@@ -156,6 +156,14 @@ pub(crate) fn duration(text: &str) -> Result<Duration, String> {
     duration.map_err(|_| "expected a duration such as 10s, 500ms or 2h".to_owned())
 }
 
+/// Waits for this time, the value of `--for`; without it, forever.
+pub(crate) async fn after(time: Option<Duration>) {
+    match time {
+        Some(time) => tokio::time::sleep(time).await,
+        None => std::future::pending().await,
+    }
+}
+
 /// Maximum wait for blocked threads after the work has ended.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 

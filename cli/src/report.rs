@@ -4,8 +4,9 @@ use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
-use fipa::ErrorChain;
 use fipa::config::{ConfigError, Mistake};
+use fipa::{ErrorChain, Performative};
+use fipa_monitor::near_standard;
 
 use crate::output;
 
@@ -154,6 +155,19 @@ impl From<Mistake> for ErrorReport {
 /// Prints a warning; the command continues.
 pub(crate) fn warn(text: &str) {
     to_stderr(&format!("warning: {}\n", indented(text)));
+}
+
+/// Warns of each user-defined performative that differs from one of FIPA by a typing error. User-defined
+/// ones are legal, so the command continues.
+pub(crate) fn warn_of_performatives<'a>(performatives: impl IntoIterator<Item = &'a Performative>) {
+    for performative in performatives {
+        let name = performative.as_str();
+        if let Some(standard) = near_standard(name) {
+            warn(&format!(
+                "{name:?} is a performative of your own, and none of FIPA00037; did you mean {standard:?}?"
+            ));
+        }
+    }
 }
 
 /// Indents all lines but the first, so that none of them looks like a line of this module.

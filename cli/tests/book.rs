@@ -214,6 +214,20 @@ fn chapters() -> Vec<PathBuf> {
 }
 
 #[test]
+fn every_published_crate_has_a_readme() {
+    for entry in fs::read_dir(root()).unwrap() {
+        let path = entry.unwrap().path();
+        let Ok(manifest) = fs::read_to_string(path.join("Cargo.toml")) else {
+            continue;
+        };
+        if !manifest.contains("publish = false") {
+            let readme = path.join("README.md");
+            assert!(readme.is_file(), "{} is missing", readme.display());
+        }
+    }
+}
+
+#[test]
 fn the_summary_lists_every_chapter_once() {
     let listed = chapters();
     let mut written = Vec::new();

@@ -273,6 +273,79 @@ fn ping_measures_round_trips() {
     );
 }
 
+/// The commands that continue until Ctrl-C end after a time and after a number of lines.
+#[test]
+fn commands_that_continue_have_limits() {
+    let host = Host::new();
+    let _listen = host.start(&["listen", "arm_1"]);
+    for command in [
+        &["listen", "monitor"][..],
+        &["echo", "monitor"],
+        &["watch"],
+        &["agents", "--watch"],
+        &["locks", "--watch"],
+        &["ping", "arm_1", "--interval", "1ms"],
+        &["send", "--to", "arm_1", "--rate", "1000"],
+    ] {
+        host.run(&[command, &["--for", "1ms"]].concat()).done();
+    }
+    let one = ["-c", "1"];
+    let pings = host.run(&[&["ping", "arm_1"][..], &one].concat()).done();
+    assert!(pings.contains("1 pings, 1 delivered"), "{pings}");
+    let agents = ["agents", "--watch", "--json"];
+    let agents = host.run(&[&agents[..], &one].concat()).done();
+    assert_eq!(agents.lines().count(), 1, "{agents}");
+    let locks = ["locks", "--watch", "--json"];
+    let locks = host.run(&[&locks[..], &one].concat()).done();
+    assert_eq!(locks.lines().count(), 1, "{locks}");
+    for command in ["agents", "locks"] {
+        let alone = host.run(&[command, "--for", "1s"]);
+        assert_eq!(alone.code, Some(2), "{alone:?}");
+    }
+}
+
+#[test]
+fn the_help_for_an_unknown_receiver_names_a_similar_one() {
+    let host = Host::new();
+    let _listen = host.start(&["listen", "arm_1"]);
+    for (to, help) in [
+        ("arm1", "did you mean \"arm_1\"?"),
+        ("Arm_2", "did you mean \"arm_1\"?"),
+        ("arm_*", "regular expressions: \"arm_.*\""),
+        ("lifter", "no gateway is running"),
+    ] {
+        let (_, error) = host.run(&["send", "--to", to]).failed_text();
+        assert!(error.contains(help), "{to}: {error}");
+    }
+}
+
+#[test]
+fn a_misspelled_performative_or_protocol_is_sent_with_a_warning() {
+    let host = Host::new();
+    let _listen = host.start(&["listen", "arm_1"]);
+    let send = |options: &[&str]| {
+        let sent = host.run(&[&["send", "--to", "arm_1"], options].concat());
+        assert_eq!(sent.code, Some(0), "{sent:?}");
+        sent.stderr
+    };
+    let warned = send(&["-p", "infrm"]);
+    assert!(warned.contains("warning: \"infrm\""), "{warned}");
+    assert!(warned.contains("did you mean \"inform\"?"), "{warned}");
+    let warned = send(&["-p", "request", "--protocol", "fipa-requst"]);
+    assert!(
+        warned.contains("did you mean \"fipa-request\"?"),
+        "{warned}"
+    );
+    for legal in [
+        ["-p", "lift"],
+        ["-p", "INFORM"],
+        ["--protocol", "FIPA-Request"],
+        ["--protocol", "lift-protocol"],
+    ] {
+        assert_eq!(send(&legal), "");
+    }
+}
+
 #[test]
 fn a_message_is_sent_at_a_rate() {
     let host = Host::new();

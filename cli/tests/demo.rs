@@ -2,16 +2,14 @@
 
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
+mod common;
+
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Command, Stdio};
-use std::sync::{Mutex, PoisonError};
 
+use common::Host;
 use fipa_testbed::ChildGuard;
 use serde_json::Value;
-
-/// Demos use mDNS on loopback and the same agent names, so two demos at a time would find each other's
-/// agents.
-static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 fn demo(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
@@ -43,8 +41,22 @@ fn processes(pid: u32) -> usize {
 
 #[test]
 fn every_step_passes() {
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
-    let child = demo(&["--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    // Another host of this network has agents of the same names.
+    let host = Host::new();
+    let _gateway = host.start(&[
+        "up",
+        "--set",
+        "discovery.mdns=true",
+        "--set",
+        "discovery.interfaces=lo",
+        "--set",
+        "mts.name=rover-mts",
+    ]);
+    let _rover = host.echo("rover");
+    let _camera = host.echo("crex_camera");
+    let mut command = demo(&["--json"]);
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    let child = command.spawn().unwrap();
     let pid = child.id();
     let output = child.wait_with_output().unwrap();
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -53,6 +65,7 @@ fn every_step_passes() {
         assert_eq!(step["ok"], true, "{step:#}");
     }
     assert!(output.status.success());
+    assert_eq!(String::from_utf8_lossy(&output.stderr), "");
     assert_eq!(steps.len(), 12);
     let via: Vec<&Value> = steps.iter().map(|step| &step["via"]).collect();
     assert_eq!((via[1], via[2]), (&"shm".into(), &"tcp".into()));
@@ -70,7 +83,6 @@ fn every_step_passes() {
 
 #[test]
 fn an_interrupted_demo_leaves_no_files_and_processes() {
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     let mut command = demo(&[]);
     let mut child = ChildGuard::start(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
     let pid = child.id();

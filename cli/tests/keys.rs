@@ -210,6 +210,85 @@ fn the_certificate_of_each_connection_is_shown() {
 }
 
 #[test]
+fn the_doctor_of_both_hosts_says_which_one_has_keys() {
+    let keyed = KeyedHost::new("rover", &[]);
+    let finds = |host: &Host, check: &str, parts: &[&str]| {
+        until("the doctor says which host has keys", || {
+            let report = host.run(&["doctor", "--json"]).done_json();
+            let checks = report["checks"].as_array().unwrap().iter();
+            let mut found = checks.filter(|it| it["check"] == check);
+            found.any(|it| {
+                let text = it["found"].as_str().unwrap();
+                it["verdict"] == "doubtful" && parts.iter().all(|part| text.contains(part))
+            })
+        });
+    };
+    // The host without keys dials the other one.
+    let (ours, address) = keyed.gateway(&[]);
+    let plain = Host::new();
+    let peer = format!("discovery.static={{ rover = [{address:?}] }}");
+    let theirs = plain.start(&["up", "--set", &peer]);
+    let none = "set security.keys here";
+    finds(&plain, "static peers", &["rover", none]);
+    let none = "it has no keys, but this gateway has";
+    finds(&keyed.host, "refused connections", &["127.0.0.1", none]);
+    drop((ours, theirs));
+
+    // The host with keys dials the other one.
+    let theirs = plain.start(&["up", "--json"]);
+    let address = format!("tcp://{}", theirs.tcp_address());
+    let (_ours, _) = keyed.gateway(&[("plain", &address)]);
+    let none = "this host has keys and the peer has none";
+    finds(&keyed.host, "static peers", &["plain", none]);
+    let none = "the peer has keys and began TLS, but this gateway has no keys";
+    finds(&plain, "refused connections", &["127.0.0.1", none]);
+}
+
+#[test]
+fn a_certificate_with_a_known_name_is_trusted_with_a_warning() {
+    let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+    rover.keys(&["trust", &crex.certificate()]);
+    assert!(
+        !rover
+            .keys(&["trust", &crex.certificate()])
+            .contains("note:")
+    );
+    crex.keys(&["renew"]);
+    let next = crex.host.path("keys/next.pem").display().to_string();
+    let trusted = rover.keys(&["trust", &next]);
+    let fingerprint = crex.list()["own"]["fingerprint"].clone();
+    let earlier = &fingerprint.as_str().unwrap()[..16];
+    let advice = format!("`fipa keys distrust {earlier}`");
+    assert!(trusted.contains(&advice), "{trusted}");
+
+    // Another host whose gateway has the name of this one.
+    let twin = Host::new();
+    let name = format!("mts.name={}", rover.name);
+    let dir = twin.path("keys").display().to_string();
+    twin.run(&["keys", "init", "--dir", &dir, "--set", &name])
+        .done();
+    let file = format!("{dir}/own.pem");
+    let trusted = rover.host.run(&[
+        "keys",
+        "trust",
+        &file,
+        "--dir",
+        &rover.dir(),
+        "--set",
+        &name,
+    ]);
+    assert_eq!(trusted.code, Some(0), "{trusted:?}");
+    for part in [
+        "warning:",
+        &rover.name,
+        "set mts.name",
+        "fipa keys distrust",
+    ] {
+        assert!(trusted.stderr.contains(part), "{}", trusted.stderr);
+    }
+}
+
+#[test]
 fn keys_are_listed_and_never_overwritten() {
     let host = KeyedHost::new(
         "rover",

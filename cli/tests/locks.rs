@@ -134,6 +134,11 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
     let host = Host::new();
     let alone = host.run(&["lock", "bay", "--", "true"]).failed(125);
     assert!(alone.contains("no agent owns \"bay\""), "{alone}");
+    let soon = host
+        .run(&["lock", "bay", "--within", "300ms", "--", "true"])
+        .failed(124);
+    assert!(soon.contains("no owner of \"bay\" was found"), "{soon}");
+    assert!(soon.contains("fipa own RESOURCE"), "{soon}");
     let crane = own(&host, &[]);
     let run = |arguments: &[&str]| host.run(&[&["lock", "bay", "--"], arguments].concat());
     assert_eq!(
@@ -170,6 +175,19 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
         .run(&["own", "dock", "--state-dir", "/dev/null"])
         .failed(1);
     assert!(nowhere.contains("--volatile"), "{nowhere}");
+}
+
+#[test]
+fn the_end_of_a_command_is_reported_as_a_release() {
+    let host = Host::new();
+    let mut crane = own(&host, &[]);
+    for grant in 1..=10 {
+        host.run(&["lock", "bay", "--agent", "rover", "--", "true"])
+            .done();
+        let fence = format!("fence 1.{grant}@crane#bay");
+        assert_eq!(crane.line(), format!("granted to rover, {fence}"));
+        assert_eq!(crane.line(), format!("released by rover, {fence}"));
+    }
 }
 
 #[test]

@@ -118,6 +118,9 @@ pub enum Failure {
     /// No agent owns the resource.
     #[error("no agent owns the resource; start its owner")]
     NoOwner,
+    /// The time of the claim is over, and no owner of the resource has been found yet.
+    #[error("timed out; no owner of the resource was found, so start its owner")]
+    OwnerNotFound,
     /// The owner is lost.
     #[error("the owner {owner} does not answer")]
     Unreachable {
@@ -1059,6 +1062,9 @@ impl<A: Algorithm> Locks<A> {
     fn time_out(&mut self, now: Millis, id: ClaimId, out: &mut Actions) {
         let wanted = self.claims.get(&id).and_then(Claim::wanted);
         let entry = wanted.and_then(|resource| self.resources.get(resource));
+        if entry.is_some_and(|entry| entry.owner.is_none()) {
+            return self.fail(now, id, Failure::OwnerNotFound, out);
+        }
         let ahead = entry.map_or(0, |entry| {
             let position = entry.waiting.iter().position(|waiting| *waiting == id);
             let current = usize::from(position.is_some() && entry.current.is_some());

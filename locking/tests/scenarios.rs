@@ -314,6 +314,22 @@ fn without_an_owner_a_claim_fails() {
 }
 
 #[test]
+fn a_claim_that_ends_before_an_owner_is_found_says_so() {
+    let mut agent = Agent::new("agent2", Kind::default());
+    let claim = agent.lock(Some(300));
+    let second = agent.lock(Some(300));
+    agent.pass(300);
+    let failed = |claim| Event::Failed {
+        claim,
+        resource: bay(),
+        failure: Failure::OwnerNotFound,
+    };
+    let events = agent.events();
+    assert_eq!(events.len(), 2, "{events:?}");
+    assert!(events.contains(&failed(claim)) && events.contains(&failed(second)));
+}
+
+#[test]
 fn a_withdrawn_request_is_answered_and_its_grant_released() {
     let mut agent = Agent::new("agent2", Kind::default());
     for name in ["agent1", "agent3"] {

@@ -68,8 +68,10 @@ impl<'a> Act<'a> {
     }
 }
 
-/// Returns the standard performative from which a user-defined one differs by a typing error.
-pub(crate) fn near_standard(name: &str) -> Option<&'static str> {
+/// Returns the standard performative from which a user-defined one differs by one edit: an inserted, a
+/// deleted, a replaced or two swapped characters. It is probably a typing error.
+#[must_use]
+pub fn near_standard(name: &str) -> Option<&'static str> {
     /// Longer names are no misspelled standard ones.
     const MAX: usize = 32;
     if !is_word(name) || name.len() > MAX || matches!(Act::named(name), Act::Standard(_)) {

@@ -40,13 +40,14 @@ pub mod scxml;
 mod table;
 mod verdict;
 
+pub use act::near_standard;
 pub use clock::Now;
 pub use header::Header;
 pub use library::{Library, LibraryError, LibraryFull};
 pub use limits::Limits;
 pub use machine::{After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition};
 pub use monitor::{Event, Monitor};
-pub use policy::{History, Policy};
+pub use policy::{History, Policy, one_edit_apart};
 pub use verdict::{
     Accepted, Expected, ReplyMismatch, Unchecked, Verdict, Violation, ViolationKind,
 };

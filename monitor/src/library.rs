@@ -1,6 +1,7 @@
 //! Libraries of protocols by name.
 
 use crate::Machine;
+use crate::policy::one_edit_apart;
 use crate::scxml::ScxmlError;
 
 /// Maximum number of protocols in a library.
@@ -106,6 +107,16 @@ impl Library {
         self.machine(self.index_of(name)?)
     }
 
+    /// Finds the protocol from whose name or alias an unknown name differs by one edit: an inserted, a
+    /// deleted, a replaced or two swapped characters. The name is probably a typing error.
+    #[must_use]
+    pub fn near(&self, name: &str) -> Option<&Machine> {
+        match self.index_of(name) {
+            Some(_) => None,
+            None => self.machine(self.index_near(name, |_| true)?),
+        }
+    }
+
     /// Iterates over all protocols, the one added last first.
     pub fn iter(&self) -> impl Iterator<Item = &Machine> {
         self.machines.iter()
@@ -117,6 +128,27 @@ impl Library {
         let found = machines.position(named).or_else(|| {
             let mut machines = self.machines.iter();
             machines.position(|machine| machine.is_called(name))
+        });
+        found.and_then(|index| u16::try_from(index).ok())
+    }
+
+    /// Finds the protocol, among those that `is_meant` admits, from whose name or alias this one differs
+    /// by one edit.
+    pub(crate) fn index_near(
+        &self,
+        name: &str,
+        is_meant: impl Fn(&Machine) -> bool,
+    ) -> Option<u16> {
+        /// Maximum length of a name that is compared with the known ones.
+        const MAX_COMPARED: usize = 128;
+        if name.len() > MAX_COMPARED {
+            return None;
+        }
+        let name = name.to_ascii_lowercase();
+        let is_near = |known: &str| one_edit_apart(&known.to_ascii_lowercase(), &name);
+        let found = self.machines.iter().position(|machine| {
+            let mut aliases = machine.aliases().iter();
+            is_meant(machine) && (is_near(machine.name()) || aliases.any(|alias| is_near(alias)))
         });
         found.and_then(|index| u16::try_from(index).ok())
     }

@@ -20,7 +20,6 @@ use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope, step};
 use crate::memory::{Refused, Removed};
 use crate::names::{Name, Names};
-use crate::policy::one_edit_apart;
 use crate::report::violation;
 use crate::table::{List, Table};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
@@ -427,18 +426,9 @@ impl Monitor {
     }
 
     fn unknown_protocol(&self, name: &str) -> Denied {
-        /// Maximum length of a name that is compared with the known ones.
-        const MAX_COMPARED: usize = 128;
-        if self.policy.spelling && !self.policy.exempts(name) && name.len() <= MAX_COMPARED {
-            let name = name.to_ascii_lowercase();
-            let near = |machine: &Machine| {
-                let mut aliases = machine.aliases().iter().map(String::as_str);
-                !self.policy.exempts(machine.name())
-                    && (one_edit_apart(&machine.name().to_ascii_lowercase(), &name)
-                        || aliases.any(|alias| one_edit_apart(&alias.to_ascii_lowercase(), &name)))
-            };
-            let similar = self.library.iter().position(near);
-            if let Some(similar) = similar.and_then(|index| u16::try_from(index).ok()) {
+        if self.policy.spelling && !self.policy.exempts(name) {
+            let is_checked = |machine: &Machine| !self.policy.exempts(machine.name());
+            if let Some(similar) = self.library.index_near(name, is_checked) {
                 return Denied::Refused(Kind::Misspelled, Some(similar));
             }
         }

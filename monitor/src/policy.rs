@@ -58,7 +58,8 @@ pub enum History {
 
 /// Whether the texts differ in one inserted, omitted or changed character, or in two neighbors that
 /// changed places. Short names are never near.
-pub(crate) fn one_edit_apart(one: &str, other: &str) -> bool {
+#[must_use]
+pub fn one_edit_apart(one: &str, other: &str) -> bool {
     let (short, long): (Vec<char>, Vec<char>) = if one.len() <= other.len() {
         (one.chars().collect(), other.chars().collect())
     } else {

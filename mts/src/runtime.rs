@@ -79,6 +79,10 @@ pub trait Contacts: Send + Sync {
     fn parted(&self, peer: &Introduction);
 }
 
+/// Maximum time for which a service that closes waits until other services confirm its reports about
+/// letters that were in its custody.
+const LAST_REPORTS: Duration = Duration::from_millis(200);
+
 /// Maximum number of routes that are computed under one lock.
 const ROUTES_AT_ONCE: usize = 64;
 
@@ -486,16 +490,33 @@ impl Mts {
     }
 
     /// Closes the service: accepts no more letters of others, gives letters in transit up to
-    /// `patience` to finish, then abandons them and closes the transports.
+    /// `patience` to finish, then abandons them and closes the transports. Letters in custody return
+    /// to the services that handed them over.
     pub async fn close(&self, patience: Duration) {
-        let until = Instant::now() + patience;
         self.shared.lock().core.refuse_custody();
-        while self.shared.lock().core.has_open_letters() && Instant::now() < until {
+        self.wait_while(patience, Core::has_open_letters).await;
+        self.give_up();
+        self.wait_while(LAST_REPORTS, Core::has_open_reports).await;
+        self.abort();
+    }
+
+    /// Waits while the condition is true, at most for this time.
+    async fn wait_while(&self, most: Duration, condition: impl Fn(&Core) -> bool) {
+        let until = Instant::now() + most;
+        while condition(&self.shared.lock().core) && Instant::now() < until {
             if !self.shared.drive() {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
         }
-        self.abort();
+    }
+
+    fn give_up(&self) {
+        let mut state = self.shared.lock();
+        state.core.give_up(Now::read());
+        for waiter in state.agents.values() {
+            waiter.close();
+        }
+        self.shared.carry_out(state);
     }
 
     /// Closes the service at once and abandons letters in transit.
@@ -506,12 +527,7 @@ impl Mts {
         for task in self.shared.tasks.lock().drain(..) {
             task.abort();
         }
-        let mut state = self.shared.lock();
-        state.core.give_up(Now::read());
-        for waiter in state.agents.values() {
-            waiter.close();
-        }
-        self.shared.carry_out(state);
+        self.give_up();
         for transport in &self.shared.transports {
             transport.close();
         }

@@ -447,3 +447,61 @@ fn predecessors_have_two_round_trips_to_arrive() {
     gateway.answer(200, report, Answer::Accepted);
     assert_eq!(patience(&mut gateway, 1000), 400);
 }
+
+#[test]
+fn a_gateway_that_ends_returns_the_letters_in_its_custody() {
+    let mut gateway = Service::new(true);
+    let mut attempts = Vec::new();
+    for (sequence, transfer) in [(5, 70), (6, 71), (7, 72), (8, 73)] {
+        gateway.arrive(0, sequence, transfer);
+        attempts.extend(gateway.dispatched().map(|(attempt, _)| attempt));
+    }
+    gateway.answer(1, attempts[0], Answer::Custody);
+    gateway.answer(1, attempts[1], Answer::Busy);
+    assert!(!gateway.core.has_open_reports());
+    let now = gateway.at(2);
+    gateway.core.give_up(now);
+    let error = || TransportError::new(TransportErrorKind::Closed, "");
+    let mut reports = Vec::new();
+    let mut ends = vec![
+        Conclusion::NotSent(error()),
+        Conclusion::Unconfirmed(error()),
+    ];
+    while let Some(action) = gateway.next_action() {
+        match action {
+            Action::Abandon { attempt, .. } => {
+                gateway.conclude(2, attempt, ends.pop().unwrap());
+            }
+            Action::Dispatch {
+                attempt, parcel, ..
+            } => reports.push((attempt, parcel)),
+            _ => {}
+        }
+    }
+    assert!(!gateway.core.has_open_letters());
+    assert!(gateway.core.has_open_reports());
+    let told = |(_, parcel): &(AttemptId, Parcel)| match parcel.body {
+        Body::Report(Report::Returned { uncertain }) => {
+            (parcel.sequence, parcel.transfer, uncertain)
+        }
+        _ => panic!("{parcel:?}"),
+    };
+    let mut told: Vec<_> = reports.iter().map(told).collect();
+    told.sort_unstable();
+    assert_eq!(
+        told,
+        [(5, 70, true), (6, 71, false), (7, 72, true), (8, 73, false)]
+    );
+    // A report that is lost is repeated.
+    let (lost, _) = reports.remove(0);
+    gateway.conclude(3, lost, Conclusion::Unconfirmed(error()));
+    for (report, _) in reports {
+        gateway.answer(3, report, Answer::Accepted);
+    }
+    let (ms, again, _) = gateway.wait_for_dispatch(3, 1000).unwrap();
+    assert!(gateway.core.has_open_reports());
+    gateway.answer(ms, again, Answer::Accepted);
+    assert!(!gateway.core.has_open_reports());
+    // Further letters stay with the services before it.
+    assert_eq!(gateway.arrive(ms, 9, 74), Verdict::Now(Answer::Busy));
+}

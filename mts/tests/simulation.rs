@@ -418,6 +418,14 @@ profiles! {
         ..Weather::busy()
     };
 
+    gateways_that_close_return_letters = Weather {
+        gateway_closings: 8,
+        loss: 0.05,
+        silence: 0.05,
+        answering_ms: 40,
+        ..Weather::busy()
+    };
+
     /// Many letters are open when a gateway dies, and their receivers remember all of them.
     letters_of_a_lost_custodian_are_remembered = Weather {
         gateway_deaths: 8,

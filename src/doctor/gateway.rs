@@ -6,16 +6,26 @@ use fipa_transport::Signature;
 
 use super::peers;
 use super::{Area, Check, Verdict};
-use crate::routes::{Connected, Report};
+use crate::routes::{Connected, RefusedConnection, Report, StaticPeer};
 use crate::{Config, Kind};
 
 const AREA: Area = Area("gateway");
 const CONFIGURATION: &str = "configuration of the running gateway";
 const CONNECTIONS: &str = "connections with other gateways";
+const PEERS: &str = "static peers";
+const REFUSED: &str = "refused connections";
 const PORTS: &str = "ports of known gateways";
 
 /// Maximum number of values that are shown.
 const MAX_SHOWN: usize = 8;
+
+/// Age in seconds of the latest refusal of a peer that may still try to connect: a gateway asks its
+/// static peers more often.
+const RECENT: u64 = 60;
+
+/// The advice if a connection is refused because of keys.
+const KEYS_ADVICE: &str = "do what the reason says; `fipa keys list` shows the keys and the trusted \
+                           certificates of a host, and the gateways connect by themselves after the change";
 
 pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &mut Vec<Check>) {
     let report = match report {
@@ -28,6 +38,9 @@ pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &m
     };
     checks.push(configuration(config, report));
     checks.extend(report.neighbours.iter().map(connection));
+    checks.extend(report.peers.iter().filter_map(static_peer));
+    let recent = report.refused.iter().filter(|it| it.seconds <= RECENT);
+    checks.extend(recent.map(refused));
     peers::connect_all(PORTS, unconnected(config, report).into_iter(), checks);
 }
 
@@ -72,6 +85,30 @@ fn connection(connected: &Connected) -> Check {
         None => "not encrypted".to_owned(),
     };
     AREA.fine(CONNECTIONS, format!("{name}: {security}"))
+}
+
+/// Reports a static peer that does not answer, with the reasons. A connected one is among the connections.
+fn static_peer(peer: &StaticPeer) -> Option<Check> {
+    if peer.answers.is_some() || peer.failures.is_empty() {
+        return None;
+    }
+    let failures = peer.failures.iter();
+    let failures = failures.map(|(location, why)| format!("{location}: {why}"));
+    let failures: Vec<String> = failures.collect();
+    let found = format!("{} does not answer: {}", peer.name, failures.join("; "));
+    Some(AREA.problem(
+        PEERS,
+        Verdict::Doubtful,
+        found,
+        "do what the reason says; the gateway asks its static peers again every few seconds",
+    ))
+}
+
+/// Reports a connection that the gateway has refused because of keys.
+fn refused(refused: &RefusedConnection) -> Check {
+    let RefusedConnection { from, why, seconds } = refused;
+    let found = format!("from {from}, {seconds} s ago: {why}");
+    AREA.problem(REFUSED, Verdict::Doubtful, found, KEYS_ADVICE)
 }
 
 /// The TCP addresses of gateways that are known but not connected, without those of the configuration,

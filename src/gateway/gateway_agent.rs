@@ -15,6 +15,7 @@ use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
 use fipa_transport::Incarnation;
+use fipa_transport_net::Refusals;
 use parking_lot::Mutex;
 
 use super::KnownPeers;
@@ -44,6 +45,8 @@ pub(crate) struct GatewayAgent {
     pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
+    /// The connections that were refused because of keys.
+    pub(super) refusals: Refusals,
     /// The questions of agents of this host about agents of other hosts.
     pub(super) questions: Mutex<Questions>,
 }
@@ -194,6 +197,7 @@ impl GatewayAgent {
         let neighbours = self.neighbours.all().into_iter();
         let report = routes::Report {
             neighbours: neighbours.map(Into::into).collect(),
+            refused: self.refusals.latest().into_iter().map(Into::into).collect(),
             configuration: self.configuration.lock().clone(),
             ..self.service.report(&entries)
         };

@@ -22,6 +22,12 @@ pub enum LockError {
         /// The resource.
         resource: String,
     },
+    /// The time of the request is over, and no owner of the resource has been found yet.
+    #[error("timed out: no owner of {resource:?} was found; start its owner")]
+    OwnerNotFound {
+        /// The resource.
+        resource: String,
+    },
     /// The owner of the resource is lost: it left, died, or does not answer.
     #[error("{resource:?} is unreachable: its owner {owner:?} does not answer")]
     Unreachable {
@@ -80,6 +86,7 @@ impl LockError {
         let resource = resource.as_str().to_owned();
         match failure {
             Failure::NoOwner => Self::NoOwner { resource },
+            Failure::OwnerNotFound => Self::OwnerNotFound { resource },
             Failure::Unreachable { owner } => Self::Unreachable {
                 resource,
                 owner: owner.name().to_owned(),

@@ -171,7 +171,7 @@ impl Agent {
     /// Requests a resource, and withdraws the request after `within`.
     ///
     /// # Errors
-    /// As for [`lock`](Self::lock), and [`LockError::TimedOut`].
+    /// As for [`lock`](Self::lock), and [`LockError::TimedOut`] or [`LockError::OwnerNotFound`].
     pub async fn lock_within(&self, resource: &str, within: Duration) -> Result<Lock, LockError> {
         let resource = Resource::new(resource)?;
         Lock::acquire(&self.core, vec![resource], |core, now, all, out| {

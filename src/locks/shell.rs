@@ -33,6 +33,9 @@ use crate::protocol::{PartnerEvent, PartnerWatch};
 /// dropped.
 const MAX_EVENTS: usize = 256;
 
+/// Maximum number of messages that are handled before the departure of an agent.
+const MAX_WAITING: usize = 1024;
+
 /// Minimum deadline of the letters of a basic algorithm, which repeats nothing. A receiver that has ended
 /// is reported before.
 const UNREPEATED: Duration = Duration::from_secs(600);
@@ -528,6 +531,7 @@ impl Task {
                     });
                 }
                 event = self.partners.next() => if let PartnerEvent::Gone { agent } = event {
+                    self.handle_waiting().await;
                     self.departed(&agent);
                 },
                 change = next_change(changes) => match change {
@@ -572,6 +576,26 @@ impl Task {
                 state.note(&from);
             }
         });
+    }
+
+    /// Handles the messages that have arrived, so that those of an agent that has left, such as the
+    /// release of its lock, count before its departure.
+    async fn handle_waiting(&mut self) {
+        for _ in 0..MAX_WAITING {
+            let core = Arc::clone(&self.core);
+            let next = core
+                .demultiplexer
+                .next_served(&core.endpoint, &self.messages);
+            let waiting = tokio::select! {
+                biased;
+                received = next => received.ok(),
+                () = std::future::ready(()) => None,
+            };
+            match waiting {
+                Some(incoming) => self.handle(&incoming),
+                None => return,
+            }
+        }
     }
 
     /// Returns the sender of a message, as far as its connection proves it.

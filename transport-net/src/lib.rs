@@ -74,7 +74,7 @@ pub use quic::{QuicConfig, QuicTransport};
 pub use stream::config::Limits;
 pub use stream::counters::Counters;
 #[cfg(feature = "ip")]
-pub use tcp::{TcpConfig, TcpTransport};
+pub use tcp::{Refusal, Refusals, TcpConfig, TcpTransport};
 #[cfg(feature = "ip")]
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};
 #[cfg(feature = "udt")]

@@ -529,6 +529,25 @@ fn an_unproved_peer_that_claims_a_connected_service_is_refused_while_that_respon
     assert_eq!(party.arrivals(), 2);
 }
 
+/// Under load, a healthy service opens a second connection because an answer on the first one is late.
+#[test]
+fn a_second_connection_of_a_service_is_refused_without_suspicion_while_the_first_responds() {
+    const PING: u8 = 4;
+    let party = Party::new();
+    let mut first = connect(&party);
+    first.write_all(&hello(77)).unwrap();
+    counted(&party, |c| c.accepted, 1);
+    let mut second = connect(&party);
+    second.write_all(&hello(77)).unwrap();
+    until_some("the refusal", || {
+        first.write_all(&fipa_testbed::frame(PING, 0, &[])).unwrap();
+        (party.transport.counters().refused_again == 1).then_some(())
+    });
+    assert_shut_out(&mut second);
+    let counters = party.transport.counters();
+    assert_eq!((counters.connections, counters.refused_unproved), (1, 0));
+}
+
 #[test]
 fn a_service_that_moved_is_admitted_when_its_older_connection_does_not_respond() {
     let party = Party::new();

@@ -19,7 +19,7 @@ use serde_json::{Value, json};
 use super::routes::security;
 use crate::complete;
 use crate::membership;
-use crate::options::Global;
+use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
 
@@ -117,6 +117,14 @@ pub(crate) struct Arguments {
     #[arg(long, short)]
     watch: bool,
 
+    /// With --watch: end after this number of lines
+    #[arg(long, short, value_name = "N", requires = "watch")]
+    count: Option<u64>,
+
+    /// With --watch: end after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", requires = "watch", value_parser = options::duration)]
+    time: Option<Duration>,
+
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -160,7 +168,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         remote: arguments.remote,
     };
     if arguments.watch {
-        return watch::run(&filter, &config, arguments.json);
+        let limits = (arguments.count, arguments.time);
+        return watch::run(&filter, limits, &config, arguments.json);
     }
     let listed = membership::run(async {
         let domain = membership::join(&config).await?;

@@ -1,6 +1,7 @@
 //! `fipa df`: registers, finds and watches services.
 
-use std::time::SystemTime;
+use std::pin::pin;
+use std::time::{Duration, SystemTime};
 
 use clap::{Args, Subcommand};
 use fipa::platform::{AgentDescription, Df, PlatformError, Property, ServiceDescription};
@@ -85,8 +86,11 @@ JSON, one object on a line:
         #[command(flatten)]
         server: Server,
         /// End after this number of changes
-        #[arg(long, value_name = "N")]
+        #[arg(long, short, value_name = "N")]
         count: Option<u64>,
+        /// End after this time, for example 10s
+        #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
+        time: Option<Duration>,
         /// Print JSON, one object on a line
         #[arg(long)]
         json: bool,
@@ -196,8 +200,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             template,
             server,
             count,
+            time,
             json,
-        } => options::block_on(watch(&template, &server, count, json, &config))?,
+        } => options::block_on(watch(&template, &server, (count, time), json, &config))?,
     }
 }
 
@@ -384,7 +389,7 @@ fn value(description: &AgentDescription) -> Value {
 async fn watch(
     template: &Template,
     server: &Server,
-    count: Option<u64>,
+    (count, time): (Option<u64>, Option<Duration>),
     as_json: bool,
     config: &Config,
 ) -> Result<(), Failure> {
@@ -404,11 +409,13 @@ async fn watch(
             ))?,
         }
         let (mut shown, mut reader) = (0, output::Reader::of_output());
+        let mut over = pin!(options::after(time));
         while count.is_none_or(|count| shown < count) {
             let changed = tokio::select! {
                 changed = notifications.next() => changed,
                 () = stop.requested() => break,
                 () = reader.gone() => break,
+                () = &mut over => break,
             };
             for description in changed.map_err(|error| failed(&error, config))? {
                 shown += 1;
@@ -418,11 +425,7 @@ async fn watch(
         Stop::ending();
         // The end of this agent ends the subscription at the DF of this host, a failed delivery at
         // others.
-        drop(
-            notifications
-                .cancel(std::time::Duration::from_secs(1))
-                .await,
-        );
+        drop(notifications.cancel(Duration::from_secs(1)).await);
         Ok(())
     };
     let done = done.await;

@@ -1,5 +1,7 @@
 //! `fipa echo`: an agent that answers.
 
+use std::time::Duration;
+
 use clap::Args;
 use fipa::{Agent, AgentId, Config, ErrorChain, Incoming, Message, Performative, RegisterOptions};
 use fipa_acl::escape;
@@ -41,8 +43,12 @@ pub(crate) struct Arguments {
     description: String,
 
     /// End after this number of messages
-    #[arg(long, value_name = "N")]
+    #[arg(long, short, value_name = "N")]
     count: Option<u64>,
+
+    /// End after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
+    time: Option<Duration>,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -66,6 +72,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let ended = tokio::select! {
         ended = answer_all(&agent, arguments.count) => ended,
         () = stop.requested() => Ok(()),
+        () = options::after(arguments.time) => Ok(()),
     };
     Stop::ending();
     drop(agent);

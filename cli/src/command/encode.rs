@@ -9,7 +9,7 @@ use fipa_acl::{AclRepresentation, Dialect, EncodeError, Representation};
 use serde_json::Value;
 
 use crate::options::Global;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 use crate::{input, output};
 
 /// Encode a message or a letter from JSON
@@ -140,6 +140,12 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     input::check_not_empty(&text, file, HELP_JSON)?;
     let json: Value = serde_json::from_slice(&text).map_err(|error| invalid_json(&error, file))?;
     let document = document_from_json(&json).map_err(|error| invalid_document(&error, file))?;
+    match &document {
+        Document::Message(message) | Document::Letter(_, message) => {
+            report::warn_of_performatives([message.performative()]);
+        }
+        Document::EncodedLetter(_, _) => {}
+    }
     let bytes = encoded(document, &arguments)?;
     if arguments.hex {
         output::text(&hexadecimal(&bytes))

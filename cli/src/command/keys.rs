@@ -12,7 +12,7 @@ use fipa_acl::escape;
 use serde_json::{Value, json};
 
 use crate::options::{self, Global};
-use crate::report::Failure;
+use crate::report::{self, Failure};
 use crate::{input, output};
 
 /// Manage this host's keys and its trusted hosts
@@ -132,6 +132,9 @@ Examples:
     },
 }
 
+/// Number of digits that identify a certificate in a warning.
+const SHOWN_DIGITS: usize = 16;
+
 /// Maximum size of a file with certificates, in bytes.
 const MAX_PEM: u64 = 1 << 20;
 
@@ -182,7 +185,18 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 ));
                 text.push_str(&described(certificate));
             }
-            output::text(&text)
+            let all = keys.trusted().map_err(|error| failed(&error, &keys))?;
+            for certificate in &trusted {
+                text.push_str(&also_trusted(certificate, &all));
+            }
+            output::text(&text)?;
+            // This host may have no keys yet.
+            if let Ok(own) = keys.own() {
+                trusted
+                    .iter()
+                    .for_each(|certificate| warn_of_own_name(certificate, &own));
+            }
+            Ok(())
         }
         Action::List { json } => list(&keys, json).map_err(|error| failed(&error, &keys))?,
         Action::Distrust { which } => {
@@ -217,6 +231,44 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             output::text(&format!("{done}\n{}", described(&renewed)))
         }
     }
+}
+
+/// The beginning of a fingerprint, which identifies a certificate on the command line.
+fn start(certificate: &Certificate) -> String {
+    let fingerprint = certificate.fingerprint().to_string();
+    fingerprint.chars().take(SHOWN_DIGITS).collect()
+}
+
+/// Warns if the gateway of a certificate that was just trusted has the name of this host's gateway.
+fn warn_of_own_name(certificate: &Certificate, own: &Certificate) {
+    let name = certificate.certified().mts();
+    if own.certified().mts() == name {
+        report::warn(&format!(
+            "the gateway of this host is named {name:?}, too: `fipa agents` and logs cannot tell the two \
+             hosts apart. Give one of them another name: set mts.name there, make new keys in an empty \
+             directory (`fipa keys init --dir DIRECTORY`), and trust the new certificate; `fipa keys \
+             distrust {}` undoes this one",
+            start(certificate)
+        ));
+    }
+}
+
+/// Describes the other trusted certificates with the gateway's name of one that was just trusted.
+fn also_trusted(certificate: &Certificate, trusted: &[Certificate]) -> String {
+    let name = certificate.certified().mts();
+    let same = |other: &&Certificate| {
+        other.certified().mts() == name && other.fingerprint() != certificate.fingerprint()
+    };
+    let others = trusted.iter().filter(same).map(|other| {
+        let (name, start) = (escape(name), start(other));
+        format!(
+            "note: another certificate of {name} is trusted, too ({start}…); a host with either of them is \
+             accepted as {name}.\n  After a renewal of the keys of that host, end the trust in the earlier \
+             one: `fipa keys distrust {start}`.\n  If they are two hosts, give one of them another \
+             mts.name and new keys.\n"
+        )
+    });
+    others.collect()
 }
 
 /// Asks for the confirmation that these certificates are to be revoked.

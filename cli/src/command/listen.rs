@@ -1,5 +1,7 @@
 //! `fipa listen`: an agent that prints its letters.
 
+use std::time::Duration;
+
 use clap::Args;
 use fipa::{AgentId, Config, ErrorChain, Incoming, RegisterOptions};
 use fipa_acl::escape;
@@ -43,8 +45,12 @@ pub(crate) struct Arguments {
     description: String,
 
     /// End after this number of messages
-    #[arg(long, value_name = "N")]
+    #[arg(long, short, value_name = "N")]
     count: Option<u64>,
+
+    /// End after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
+    time: Option<Duration>,
 
     /// Print JSON, one object on a line
     #[arg(long)]
@@ -92,6 +98,7 @@ async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         ended = print_all => ended,
         () = stop.requested() => Ok(()),
         () = reader.gone() => Ok(()),
+        () = options::after(arguments.time) => Ok(()),
     };
     Stop::ending();
     drop(agent);

@@ -104,11 +104,11 @@ async fn lock(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
         ..RegisterOptions::default()
     };
     let agent = membership::register(&domain, &name, options, config).await;
-    let ended = match agent {
-        Err(failure) => Err(own_failure(failure)),
+    let ended = match &agent {
+        Err(_) => Ok(()),
         Ok(agent) => {
             let locked = tokio::select! {
-                locked = acquire(&agent, arguments) => locked,
+                locked = acquire(agent, arguments) => locked,
                 _ = signals.next() => Err(own_failure(Failure::failed(
                     "canceled by a signal before the lock was acquired",
                     format!("resource {:?}", arguments.resource),
@@ -121,7 +121,9 @@ async fn lock(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
             }
         }
     };
+    // While the agent is registered, the domain delivers the release of its lock.
     domain.close().await;
+    agent.map_err(own_failure)?;
     ended
 }
 
@@ -136,11 +138,13 @@ async fn acquire(agent: &Agent, arguments: &Arguments) -> Result<Lock, Failure> 
     };
     locked.await.map_err(|error| {
         let code = match error {
-            LockError::TimedOut { .. } => TIMED_OUT,
+            LockError::TimedOut { .. } | LockError::OwnerNotFound { .. } => TIMED_OUT,
             _ => FAILED,
         };
         let help = match error {
-            LockError::NoOwner { .. } => "start the owner, for example `fipa own RESOURCE`",
+            LockError::NoOwner { .. } | LockError::OwnerNotFound { .. } => {
+                "start the owner, for example `fipa own RESOURCE`"
+            }
             LockError::Name(_) => "use a name of 1 to 255 bytes without control characters",
             _ => "`fipa locks` shows the owner, the holder and the waiting agents",
         };

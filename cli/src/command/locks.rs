@@ -46,6 +46,14 @@ pub(crate) struct Arguments {
     #[arg(long, short)]
     watch: bool,
 
+    /// With --watch: end after this number of lists
+    #[arg(long, short, value_name = "N", requires = "watch")]
+    count: Option<u64>,
+
+    /// With --watch: end after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", requires = "watch", value_parser = options::duration)]
+    time: Option<Duration>,
+
     /// Maximum wait for the answers of the owners
     #[arg(long, value_name = "TIME", default_value = "2s", value_parser = options::duration)]
     timeout: Duration,
@@ -79,12 +87,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         tokio::select! {
             listed = listing => listed,
             () = stop.requested() => Ok(()),
+            () = options::after(arguments.time) => Ok(()),
         }
     })?
 }
 
 async fn list(agent: &Agent, arguments: &Arguments, config: &Config) -> Result<(), Failure> {
     let mut before = None;
+    let mut printed = 0;
     loop {
         let locks = agent.query_locks(arguments.timeout).await;
         let locks = locks.map_err(|error| {
@@ -98,8 +108,10 @@ async fn list(agent: &Agent, arguments: &Arguments, config: &Config) -> Result<(
         if before.as_ref() != Some(&shown) {
             print(&locks, arguments, config)?;
             before = Some(shown);
+            printed += 1;
         }
-        if !arguments.watch {
+        let is_last = arguments.count.is_some_and(|count| printed >= count);
+        if !arguments.watch || is_last {
             return Ok(());
         }
         tokio::time::sleep(INTERVAL).await;

@@ -137,8 +137,9 @@ async fn own(arguments: Arguments, config: &Config) -> Result<(), Failure> {
             served
         }
     };
-    drop(agent);
+    // While the agent is registered, the domain delivers its last messages.
     domain.close().await;
+    drop(agent);
     ended
 }
 

@@ -30,7 +30,8 @@ const ONTOLOGY: &str = "fipa-ping";
 #[command(after_help = "\
 Examples:
   fipa ping arm_1                            until Ctrl-C
-  fipa ping arm_1 --count 5
+  fipa ping arm_1 -c 5
+  fipa ping arm_1 --for 1min
   fipa ping arm_1 --count 1000 --interval 10ms --size 1000 --json | tail -n 1
 
 JSON, one object on each line:
@@ -43,7 +44,7 @@ pub(crate) struct Arguments {
     name: AgentId,
 
     /// End after this number of pings [default: until Ctrl-C]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, short, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
 
     /// Time between the starts of two pings, for example 100ms
@@ -54,6 +55,10 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "BYTES", default_value = "0",
           value_parser = clap::value_parser!(u32).range(0..=16 << 20))]
     size: u32,
+
+    /// End after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
+    time: Option<Duration>,
 
     /// Print JSON, one object on a line
     #[arg(long)]
@@ -88,6 +93,7 @@ async fn ping(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
         ended = ping_all(&agent, arguments, &mut tally) => ended,
         () = stop.requested() => Ok(()),
         () = reader.gone() => Ok(()),
+        () = options::after(arguments.time) => Ok(()),
     };
     Stop::ending();
     drop(agent);

@@ -18,7 +18,7 @@ use crate::complete;
 use crate::input;
 use crate::options::Global;
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// List, show, export, check and draw interaction protocols, and judge recorded letters
 ///
@@ -247,6 +247,19 @@ fn find(named: &str, global: &Global) -> Result<Machine, Failure> {
         Some(machine) => Ok(machine.clone()),
         None if named == "-" || named.contains(['/', '.']) || path.is_file() => read(path),
         None => Err(unknown(named, &library)),
+    }
+}
+
+/// Warns of the name of an unknown protocol that differs from a known one by a typing error. Protocols need
+/// not be known, so the command continues.
+pub(super) fn warn_if_misspelled(named: &str, global: &Global) {
+    // Files of protocols with mistakes are reported where they are needed.
+    let library = library(global).unwrap_or_else(|_| Library::standard());
+    if let Some(near) = library.near(named) {
+        report::warn(&format!(
+            "no protocol has the name {named:?}; did you mean {:?}? (`fipa protocol list` has all)",
+            near.name()
+        ));
     }
 }
 

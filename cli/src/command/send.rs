@@ -19,6 +19,7 @@ use fipa::{
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
+use super::protocol;
 use crate::options::{self, Global};
 use crate::report::{self, Failure};
 use crate::{complete, input, membership, output};
@@ -114,7 +115,7 @@ pub(crate) struct Arguments {
     accept: Vec<AgentId>,
 
     /// Send the message this number of times [default with --rate: until Ctrl-C]
-    #[arg(long, value_name = "N", conflicts_with = "wait",
+    #[arg(long, short, value_name = "N", conflicts_with = "wait",
           value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
 
@@ -122,6 +123,11 @@ pub(crate) struct Arguments {
     /// after the outcome of the one before]
     #[arg(long, value_name = "N", conflicts_with = "wait", value_parser = repeat::rate)]
     rate: Option<f64>,
+
+    /// With --count or --rate: end after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", conflicts_with = "wait",
+          value_parser = options::duration)]
+    time: Option<Duration>,
 
     /// Maximum wait for the replies, for example 10s
     #[arg(long, value_name = "TIME", default_value = "10s", requires = "wait",
@@ -190,13 +196,25 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
             "give --to once, and send to the other receivers by another command",
         ));
     }
+    report::warn_of_performatives([&arguments.performative]);
+    if let Some(named) = &arguments.parameters.protocol {
+        protocol::warn_if_misspelled(named, global);
+    }
     // Read before the domain is joined: input from a terminal can take long.
     let content = match (arguments.content.take(), &arguments.content_file) {
         (Some(text), _) => Some(text.into_bytes()),
         (None, Some(file)) => Some(input::read(file, Message::MAX_CONTENT)?),
         (None, None) => None,
     };
-    if arguments.count.is_some() || arguments.rate.is_some() {
+    let is_repeated = arguments.count.is_some() || arguments.rate.is_some();
+    if arguments.time.is_some() && !is_repeated {
+        return Err(Failure::wrong_usage(
+            "--for limits repeated sending",
+            "--for",
+            "give --rate or --count, too",
+        ));
+    }
+    if is_repeated {
         return options::block_on(repeat::send(&arguments, content, &config))?;
     }
     membership::run(async {

@@ -39,8 +39,12 @@ pub(crate) struct Arguments {
     content: String,
 
     /// End after this number of notifications
-    #[arg(long, value_name = "N")]
+    #[arg(long, short, value_name = "N")]
     count: Option<u64>,
+
+    /// End after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
+    time: Option<Duration>,
 
     /// Maximum wait for the agreement, for example 10s
     #[arg(long, value_name = "TIME", default_value = "10s", value_parser = options::duration)]
@@ -96,6 +100,7 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
         tokio::select! {
             printed = print_all(&mut subscription, arguments) => printed,
             () = reader.gone() => Ok(()),
+            () = options::after(arguments.time) => Ok(()),
         }
     };
     match unless_stopped(print, &mut reachability, stop).await {

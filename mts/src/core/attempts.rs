@@ -136,7 +136,7 @@ pub(crate) struct Upstream {
 pub(crate) enum Settlement {
     /// It has an outcome.
     Outcome(Outcome),
-    /// A custodian returns it, because its predecessor did not arrive.
+    /// A custodian returns it, because its predecessor did not arrive, or the custodian ends.
     Returned { uncertain: bool },
     /// A custodian returns it, because the receiver's registration has left this host.
     Moved,
@@ -646,6 +646,11 @@ impl AttemptTable {
     /// Whether the end of this hand-over of a letter is being reported and not acknowledged yet.
     pub(crate) fn is_reporting(&self, stream: Stream, sequence: u64, transfer: u64) -> bool {
         self.open_reports.contains(&(stream, sequence, transfer))
+    }
+
+    /// Whether the end of any hand-over is being reported and not acknowledged yet.
+    pub(super) fn has_open_reports(&self) -> bool {
+        !self.open_reports.is_empty()
     }
 
     /// Records the time in which a service acknowledged a report.

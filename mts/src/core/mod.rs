@@ -691,6 +691,10 @@ impl Core {
                     let detail = "the letter's sequence is not above its predecessor's";
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
+                if self.closed && self.agents.contains_key(&parcel.stream.receiver) {
+                    let reason = FailureReason::NoSuchAgent;
+                    return Verdict::Now(Answer::failed(reason, "the process is closing"));
+                }
                 let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
@@ -1053,10 +1057,20 @@ impl Core {
         !self.waiting.is_empty() || self.lanes.values().any(|lane| !lane.is_empty())
     }
 
-    /// Abandons all open letters, because the service ends; later submissions fail as closed.
-    /// Outcomes are among the actions, and follow from the conclusions of the abandoned attempts.
+    /// Whether the end of a letter in custody was reported, and the service that handed it over has
+    /// not confirmed the report.
+    #[must_use]
+    pub fn has_open_reports(&self) -> bool {
+        self.table.has_open_reports()
+    }
+
+    /// Abandons all open letters, because the service ends; later submissions fail as closed, and
+    /// letters that arrive are not taken. Outcomes are among the actions, and follow from the
+    /// conclusions of the abandoned attempts. Letters in custody return to the services that handed
+    /// them over, which may take a moment; see [`has_open_reports`](Self::has_open_reports).
     pub fn give_up(&mut self, now: Now) {
         self.closed = true;
+        self.ending = true;
         for letter in self.waiting.remove(|_| true) {
             self.fail_unresolved(letter, FailureReason::Closed);
         }

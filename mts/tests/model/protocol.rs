@@ -81,11 +81,13 @@ pub(crate) enum Fault {
     Expiry,
     /// The deadline of a letter ends at a custodian.
     EarlyExpiry,
+    /// A custodian returns a letter because it is about to end.
+    Closing,
     /// A custodian dies. Another starts at once.
     Death,
 }
 
-pub(crate) const ALL_FAULTS: [Fault; 8] = [
+pub(crate) const ALL_FAULTS: [Fault; 9] = [
     Fault::Loss,
     Fault::Late,
     Fault::NotSent,
@@ -93,6 +95,7 @@ pub(crate) const ALL_FAULTS: [Fault; 8] = [
     Fault::Refusal,
     Fault::Expiry,
     Fault::EarlyExpiry,
+    Fault::Closing,
     Fault::Death,
 ];
 
@@ -147,6 +150,8 @@ pub(crate) enum Action {
     Expire { sequence: u8 },
     /// The letter's deadline ends at a custodian.
     ExpireEarly { custodian: usize, key: Key },
+    /// A custodian that is about to end returns the letter.
+    ReturnEarly { custodian: usize, key: Key },
     /// A custodian dies; its reports that are in transit are lost with it or not.
     Die {
         custodian: usize,
@@ -174,6 +179,7 @@ impl Action {
                 | Self::NotSent(_)
                 | Self::Expire { .. }
                 | Self::ExpireEarly { .. }
+                | Self::ReturnEarly { .. }
                 | Self::Die { .. }
                 | Self::Register
                 | Self::EndOld
@@ -342,6 +348,9 @@ impl Model for Protocol {
                 if self.allows(state, Fault::EarlyExpiry) {
                     actions.push(Action::ExpireEarly { custodian, key });
                 }
+                if self.allows(state, Fault::Closing) {
+                    actions.push(Action::ReturnEarly { custodian, key });
+                }
             }
             if *life + 1 < LIVES && self.allows(state, Fault::Death) {
                 let reports = state.network.iter().any(|message| {
@@ -463,6 +472,13 @@ impl Model for Protocol {
                 let held = Self::held(state, custodian, key)?;
                 held.uncertain |= matches!(held.place, Place::Out { .. });
                 self.leave(state, custodian, key, |uncertain| What::Failed {
+                    uncertain,
+                });
+            }
+            Action::ReturnEarly { custodian, key } => {
+                let held = Self::held(state, custodian, key)?;
+                held.uncertain |= matches!(held.place, Place::Out { .. });
+                self.leave(state, custodian, key, |uncertain| What::Returned {
                     uncertain,
                 });
             }

@@ -18,10 +18,11 @@ impl World {
     pub(super) fn plan_faults(&mut self) {
         let w = self.weather;
         type Fault = (u32, fn() -> Event);
-        let faults: [Fault; 9] = [
+        let faults: [Fault; 10] = [
             (w.deaths, || Event::Die),
             (w.gateway_deaths, || Event::GatewayDies),
-            (w.closings, || Event::Close),
+            (w.closings, || Event::Close { gateway: false }),
+            (w.gateway_closings, || Event::Close { gateway: true }),
             (w.restarts, || Event::Restart),
             (w.moves, || Event::Move),
             (w.partitions, || Event::CutOff),
@@ -80,11 +81,16 @@ impl World {
         }
     }
 
-    /// A robot process abandons its letters in transit, refuses to send for a moment, and ends.
-    pub(super) fn close(&mut self) -> Result<(), Breach> {
-        let open = self
-            .robots()
-            .filter(|at| self.processes[*at].closed.is_none());
+    /// A robot process or a gateway abandons its letters in transit, refuses to send for a moment,
+    /// and ends.
+    pub(super) fn close(&mut self, gateway: bool) -> Result<(), Breach> {
+        let open = (0..self.processes.len()).filter(|at| {
+            let process = &self.processes[*at];
+            process.alive
+                && process.gateway == gateway
+                && !process.hostile
+                && process.closed.is_none()
+        });
         let open: Vec<usize> = open.collect();
         let Some(&at) = self.random.choice(&open) else {
             return Ok(());

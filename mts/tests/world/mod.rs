@@ -103,8 +103,10 @@ enum Event {
     Die,
     Restart,
     GatewayDies,
-    /// A process starts to close.
-    Close,
+    /// A process starts to close: a robot process, or a gateway.
+    Close {
+        gateway: bool,
+    },
     /// A process that closed ends.
     Closed {
         process: usize,
@@ -537,7 +539,7 @@ impl World {
             Event::Die => self.die(),
             Event::Restart => self.restart(),
             Event::GatewayDies => self.gateway_dies(),
-            Event::Close => self.close(),
+            Event::Close { gateway } => self.close(gateway),
             Event::Closed { process } => self.closed(process),
             Event::Forgotten { process, returns } => self.forgotten(process, returns),
             Event::Reborn { process } => self.reborn(process),

@@ -68,6 +68,9 @@ pub(crate) struct Weather {
     /// Number of robot processes that close gracefully: they abandon letters in transit, refuse
     /// more, and end.
     pub closings: u32,
+    /// Number of gateways that close gracefully: they return the letters in their custody, take no
+    /// more, and end.
+    pub gateway_closings: u32,
     /// Number of robot processes that are killed and restarted, with agents of the same names.
     pub restarts: u32,
     /// Number of agents that leave their process and are registered in another one, usually on
@@ -160,6 +163,7 @@ impl Weather {
             custody_bytes: 256 << 20,
             gateway_deaths: 0,
             closings: 0,
+            gateway_closings: 0,
             burst: 6,
             order: &[Kind::Shm, Kind::Udp, Kind::Tcp],
             deadlines: Deadlines::Same,
@@ -223,7 +227,8 @@ impl Weather {
         self.loss + self.answer_loss + self.refusal + self.silence == 0.0
             && self.overtaken + self.copies == 0.0
             && self.partitions + self.stalls + self.outages + self.addresses == 0
-            && self.deaths + self.restarts + self.moves + self.gateway_deaths + self.closings == 0
+            && self.deaths + self.restarts + self.moves == 0
+            && self.gateway_deaths + self.closings + self.gateway_closings == 0
             && self.refused_by_gateways + self.refused_by_receivers + self.rate == 0.0
             && self.denials == 0
             && self.deadlines == Deadlines::Same

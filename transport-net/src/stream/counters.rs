@@ -55,6 +55,9 @@ counters! {
     /// Connections refused because the peer did not prove its identity, or claimed to be a service
     /// that is already connected.
     refused_unproved,
+    /// Connections refused because the peer has an earlier one from the same address, which is alive. A
+    /// healthy peer opens another one when its first one is slow.
+    refused_again,
     /// Connections refused or evicted because a limit was reached.
     refused_crowd,
     /// Number of times that reading from a peer paused because of its rate limit.

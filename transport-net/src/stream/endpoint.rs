@@ -711,7 +711,7 @@ impl Endpoint {
             asked.iter().for_each(|other| other.ask());
             for other in asked {
                 if other.answers(now, RESPONSE_TIMEOUT).await {
-                    return Err(self.refuse(from, "it claims the incarnation of a connected service whose connection is alive"));
+                    return Err(self.refuse_beside(&other, from));
                 }
                 silent.push(other.number);
             }
@@ -792,6 +792,26 @@ impl Endpoint {
         let before = self.tally.refused_unproved.fetch_add(1, Ordering::Relaxed);
         warn_limited(before, format_args!("{from}: connection refused: {why}"));
         ConnectionEnd::IdentityConflict(why)
+    }
+
+    /// Logs and returns the refusal of an unproved peer that claims to be the service of another connection,
+    /// which is alive. From the same address, it is that service itself in the normal case: under load, a
+    /// service opens a second connection when an answer on the first one is late.
+    fn refuse_beside(&self, other: &Arc<Link>, from: Source) -> ConnectionEnd {
+        const WHY: &str =
+            "it claims the incarnation of a connected service whose connection is alive";
+        let home = {
+            let registry = self.registry.lock();
+            registry.peers.get(&other.number).map(|peer| peer.home)
+        };
+        if home != Some(from.home()) {
+            return self.refuse(from, WHY);
+        }
+        count(&self.tally.refused_again);
+        tracing::debug!(
+            "{from}: another connection of a connected service was refused, because the first one is alive"
+        );
+        ConnectionEnd::IdentityConflict(WHY)
     }
 
     /// Logs the end of a connection and removes the connection from every table.

@@ -190,10 +190,11 @@ async fn receive(
             }
         }
         First::Byte(TLS_RECORD) => {
-            "the peer has keys and began TLS, but this gateway has no keys: set \
-                                    security.keys here (`fipa keys init`) and trust each other's \
-                                    certificates, or remove security.keys there"
-                .to_owned()
+            let why = "the peer has keys and began TLS, but this gateway has no keys: set \
+                       security.keys here (`fipa keys init`) and trust each other's certificates, \
+                       or remove security.keys there";
+            endpoint.refusals.add(from.ip(), why);
+            why.to_owned()
         }
         First::Byte(byte) => format!("unknown protocol: the first byte is {byte:#04x}"),
         First::End => return,
@@ -378,6 +379,9 @@ async fn prove(
         First::Broken(error) => error.to_string(),
         First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
+    if matches!(first, First::Byte(_)) {
+        endpoint.refusals.add(from.ip(), &refused);
+    }
     let counter = &endpoint.tally().refused_unproved;
     let before = counter.fetch_add(1, Ordering::Relaxed);
     warn_limited(

@@ -1,5 +1,6 @@
 //! Configuration of a TCP endpoint.
 
+use super::refusals::Refusals;
 use crate::Identity;
 use crate::stream::config::Limits;
 
@@ -20,6 +21,8 @@ pub struct TcpConfig {
     /// is unproved, even if it claims this host and domain, and must also prove its identity when
     /// `security` is set.
     pub processes: bool,
+    /// Receives the connections that are refused because of keys.
+    pub refusals: Refusals,
     /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]
     pub security: Option<crate::secure::Security>,
@@ -35,6 +38,7 @@ impl TcpConfig {
             identity,
             limits: Limits::default(),
             processes: false,
+            refusals: Refusals::default(),
             #[cfg(feature = "secure")]
             security: None,
         }

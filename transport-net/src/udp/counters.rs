@@ -32,4 +32,7 @@ pub struct UdpCounters {
     pub refused_crowd: u64,
     /// Connections refused because their peer claimed to be a service that is already connected.
     pub refused_unproved: u64,
+    /// Connections refused because the peer has an earlier one from the same address, which is alive. A
+    /// healthy peer opens another one when its first one is slow.
+    pub refused_again: u64,
 }

@@ -721,6 +721,11 @@ fn an_unproved_peer_at_the_service_address_is_admitted_when_the_service_does_not
             (after.connections, after.accepted),
             (1, 1 + u64::from(gone))
         );
+        // At its own address, the service itself may have opened another connection.
+        assert_eq!(
+            (after.refused_again > 0, after.refused_unproved),
+            (!gone, 0)
+        );
         // The letters of the service still arrive.
         if !gone {
             simulation.send(B, 2, 10).unwrap();

@@ -1,8 +1,9 @@
 //! `fipa agents --watch`: prints each agent that joins, changes or leaves.
 
 use std::collections::BTreeMap;
+use std::pin::pin;
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use fipa::{Change, Config, DirectoryView, Entry, Time};
 use serde_json::json;
@@ -13,8 +14,14 @@ use crate::options;
 use crate::output;
 use crate::report::Failure;
 
-/// Prints changes until a signal, or until the output has no reader.
-pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Failure> {
+/// Prints changes until a signal, until the output has no reader, or until one of the limits: a number of
+/// lines, and a time.
+pub(super) fn run(
+    filter: &Filter,
+    (count, time): (Option<u64>, Option<Duration>),
+    config: &Config,
+    json: bool,
+) -> Result<(), Failure> {
     options::block_on(async {
         let mut stop = Stop::listen()?;
         let mut reader = output::Reader::of_output();
@@ -27,15 +34,20 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
             let domain = &config.domain;
             output::text(&format!("watching domain {domain}; press Ctrl-C to stop\n"))?;
         }
-        let mut shown = Shown::default();
+        let mut shown = Shown {
+            left: count,
+            ..Shown::default()
+        };
+        let mut over = pin!(options::after(time));
         let mut printed = shown.all(directory, filter, ChangeKind::Present, json);
         loop {
-            if printed.is_err() {
+            if printed.is_err() || shown.left == Some(0) {
                 break;
             }
             tokio::select! {
                 () = stop.requested() => break,
                 () = reader.gone() => break,
+                () = &mut over => break,
                 change = changes.next() => match change {
                     None => break,
                     Some(change) => {
@@ -74,7 +86,11 @@ impl ChangeKind {
 
 /// The agents that were shown and have not left.
 #[derive(Default)]
-struct Shown(BTreeMap<Arc<str>, Arc<Entry>>);
+struct Shown {
+    entries: BTreeMap<Arc<str>, Arc<Entry>>,
+    /// Number of lines that are left to print; `None` without a limit.
+    left: Option<u64>,
+}
 
 impl Shown {
     /// Prints all differences from the shown agents; an agent that was not shown is printed as `new`.
@@ -87,7 +103,7 @@ impl Shown {
     ) -> Result<(), Failure> {
         let entries = directory.entries();
         let gone: Vec<Arc<str>> = self
-            .0
+            .entries
             .keys()
             .filter(|name| entries.iter().all(|entry| entry.name != **name))
             .cloned()
@@ -96,9 +112,10 @@ impl Shown {
             self.update(&name, None, directory, filter, json)?;
         }
         for entry in entries.iter() {
-            if filter.matches(entry) && !self.0.contains_key(&entry.name) {
-                self.0.insert(Arc::clone(&entry.name), Arc::clone(entry));
-                print(new, entry, directory, json)?;
+            if filter.matches(entry) && !self.entries.contains_key(&entry.name) {
+                self.entries
+                    .insert(Arc::clone(&entry.name), Arc::clone(entry));
+                self.print(new, entry, directory, json)?;
             } else {
                 self.update(&entry.name, Some(entry), directory, filter, json)?;
             }
@@ -137,17 +154,33 @@ impl Shown {
         // An agent that no longer matches the filter is printed as left.
         let entry = entry.filter(|entry| filter.matches(entry));
         let before = match entry {
-            Some(entry) => self.0.insert(Arc::clone(name), Arc::clone(entry)),
-            None => self.0.remove(name),
+            Some(entry) => self.entries.insert(Arc::clone(name), Arc::clone(entry)),
+            None => self.entries.remove(name),
         };
         match (before, entry) {
-            (None, Some(entry)) => print(ChangeKind::Joined, entry, directory, json),
+            (None, Some(entry)) => self.print(ChangeKind::Joined, entry, directory, json),
             (Some(before), Some(entry)) if before != *entry => {
-                print(ChangeKind::Changed, entry, directory, json)
+                self.print(ChangeKind::Changed, entry, directory, json)
             }
-            (Some(before), None) => print(ChangeKind::Left, &before, directory, json),
+            (Some(before), None) => self.print(ChangeKind::Left, &before, directory, json),
             _ => Ok(()),
         }
+    }
+
+    /// Prints a line, unless the limit is reached.
+    fn print(
+        &mut self,
+        change: ChangeKind,
+        entry: &Entry,
+        directory: DirectoryView<'_>,
+        json: bool,
+    ) -> Result<(), Failure> {
+        match &mut self.left {
+            Some(0) => return Ok(()),
+            Some(left) => *left -= 1,
+            None => {}
+        }
+        print(change, entry, directory, json)
     }
 }
 

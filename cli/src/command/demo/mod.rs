@@ -14,7 +14,8 @@ use crate::report::Failure;
 /// Demonstrate the main functions with two simulated hosts and several agents
 ///
 /// Starts two gateways and several agents, all as separate processes. Each gateway has its own domain
-/// on this machine and stands for one robot. Root is not needed, and no traffic leaves this machine.
+/// on this machine and stands for one robot. Root is not needed, and no traffic leaves this machine. The
+/// second gateway has the first one as a static peer; mDNS is off, so that the demo meets no other domains.
 ///
 /// The agents converse through shared memory and, between the hosts, over TCP. Large content is
 /// delivered without a copy, one agent is killed, shared memory breaks, a legacy peer sends a letter,

@@ -144,8 +144,9 @@ impl Processes {
             .args(["demo", "--role", role, "--name", name])
             .args(["--set", &format!("domain={}", Self::domain(host))])
             .args(["--set", &format!("mts.name={name}")])
-            // No traffic of the demo leaves this machine.
-            .args(["--set", "discovery.interfaces=lo"])
+            // No traffic of the demo leaves this machine, and it meets no other domains: neither those of
+            // this machine nor those of another demo, whose agents have the same names.
+            .args(["--set", "discovery.mdns=false"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
             .args(["--set", "mts.transports=shm,unix,tcp"])
             .args(["--set", set])

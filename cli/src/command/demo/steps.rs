@@ -15,7 +15,7 @@ use crate::report::Failure;
 /// A letter for the agent `echo`, as the C++ library fipa_services sends it over TCP.
 const LEGACY_LETTER: &[u8] = include_bytes!("../../../data/tcp_letter.bin");
 const LARGE: usize = 4 << 20;
-/// Maximum time for the hosts to discover each other.
+/// Maximum time for one host to learn of the agents of the other.
 const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// The result of the demo.
@@ -167,7 +167,13 @@ impl Demo {
         self.processes
             .start("rover", "rover-mts", "gateway")
             .await?;
-        self.processes.start("crex", "crex-mts", "gateway").await?;
+        let locations = &self.processes.get("rover-mts")?.locations;
+        let tcp = locations.iter().find(|url| url.starts_with("tcp://"));
+        let tcp = tcp.ok_or("the gateway of rover has no TCP port")?;
+        let peer = format!("discovery.static={{ rover-mts = [\"{tcp}\"] }}");
+        self.processes
+            .start_with("crex", "crex-mts", "gateway", &peer)
+            .await?;
         for agent in ["rover", "arm_1", "arm_2", "arm_3", "arm_4", "echo"] {
             self.processes.start("rover", agent, "agent").await?;
             let process = self.processes.get(agent)?;
@@ -175,7 +181,9 @@ impl Demo {
             self.say(&format!("  {agent:<12} process {pid:<7} {locations}"));
         }
         self.processes.start("crex", "crex_camera", "agent").await?;
-        self.say("  crex_camera  on the other host; the gateways discover each other by mDNS ...");
+        self.say(
+            "  crex_camera  on the other host; its gateway connects with that of rover, its static peer ...",
+        );
         let started = Instant::now();
         let agents = loop {
             let agents = self.agents_seen_by("rover").await?;
@@ -184,12 +192,12 @@ impl Demo {
             }
             ensure!(
                 started.elapsed() < DISCOVERY_TIMEOUT,
-                "crex_camera was not discovered within {DISCOVERY_TIMEOUT:?}"
+                "crex_camera was not known within {DISCOVERY_TIMEOUT:?}"
             );
             tokio::time::sleep(Duration::from_millis(50)).await;
         };
         let took = started.elapsed().as_millis();
-        self.say(&format!("  discovered after {took} ms"));
+        self.say(&format!("  known after {took} ms"));
         for agent in ["rover", "arm_1", "arm_2", "arm_3", "arm_4", "echo"] {
             let entry = agents.iter().find(|entry| entry.name == agent);
             let entry = entry.ok_or_else(|| format!("{agent} is not listed"))?;

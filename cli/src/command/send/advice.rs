@@ -5,6 +5,8 @@ use fipa::{
     Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, SendError, is_pattern,
 };
 
+use fipa_monitor::one_edit_apart;
+
 use crate::report::Failure;
 
 /// One failure per reason, with the receivers that it concerns.
@@ -72,7 +74,32 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
     if let Some(error) = patterns.filter_map(|name| Pattern::new(name).err()).next() {
         return error.to_string();
     }
+    // In the shell, `arm_*` stands for what is `arm_.*` here.
+    let is_glob = |name: &&&str| {
+        let pairs = name.chars().zip(name.chars().skip(1));
+        pairs
+            .into_iter()
+            .any(|(before, it)| it == '*' && (before.is_alphanumeric() || "_-".contains(before)))
+    };
+    let glob = names.iter().find(is_glob);
+    if let Some(glob) = glob {
+        return format!(
+            "patterns are regular expressions: {:?} stands for any ending",
+            glob.replace('*', ".*")
+        );
+    }
     let entries = agent.domain().directory().entries();
+    let near = entries.iter().find(|entry| {
+        let known = entry.name.to_ascii_lowercase();
+        let is_near = |name: &&str| one_edit_apart(&known, &name.to_ascii_lowercase());
+        entry.role == Role::Agent && names.iter().any(is_near)
+    });
+    if let Some(near) = near {
+        return format!(
+            "did you mean {:?}? `fipa agents` lists the agents of domain {:?}",
+            near.name, config.domain
+        );
+    }
     let gateway = entries.iter().find(|entry| entry.role == Role::Gateway);
     let domain = &config.domain;
     match gateway {

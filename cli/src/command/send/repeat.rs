@@ -9,6 +9,7 @@ use tokio::time::Interval;
 
 use super::{Arguments, message, not_sent, register};
 use crate::membership::{self, Stop};
+use crate::options;
 use crate::output::{self, Reader};
 use crate::report::Failure;
 
@@ -39,6 +40,7 @@ pub(super) async fn send(
         ended = send_all(&agent, arguments, content, config, &mut tally) => ended,
         () = stop.requested() => Ok(()),
         () = reader.gone() => Ok(()),
+        () = options::after(arguments.time) => Ok(()),
     };
     let seconds = began.elapsed().as_secs_f64();
     Stop::ending();

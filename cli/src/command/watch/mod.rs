@@ -17,7 +17,6 @@ use std::time::{Duration, SystemTime};
 use clap::Args;
 use fipa::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::{Config, Matcher, Performative};
-use tokio::time::Instant;
 
 use self::checker::{CheckResult, Checker, Earlier, Letter};
 use self::conversations::Conversations;
@@ -28,7 +27,7 @@ use self::text::{Look, TextOutput};
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Show the letters of this host live
 ///
@@ -126,7 +125,7 @@ pub(crate) struct Arguments {
     record: Option<PathBuf>,
 
     /// End after this number of shown letters
-    #[arg(long, value_name = "N")]
+    #[arg(long, short, value_name = "N")]
     count: Option<u64>,
 
     /// End after this time, for example 10s
@@ -145,6 +144,7 @@ fn bytes(text: &str) -> Result<usize, String> {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
+    report::warn_of_performatives(&arguments.performative);
     let directory = arguments.protocols.as_deref();
     let library = checker::protocols(&config.monitor.protocols, directory)?;
     let checker = Checker::new(library);
@@ -193,12 +193,9 @@ async fn watch(
         has_reader: true,
     };
     display.begin(&config.domain, watcher.processes())?;
-    // A time beyond the range of the clock means no end.
-    let ends = arguments
-        .time
-        .and_then(|time| Instant::now().checked_add(time));
     {
         let mut stopped = pin!(stop.requested());
+        let mut over = pin!(options::after(arguments.time));
         while display.has_reader
             && arguments
                 .count
@@ -213,7 +210,7 @@ async fn watch(
                 }
                 () = tokio::time::sleep(TICK) => {}
                 () = &mut stopped => break,
-                () = at(ends) => break,
+                () = &mut over => break,
             }
             display.handle_timeout()?;
         }
@@ -240,13 +237,6 @@ async fn watch(
 const TICK: Duration = Duration::from_millis(200);
 /// Maximum delay between sending a letter and observing it. A message is overdue only after it.
 const OBSERVATION_DELAY: Duration = Duration::from_millis(500);
-
-async fn at(end: Option<Instant>) {
-    match end {
-        Some(end) => tokio::time::sleep_until(end).await,
-        None => std::future::pending().await,
-    }
-}
 
 /// Prints the observed events.
 struct Display<'a> {

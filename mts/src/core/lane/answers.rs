@@ -42,7 +42,10 @@ impl Lane {
         self.record_event(now, index);
         self.letters[index].progress.state = State::Waiting;
         // The timer visits the letter again, also if its deadline passed in the meantime.
-        self.due_at(self.letters[index].deadline);
+        self.due_at(match self.returning {
+            true => now,
+            false => self.letters[index].deadline,
+        });
         match conclusion {
             Conclusion::Answered(answer) => {
                 if let Some(tally) = self.tally() {

@@ -58,6 +58,10 @@ impl Lane {
                     self.fail(now, index, FailureReason::Unconfirmed, table);
                     continue;
                 }
+                State::Waiting if self.returning => {
+                    self.return_letter(now, index, table);
+                    continue;
+                }
                 State::Waiting if expired => {
                     let reason = self.reason_while_waiting(index);
                     self.fail(now, index, reason, table);

@@ -103,6 +103,8 @@ pub(crate) struct Lane {
     failed: Vec<Attempt>,
     /// Whether a letter came back: nothing is dispatched until all letters in transit have ended.
     recovering: bool,
+    /// Whether the service ends, and returns the letters that are in its custody.
+    returning: bool,
     /// The refresh of the directory that the letters wait for.
     awaited: Option<u64>,
     /// Whether the directory has just been refreshed, so that an unknown receiver is final.
@@ -159,6 +161,7 @@ impl Lane {
             tally: None,
             failed: Vec::new(),
             recovering: false,
+            returning: false,
             awaited: None,
             is_fresh: false,
             paused_until: None,
@@ -634,13 +637,18 @@ impl Lane {
     }
 
     /// Abandons all letters, when the sending agent goes away or the service ends. A letter in
-    /// transit gets its outcome from the conclusion of its transport, which follows at once.
+    /// transit gets its outcome from the conclusion of its transport, which follows at once. Letters
+    /// in custody are returned to the services that handed them over, which try other routes, or
+    /// give the outcome.
     pub(crate) fn give_up(&mut self, now: Instant, table: &mut AttemptTable) {
         self.recovering = true;
+        self.returning = self.is_custody();
         work::steps(self.letters.len());
         let mut index = 0;
         while let Some(delivery) = self.letters.get_mut(index) {
-            delivery.deadline = now;
+            if !self.returning {
+                delivery.deadline = now;
+            }
             match &mut delivery.progress.state {
                 State::UnderWay {
                     attempt,
@@ -655,6 +663,11 @@ impl Lane {
                     }
                     index += 1;
                 }
+                State::Custody { .. } if self.returning => {
+                    delivery.ended(rules::AttemptEnd::Unknown);
+                    self.return_letter(now, index, table);
+                }
+                State::Waiting if self.returning => self.return_letter(now, index, table),
                 State::Custody { .. } => {
                     self.fail(now, index, FailureReason::Unconfirmed, table);
                 }

@@ -1,7 +1,7 @@
 //! The handshake: an unproved peer gets a cookie, and a peer that returns the cookie gets a
 //! connection.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{Hop, Kind, Location, Principal, quota_address};
@@ -29,8 +29,8 @@ enum ClaimStatus {
     Free,
     /// A ping was sent on the other connection.
     Asked,
-    /// The other connection responded.
-    Taken,
+    /// The other connection, at this address, responded.
+    Taken { by: Option<IpAddr> },
 }
 
 impl Core {
@@ -79,7 +79,15 @@ impl Core {
             ClaimStatus::Free => {}
             // The peer repeats its hello because it gets no reply.
             ClaimStatus::Asked => return,
-            ClaimStatus::Taken => {
+            ClaimStatus::Taken { by } if by == Some(from.ip()) => {
+                self.counters.refused_again += 1;
+                tracing::debug!(
+                    "{from}: another connection of a connected service was refused, because the first one is alive"
+                );
+                self.reply(path, packet::refused(initiator));
+                return;
+            }
+            ClaimStatus::Taken { .. } => {
                 let before = self.counters.refused_unproved;
                 warn_limited(
                     before,
@@ -140,7 +148,10 @@ impl Core {
                     other.connection.ask();
                     self.connections.touch(number);
                 }
-                Some(asked) if other.connection.received_since(asked) => return ClaimStatus::Taken,
+                Some(asked) if other.connection.received_since(asked) => {
+                    let by = other.connection.path().map(|path| path.remote.ip());
+                    return ClaimStatus::Taken { by };
+                }
                 Some(asked) if now >= asked + RESPONSE_TIMEOUT => {
                     // Letters that the peer sent on the previous connection must not arrive after
                     // letters on this one.
