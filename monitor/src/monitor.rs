@@ -1455,7 +1455,8 @@ fn take_back(
     let taken = party.is_some_and(|party| party.take_back(side, act, reply_with));
     let rare = conversation.rare.as_deref_mut();
     if let Some(rare) = rare.filter(|rare| taken && rare.may_continue) {
-        // The message that has ruled out states has no effect.
+        // The state before the first known message is unknown, and a message that has ruled out
+        // states has no effect.
         let unknown = (u32::try_from(at).unwrap_or(NONE), FAILED);
         if !rare.alternatives.contains(&unknown) {
             rare.alternatives.push(unknown);

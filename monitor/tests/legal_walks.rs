@@ -5,8 +5,8 @@
 //! delivered and are sent again, go to groups, and carry `in-reply-to` or not. Monitors forget
 //! conversations and restart. An intruder guesses identifiers.
 //!
-//! `FIPA_WALK_STEPS` sets the number of steps for each seed, `FIPA_WALK_SEEDS` the number of seeds.
-//! `FIPA_WALK_SEED` repeats one seed.
+//! `FIPA_WALK_STEPS` sets the number of steps for each seed, `FIPA_WALK_SEEDS` the number of seeds, and
+//! `FIPA_WALK_FIRST` the first one. `FIPA_WALK_SEED` repeats one seed.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -495,13 +495,12 @@ fn no_legal_message_is_refused() {
         text.map(|text| text.parse::<u64>().unwrap())
     };
     let steps = number("FIPA_WALK_STEPS").unwrap_or(5_000);
-    let seeds = match number("FIPA_WALK_SEED") {
-        Some(seed) => seed..seed + 1,
-        None => 0..number("FIPA_WALK_SEEDS").unwrap_or(30),
-    };
+    let repeated = number("FIPA_WALK_SEED");
+    let first = repeated.or_else(|| number("FIPA_WALK_FIRST")).unwrap_or(0);
+    let count = repeated.map_or_else(|| number("FIPA_WALK_SEEDS").unwrap_or(30), |_| 1);
     let library = Library::standard();
     let mut all = [0; 4];
-    for seed in seeds {
+    for seed in first..first + count {
         println!("seed {seed}");
         let mut world = World::new(seed, &library);
         for _ in 0..steps {
@@ -513,5 +512,8 @@ fn no_legal_message_is_refused() {
     }
     let [accepted, unchecked, lost, crossed] = all;
     println!("{accepted} accepted, {unchecked} unchecked, {lost} lost, {crossed} crossed");
-    assert!(accepted > steps && unchecked > steps / 20 && lost > 0 && crossed > 0);
+    // A single walk may have few events of one kind.
+    if repeated.is_none() {
+        assert!(accepted > steps && unchecked > steps / 20 && lost > 0 && crossed > 0);
+    }
 }
