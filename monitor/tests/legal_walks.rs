@@ -177,7 +177,8 @@ impl<'l> World<'l> {
         self.counts[usize::from(!verdict.is_accepted())] += 1;
         if let Some(violation) = verdict.violation() {
             let id = format!("{:?}", violation.conversation_id);
-            let own: Vec<&String> = self.log.iter().filter(|line| line.contains(&id)).collect();
+            let concerns = |line: &&String| line.contains(&id) || !line.contains(':');
+            let own: Vec<&String> = self.log.iter().filter(concerns).collect();
             let last = &own[own.len().saturating_sub(60)..];
             panic!("{by}: {violation}\n{last:#?}");
         }
