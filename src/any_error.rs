@@ -119,6 +119,10 @@ pub enum Error {
     #[cfg(feature = "protocols")]
     #[error(transparent)]
     Dialogue(#[from] DialogueError),
+    /// The conversations of an earlier registration cannot be restored.
+    #[cfg(feature = "protocols")]
+    #[error(transparent)]
+    Restore(#[from] fipa_monitor::SnapshotError),
     /// The directory facilitator or the agent management system has refused a request or failed.
     #[cfg(feature = "protocols")]
     #[error(transparent)]

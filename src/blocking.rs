@@ -358,6 +358,28 @@ impl Agent {
         self.agent.expect_conversation(id);
     }
 
+    /// Continues the checks of conversations of an earlier registration; see
+    /// [`crate::Agent::restore_conversations`].
+    ///
+    /// # Errors
+    /// See [`crate::Agent::restore_conversations`].
+    #[cfg(feature = "protocols")]
+    pub fn restore_conversations(
+        &self,
+        conversations: &[u8],
+    ) -> Result<usize, fipa_monitor::SnapshotError> {
+        self.agent.restore_conversations(conversations)
+    }
+
+    /// Deregisters the agent and keeps the states of its conversations; see [`crate::Agent::depart`].
+    ///
+    /// # Errors
+    /// See [`crate::Agent::depart`].
+    #[cfg(feature = "protocols")]
+    pub fn depart(self) -> Result<crate::protocol::Departure, DeregisterError> {
+        self.agent.depart()
+    }
+
     /// Sets the extent of the monitor's knowledge; see [`crate::Agent::set_history`].
     #[cfg(feature = "protocols")]
     pub fn set_history(&self, history: fipa_monitor::History) {

@@ -8,8 +8,8 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Message, Performative};
 use fipa_monitor::{
-    Header, History, Library, LibraryError, LibraryFull, Limits, Monitor, Now, Policy, Verdict,
-    Violation, ViolationKind,
+    Header, History, Library, LibraryError, LibraryFull, Limits, Monitor, Now, Policy,
+    SnapshotError, Verdict, Violation, ViolationKind,
 };
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Resolution, Role, resolve};
@@ -89,6 +89,7 @@ impl Rules {
 }
 
 /// The checks of one agent; empty if the configuration turns them off.
+#[derive(Clone)]
 pub(crate) struct Checks(Option<Arc<Monitored>>);
 
 /// The monitor of one agent.
@@ -127,6 +128,27 @@ impl Checks {
     pub(crate) fn expect_conversation(&self, id: &str) {
         if let Some(monitored) = &self.0 {
             monitored.monitor.lock().expect(id);
+        }
+    }
+
+    /// See [`Departure::conversations`](crate::protocol::Departure::conversations).
+    pub(crate) fn conversations(&self) -> Vec<u8> {
+        let monitored = self.0.as_ref();
+        monitored.map_or_else(Vec::new, |monitored| {
+            monitored.monitor.lock().snapshot(now())
+        })
+    }
+
+    /// See [`Agent::restore_conversations`](crate::Agent::restore_conversations).
+    pub(crate) fn restore_conversations(
+        &self,
+        conversations: &[u8],
+    ) -> Result<usize, SnapshotError> {
+        match &self.0 {
+            Some(monitored) if !conversations.is_empty() => {
+                monitored.monitor.lock().restore(conversations, now())
+            }
+            _ => Ok(0),
         }
     }
 

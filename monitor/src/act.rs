@@ -52,6 +52,11 @@ impl<'a> Act<'a> {
         })
     }
 
+    /// Whether this is a number of [`act_number`](crate::conversation::act_number), or 0 for none.
+    pub(crate) fn is_number(number: u8) -> bool {
+        usize::from(number) <= Performative::STANDARD.len() || number == u8::MAX
+    }
+
     pub(crate) fn named(name: &'a str) -> Self {
         let mut standard = (0..).zip(&Performative::STANDARD);
         match standard.find(|(_, act)| act.as_str().eq_ignore_ascii_case(name)) {

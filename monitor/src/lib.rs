@@ -23,6 +23,7 @@ mod clock;
 mod conversation;
 mod deadlines;
 mod delegated;
+mod fingerprints;
 mod header;
 mod judge;
 mod library;
@@ -37,6 +38,7 @@ pub mod recording;
 mod report;
 mod roles;
 pub mod scxml;
+mod snapshot;
 mod table;
 mod verdict;
 
@@ -48,6 +50,7 @@ pub use limits::Limits;
 pub use machine::{After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition};
 pub use monitor::{Event, Monitor};
 pub use policy::{History, Policy, one_edit_apart};
+pub use snapshot::SnapshotError;
 pub use verdict::{
     Accepted, Expected, ReplyMismatch, Unchecked, Verdict, Violation, ViolationKind,
 };

@@ -238,22 +238,29 @@ impl Machine {
 
     /// The states to which a message that looks like the first one leads later: see [`step`].
     pub(crate) fn later_targets(&self, act: Act<'_>, first: &Transition) -> Vec<u16> {
-        let later = (0_u16..).zip(&self.states);
-        let later = later.filter(|(at, _)| *at != self.initial);
-        let mut targets: Vec<u16> = later
-            .flat_map(|(_, state)| &state.transitions)
-            .filter(|step| step.acts.contains(act) && step.from.overlaps(&first.from))
-            .map(|step| step.target)
-            .filter(|target| *target != first.target)
-            .collect();
+        let later = self.later_steps(act, first).map(|step| step.target);
+        let mut targets: Vec<u16> = later.filter(|target| *target != first.target).collect();
         targets.sort_unstable();
         targets.dedup();
         targets
     }
 
-    /// Whether a message like the first one may come later, and then leads to another state.
+    /// Whether a message like the first one may come later. If it leads to the state after the first
+    /// one, only the state before it is uncertain.
     pub(crate) fn may_repeat(&self, act: Act<'_>, first: &Transition) -> bool {
-        !self.later_targets(act, first).is_empty()
+        self.later_steps(act, first).next().is_some()
+    }
+
+    fn later_steps<'m>(
+        &'m self,
+        act: Act<'m>,
+        first: &'m Transition,
+    ) -> impl Iterator<Item = &'m Transition> {
+        let later = (0_u16..).zip(&self.states);
+        let later = later.filter(|(at, _)| *at != self.initial || self.returns());
+        later
+            .flat_map(|(_, state)| &state.transitions)
+            .filter(move |step| step.acts.contains(act) && step.from.overlaps(&first.from))
     }
 
     fn returns(&self) -> bool {

@@ -15,6 +15,7 @@ use crate::conversation::{
     is_final, is_over, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
+use crate::fingerprints::Fingerprints;
 use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope, step};
@@ -46,14 +47,15 @@ pub struct Monitor {
     pub(crate) table: Table,
     pub(crate) removed: Removed,
     refused: Refused,
-    deadlines: Deadlines,
+    pub(crate) deadlines: Deadlines,
     hasher: RandomState,
+    pub(crate) fingerprints: Fingerprints,
     /// Whether all messages belong to one conversation.
     single: bool,
     /// Buffer that is reused.
     moves: Vec<Move>,
     forgotten: u64,
-    last: Now,
+    pub(crate) last: Now,
 }
 
 /// An event that has no message.
@@ -135,6 +137,7 @@ impl Monitor {
             refused: Refused::default(),
             deadlines: Deadlines::default(),
             hasher,
+            fingerprints: Fingerprints::random(),
             single: false,
             moves: Vec::new(),
             forgotten: 0,
@@ -258,7 +261,7 @@ impl Monitor {
             return;
         };
         let act = header.act();
-        let reply_with = self.fingerprint(header.reply_with_text());
+        let reply_with = self.fingerprints.of(header.reply_with_text());
         let library = Arc::clone(&self.library);
         let mains: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
         for main in mains {
@@ -287,10 +290,6 @@ impl Monitor {
                 (at, next) = (next, slot.sibling);
             }
         }
-    }
-
-    fn fingerprint(&self, text: Option<&str>) -> u64 {
-        text.map_or(0, |text| self.hasher.hash_one(text))
     }
 
     /// Whether a conversation with this identifier that the monitor does not have did not begin.
@@ -360,9 +359,9 @@ impl Monitor {
             act: header.act(),
             sender,
             receivers,
-            reply_with: self.fingerprint(header.reply_with_text()),
+            reply_with: self.fingerprints.of(header.reply_with_text()),
             reply_with_text: header.reply_with_text().unwrap_or_default(),
-            in_reply_to: self.fingerprint(header.in_reply_to_text()),
+            in_reply_to: self.fingerprints.of(header.in_reply_to_text()),
             own,
             own_receiver,
         };
@@ -438,29 +437,28 @@ impl Monitor {
     /// Finds the conversation of a message among those with its identifier: the one in which sender and
     /// receiver take part. Otherwise, an agent that does not lead one of them can begin another.
     fn place(&self, id: &str, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<u32> {
-        let ranked = self.table.find_all(id).map(|at| {
-            let rank = self.rank(at, observed);
-            let slot = self.table.slot(at);
+        // One search: hashing the identifier is a large part of a check.
+        let alike: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
+        let mut local = alike.iter();
+        if let Some(at) = local.find(|at| self.fits_role(**at, header, observed)) {
+            return Some(*at);
+        }
+        let ranked = alike.iter().map(|at| {
+            let rank = self.rank(*at, observed);
+            let slot = self.table.slot(*at);
             // Other agents may take part in a conversation that began elsewhere.
             let joined = rank == 0 && slot.is_some_and(|slot| slot.conversation.joined);
             let serial = slot.map_or(0, |slot| slot.serial);
             (
                 rank,
                 joined,
-                self.has_protocol(at, header, observed),
+                self.has_protocol(*at, header, observed),
                 serial,
-                at,
+                *at,
             )
         });
         // Of several, the last that began.
         let best = ranked.max();
-        let local = self
-            .table
-            .find_all(id)
-            .find(|at| self.fits_role(*at, header, observed));
-        if local.is_some() {
-            return local;
-        }
         let (rank, .., at) = best?;
         if rank == 2 || self.single {
             return Some(at);
@@ -874,7 +872,7 @@ impl Monitor {
 
     /// Removes conversations until there is space for so many more of this peer, with so many bytes.
     /// The conversation `keep` is kept.
-    fn evict(&mut self, keep: u32, peer: Name, more: usize, bytes: usize) {
+    pub(crate) fn evict(&mut self, keep: u32, peer: Name, more: usize, bytes: usize) {
         loop {
             let full = self.table.len() + more > self.limits.conversations.max(1);
             let heavy = self.table.bytes() + bytes > self.limits.bytes;
@@ -1445,7 +1443,8 @@ fn take_back(
     let taken = party.is_some_and(|party| party.take_back(side, act, reply_with));
     let rare = conversation.rare.as_deref_mut();
     if let Some(rare) = rare.filter(|rare| taken && rare.may_continue) {
-        // The message that has ruled out states has no effect.
+        // The state before the first known message is unknown, and a message that has ruled out
+        // states has no effect.
         let unknown = (u32::try_from(at).unwrap_or(NONE), FAILED);
         if !rare.alternatives.contains(&unknown) {
             rare.alternatives.push(unknown);

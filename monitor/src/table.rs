@@ -153,6 +153,13 @@ impl Table {
         self.find_all(id).next()
     }
 
+    /// The main conversations: the time of the last message, the serial number and the slot.
+    pub(crate) fn mains(&self) -> impl Iterator<Item = (u64, u64, u32)> + '_ {
+        let used = (0..).zip(&self.slots).filter(|(_, slot)| slot.used);
+        used.filter(|(_, slot)| slot.parent == NONE)
+            .map(|(at, slot)| (slot.touched, slot.serial, at))
+    }
+
     pub(crate) fn slot(&self, at: u32) -> Option<&Slot> {
         self.slots.get(at as usize).filter(|slot| slot.used)
     }

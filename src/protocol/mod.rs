@@ -63,6 +63,7 @@ pub use auction::Auction;
 pub use bids::Bids;
 pub use contract_net::{Awarded, ContractNet};
 pub use dialogue::DialogueError;
+pub use history::Departure;
 pub use initiator::{Decision, Request};
 pub use participant::{Reply, Task};
 pub use partners::PartnerEvent;

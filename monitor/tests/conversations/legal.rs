@@ -413,6 +413,44 @@ fn each_participant_of_a_forgotten_conversation_may_be_in_a_later_state() {
 }
 
 #[test]
+fn an_undelivered_message_that_may_have_been_a_later_one_leaves_an_unknown_state() {
+    let iterated = |text| say_in("fipa-iterated-contract-net", text);
+    let restarted = || {
+        let monitor = Monitor::agent(library(), "ann").with_history(History::Unknown);
+        Stage::new(monitor)
+    };
+    // The second call is the first message after the restart.
+    let call = || iterated("cfp ann>ben").reply_with("2");
+    for next in [
+        "accept-proposal ann>ben",
+        "reject-proposal ann>ben",
+        "failure ben>ann",
+    ] {
+        let mut stage = restarted();
+        stage.right(call());
+        let now = stage.now;
+        stage.monitor.undelivered(&call(), "ben", now);
+        assert_eq!(stage.check(&iterated(next)), UNKNOWN, "{next}");
+    }
+    let mut stage = restarted();
+    stage.right(call());
+    let now = stage.now;
+    stage.monitor.undelivered(&call(), "ben", now);
+    assert_eq!(stage.right(call()), "called", "it may be sent again");
+    // If it was delivered, the state is known.
+    let mut stage = restarted();
+    stage.right(call());
+    let early = stage.wrong(iterated("accept-proposal ann>ben"));
+    assert_eq!(early.kind, Kind::OutOfOrder);
+    // A monitor that knows all conversations knows that this one had not begun.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(call());
+    let now = stage.now;
+    stage.monitor.undelivered(&call(), "ben", now);
+    stage.wrong(iterated("accept-proposal ann>ben"));
+}
+
+#[test]
 fn messages_go_to_the_delegate_of_a_participant() {
     for name in [None, Some("ann")] {
         let mut stage = Stage::new(match name {

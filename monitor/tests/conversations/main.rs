@@ -8,6 +8,7 @@ mod details;
 mod guards;
 mod hostile;
 mod legal;
+mod moved;
 mod own;
 mod plain;
 

@@ -1,0 +1,283 @@
+//! Conversations of an agent that moves: the next monitor of the agent continues them.
+
+use fastrand::Rng;
+use fipa_monitor::SnapshotError;
+
+use super::*;
+
+fn moved(stage: &Stage, agent: &str) -> Stage {
+    let mut monitor = Monitor::agent(library(), agent);
+    let taken = stage.monitor.snapshot(stage.now);
+    let restored = monitor.restore(&taken, stage.now).unwrap();
+    assert_eq!(restored, stage.monitor.len());
+    assert_eq!(monitor.bytes(), stage.monitor.bytes());
+    Stage {
+        monitor,
+        now: stage.now,
+    }
+}
+
+/// A participant and an initiator in conversations of each kind of state.
+fn filled() -> Stage {
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(request("request ann>ben").reply_with("q"));
+    stage.right(request("agree ben>ann").in_reply_to("q").reply_with("a"));
+    let call = |words| say(words).conversation_id("calls");
+    stage.right(call("cfp ben>ann,cid").reply_with("call"));
+    stage.right(call("propose ann>ben").in_reply_to("call"));
+    let pattern = |words| say(words).conversation_id("pattern");
+    stage.right(pattern("cfp ben>arm_.*"));
+    stage.right(pattern("propose arm_1>ben"));
+    let news = |words| say_in("fipa-subscribe", words).conversation_id("news");
+    stage.right(news("subscribe ben>ann").reply_with("s"));
+    stage.right(news("agree ann>ben"));
+    stage.right(news("cancel ben>ann").reply_with("x"));
+    let query = |words| say_in("fipa-query", words).conversation_id("query");
+    stage.right(query("query-if cid>ben").reply_to(["dan"]));
+    let broken = |words| request(words).conversation_id("broken");
+    stage.right(broken("request cid>ben"));
+    stage.right(broken("not-understood ben>cid"));
+    stage
+}
+
+#[test]
+fn the_next_monitor_has_the_same_states() {
+    let mut stage = moved(&filled(), "ben");
+    // The fingerprints are the same.
+    let answer = || request("inform ben>ann");
+    assert_eq!(
+        stage.wrong(answer().in_reply_to("other")).kind,
+        Kind::WrongReply
+    );
+    assert_eq!(
+        stage.wrong(request("agree ben>ann").reply_with("a")).kind,
+        Kind::Repeated
+    );
+    assert_eq!(
+        stage.wrong(request("refuse ben>ann")).kind,
+        Kind::Unexpected
+    );
+    assert_eq!(stage.right(answer().in_reply_to("q")), "done");
+    let call = |words| say(words).conversation_id("calls");
+    assert_eq!(stage.wrong(call("propose dan>ben")).kind, Kind::Stranger);
+    stage.right(call("accept-proposal ben>ann"));
+    assert_eq!(
+        stage.wrong(call("accept-proposal ben>cid")).kind,
+        Kind::OutOfOrder
+    );
+    let pattern = |words| say(words).conversation_id("pattern");
+    stage.right(pattern("propose arm_2>ben"));
+    stage.right(pattern("accept-proposal ben>arm_1"));
+    let news = |words| say_in("fipa-subscribe", words).conversation_id("news");
+    assert_eq!(
+        stage.right(news("inform ann>ben").in_reply_to("s")),
+        "cancelling"
+    );
+    assert_eq!(
+        stage.right(news("inform ann>ben").in_reply_to("x")),
+        "cancelled"
+    );
+    let query = |words| say_in("fipa-query", words).conversation_id("query");
+    stage.right(query("inform ben>dan"));
+    let broken = |words| request(words).conversation_id("broken");
+    assert_eq!(stage.wrong(broken("agree ben>cid")).kind, Kind::Ended);
+}
+
+#[test]
+fn deadlines_move_along() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    let due = Time::from_system_time(stage.now + Duration::from_secs(10)).unwrap();
+    stage.right(say("cfp ben>ann").reply_by(due));
+    stage.pass(4);
+    let mut stage = moved(&stage, "ben");
+    assert_eq!(stage.pass(5), []);
+    assert!(matches!(&stage.pass(2)[..], [Event::Overdue { .. }]));
+}
+
+#[test]
+fn uncertain_conversations_are_left_out() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(request("request ben>ann"));
+    let now = stage.now;
+    stage
+        .monitor
+        .undelivered(&request("request ben>ann"), "ann", now);
+    stage.right(say("cfp ben>ann").reply_to(["dan"]).conversation_id("d"));
+    stage.right(request("request ben>ann").conversation_id("e"));
+    let mut next = Monitor::agent(library(), "ben").with_history(History::Unknown);
+    assert_eq!(next.restore(&stage.monitor.snapshot(now), now), Ok(1));
+    let mut next = Stage { monitor: next, now };
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_ne!(
+        next.check(&request("inform ann>ben").conversation_id("d")),
+        unknown
+    );
+    assert_eq!(next.check(&request("cancel ben>ann")), unknown);
+    next.right(request("agree ann>ben").conversation_id("e"));
+    // An observer belongs to no agent.
+    let empty = Stage::observer().monitor.snapshot(now);
+    let mut ben = Monitor::agent(library(), "ben");
+    assert!(matches!(
+        ben.restore(&empty, now),
+        Err(SnapshotError::OtherAgent { .. })
+    ));
+}
+
+#[test]
+fn the_limits_of_the_next_monitor_hold() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    for number in 0..100 {
+        stage.right(request("request ann>ben").conversation_id(number.to_string()));
+        stage.pass(2);
+    }
+    let taken = stage.monitor.snapshot(stage.now);
+    let mut limits = Limits::default();
+    limits.conversations = 10;
+    let mut next = Monitor::agent(library(), "ben").with_limits(limits);
+    assert_eq!(
+        next.restore(&taken, stage.now),
+        Ok(8),
+        "the share of a peer"
+    );
+    let mut next = Stage {
+        monitor: next,
+        now: stage.now,
+    };
+    // The latest are kept, and the others are unknown.
+    next.right(request("agree ben>ann").conversation_id("99"));
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_eq!(
+        next.check(&request("agree ben>ann").conversation_id("3")),
+        unknown
+    );
+    limits.bytes = taken.len() - 1;
+    let mut next = Monitor::agent(library(), "ben").with_limits(limits);
+    let refused = next.restore(&taken, stage.now);
+    assert!(
+        matches!(refused, Err(SnapshotError::TooLarge(_))),
+        "{refused:?}"
+    );
+    // A snapshot has at most as many bytes as the conversations may have.
+    limits.conversations = 100_000;
+    limits.bytes = 4_000;
+    let mut small = Stage::new(Monitor::agent(library(), "ben").with_limits(limits));
+    for number in 0..100 {
+        small.check(&request("request ben>ann").conversation_id(number.to_string()));
+    }
+    assert!(small.monitor.snapshot(small.now).len() <= 4_000);
+}
+
+#[test]
+fn other_bytes_are_refused_without_effect() {
+    let stage = filled();
+    let taken = stage.monitor.snapshot(stage.now);
+    let fresh = || Monitor::agent(library_once(), "ben");
+    let refused = |bytes: &[u8]| {
+        let mut monitor = fresh();
+        let refused = monitor.restore(bytes, stage.now).unwrap_err();
+        assert!(monitor.is_empty() && monitor.bytes() == 0);
+        refused
+    };
+    for end in 0..taken.len() {
+        refused(&taken[..end]);
+    }
+    assert_eq!(
+        refused(b"{\"conversations\":[]}"),
+        SnapshotError::NotASnapshot
+    );
+    let mut longer = taken.clone();
+    longer.push(0);
+    assert!(matches!(refused(&longer), SnapshotError::Malformed(_)));
+    let mut newer = taken.clone();
+    newer[8] = 2;
+    assert_eq!(refused(&newer), SnapshotError::Version(2));
+    let mut ann = Monitor::agent(library(), "ann");
+    let other = ann.restore(&taken, stage.now);
+    assert!(
+        matches!(other, Err(SnapshotError::OtherAgent { .. })),
+        "{other:?}"
+    );
+    let mut twice = fresh();
+    twice.restore(&taken, stage.now).unwrap();
+    assert_eq!(twice.restore(&taken, stage.now), Err(SnapshotError::InUse));
+    // Names of the same length.
+    let replaced = |from: &str, to: &str| {
+        let mut bytes = taken.clone();
+        let mut found = 0;
+        for at in 0..bytes.len() - from.len() {
+            // After the name of the agent itself.
+            if at > 20 && &bytes[at..at + from.len()] == from.as_bytes() {
+                bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+                found += 1;
+            }
+        }
+        assert!(found > 0, "{from}");
+        refused(&bytes)
+    };
+    assert_eq!(
+        replaced("agreed", "AGREED"),
+        SnapshotError::Malformed("an unknown state")
+    );
+    assert_eq!(
+        replaced("ben", "eve"),
+        SnapshotError::Malformed("a conversation without the agent")
+    );
+    assert_eq!(
+        replaced("cid", "ann"),
+        SnapshotError::Malformed("participants that do not fit the protocol")
+    );
+}
+
+/// Changed snapshots are refused without effect, or restored within the limits. Then no message and no
+/// timeout makes the monitor fail.
+#[test]
+fn changed_bytes_do_no_harm() {
+    let stage = filled();
+    let taken = stage.monitor.snapshot(stage.now);
+    let mut rng = Rng::with_seed(7);
+    let (mut refused, mut restored) = (0, 0);
+    for _ in 0..5_000 {
+        let mut bytes = taken.clone();
+        for _ in 0..rng.usize(1..4) {
+            let at = rng.usize(..bytes.len());
+            match rng.u8(..8) {
+                0 => drop(bytes.remove(at)),
+                1 => bytes.insert(at, rng.u8(..)),
+                2 => bytes[at] = u8::MAX,
+                3 => bytes[at] = bytes[at].wrapping_add(1),
+                _ => bytes[at] ^= 1 << rng.u8(..8),
+            }
+        }
+        let mut monitor = Monitor::agent(library_once(), "ben");
+        if monitor.restore(&bytes, stage.now).is_err() {
+            assert!(monitor.is_empty() && monitor.bytes() == 0);
+            refused += 1;
+            continue;
+        }
+        restored += 1;
+        for (words, id) in [
+            ("agree ben>ann", "c"),
+            ("inform ann>ben", "news"),
+            ("propose cid>ben", "calls"),
+            ("cancel ben>ann", "calls"),
+            ("failure ann>ben", "pattern"),
+            ("not-understood cid>ben", "query"),
+            ("inform cid>ben", "broken"),
+        ] {
+            let (act, _) = words.split_once(' ').unwrap();
+            let (from, to) = words[act.len() + 1..].split_once('>').unwrap();
+            let header = Header::new(act.parse().unwrap()).sender(from);
+            let header = header.receivers([to]).conversation_id(id);
+            monitor.check(&header.in_reply_to("q").reply_with("r"), stage.now);
+            let _ = monitor.snapshot(stage.now);
+        }
+        monitor.handle_timeout(stage.now + Duration::from_secs(1_000_000));
+        assert!(monitor.is_empty() && monitor.bytes() == 0);
+    }
+    assert!(refused > 500 && restored > 100, "{refused} {restored}");
+}
+
+fn library_once() -> Arc<Library> {
+    static ONCE: std::sync::LazyLock<Arc<Library>> = std::sync::LazyLock::new(library);
+    Arc::clone(&ONCE)
+}
