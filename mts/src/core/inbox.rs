@@ -10,8 +10,8 @@ use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Pa
 
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE, work};
-use crate::AccessGate;
 use crate::gate::{Link, Source};
+use crate::{AccessGate, LetterParts};
 
 /// A letter taken from an agent's queue.
 #[derive(Debug, Clone)]
@@ -85,14 +85,15 @@ impl Inbox {
         }
     }
 
-    /// Puts a letter into the queue, or returns the reason why not. Asks the gate as well.
+    /// Puts a letter into the queue, or returns the reason why not. Asks the gate as well, which
+    /// has read the letter.
     pub(crate) fn accept(
         &mut self,
         now: Instant,
         parcel: &Parcel,
         letter: Letter,
         (via, from): (Kind, &Hop),
-        gate: Option<&dyn AccessGate>,
+        gate: Option<(&dyn AccessGate, LetterParts)>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
         if stream.sender.is_known() {
@@ -114,8 +115,8 @@ impl Inbox {
             self.wait(stream, &from.location);
             return Answer::Busy;
         }
-        if let Some(gate) = gate
-            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, from))
+        if let Some((gate, parts)) = gate
+            && let Err(why) = gate.admits(now, &self.name, &parts, link_of(via, from))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
