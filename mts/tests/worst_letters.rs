@@ -166,22 +166,39 @@ fn a_letter_of_a_legacy_peer_to_the_maximum_of_receivers() {
     }
 }
 
+/// Number of agents that get a copy of a legacy peer's letter to these receivers.
+fn copies(agents: u64, receivers: &[String]) -> usize {
+    let (mut core, directory) = core_with(agents);
+    let from = LegacySource {
+        address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+        signature: Signature::FipaServices,
+    };
+    let letter = letter(receivers, 0);
+    let read = Unframed::read(letter, Kind::Tcp, from, &*directory).unwrap();
+    core.handle_unframed(now(), Duration::from_secs(5), read);
+    let actions = std::iter::from_fn(|| core.poll_action());
+    let sent = actions.filter(|action| matches!(action, Action::Dispatch { .. }));
+    sent.count()
+}
+
 /// Of 1,025 agents, one more than a letter of a legacy peer may be for, each would get a copy.
 #[test]
 fn a_letter_of_a_legacy_peer_to_too_many_agents_goes_to_none() {
-    for (agents, copies) in [(1024, 1024), (1025, 0)] {
-        let (mut core, directory) = core_with(agents);
-        let from = LegacySource {
-            address: IpAddr::V4(Ipv4Addr::LOCALHOST),
-            signature: Signature::FipaServices,
-        };
-        let letter = letter(&["arm_.*".to_owned()], 0);
-        let read = Unframed::read(letter, Kind::Tcp, from, &*directory).unwrap();
-        core.handle_unframed(now(), Duration::from_secs(5), read);
-        let actions = std::iter::from_fn(|| core.poll_action());
-        let sent = actions.filter(|action| matches!(action, Action::Dispatch { .. }));
-        assert_eq!(sent.count(), copies);
-    }
+    let all = ["arm_.*".to_owned()];
+    assert_eq!(copies(1024, &all), 1024);
+    assert_eq!(copies(1025, &all), 0);
+}
+
+#[test]
+fn a_letter_of_a_legacy_peer_with_too_many_receivers_or_a_long_pattern_goes_to_none() {
+    let names =
+        |count: u64| -> Vec<String> { (0..count).map(|number| format!("arm_{number}")).collect() };
+    assert_eq!(copies(100, &names(64)), 64);
+    assert_eq!(copies(100, &names(65)), 0);
+    let pattern = |len| format!("{:x<len$}", "arm_.*|");
+    assert_eq!(copies(100, &[pattern(128)]), 100);
+    assert_eq!(copies(100, &[pattern(129)]), 0);
+    assert_eq!(copies(100, &[pattern(20), pattern(21)]), 0);
 }
 
 #[test]
