@@ -186,7 +186,7 @@ async fn another_host_gets_no_routes_and_introduces_no_agents() {
 }
 
 /// Returns the entry of an agent of another host in the directory of a process.
-fn seen(domain: &Domain, name: &str) -> Option<std::sync::Arc<fipa::Entry>> {
+fn seen(domain: &Domain, name: &str) -> Option<Arc<fipa::Entry>> {
     let found = domain.directory().known(name)?;
     matches!(found.reach, fipa::Reach::Remote { .. }).then_some(found)
 }
