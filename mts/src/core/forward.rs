@@ -13,7 +13,7 @@ use fipa_transport::{
 
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
-use super::inbox::link_of;
+use super::inbox::{ask, link_of};
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
@@ -188,8 +188,12 @@ impl Core {
         (via, from, unanswered): (Kind, Hop, Option<(Kind, Ticket)>),
         parcel: &Parcel,
         letter: Letter,
-        ReadLetter { parts, envelope }: ReadLetter,
+        read: Option<Box<ReadLetter>>,
     ) -> Verdict {
+        let (parts, envelope) = match read {
+            Some(read) => (read.parts, read.envelope),
+            None => (None, None),
+        };
         let (entry, stamped, envelope) = match self.admit(now, parcel, (letter, envelope), &from) {
             Ok(admitted) => admitted,
             Err(refusal) => return Verdict::Now(refusal),
@@ -295,9 +299,9 @@ impl Core {
         parts: Option<&LetterParts>,
         link: Link,
     ) -> Result<(), String> {
-        match (&self.reader.gate, parts) {
-            (Some(gate), Some(parts)) => gate.admits(now.instant, receiver, parts, link),
-            _ => Ok(()),
+        match &self.reader.gate {
+            Some(gate) => ask(&**gate, now.instant, receiver, parts, link),
+            None => Ok(()),
         }
     }
 

@@ -93,7 +93,7 @@ impl Inbox {
         parcel: &Parcel,
         letter: Letter,
         (via, from): (Kind, &Hop),
-        gate: Option<(&dyn AccessGate, LetterParts)>,
+        gate: Option<(&dyn AccessGate, Option<&LetterParts>)>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
         if stream.sender.is_known() {
@@ -116,7 +116,7 @@ impl Inbox {
             return Answer::Busy;
         }
         if let Some((gate, parts)) = gate
-            && let Err(why) = gate.admits(now, &self.name, &parts, link_of(via, from))
+            && let Err(why) = ask(gate, now, &self.name, parts, link_of(via, from))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
@@ -248,6 +248,20 @@ impl Inbox {
         self.senders
             .retain(|_, taken| now.saturating_duration_since(taken.seen) < memory);
         self.next_sweep = Some(now + Duration::from_secs(60));
+    }
+}
+
+/// Asks a gate about a letter that it has read. It refuses one that it has not read.
+pub(super) fn ask(
+    gate: &dyn AccessGate,
+    now: Instant,
+    receiver: &str,
+    parts: Option<&LetterParts>,
+    link: Link,
+) -> Result<(), String> {
+    match parts {
+        Some(parts) => gate.admits(now, receiver, parts, link),
+        None => Err("the access gate has not read the letter".to_owned()),
     }
 }
 

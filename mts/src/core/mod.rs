@@ -665,6 +665,7 @@ impl Core {
     }
 
     /// Handles a parcel that arrived by this kind of transport.
+    #[inline]
     pub fn handle_arrival(
         &mut self,
         now: Now,
@@ -676,15 +677,16 @@ impl Core {
         self.handle_read_arrival(now, via, answers_at_once, arrival, read)
     }
 
-    /// Handles a parcel whose letter was [read](LetterReader::read_arrival) before the core was
-    /// locked.
+    /// Handles a parcel whose letter the [reader](Self::reader) of this core has
+    /// [read](LetterReader::read_arrival) before the core was locked. A gateway refuses a letter that
+    /// was not read, and so does a core with a gate.
     pub fn handle_read_arrival(
         &mut self,
         now: Now,
         via: Kind,
         answers_at_once: bool,
         arrival: Arrival,
-        read: Option<ReadLetter>,
+        read: Option<Box<ReadLetter>>,
     ) -> Verdict {
         let Arrival {
             mut parcel,
@@ -712,11 +714,11 @@ impl Core {
                     let detail = "the letter's sequence is not above its predecessor's";
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
-                let read = read.unwrap_or_else(|| self.reader.read(&letter));
                 let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
-                    let gate = self.reader.gate.as_deref().zip(read.parts);
+                    let parts = read.as_ref().and_then(|read| read.parts.as_ref());
+                    let gate = self.reader.gate.as_deref().map(|gate| (gate, parts));
                     let came = (via, &from);
                     let answer = inbox.accept(now.instant, &parcel, letter, came, gate);
                     if answer == Answer::Accepted {

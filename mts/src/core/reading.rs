@@ -45,23 +45,27 @@ impl LetterReader {
         }
     }
 
-    /// Reads the letter of this arrival, if it has one.
+    /// Reads the letter of this arrival, if it has one. Returns `None` where no part is needed, in a
+    /// process without a gate.
     #[must_use]
-    pub fn read_arrival(&self, arrival: &Arrival) -> Option<ReadLetter> {
+    pub fn read_arrival(&self, arrival: &Arrival) -> Option<Box<ReadLetter>> {
         match &arrival.parcel.body {
-            Body::Letter(letter) => Some(self.read(letter)),
+            Body::Letter(letter) => self.read(letter),
             _ => None,
         }
     }
 
-    pub(super) fn read(&self, letter: &Letter) -> ReadLetter {
+    pub(super) fn read(&self, letter: &Letter) -> Option<Box<ReadLetter>> {
+        if self.gate.is_none() && !self.forwards {
+            return None;
+        }
         work::steps(letter.len() / 512);
-        ReadLetter {
+        Some(Box::new(ReadLetter {
             parts: self.parts(letter),
             envelope: self
                 .forwards
                 .then(|| stamp::read(letter, &self.name, self.incarnation)),
-        }
+        }))
     }
 
     /// Has the gate read a letter, if there is one.
