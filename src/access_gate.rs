@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
-use fipa_mts::{AccessGate, Link};
+use fipa_mts::{AccessGate, LetterParts, Link};
 use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
 use parking_lot::Mutex;
 
@@ -46,43 +46,46 @@ impl RulesGate {
         }
     }
 
-    /// Checks a letter from this sender to this receiver.
+    /// Reads the parts of a message with this sender in its envelope.
+    fn parts_of(&self, message: &MessageView<'_>, sender: String) -> LetterParts {
+        let signed = message.sender().map(|it| it.name());
+        let other = signed.filter(|signed| signed.as_str() != sender);
+        let fault = other
+            .map(|signed| format!("its envelope names the sender {sender}, its message {signed}"));
+        LetterParts {
+            performative: message.performative_name().as_str().into_owned(),
+            protocol: message.protocol().map(|it| it.as_str().into_owned()),
+            ontology: message.ontology().map(|it| it.as_str().into_owned()),
+            action: self.action(message),
+            is_stamped: false,
+            fault,
+            sender,
+        }
+    }
+
+    /// Checks a letter to this receiver.
     fn judge(
         &self,
         now: Instant,
         receiver: &str,
-        letter: &Letter,
-        view: &EnvelopeView<'_>,
-        sender: &str,
+        letter: &LetterParts,
         link: Link,
     ) -> Result<(), Refused> {
-        let message = MessageView::parse_payload(letter.payload());
-        let message = message
-            .map_err(|error| Refused::Other(format!("its message cannot be decoded: {error}")))?;
-        if let Some(signed) = message.sender().map(|it| it.name())
-            && signed.as_str() != sender
-        {
-            let what = format!("its envelope names the sender {sender}, its message {signed}");
-            return Err(Refused::Other(what));
+        if let Some(fault) = &letter.fault {
+            return Err(Refused::Other(fault.clone()));
         }
-        let performative = message.performative_name();
-        let protocol = message.protocol();
-        let protocol = protocol.as_ref().map(|text| text.as_str());
-        let ontology = message.ontology();
-        let ontology = ontology.as_ref().map(|text| text.as_str());
-        let action = self.action(&message);
+        let sender = &*letter.sender;
         let facts = LetterFacts {
             sender,
             receiver,
-            performative: &performative.as_str(),
-            protocol: protocol.as_deref(),
-            ontology: ontology.as_deref(),
-            action: action.as_deref(),
+            performative: &letter.performative,
+            protocol: letter.protocol.as_deref(),
+            ontology: letter.ontology.as_deref(),
+            action: letter.action.as_deref(),
         };
-        let is_stamped = view.stamps().next().is_some();
         let judge = |gateway: Option<Arc<Entry>>| match gateway {
             // The gateway has forwarded this letter: it has stamped and counted it.
-            Some(_) if is_stamped => self.access.lock().judge(&facts),
+            Some(_) if letter.is_stamped => self.access.lock().judge(&facts),
             Some(gateway) if *gateway.name == *sender => Ok(()),
             _ => {
                 let mut access = self.access.lock();
@@ -160,11 +163,35 @@ enum Refused {
 }
 
 impl AccessGate for RulesGate {
+    fn read(&self, letter: &Letter) -> LetterParts {
+        let envelope = letter.envelope();
+        let view = EnvelopeView::parse(&envelope).ok();
+        let sender = view.as_ref().and_then(EnvelopeView::from_name);
+        let (Some(view), Some(sender)) = (&view, sender) else {
+            return LetterParts {
+                fault: Some("its envelope names no sender".to_owned()),
+                ..LetterParts::default()
+            };
+        };
+        let sender = sender.as_str().into_owned();
+        match MessageView::parse_payload(letter.payload()) {
+            Ok(message) => LetterParts {
+                is_stamped: view.stamps().next().is_some(),
+                ..self.parts_of(&message, sender)
+            },
+            Err(error) => LetterParts {
+                fault: Some(format!("its message cannot be decoded: {error}")),
+                sender,
+                ..LetterParts::default()
+            },
+        }
+    }
+
     fn admits(
         &self,
         now: Instant,
         receiver: &str,
-        letter: &Letter,
+        letter: &LetterParts,
         link: Link,
     ) -> Result<(), String> {
         if let Of::Gateway(own) = &self.of
@@ -172,19 +199,11 @@ impl AccessGate for RulesGate {
         {
             return Ok(());
         }
-        let envelope = letter.envelope();
-        let view = EnvelopeView::parse(&envelope).ok();
-        let sender = view.as_ref().and_then(EnvelopeView::from_name);
-        let judged = match (&view, sender) {
-            (Some(view), Some(sender)) => {
-                self.judge(now, receiver, letter, view, &sender.as_str(), link)
-            }
-            _ => Err(Refused::Other("its envelope names no sender".to_owned())),
-        };
+        let judged = self.judge(now, receiver, letter, link);
         judged.map_err(|why| {
             // A sender that exceeds its rate must not fill the log as well.
             if !matches!(why, Refused::ByRule(Refusal::TooMany { told: false })) {
-                let sender = sender.map(|name| name.to_string()).unwrap_or_default();
+                let sender = &*letter.sender;
                 tracing::warn!(target: AUDIT, sender, receiver, "letter refused: {why}");
             }
             why.to_string()
@@ -296,6 +315,10 @@ mod tests {
         }
     }
 
+    fn admits(gate: &RulesGate, now: Instant, letter: &Letter, link: Link) -> Result<(), String> {
+        gate.admits(now, "arm", &gate.read(letter), link)
+    }
+
     #[tokio::test]
     async fn what_the_gateway_has_counted_is_not_counted_again() {
         let (gate, gateway, _place) = gate(&[]);
@@ -303,7 +326,7 @@ mod tests {
         let now = Instant::now();
         let taken = |is_stamped, link| {
             let letter = letter("rover", "rover", is_stamped);
-            gate.admits(now, "arm", &letter, link).is_ok()
+            admits(&gate, now, &letter, link).is_ok()
         };
         let link = gateway_by(Kind::Unix);
         // Delayed letters may arrive closer together than they were sent.
@@ -324,8 +347,8 @@ mod tests {
             register(&gateway, &gate);
             let now = Instant::now();
             let stamped = letter("rover", "rover", true);
-            assert!(gate.admits(now, "arm", &stamped, link).is_ok());
-            assert!(gate.admits(now, "arm", &stamped, link).is_err(), "{link:?}");
+            assert!(admits(&gate, now, &stamped, link).is_ok());
+            assert!(admits(&gate, now, &stamped, link).is_err(), "{link:?}");
         }
     }
 
@@ -333,7 +356,7 @@ mod tests {
     async fn envelope_and_message_name_one_sender() {
         let (gate, _gateway, _place) = gate(&[]);
         let letter = letter("rover", "crex", false);
-        let judged = gate.admits(Instant::now(), "arm", &letter, process_by(Kind::Shm));
+        let judged = admits(&gate, Instant::now(), &letter, process_by(Kind::Shm));
         let told = judged.unwrap_err();
         assert!(told.contains("rover") && told.contains("crex"), "{told}");
     }
@@ -344,7 +367,7 @@ mod tests {
         register(&gateway, &gate);
         let taken = |sender, is_passed_on, link| {
             let letter = letter(sender, sender, is_passed_on);
-            gate.admits(Instant::now(), "arm", &letter, link).is_ok()
+            admits(&gate, Instant::now(), &letter, link).is_ok()
         };
         for local in [Kind::Shm, Kind::Unix] {
             assert!(taken("mts", false, gateway_by(local)));

@@ -1,7 +1,8 @@
 //! Runs the bodies of the fuzz targets with random inputs, for machines without libFuzzer.
 //!
 //! `FIPA_FUZZ_SECONDS` is the time per target. By default, each target runs a fixed number of
-//! inputs. `FIPA_FUZZ_SEED` repeats the inputs of an earlier run.
+//! inputs. `FIPA_FUZZ_SEED` repeats the inputs of an earlier run. An input that fails, or does not end,
+//! is printed.
 
 #![allow(
     dead_code,
@@ -52,6 +53,8 @@ mod texts;
 #[path = "../fuzz/src/udt.rs"]
 mod udt;
 
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
@@ -59,17 +62,20 @@ use fipa::fuzzing;
 
 /// Number of inputs per target, unless a time is set.
 const INPUTS: usize = 150;
+/// Time after which an input counts as endless.
+const WATCHDOG: Duration = Duration::from_secs(120);
 
 fn number(variable: &str) -> Option<u64> {
     std::env::var(variable).ok()?.parse().ok()
 }
 
 /// Runs a target with its seeds, and with random mutations of them.
-fn plays(target: &str, play: fn(&[u8])) {
+fn plays(target: &'static str, play: fn(&[u8])) {
     let seed = number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
     println!("{target}: FIPA_FUZZ_SEED={seed}");
     let seconds = number("FIPA_FUZZ_SECONDS").map(Duration::from_secs);
     let seeds = seeds::of(target);
+    let play = watched(target, play);
     seeds.iter().for_each(|seed| play(seed));
     let (mut random, began) = (Rng::with_seed(seed), Instant::now());
     let mut count = 0;
@@ -78,15 +84,37 @@ fn plays(target: &str, play: fn(&[u8])) {
         for _ in 0..random.usize(..8) {
             change(&mut random, &mut input, &seeds);
         }
-        let before = input.clone();
-        let played = std::panic::catch_unwind(|| play(&input));
-        if let Err(panic) = played {
-            println!("{target}, input {count}: {before:?}");
-            std::panic::resume_unwind(panic);
-        }
+        play(&input);
         count += 1;
     }
     println!("{target}: {count} inputs");
+}
+
+/// Runs inputs on a thread of their own, and prints an input that fails or does not end.
+fn watched(target: &'static str, play: fn(&[u8])) -> impl Fn(&[u8]) {
+    let (inputs, coming) = channel::<Vec<u8>>();
+    let (ended, ends) = channel();
+    thread::spawn(move || {
+        for input in coming {
+            let played = std::panic::catch_unwind(|| play(&input));
+            if ended.send(played).is_err() {
+                return;
+            }
+        }
+    });
+    move |input| {
+        inputs.send(input.to_vec()).unwrap();
+        match ends.recv_timeout(WATCHDOG) {
+            Ok(Ok(())) => {}
+            Ok(Err(panic)) => {
+                println!("{target}, input: {input:?}");
+                std::panic::resume_unwind(panic);
+            }
+            Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
+                panic!("{target}: no end within {WATCHDOG:?} of the input {input:?}")
+            }
+        }
+    }
 }
 
 fn change(random: &mut Rng, input: &mut Vec<u8>, seeds: &[Vec<u8>]) {

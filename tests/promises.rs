@@ -20,7 +20,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fastrand::Rng;
 use fipa::{AgentId, FailureReason, Kind, Letter, Message, Outcome, Performative};
 use fipa_mts::core::Submission;
-use fipa_mts::{AccessGate, Sending, letter_for};
+use fipa_mts::{AccessGate, LetterParts, Sending, letter_for};
 use fipa_testbed::until_async;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
@@ -98,15 +98,22 @@ impl Draft {
 struct NoCancel;
 
 impl AccessGate for NoCancel {
+    fn read(&self, letter: &Letter) -> LetterParts {
+        let message = Message::decode(letter.payload()).unwrap();
+        LetterParts {
+            performative: message.performative().to_string(),
+            ..LetterParts::default()
+        }
+    }
+
     fn admits(
         &self,
         _: Instant,
         _: &str,
-        letter: &Letter,
+        letter: &LetterParts,
         _: fipa_mts::Link,
     ) -> Result<(), String> {
-        let message = Message::decode(letter.payload()).map_err(|error| error.to_string())?;
-        match *message.performative() == Performative::Cancel {
+        match letter.performative == Performative::Cancel.to_string() {
             true => Err("cancel is not allowed here".to_owned()),
             false => Ok(()),
         }

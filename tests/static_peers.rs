@@ -4,10 +4,21 @@
 
 mod support;
 
-use std::time::Duration;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
 
-use fipa::{AgentId, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative};
+use fipa::{
+    AgentId, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative, contact,
+    routes,
+};
+use fipa_mts::letter_for;
 use fipa_testbed::until_async;
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
+    Transport as _, Verdict,
+};
+use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
+use parking_lot::Mutex;
 use support::config;
 use tokio::io::AsyncReadExt;
 
@@ -82,8 +93,100 @@ async fn the_gateway_answers_an_unknown_ontology_with_not_understood() {
     assert_eq!(answer.sender().unwrap().name(), gateway.name());
 }
 
+/// The messages that a gateway of another host gets.
+#[derive(Default)]
+struct Inbox(Mutex<Vec<Message>>);
+
+impl Inbox {
+    fn reply_to(&self, question: &str) -> Option<Message> {
+        let messages = self.0.lock();
+        let mut replies = messages.iter();
+        replies
+            .find(|it| it.in_reply_to() == Some(question))
+            .cloned()
+    }
+}
+
+impl Sink for Inbox {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        if let Body::Letter(letter) = arrival.parcel.body {
+            let message = Message::decode(letter.payload()).unwrap();
+            self.0.lock().push(message);
+        }
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
+
+    fn concluded(&self, _: AttemptId, _: Conclusion) {}
+}
+
+/// Routes contain the incarnations of agents and gateways, and an introduced agent takes a name.
+#[tokio::test(flavor = "multi_thread")]
+async fn another_host_gets_no_routes_and_introduces_no_agents() {
+    let config = config(&[]);
+    let gateway = Gateway::open(&config).await.unwrap();
+    let domain = Domain::open(&config).await.unwrap();
+    let arm = domain.register("arm").await.unwrap();
+    let incarnation = Incarnation::random();
+    let identity = Identity {
+        name: "stranger-mts".to_owned(),
+        incarnation,
+        domain: "elsewhere".to_owned(),
+        host: "elsewhere".to_owned(),
+    };
+    let tcp = TcpConfig::new(Vec::new(), identity);
+    let transport = TcpTransport::new(tcp, tokio::runtime::Handle::current());
+    let inbox = Arc::new(Inbox::default());
+    transport.listen(inbox.clone()).unwrap();
+    let mut locations = gateway.locations().into_iter();
+    let at = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    let at = at.with_incarnation(gateway.incarnation());
+    let stolen = br#"{"version":1,"name":"thief","addresses":["tcp://127.0.0.1:9;fipa-services"]}"#;
+    for (sequence, ontology, content) in [
+        (1, routes::ONTOLOGY, &b""[..]),
+        (2, contact::ONTOLOGY, stolen),
+    ] {
+        let request = Message::builder(Performative::Request)
+            .sender(AgentId::new("stranger-mts").unwrap())
+            .receiver(AgentId::new(gateway.name()).unwrap())
+            .ontology(ontology)
+            .reply_with(ontology)
+            .content(content)
+            .build()
+            .unwrap();
+        let parcel = Parcel {
+            receiver: gateway.name().into(),
+            stream: Stream {
+                sender: incarnation,
+                receiver: gateway.incarnation(),
+            },
+            sequence,
+            after: 0,
+            remaining: Duration::from_secs(30),
+            transfer: sequence,
+            body: Body::Letter(letter_for(&request, SystemTime::now()).unwrap()),
+        };
+        transport
+            .dispatch(AttemptId(sequence), &at, parcel)
+            .unwrap();
+        until_async("the answer", || inbox.reply_to(ontology).is_some()).await;
+        let answer = inbox.reply_to(ontology).unwrap();
+        assert_eq!(*answer.performative(), Performative::Refuse, "{answer}");
+        let content = answer.content().unwrap();
+        let told = String::from_utf8(content.to_vec()).unwrap();
+        assert!(told.contains("agents of the gateway's host"), "{told}");
+        let secret = arm.incarnation().to_string();
+        assert!(!answer.to_string().contains(&secret), "{answer}");
+    }
+    assert!(gateway.directory().known("thief").is_none());
+    transport.close();
+    domain.close().await;
+    gateway.close().await;
+}
+
 /// Returns the entry of an agent of another host in the directory of a process.
-fn seen(domain: &Domain, name: &str) -> Option<std::sync::Arc<fipa::Entry>> {
+fn seen(domain: &Domain, name: &str) -> Option<Arc<fipa::Entry>> {
     let found = domain.directory().known(name)?;
     matches!(found.reach, fipa::Reach::Remote { .. }).then_some(found)
 }

@@ -12,7 +12,7 @@ use tokio::runtime::Runtime;
 
 use crate::command::Command;
 use crate::complete;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Agent communication to the FIPA standards: through shared memory or Unix domain sockets on one
 /// host, through gateways between hosts.
@@ -42,13 +42,14 @@ impl CommandLine {
     /// and merged here, because clap's own global options lose the value given before the command
     /// when the option is also given after it.
     pub(crate) fn read() -> Self {
-        let matches = command().get_matches();
+        let matches = command().try_get_matches();
+        let matches = matches.unwrap_or_else(|error| report::usage(&error));
         let read = || {
             let mut line = Self::from_arg_matches(&matches)?;
             line.global = Global::of(&matches)?;
             Ok(line)
         };
-        read().unwrap_or_else(|error: clap::Error| error.exit())
+        read().unwrap_or_else(|error: clap::Error| report::usage(&error))
     }
 }
 

@@ -73,6 +73,15 @@ fn rows_within(width: Option<usize>) -> Table {
     table
 }
 
+/// Prints the converted input of a command: unchanged for another program or a file, escaped on a
+/// terminal.
+pub(crate) fn converted(converted: &[u8]) -> Result<(), Failure> {
+    match io::stdout().is_terminal() {
+        true => text(&String::from_utf8_lossy(converted)),
+        false => bytes(converted),
+    }
+}
+
 /// Columns of the terminal; `None` if standard output is not a terminal.
 pub(crate) fn terminal_width() -> Option<usize> {
     let size = terminal_size::terminal_size();

@@ -1,11 +1,14 @@
 //! Prints errors on standard error: the problem, its place and the remedy.
 
+use std::env;
+use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
-use std::process::ExitCode;
+use std::process::{self, ExitCode};
 
 use fipa::config::{ConfigError, Mistake};
 use fipa::{ErrorChain, Performative};
+use fipa_acl::is_unprintable;
 use fipa_monitor::near_standard;
 
 use crate::output;
@@ -168,6 +171,21 @@ pub(crate) fn warn_of_performatives<'a>(performatives: impl IntoIterator<Item = 
             ));
         }
     }
+}
+
+/// Prints an error of the command line, the help or the version, and ends the process. An error repeats
+/// arguments, which may be texts from outside in a script.
+pub(crate) fn usage(error: &clap::Error) -> ! {
+    let is_harmless = |argument: OsString| {
+        let text = argument.to_string_lossy();
+        !text.contains(is_unprintable)
+    };
+    if !error.use_stderr() || env::args_os().all(is_harmless) {
+        error.exit();
+    }
+    let text = error.render().to_string();
+    to_stderr(&format!("{}\n", indented(text.trim_end())));
+    process::exit(error.exit_code())
 }
 
 /// Indents all lines but the first, so that none of them looks like a line of this module.

@@ -7,6 +7,7 @@ mod common;
 use std::fs;
 use std::io::Write;
 use std::net::TcpStream;
+use std::process::Command;
 use std::thread;
 
 use common::{Host, Ran};
@@ -283,5 +284,98 @@ fn configuration_and_doctor_are_shown_without_unprintable_characters() {
     ] {
         let ran = host.run(arguments);
         all_harmless(&ran);
+    }
+}
+
+#[test]
+fn services_resources_and_platforms_are_shown_without_unprintable_characters() {
+    let host = Host::new();
+    let _gateway = host.start(&["up"]);
+    let mut watching = host.start(&["df", "watch", "--count", "1"]);
+    let mut machine = host.start(&["df", "watch", "--json", "--count", "1"]);
+    let property = format!("{HOSTILE}={HOSTILE}");
+    let crane = host.start(&[
+        "df",
+        "register",
+        "crane",
+        HOSTILE,
+        "--service",
+        HOSTILE,
+        "--property",
+        &property,
+    ]);
+    harmless(&crane.ready);
+    for watching in [&mut watching, &mut machine] {
+        while let Some(line) = watching.next_line() {
+            harmless(&line);
+            assert!(line.contains("31m"), "{line}");
+        }
+    }
+    for arguments in [
+        &["df", "search"][..],
+        &["df", "search", "--json"],
+        &["df", "search", "--type", HOSTILE],
+    ] {
+        let ran = host.run(arguments);
+        assert_eq!(ran.code, Some(0), "{ran:?}");
+        let printed = all_harmless(&ran);
+        assert!(printed.contains("31m"), "{printed}");
+    }
+    for arguments in [
+        &["df", "search", "--service", "\u{9b}"][..],
+        &["df", "search", "--df", HOSTILE],
+        &["ams"],
+        &["ams", "--json"],
+        &["ams", "--ownership", HOSTILE],
+        &["ams", "--ams", HOSTILE],
+        &["actions", HOSTILE],
+        &["do", HOSTILE, HOSTILE, HOSTILE],
+        &["own", HOSTILE, "--volatile"],
+        &["lock", HOSTILE, "--within", "10ms", "--", "true"],
+        &["locks"],
+        &["request", HOSTILE, HOSTILE],
+        &["subscribe", HOSTILE, HOSTILE],
+        &["ping", HOSTILE, "--count", "1"],
+    ] {
+        all_harmless(&host.run(arguments));
+    }
+}
+
+#[test]
+fn input_is_converted_without_unprintable_characters_on_a_terminal() {
+    let host = Host::new();
+    // A byte string makes the content other than text.
+    let content = b"((a \"x\x1b]0;t\x07\" #1\"\x9b))";
+    fs::write(host.path("goal.sl"), content).unwrap();
+    let message = format!(
+        "{{ \"performative\": \"inform\", \"content\": {:?} }}",
+        "x\u{1b}[31m"
+    );
+    let message = message.replace("\\u{1b}", "\\u001b");
+    fs::write(host.path("message.json"), message).unwrap();
+    let program = env!("CARGO_BIN_EXE_fipa");
+    for arguments in [
+        "content format goal.sl",
+        "content check goal.sl",
+        "content to-json goal.sl",
+        "encode --representation string message.json",
+    ] {
+        let piped = host.run(&arguments.split(' ').collect::<Vec<_>>());
+        assert_eq!(piped.code, Some(0), "{piped:?}");
+        // `script` runs the command on a terminal of its own.
+        let shown = Command::new("script")
+            .args([
+                "--quiet",
+                "--command",
+                &format!("{program} {arguments}"),
+                "/dev/null",
+            ])
+            .current_dir(host.path(""))
+            .output()
+            .unwrap();
+        let shown = String::from_utf8(shown.stdout).unwrap();
+        // A terminal has a carriage return in front of each newline.
+        harmless(&shown.replace("\r\n", "\n"));
+        assert!(!shown.is_empty(), "{arguments}");
     }
 }

@@ -55,11 +55,35 @@ impl Source {
     }
 }
 
+/// The parts of a letter that an [`AccessGate`] decides about.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct LetterParts {
+    /// The sender in the envelope; empty if there is none.
+    pub sender: String,
+    /// The name of the performative.
+    pub performative: String,
+    /// The protocol.
+    pub protocol: Option<String>,
+    /// The ontology.
+    pub ontology: Option<String>,
+    /// The action of a goal for a robot.
+    pub action: Option<String>,
+    /// Whether a gateway has stamped the letter.
+    pub is_stamped: bool,
+    /// The reason why no rule can admit the letter.
+    pub fault: Option<String>,
+}
+
 /// Decides which letters are accepted, for an agent of this service or into a gateway's custody.
 pub trait AccessGate: Send + Sync {
+    /// Reads the parts of a letter that the decision depends on. That takes time in proportion to
+    /// the bytes of the letter, so the runtime calls it before it locks the core, and once for all
+    /// receivers of the letter.
+    fn read(&self, letter: &Letter) -> LetterParts;
+
     /// Decides whether a letter for this receiver that arrived on this link is accepted. Called
-    /// once per letter when there is space for it: not for copies of an accepted letter, and not
-    /// for one that must wait. Must not block or call the service back.
+    /// once per letter and receiver when there is space for it: not for copies of an accepted
+    /// letter, and not for one that must wait. Must not block or call the service back.
     ///
     /// # Errors
     /// Returns the reason of the refusal, which the sender is told.
@@ -67,7 +91,7 @@ pub trait AccessGate: Send + Sync {
         &self,
         now: Instant,
         receiver: &str,
-        letter: &Letter,
+        letter: &LetterParts,
         link: Link,
     ) -> Result<(), String>;
 }

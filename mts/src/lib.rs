@@ -21,6 +21,6 @@ type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 type Set<K> = std::collections::HashSet<K, foldhash::fast::RandomState>;
 
 pub use failure::DeliveryFailure;
-pub use gate::{AccessGate, Link, Source};
+pub use gate::{AccessGate, LetterParts, Link, Source};
 pub use post::{LetterDraft, PostError, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};

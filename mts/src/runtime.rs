@@ -33,8 +33,8 @@ use self::receiving::TransportSink;
 use crate::AccessGate;
 use crate::Map;
 use crate::core::{
-    Action, Core, CoreConfig, Notice, Now, Peer, PeerState, Received, Route, RouteState, SendId,
-    Submission,
+    Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
+    RouteState, SendId, Submission,
 };
 
 /// Configuration of the runtime, in addition to that of the core.
@@ -141,6 +141,8 @@ struct Shared {
     transports: Vec<Arc<dyn Transport>>,
     directory: Arc<dyn Directory>,
     config: RuntimeConfig,
+    /// Reads arriving letters before the state is locked.
+    reader: LetterReader,
     /// Wakes the timer when an action is due earlier than its wake-up, or the service is gone.
     timer: Arc<Notify>,
     closed: AtomicBool,
@@ -234,12 +236,13 @@ impl Mts {
         handle: &Handle,
     ) -> Started {
         let generation = directory.generation();
-        let core = Core::new(core, directory.view());
+        let mut core = Core::new(core, directory.view());
+        if let Some(gate) = &config.gate {
+            core = core.gated(Arc::clone(gate));
+        }
+        let reader = core.reader().clone();
         let state = State {
-            core: match &config.gate {
-                Some(gate) => core.gated(Arc::clone(gate)),
-                None => core,
-            },
+            core,
             generation,
             replaced: Vec::new(),
             unframed_deadline: config.unframed_deadline,
@@ -252,6 +255,7 @@ impl Mts {
             transports: transports.clone(),
             directory: Arc::clone(&directory),
             config,
+            reader,
             timer: Arc::default(),
             closed: AtomicBool::new(false),
             tasks: Mutex::default(),

@@ -24,24 +24,38 @@ pub(crate) enum StampError {
     Encode(#[from] EncodeError),
 }
 
-/// Whether the letter has the stamp of this service.
-pub(crate) fn carries(
+/// The parts of an envelope that a service reads before it forwards the letter.
+#[derive(Debug)]
+pub(crate) struct EnvelopeParts {
+    /// Whether the letter has the stamp of the service already.
+    pub(crate) is_loop: bool,
+    /// Number of stamps.
+    pub(crate) stamps: usize,
+    /// The name in the effective from parameter.
+    pub(crate) sender: Option<String>,
+}
+
+/// Reads the envelope for the service with this name and incarnation.
+pub(crate) fn read(
     letter: &Letter,
     name: &str,
     incarnation: Incarnation,
-) -> Result<bool, DecodeError> {
+) -> Result<EnvelopeParts, DecodeError> {
     let envelope = letter.envelope();
     let view = EnvelopeView::parse(&envelope)?;
     let id = incarnation.to_string();
-    let mut stamps = view.stamps();
-    Ok(stamps
-        .any(|stamp| stamp.by().as_str() == name && stamp.id().is_some_and(|it| it.as_str() == id)))
-}
-
-/// Number of stamps in the letter.
-pub(crate) fn count(letter: &Letter) -> Result<usize, DecodeError> {
-    let envelope = letter.envelope();
-    Ok(EnvelopeView::parse(&envelope)?.stamps().count())
+    let (mut is_loop, mut stamps) = (false, 0);
+    for stamp in view.stamps() {
+        stamps += 1;
+        let is_own = stamp.by().as_str() == name;
+        is_loop |= is_own && stamp.id().is_some_and(|it| it.as_str() == id);
+    }
+    let sender = view.from_name().map(|name| name.as_str().into_owned());
+    Ok(EnvelopeParts {
+        is_loop,
+        stamps,
+        sender,
+    })
 }
 
 /// Adds the stamp of this service in front of the letter.

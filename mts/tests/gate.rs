@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now};
-use fipa_mts::{AccessGate, Link, Source, letter_for};
+use fipa_mts::{AccessGate, LetterParts, Link, Source, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
@@ -23,7 +23,17 @@ const BRAKE: Incarnation = Incarnation::from_u64(0xb);
 struct Guarded(Mutex<Vec<String>>);
 
 impl AccessGate for Guarded {
-    fn admits(&self, _: Instant, receiver: &str, _: &Letter, link: Link) -> Result<(), String> {
+    fn read(&self, _: &Letter) -> LetterParts {
+        LetterParts::default()
+    }
+
+    fn admits(
+        &self,
+        _: Instant,
+        receiver: &str,
+        _: &LetterParts,
+        link: Link,
+    ) -> Result<(), String> {
         assert_eq!(link.via, Kind::Shm);
         assert_eq!(link.service, Incarnation::from_u64(1), "the other end");
         assert_eq!(link.source, Source::Process(Incarnation::from_u64(1)));

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
-use fipa_mts::{AccessGate, Link, letter_for};
+use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{
     ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
     StaticDirectory,
@@ -203,7 +203,11 @@ fn a_location_on_another_host_than_the_source_gets_no_failure_message() {
 struct Refusing(&'static str);
 
 impl AccessGate for Refusing {
-    fn admits(&self, _: Instant, receiver: &str, _: &Letter, _: Link) -> Result<(), String> {
+    fn read(&self, _: &Letter) -> LetterParts {
+        LetterParts::default()
+    }
+
+    fn admits(&self, _: Instant, receiver: &str, _: &LetterParts, _: Link) -> Result<(), String> {
         match receiver.starts_with(self.0) {
             true => Err("a rule denies it".to_owned()),
             false => Ok(()),

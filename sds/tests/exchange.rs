@@ -756,6 +756,9 @@ fn invalid_agents_are_left_out() {
     let mut exchange = with_neighbour();
     let agents = r#"[{"name":"","id":"0000000000000001","registered":1},
         {"name":"a\nb","id":"0000000000000001","registered":1},
+        {"name":"arm_.*","id":"0000000000000001","registered":1},
+        {"name":"arm\u202eleft","id":"0000000000000001","registered":1},
+        {"name":"arm\u009b31m","id":"0000000000000001","registered":1},
         {"name":"absent","id":"0000000000000000","registered":1},
         {"name":"good","id":"0000000000000001","registered":99999999999999999,"more":[]}]"#;
     let full = format!(

@@ -151,9 +151,19 @@ mod tests {
             rate_limit.spend(1, 1, now);
         }
         assert_eq!(rate_limits.0.lock().len(), MAX_ADDRESSES);
-        let later = now + Duration::from_secs(2);
+        // An address that has just spent its limit does not get a new one.
+        let (soon, later) = (
+            now + Duration::from_millis(1900),
+            now + Duration::from_secs(2),
+        );
+        let busy = address(0);
+        let spent = rate_limits.of(busy, rates(1, 1), soon).unwrap();
+        spent.spend(100, 100, soon);
+        drop(spent);
         rate_limits.of(address(u32::MAX), rates(1, 1), later);
-        assert_eq!(rate_limits.0.lock().len(), 1);
+        assert_eq!(rate_limits.0.lock().len(), 2);
+        let same = rate_limits.of(busy, rates(1, 1), later).unwrap();
+        assert!(same.spend(1, 1, later).is_some());
     }
 
     #[test]

@@ -111,6 +111,19 @@ fn another_host_or_domain_is_remote() {
     }
 }
 
+/// A gateway does not list loopback, so its letters are not relayed although it repeats the host and
+/// the domain of the gateway.
+#[test]
+fn a_peer_that_repeats_host_and_domain_is_remote_unless_loopback_is_listed() {
+    for (listed, is_remote) in [(true, false), (false, true)] {
+        let mut here = config(&["127.0.0.1:0"]);
+        here.processes = listed;
+        let here = Party::with(here);
+        Party::new().assert_reaches(1, &here);
+        assert_eq!(here.sink.record.lock().arrivals[0].1.is_remote(), is_remote);
+    }
+}
+
 #[test]
 fn a_restarted_peer_has_another_incarnation_and_is_reachable_again() {
     let a = Party::new();

@@ -172,6 +172,6 @@ fn print(printer: &Printer, content: &Content<'_>, file: &std::path::Path) -> Re
     match std::str::from_utf8(&bytes) {
         Ok(text) => output::text(text),
         // Byte strings of the standard dialect.
-        Err(_) => output::bytes(&bytes),
+        Err(_) => output::converted(&bytes),
     }
 }

@@ -150,7 +150,7 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     if arguments.hex {
         output::text(&hexadecimal(&bytes))
     } else {
-        output::bytes(&bytes)
+        output::converted(&bytes)
     }
 }
 

@@ -13,15 +13,15 @@ use fipa_transport::{
 
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
-use super::inbox::link_of;
+use super::inbox::{ask, link_of};
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
-use super::{Core, MAX_DEADLINE, News, Now, own_lane, work};
-use crate::gate::{self, Link};
+use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
+use crate::gate::{self, LetterParts, Link};
 use smallvec::smallvec;
 
 use crate::failure::{Failed, sender_of};
-use crate::stamp;
+use crate::stamp::{self, EnvelopeParts};
 
 /// Time after which a sender is told that its letter is in custody, unless its outcome is known
 /// earlier.
@@ -65,6 +65,8 @@ pub struct Unframed {
     failed: Option<Arc<Failed>>,
     /// The reason why the letter is refused, if it is.
     fault: Option<String>,
+    /// What the gate has read.
+    parts: Option<LetterParts>,
 }
 
 impl Unframed {
@@ -116,7 +118,17 @@ impl Unframed {
             sender,
             failed: failed.map(Arc::new),
             fault,
+            parts: None,
         })
+    }
+
+    /// Has the gate read the letter, which otherwise happens while the core is locked.
+    #[must_use]
+    pub fn read_by(self, reader: &LetterReader) -> Self {
+        Self {
+            parts: reader.parts(&self.letter),
+            ..self
+        }
     }
 }
 
@@ -168,17 +180,21 @@ pub(super) fn contact_limit() -> SenderLimit {
 
 impl Core {
     /// Takes a letter for an agent of another process into custody, or returns the reason why not.
-    /// `unanswered` is the arrival that may be answered later.
+    /// `unanswered` is the arrival that may be answered later, `read` has the parts of the
+    /// letter.
     pub(super) fn forward(
         &mut self,
         now: Now,
-        via: Kind,
+        (via, from, unanswered): (Kind, Hop, Option<(Kind, Ticket)>),
         parcel: &Parcel,
         letter: Letter,
-        from: Hop,
-        unanswered: Option<(Kind, Ticket)>,
+        read: Option<Box<ReadLetter>>,
     ) -> Verdict {
-        let (entry, stamped) = match self.admit(now, parcel, letter, &from) {
+        let (parts, envelope) = match read {
+            Some(read) => (read.parts, read.envelope),
+            None => (None, None),
+        };
+        let (entry, stamped, envelope) = match self.admit(now, parcel, (letter, envelope), &from) {
             Ok(admitted) => admitted,
             Err(refusal) => return Verdict::Now(refusal),
         };
@@ -217,11 +233,11 @@ impl Core {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
         }
-        if let Err(why) = self.admits(now, &entry.name, &stamped, link_of(via, &from)) {
+        if let Err(why) = self.admits(now, &entry.name, parts.as_ref(), link_of(via, &from)) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.is_remote() {
-            self.report_contact(stream.sender, &stamped, &from);
+            self.report_contact(stream.sender, envelope, &from);
         }
         self.table
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
@@ -275,29 +291,35 @@ impl Core {
         (!wait.is_zero()).then(|| now.instant + wait)
     }
 
-    /// Asks the gate, if there is one.
-    fn admits(&self, now: Now, receiver: &str, letter: &Letter, link: Link) -> Result<(), String> {
-        match &self.gate {
-            Some(gate) => gate.admits(now.instant, receiver, letter, link),
+    /// Asks the gate, if there is one, about a letter that it has read.
+    fn admits(
+        &self,
+        now: Now,
+        receiver: &str,
+        parts: Option<&LetterParts>,
+        link: Link,
+    ) -> Result<(), String> {
+        match &self.reader.gate {
+            Some(gate) => ask(&**gate, now.instant, receiver, parts, link),
             None => Ok(()),
         }
     }
 
-    /// Checks whether this service forwards the letter; returns the receiver and the stamped
-    /// letter.
+    /// Checks whether this service forwards the letter; returns the receiver, the stamped letter, and
+    /// the parts of its envelope.
     fn admit(
         &self,
         now: Now,
         parcel: &Parcel,
-        letter: Letter,
+        (letter, envelope): (Letter, Option<Result<EnvelopeParts, DecodeError>>),
         from: &Hop,
-    ) -> Result<(Arc<Entry>, Letter), Answer> {
+    ) -> Result<(Arc<Entry>, Letter, EnvelopeParts), Answer> {
         let config = &self.table.config;
         let unknown = |why: &str| Answer::failed(FailureReason::NoSuchAgent, why);
         let refused = |why: String| Answer::failed(FailureReason::Refused, why);
-        if !config.forwards {
+        let Some(envelope) = envelope else {
             return Err(unknown("the agent is no longer in this process"));
-        }
+        };
         let registration = parcel.stream.receiver;
         let Some(entry) = self.table.receiver(registration, &parcel.receiver) else {
             return Err(
@@ -316,30 +338,26 @@ impl Core {
         if from.is_remote() && entry.reach != Reach::Local {
             return Err(unknown("the agent is not on the gateway's host"));
         }
-        // The envelope is parsed for stamps, and later for its sender.
-        work::steps(letter.envelope().len() / 512);
-        match stamp::carries(&letter, &config.name, config.incarnation) {
-            Ok(true) => return Err(Answer::failed(FailureReason::Loop, &*config.name)),
-            Ok(false) => {}
-            Err(error) => return Err(refused(error.to_string())),
+        let envelope = envelope.map_err(|error| refused(error.to_string()))?;
+        if envelope.is_loop {
+            return Err(Answer::failed(FailureReason::Loop, &*config.name));
         }
         let stamped = stamp::put(letter, &config.name, config.incarnation, now.utc)
             .map_err(|error| refused(error.to_string()))?;
-        Ok((entry, stamped))
+        Ok((entry, stamped, envelope))
     }
 
-    /// Reports the sender of this stamped letter as a contact if it is unknown, so that it can be
-    /// answered.
-    fn report_contact(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
+    /// Reports the sender of a letter with this envelope as a contact if it is unknown, so that it can
+    /// be answered.
+    fn report_contact(&mut self, agent: Incarnation, envelope: EnvelopeParts, from: &Hop) {
         let view = &self.table.view;
         if !agent.is_known() || view.registered(agent).is_some() {
             return;
         }
         // A letter that was forwarded by the receiver's previous gateway does not come from the
         // sender's location.
-        let direct = stamp::count(letter).is_ok_and(|stamps| stamps <= 2);
-        if let Some(name) = stamp::sender(letter)
-            && direct
+        if let Some(name) = envelope.sender
+            && envelope.stamps <= 1
             && view.named(&name).is_none()
         {
             let location = from.location.clone();
@@ -407,6 +425,7 @@ impl Core {
             sender: mut located,
             failed,
             fault,
+            parts,
         } = unframed;
         let target = failed.clone();
         let target = target.map(|failed| FailureTarget::LegacyPeer { from, failed });
@@ -421,6 +440,7 @@ impl Core {
             self.send_failures(now);
             return;
         }
+        let parts = parts.or_else(|| self.reader.parts(&letter));
         let stream_sender = self.table.config.incarnation;
         let unproved = Link {
             via,
@@ -451,7 +471,7 @@ impl Core {
             }
             for entry in here {
                 work::steps(1);
-                if let Err(why) = self.admits(now, &entry.name, &letter, unproved) {
+                if let Err(why) = self.admits(now, &entry.name, parts.as_ref(), unproved) {
                     let why = (FailureReason::Refused, why);
                     self.unframed_failed(&entry.name, &letter, (via, target.as_ref()), why);
                     continue;

@@ -10,8 +10,8 @@ use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Pa
 
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE, work};
-use crate::AccessGate;
 use crate::gate::{Link, Source};
+use crate::{AccessGate, LetterParts};
 
 /// A letter taken from an agent's queue.
 #[derive(Debug, Clone)]
@@ -85,14 +85,15 @@ impl Inbox {
         }
     }
 
-    /// Puts a letter into the queue, or returns the reason why not. Asks the gate as well.
+    /// Puts a letter into the queue, or returns the reason why not. Asks the gate as well, which
+    /// has read the letter.
     pub(crate) fn accept(
         &mut self,
         now: Instant,
         parcel: &Parcel,
         letter: Letter,
         (via, from): (Kind, &Hop),
-        gate: Option<&dyn AccessGate>,
+        gate: Option<(&dyn AccessGate, Option<&LetterParts>)>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
         if stream.sender.is_known() {
@@ -114,8 +115,8 @@ impl Inbox {
             self.wait(stream, &from.location);
             return Answer::Busy;
         }
-        if let Some(gate) = gate
-            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, from))
+        if let Some((gate, parts)) = gate
+            && let Err(why) = ask(gate, now, &self.name, parts, link_of(via, from))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
@@ -247,6 +248,20 @@ impl Inbox {
         self.senders
             .retain(|_, taken| now.saturating_duration_since(taken.seen) < memory);
         self.next_sweep = Some(now + Duration::from_secs(60));
+    }
+}
+
+/// Asks a gate about a letter that it has read. It refuses one that it has not read.
+pub(super) fn ask(
+    gate: &dyn AccessGate,
+    now: Instant,
+    receiver: &str,
+    parts: Option<&LetterParts>,
+    link: Link,
+) -> Result<(), String> {
+    match parts {
+        Some(parts) => gate.admits(now, receiver, parts, link),
+        None => Err("the access gate has not read the letter".to_owned()),
     }
 }
 

@@ -38,6 +38,7 @@ mod limits;
 mod notice;
 mod peers;
 mod principals;
+mod reading;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
@@ -68,6 +69,7 @@ pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey};
 use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
+pub use reading::{LetterReader, ReadLetter};
 
 use waiting::{Unresolved, WaitingLetters};
 
@@ -130,7 +132,7 @@ pub struct Core {
     waiting: WaitingLetters,
     peers: Peers,
     principals: Principals,
-    gate: Option<Arc<dyn AccessGate>>,
+    reader: LetterReader,
     failure_limit: FailureLimit,
     /// Limits the rate at which agents of legacy peers become known by their letters.
     contact_limit: SenderLimit,
@@ -196,6 +198,7 @@ impl Core {
     /// Creates a core that looks up receivers in this view of the directory.
     #[must_use]
     pub fn new(config: CoreConfig, view: Arc<dyn View>) -> Self {
+        let reader = LetterReader::new(&config);
         Self {
             table: AttemptTable::new(config, view),
             lanes: Map::default(),
@@ -206,7 +209,7 @@ impl Core {
             waiting: WaitingLetters::default(),
             peers: Peers::default(),
             principals: Principals::default(),
-            gate: None,
+            reader,
             failure_limit: FailureLimit::default(),
             contact_limit: forward::contact_limit(),
             ending: false,
@@ -220,11 +223,15 @@ impl Core {
 
     /// Sets the gate that decides which letters are accepted.
     #[must_use]
-    pub fn gated(self, gate: Arc<dyn AccessGate>) -> Self {
-        Self {
-            gate: Some(gate),
-            ..self
-        }
+    pub fn gated(mut self, gate: Arc<dyn AccessGate>) -> Self {
+        self.reader.gate = Some(gate);
+        self
+    }
+
+    /// Returns the reader of the letters for [`handle_read_arrival`](Self::handle_read_arrival).
+    #[must_use]
+    pub fn reader(&self) -> &LetterReader {
+        &self.reader
     }
 
     /// Returns the configuration.
@@ -658,12 +665,28 @@ impl Core {
     }
 
     /// Handles a parcel that arrived by this kind of transport.
+    #[inline]
     pub fn handle_arrival(
         &mut self,
         now: Now,
         via: Kind,
         answers_at_once: bool,
         arrival: Arrival,
+    ) -> Verdict {
+        let read = self.reader.read_arrival(&arrival);
+        self.handle_read_arrival(now, via, answers_at_once, arrival, read)
+    }
+
+    /// Handles a parcel whose letter the [reader](Self::reader) of this core has
+    /// [read](LetterReader::read_arrival) before the core was locked. A gateway refuses a letter that
+    /// was not read, and so does a core with a gate.
+    pub fn handle_read_arrival(
+        &mut self,
+        now: Now,
+        via: Kind,
+        answers_at_once: bool,
+        arrival: Arrival,
+        read: Option<Box<ReadLetter>>,
     ) -> Verdict {
         let Arrival {
             mut parcel,
@@ -698,7 +721,8 @@ impl Core {
                 let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
-                    let gate = self.gate.as_deref();
+                    let parts = read.as_ref().and_then(|read| read.parts.as_ref());
+                    let gate = self.reader.gate.as_deref().map(|gate| (gate, parts));
                     let came = (via, &from);
                     let answer = inbox.accept(now.instant, &parcel, letter, came, gate);
                     if answer == Answer::Accepted {
@@ -719,7 +743,8 @@ impl Core {
                     return Verdict::Now(answer);
                 }
                 let unanswered = (!answers_at_once).then_some((via, ticket));
-                let verdict = self.forward(now, via, &parcel, letter, from, unanswered);
+                let came = (via, from, unanswered);
+                let verdict = self.forward(now, came, &parcel, letter, read);
                 self.send_failures(now);
                 verdict
             }

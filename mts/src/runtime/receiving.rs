@@ -24,6 +24,7 @@ impl Sink for TransportSink {
         let Some(shared) = self.shared.upgrade() else {
             return closing();
         };
+        let read = shared.reader.read_arrival(&arrival);
         let mut state = shared.lock();
         if shared.closed.load(Ordering::Acquire) {
             return closing();
@@ -37,9 +38,10 @@ impl Sink for TransportSink {
             state = shared.lock();
         }
         let at_once = self.answers_at_once;
-        let verdict = state
-            .core
-            .handle_arrival(Now::read(), self.kind, at_once, arrival);
+        let verdict =
+            state
+                .core
+                .handle_read_arrival(Now::read(), self.kind, at_once, arrival, read);
         shared.carry_out(state);
         verdict
     }
@@ -50,7 +52,7 @@ impl Sink for TransportSink {
         };
         shared.directory.refresh();
         let unframed = match Unframed::read(letter, via, from, &*shared.directory) {
-            Ok(unframed) => unframed,
+            Ok(unframed) => unframed.read_by(&shared.reader),
             Err(error) => {
                 tracing::warn!(%error, "dropping an unframed letter: its envelope is malformed");
                 return;

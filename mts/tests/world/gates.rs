@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_mts::{AccessGate, Link};
+use fipa_mts::{AccessGate, LetterParts, Link};
 use fipa_transport::TokenBucket;
 use parking_lot::Mutex;
 
@@ -56,8 +56,23 @@ impl Rules {
 }
 
 impl AccessGate for Rules {
-    fn admits(&self, now: Instant, receiver: &str, letter: &Letter, _: Link) -> Result<(), String> {
-        let Some(number) = number_of(letter) else {
+    /// The rules of the simulation are about the numbers of letters.
+    fn read(&self, letter: &Letter) -> LetterParts {
+        LetterParts {
+            action: number_of(letter).map(|number| number.to_string()),
+            ..LetterParts::default()
+        }
+    }
+
+    fn admits(
+        &self,
+        now: Instant,
+        receiver: &str,
+        letter: &LetterParts,
+        _: Link,
+    ) -> Result<(), String> {
+        let number = letter.action.as_ref().and_then(|it| it.parse().ok());
+        let Some(number) = number else {
             return match self.strangers {
                 true => Ok(()),
                 false => Err("strangers are refused".to_owned()),

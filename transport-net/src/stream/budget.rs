@@ -109,6 +109,13 @@ impl State {
             && (self.taken == 0 || self.taken.saturating_add(len) <= budget.total)
     }
 
+    /// Ends the turn of a meter that was admitted. Returns whether to notify the next waiting meters,
+    /// which may be admitted as well.
+    fn end_turn(&mut self, turn: Option<u64>) -> bool {
+        let waited = turn.is_some_and(|turn| self.waiting.remove(&turn).is_some());
+        waited && !self.waiting.is_empty()
+    }
+
     fn add(&mut self, quota_key: &QuotaKey, len: usize) {
         self.taken += len;
         *self.by.entry(quota_key.clone()).or_default() += len;
@@ -173,12 +180,9 @@ impl Meter {
             return None;
         }
         state.add(&self.quota_key, len);
-        let turn = self.turn.take();
-        let waited = turn.is_some_and(|turn| state.waiting.remove(&turn).is_some());
-        let notify = waited && !state.waiting.is_empty();
+        let notify = state.end_turn(self.turn.take());
         drop(state);
         if notify {
-            // The next waiting meters may be admitted as well.
             byte_budget.0.freed.notify_waiters();
         }
         Some(ReservedBytes {
@@ -211,13 +215,18 @@ impl Meter {
         let len = room.len.saturating_add(more);
         let has_room = (of_others == 0 || of_others.saturating_add(len) <= self.budget.total)
             && (of_quota_key == 0 || of_quota_key.saturating_add(len) <= self.budget.each);
-        if has_room {
-            state.add(&self.quota_key, more);
-            room.len = len;
-        } else {
+        if !has_room {
             self.wait(&mut state, more);
+            return false;
         }
-        has_room
+        state.add(&self.quota_key, more);
+        room.len = len;
+        let notify = state.end_turn(self.turn.take());
+        drop(state);
+        if notify {
+            byte_budget.0.freed.notify_waiters();
+        }
+        true
     }
 
     fn wait(&mut self, state: &mut State, len: usize) {
@@ -331,6 +340,8 @@ mod tests {
         let second = byte_budget.lend(40, 100);
         assert!(second.is_some());
         drop(first);
+        // Exactly the bytes of the first loan are free again.
+        assert!(byte_budget.lend(61, 100).is_none());
         assert!(byte_budget.lend(60, 100).is_some());
     }
 
@@ -374,6 +385,33 @@ mod tests {
         assert!(other.take(1).is_none());
         drop(large);
         assert!(other.take(1).is_some());
+    }
+
+    #[test]
+    fn a_letter_grows_within_its_share_and_the_budget() {
+        let byte_budget = ByteBudget::default();
+        let mut meters: Vec<Meter> = [1, 1, 2, 3].map(|p| meter(&byte_budget, p)).into();
+        let other = meters[1].take(30).unwrap();
+        let mut letter = meters[0].take(20).unwrap();
+        assert!(!meters[0].grow(&mut letter, 51), "its share is 100");
+        assert_eq!(byte_budget.taken(), 50);
+        assert!(
+            meters[0].grow(&mut letter, 50),
+            "it waits, and has precedence"
+        );
+        assert_eq!(byte_budget.taken(), 100);
+        // It waits no longer, so it holds back nothing else.
+        assert_eq!(letter.least_progress(), 0);
+        assert!(meters[2].take(10).is_some());
+        drop(other);
+        drop(meters);
+        let mut meters: Vec<Meter> = [1, 2, 3].map(|p| meter(&byte_budget, p)).into();
+        let others = (meters[1].take(60).unwrap(), meters[2].take(60).unwrap());
+        assert!(!meters[0].grow(&mut letter, 11), "the whole budget is 200");
+        assert!(meters[0].grow(&mut letter, 10));
+        assert_eq!(byte_budget.taken(), 200);
+        drop((others, letter));
+        assert_eq!(byte_budget.taken(), 0);
     }
 
     #[test]

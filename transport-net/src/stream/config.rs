@@ -236,3 +236,50 @@ impl Default for Limits {
         }
     }
 }
+
+#[cfg(all(test, feature = "ip"))]
+mod tests {
+    use std::net::{IpAddr, Ipv4Addr};
+
+    use super::*;
+    use fipa_transport::Incarnation;
+
+    fn identity(host: &str, domain: &str) -> Identity {
+        Identity {
+            name: "mts".into(),
+            incarnation: Incarnation::from_u64(1),
+            domain: domain.into(),
+            host: host.into(),
+        }
+    }
+
+    /// Host and domain are in every hello, so a peer can repeat them.
+    #[test]
+    fn only_a_listed_loopback_peer_of_this_host_and_domain_is_local() {
+        let (loopback, elsewhere) = (Ipv4Addr::LOCALHOST, Ipv4Addr::new(192, 0, 2, 1));
+        let mapped = IpAddr::V6(loopback.to_ipv6_mapped());
+        for (processes, ip, host, domain, is_local) in [
+            (true, IpAddr::V4(loopback), "here", "test", true),
+            (true, mapped, "here", "test", true),
+            (true, IpAddr::V4(loopback), "there", "test", false),
+            (true, IpAddr::V4(loopback), "here", "other", false),
+            (true, IpAddr::V4(elsewhere), "here", "test", false),
+            (false, IpAddr::V4(loopback), "here", "test", false),
+            (false, IpAddr::V4(elsewhere), "here", "test", false),
+        ] {
+            let config = StreamConfig {
+                identity: identity("here", "test"),
+                limits: Limits::default(),
+                processes,
+                #[cfg(feature = "secure")]
+                security: None,
+            };
+            let principal = config.principal_at(ip, &identity(host, domain));
+            let expected = match is_local {
+                true => Principal::Host,
+                false => Principal::Unproved,
+            };
+            assert_eq!(principal, expected, "{processes}, {ip}, {host}, {domain}");
+        }
+    }
+}

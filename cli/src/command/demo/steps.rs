@@ -4,12 +4,14 @@
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
+use fipa_acl::escape;
 use serde_json::{Map, Value, json};
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 
 use super::process::{Event, Listed, Order, Received, shown};
 use super::processes::{Process, Processes};
+use crate::output;
 use crate::report::Failure;
 
 /// A letter for the agent `echo`, as the C++ library fipa_services sends it over TCP.
@@ -139,6 +141,7 @@ impl Demo {
         if self.verbose {
             // A closed standard output does not change the steps.
             let mut out = std::io::stdout().lock();
+            let text = output::printable(text);
             let _ = writeln!(out, "{text}").and_then(|()| out.flush());
         }
     }
@@ -152,7 +155,7 @@ impl Demo {
         let number = self.steps.len() + 1;
         self.say(&match object.get("error").and_then(Value::as_str) {
             None => format!("  [ok] {number}. {name}\n"),
-            Some(error) => format!("  [FAILED] {number}. {name}: {error}\n"),
+            Some(error) => format!("  [FAILED] {number}. {name}: {}\n", escape(error)),
         });
         object.insert("name".to_owned(), json!(name));
         object.insert("ok".to_owned(), json!(ok));
