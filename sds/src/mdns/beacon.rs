@@ -118,6 +118,17 @@ struct BeaconState {
     due: Instant,
 }
 
+impl BeaconState {
+    fn new(now: Instant, digest: Digest) -> Self {
+        Self {
+            digest,
+            last: now,
+            repairs: 0,
+            due: now + QUIET,
+        }
+    }
+}
+
 impl Beacons {
     /// Handles a beacon, and returns the query that it triggers, given the stored records of the
     /// gateway.
@@ -131,12 +142,10 @@ impl Beacons {
         if self.gateways.len() >= MAX_GATEWAYS && !self.gateways.contains_key(&gateway) {
             return None;
         }
-        let state = self.gateways.entry(gateway).or_insert_with(|| BeaconState {
-            digest,
-            last: now,
-            repairs: 0,
-            due: now + QUIET,
-        });
+        let state = self
+            .gateways
+            .entry(gateway)
+            .or_insert_with(|| BeaconState::new(now, digest));
         if state.digest != digest {
             // The gateway is still announcing its latest change.
             state.due = state.due.max(now + QUIET);
@@ -162,7 +171,20 @@ impl Beacons {
         })
     }
 
-    /// Returns the gateways whose beacons have stopped, each once.
+    /// Expects beacons of these gateways, because their records are stored. A gateway that ends before
+    /// its first beacon arrives is silent, too, and so is one that a query has not removed.
+    pub(super) fn expect(&mut self, now: Instant, gateways: impl Iterator<Item = Incarnation>) {
+        for gateway in gateways.filter(|gateway| gateway.is_known()) {
+            if self.gateways.len() >= MAX_GATEWAYS {
+                return;
+            }
+            self.gateways
+                .entry(gateway)
+                .or_insert_with(|| BeaconState::new(now, Digest::default()));
+        }
+    }
+
+    /// Returns the gateways whose beacons have stopped, each once unless it is expected again.
     pub(super) fn silent(&mut self, now: Instant) -> Vec<Repair> {
         let mut silent = Vec::new();
         self.gateways.retain(|gateway, state| {
@@ -350,6 +372,10 @@ mod tests {
         assert_eq!(beacons.silent(now + SILENCE / 2), []);
         assert_eq!(beacons.silent(now + SILENCE), [Repair::Silent(gateway(1))]);
         assert_eq!(beacons.silent(now + SILENCE * 2), []);
+        // A gateway with records, of which no beacon has arrived.
+        beacons.expect(now, [gateway(2), Incarnation::UNKNOWN].into_iter());
+        beacons.expect(now + SILENCE / 2, [gateway(2)].into_iter());
+        assert_eq!(beacons.silent(now + SILENCE), [Repair::Silent(gateway(2))]);
         for number in 0..MAX_GATEWAYS as u64 + 10 {
             beacons.handle(now, gateway(number + 1), digest(&[]), None);
         }

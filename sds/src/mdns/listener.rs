@@ -75,6 +75,8 @@ impl Listener {
             }
             let beacon = beacon::packet(shared.config.mts.incarnation, shared.announced());
             self.send(beacon);
+            self.beacons
+                .expect(now, shared.peer_records.lock().gateways());
             for silent in self.beacons.silent(now) {
                 self.repair(shared, silent);
             }

@@ -96,6 +96,11 @@ impl PeerRecords {
         self.gateways.get(&gateway).map(|known| known.stored)
     }
 
+    /// Returns the gateways with stored records.
+    pub(super) fn gateways(&self) -> impl Iterator<Item = Incarnation> {
+        self.gateways.keys().copied()
+    }
+
     /// Doubts the gateway: queues up to `BATCH` of its records for verification first. If it has
     /// more, one of these stands for the rest. Returns false when there are no records, or a doubt
     /// has already started and no record changed since.
