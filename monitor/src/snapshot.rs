@@ -367,7 +367,7 @@ struct Part<'s> {
     delegates: Vec<(u32, &'s str)>,
 }
 
-/// What the checks of a snapshot need.
+/// The input of the checks of a snapshot.
 struct Context<'a> {
     library: &'a Library,
     limits: &'a Limits,

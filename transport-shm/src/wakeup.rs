@@ -184,7 +184,7 @@ impl Account {
     }
 }
 
-/// What a process knows of a peer's wake-ups.
+/// The wake-ups of a peer as far as a process knows them.
 #[derive(Debug)]
 pub(crate) struct RingState {
     /// Value of the page's `wakeups` when this process last rang; [`NO_WAKEUP_COUNT`] before that.

@@ -104,7 +104,7 @@ fn explore(model: impl Fn() + Send + Sync + 'static) {
 
 const PEERS: usize = 2;
 
-/// What a process shares with its peers.
+/// The memory that a process shares with its peers.
 struct Process {
     words: StatusWords,
     /// Number of parcels that each peer has put into the mailbox.
@@ -223,24 +223,32 @@ fn handle_wakeup(process: &Process, inbox: &Combiner<Inbox>) {
     }
 }
 
+/// Sleeps and handles wake-ups until this many parcels were taken.
+fn sleep_until_taken(process: &Process, inbox: &Combiner<Inbox>, parcels: u64) {
+    while inbox.lock().total() < parcels {
+        process.sleep();
+        handle_wakeup(process, inbox);
+    }
+}
+
+/// Starts a peer with one thread that sends this many parcels.
+fn start_peer(process: &Arc<Process>, peer: usize, parcels: usize) -> thread::JoinHandle<()> {
+    let process = Arc::clone(process);
+    thread::spawn(move || {
+        let rings = RingState::new();
+        for _ in 0..parcels {
+            process.send(peer, &rings);
+        }
+    })
+}
+
 #[test]
 fn a_sleeping_process_is_woken_for_every_parcel() {
     explore(|| {
         let process = Process::new();
-        let peer = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || {
-                let rings = RingState::new();
-                for _ in 0..2 {
-                    process.send(0, &rings);
-                }
-            })
-        };
+        let peer = start_peer(&process, 0, 2);
         let inbox = Combiner::new(Inbox::new());
-        while inbox.lock().total() < 2 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 2);
         peer.join().unwrap();
     });
 }
@@ -249,17 +257,9 @@ fn a_sleeping_process_is_woken_for_every_parcel() {
 fn a_process_is_woken_by_two_peers() {
     explore(|| {
         let process = Process::new();
-        let peers: Vec<_> = (0..PEERS)
-            .map(|peer| {
-                let process = Arc::clone(&process);
-                thread::spawn(move || process.send(peer, &RingState::new()))
-            })
-            .collect();
+        let peers = [0, 1].map(|peer| start_peer(&process, peer, 1));
         let inbox = Combiner::new(Inbox::new());
-        while inbox.lock().total() < 2 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 2);
         for peer in peers {
             peer.join().unwrap();
         }
@@ -279,10 +279,7 @@ fn a_process_is_woken_by_two_threads_of_a_peer() {
             })
             .collect();
         let inbox = Combiner::new(Inbox::new());
-        while inbox.lock().total() < 2 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 2);
         for peer in peers {
             peer.join().unwrap();
         }
@@ -293,21 +290,10 @@ fn a_process_is_woken_by_two_threads_of_a_peer() {
 fn a_process_that_stops_polling_misses_no_parcel() {
     explore(|| {
         let process = Process::new();
-        let peer = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || {
-                let rings = RingState::new();
-                for _ in 0..2 {
-                    process.send(0, &rings);
-                }
-            })
-        };
+        let peer = start_peer(&process, 0, 2);
         let inbox = Combiner::new(Inbox::new());
         drive(&process, &inbox);
-        while inbox.lock().total() < 2 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 2);
         peer.join().unwrap();
     });
 }
@@ -318,10 +304,7 @@ fn a_process_that_stops_polling_misses_no_parcel() {
 fn a_busy_process_finds_the_parcel_of_a_slow_peer() {
     explore(|| {
         let process = Process::new();
-        let slow = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || process.send(0, &RingState::new()))
-        };
+        let slow = start_peer(&process, 0, 1);
         let inbox = Combiner::new(Inbox::new());
         for _ in 0..Account::PATIENCE {
             inbox.lock().drain(&process, false);
@@ -329,10 +312,7 @@ fn a_busy_process_finds_the_parcel_of_a_slow_peer() {
         // Its peer sees that the process polls, and does not ring.
         process.put(1);
         drive(&process, &inbox);
-        while inbox.lock().total() < 2 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 2);
         slow.join().unwrap();
     });
 }
@@ -343,10 +323,7 @@ fn a_parcel_is_found_by_the_polling_thread_or_the_woken_one() {
     explore(|| {
         let process = Process::new();
         let inbox = Arc::new(Combiner::new(Inbox::new()));
-        let peer = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || process.send(0, &RingState::new()))
-        };
+        let peer = start_peer(&process, 0, 1);
         let woken = {
             let (process, inbox) = (Arc::clone(&process), Arc::clone(&inbox));
             thread::spawn(move || {
@@ -373,10 +350,7 @@ fn a_parcel_that_never_arrives_hides_no_other_one() {
             let process = Arc::clone(&process);
             thread::spawn(move || drop(process.words.announce()))
         };
-        let sending = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || process.send(0, &RingState::new()))
-        };
+        let sending = start_peer(&process, 0, 1);
         let mut inbox = Inbox::new();
         inbox.drain(&process, false);
         inbox.drain(&process, false);
@@ -403,16 +377,10 @@ fn an_announcement_that_was_written_off_hides_no_parcel() {
             inbox.drain(&process, false);
         }
         assert!(!inbox.account.is_open(&process.words));
-        let peer = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || process.send(0, &RingState::new()))
-        };
+        let peer = start_peer(&process, 0, 1);
         let inbox = Combiner::new(inbox);
         drive(&process, &inbox);
-        while inbox.lock().total() < 1 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 1);
         peer.join().unwrap();
     });
 }
@@ -421,19 +389,13 @@ fn an_announcement_that_was_written_off_hides_no_parcel() {
 fn a_parcel_of_a_slow_peer_is_found_after_its_announcement_was_written_off() {
     explore(|| {
         let process = Process::new();
-        let peer = {
-            let process = Arc::clone(&process);
-            thread::spawn(move || process.send(0, &RingState::new()))
-        };
+        let peer = start_peer(&process, 0, 1);
         let inbox = Combiner::new(Inbox::new());
         for _ in 0..Account::PATIENCE {
             inbox.lock().drain(&process, false);
         }
         drive(&process, &inbox);
-        while inbox.lock().total() < 1 {
-            process.sleep();
-            handle_wakeup(&process, &inbox);
-        }
+        sleep_until_taken(&process, &inbox, 1);
         peer.join().unwrap();
         // The next look corrects the account.
         inbox.lock().drain(&process, true);
@@ -447,8 +409,7 @@ fn a_request_for_work_is_never_lost() {
     explore(|| {
         let requests = Arc::new(AtomicU64::new(0));
         let combiner = Arc::new(Combiner::new(0));
-        let request = |requests: &AtomicU64, combiner: &Combiner<u64>| {
-            requests.fetch_add(1, Ordering::Release);
+        let take_all = |requests: &AtomicU64, combiner: &Combiner<u64>| {
             combiner.work(|done| {
                 *done = requests.load(Ordering::Acquire);
                 true
@@ -457,15 +418,15 @@ fn a_request_for_work_is_never_lost() {
         let others: Vec<_> = (0..2)
             .map(|_| {
                 let (requests, combiner) = (Arc::clone(&requests), Arc::clone(&combiner));
-                thread::spawn(move || request(&requests, &combiner))
+                thread::spawn(move || {
+                    requests.fetch_add(1, Ordering::Release);
+                    take_all(&requests, &combiner);
+                })
             })
             .collect();
         let has_any = combiner.has_any(|done| requests.load(Ordering::Acquire) > *done);
         if has_any {
-            combiner.work(|done| {
-                *done = requests.load(Ordering::Acquire);
-                true
-            });
+            take_all(&requests, &combiner);
         }
         for other in others {
             other.join().unwrap();

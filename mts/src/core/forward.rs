@@ -65,7 +65,7 @@ pub struct Unframed {
     failed: Option<Arc<Failed>>,
     /// The reason why the letter is refused, if it is.
     fault: Option<String>,
-    /// What the gate has read.
+    /// The parts that the gate has read.
     parts: Option<LetterParts>,
 }
 

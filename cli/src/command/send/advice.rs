@@ -76,10 +76,8 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
     }
     // In the shell, `arm_*` stands for what is `arm_.*` here.
     let is_glob = |name: &&&str| {
-        let pairs = name.chars().zip(name.chars().skip(1));
-        pairs
-            .into_iter()
-            .any(|(before, it)| it == '*' && (before.is_alphanumeric() || "_-".contains(before)))
+        let mut pairs = name.chars().zip(name.chars().skip(1));
+        pairs.any(|(before, it)| it == '*' && (before.is_alphanumeric() || "_-".contains(before)))
     };
     let glob = names.iter().find(is_glob);
     if let Some(glob) = glob {
