@@ -18,6 +18,7 @@ mod membership;
 mod options;
 mod output;
 mod report;
+mod signals;
 
 use std::fmt::{self, Debug};
 use std::io::IsTerminal;

@@ -6,24 +6,24 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use clap::Args;
 use fipa::routes::{self, AskError, Report};
 use fipa::{
     Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
     OpenError, Reach, RegisterError, RegisterOptions, Role, contact,
 };
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use rustix::process::Signal;
 
 use crate::options;
 use crate::report::Failure;
+use crate::signals::Signals;
 
 /// Signals within this time after the first one count as the same request to end.
 const SIGNAL_GRACE: Duration = Duration::from_millis(500);
 
-/// The signals that end a command: SIGINT (Ctrl-C), SIGTERM (`kill`) and SIGHUP (a closed terminal).
+/// The signals that end a command.
 pub(crate) struct Stop {
-    interrupt: Signal,
-    terminate: Signal,
-    hang_up: Signal,
+    signals: Signals,
     /// Whether the command was started from a terminal.
     from_terminal: bool,
 }
@@ -41,19 +41,8 @@ impl Stop {
     ///
     /// Must be called within a tokio runtime.
     pub(crate) fn listen() -> Result<Self, Failure> {
-        let listen = |kind| {
-            signal(kind).map_err(|error: io::Error| {
-                Failure::failed(
-                    format!("cannot listen for signals: {error}"),
-                    "this process",
-                    "check the limit on open files: `ulimit -n`",
-                )
-            })
-        };
         Ok(Self {
-            interrupt: listen(SignalKind::interrupt())?,
-            terminate: listen(SignalKind::terminate())?,
-            hang_up: listen(SignalKind::hangup())?,
+            signals: Signals::listen()?,
             from_terminal: io::stdin().is_terminal(),
         })
     }
@@ -61,26 +50,16 @@ impl Stop {
     /// Waits for the next signal to a service. SIGHUP requests a reload, unless the terminal from which
     /// the service was started has been closed.
     pub(crate) async fn next_request(&mut self) -> SignalRequest {
-        tokio::select! {
-            _ = self.interrupt.recv() => SignalRequest::End,
-            _ = self.terminate.recv() => SignalRequest::End,
-            _ = self.hang_up.recv() => {
-                if self.from_terminal && !io::stdin().is_terminal() {
-                    SignalRequest::End
-                } else {
-                    SignalRequest::Reload
-                }
-            }
+        let closed = |from_terminal| from_terminal && !io::stdin().is_terminal();
+        match self.signals.next().await {
+            Signal::HUP if !closed(self.from_terminal) => SignalRequest::Reload,
+            _ => SignalRequest::End,
         }
     }
 
     /// Waits for a signal.
     pub(crate) async fn requested(&mut self) {
-        tokio::select! {
-            _ = self.interrupt.recv() => {}
-            _ = self.terminate.recv() => {}
-            _ = self.hang_up.recv() => {}
-        }
+        self.signals.next().await;
     }
 
     /// Marks the start of the orderly end, which can take a while when another process delays it. A
@@ -189,6 +168,45 @@ pub(crate) async fn register(
 ) -> Result<Agent, Failure> {
     let registered = domain.register_with(name, options).await;
     registered.map_err(|error| not_registered(error, name, config))
+}
+
+// The agent of a command that receives messages, and the command's end. Not a doc comment: clap would print
+// it as the help of the command.
+#[derive(Debug, Args)]
+pub(crate) struct Receiver {
+    /// Name of the agent
+    name: AgentId,
+
+    /// Type of the agent, for `fipa agents --type`
+    #[arg(long = "type", value_name = "TYPE", default_value = "")]
+    agent_type: String,
+
+    /// Description of the agent, for `fipa agents --description`
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    description: String,
+
+    /// End after this number of messages
+    #[arg(long, short, value_name = "N")]
+    pub(crate) count: Option<u64>,
+
+    /// End after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
+    pub(crate) time: Option<Duration>,
+}
+
+impl Receiver {
+    /// Registers the agent in the domain of the configuration.
+    pub(crate) async fn register(
+        &self,
+        domain: &Domain,
+        config: &Config,
+    ) -> Result<Agent, Failure> {
+        let options = RegisterOptions {
+            agent_type: self.agent_type.clone(),
+            description: self.description.clone(),
+        };
+        register(domain, self.name.name(), options, config).await
+    }
 }
 
 /// The error report for a name that cannot be registered.

@@ -8,10 +8,10 @@ mod common;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};
 
+use common::mdns::{free_port, open};
 use common::registration;
-use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts};
+use fipa_sds::{Change, Directory, MdnsDirectory};
 use fipa_testbed::until_some_async;
-use fipa_transport::Incarnation;
 use simple_dns::rdata::{A, PTR, RData, SRV, TXT};
 use simple_dns::{CLASS, CharacterString, Label, Name, Packet, PacketFlag, ResourceRecord};
 
@@ -78,20 +78,6 @@ fn labels<'a>(first: &[&'a [u8]]) -> Name<'a> {
     let mut labels: Vec<Label<'a>> = first.iter().map(|one| Label::new_unchecked(*one)).collect();
     labels.extend(SERVICE.map(|label| Label::new_unchecked(label.as_bytes())));
     Name::new_with_labels(&labels)
-}
-
-fn free_port() -> u16 {
-    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-    socket.local_addr().unwrap().port()
-}
-
-fn open(port: u16, name: &str) -> MdnsDirectory {
-    let config = MdnsConfig {
-        interfaces: vec!["lo".to_owned()],
-        port,
-        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
-    };
-    MdnsDirectory::open(config).unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread")]

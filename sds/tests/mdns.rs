@@ -6,30 +6,14 @@
 mod common;
 
 use std::collections::BTreeMap;
-use std::net::{Ipv4Addr, UdpSocket};
+use std::net::Ipv4Addr;
 use std::time::{Duration, UNIX_EPOCH};
 
+use common::mdns::{free_port, open};
 use common::{conforms, next, registration};
-use fipa_sds::{
-    Change, Directory, MdnsConfig, MdnsDirectory, Members, Mts, Reach, RegisterError, Role, Source,
-};
+use fipa_sds::{Change, Directory, MdnsDirectory, Members, Reach, RegisterError, Role, Source};
 use fipa_testbed::{ChildGuard, PacketRepeater, until_some_async};
 use fipa_transport::{Incarnation, Location};
-
-/// An unused port, so that tests do not receive each other's packets.
-fn free_port() -> u16 {
-    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-    socket.local_addr().unwrap().port()
-}
-
-fn open(port: u16, name: &str) -> MdnsDirectory {
-    let config = MdnsConfig {
-        interfaces: vec!["lo".to_owned()],
-        port,
-        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
-    };
-    MdnsDirectory::open(config).unwrap()
-}
 
 #[tokio::test(flavor = "multi_thread")]
 async fn mdns_conforms() {

@@ -13,7 +13,7 @@ use std::thread;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, Recorder, config, letter_parcel};
+use common::{Party, Recorder, config, letter_parcel, message_parcel};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
@@ -269,32 +269,6 @@ fn idle_connections_give_way_and_busy_ones_do_not() {
     assert_eq!(answer(&mut busy), OK);
 }
 
-fn parcel(sequence: u64, content: &str) -> Parcel {
-    let arm = AgentId::new("arm_1").unwrap();
-    let rover = AgentId::new("rover").unwrap();
-    let message = Message::builder(Performative::Inform)
-        .sender(rover.clone())
-        .receiver(arm.clone())
-        .content(content.to_owned())
-        .conversation_id("c-1")
-        .build()
-        .unwrap();
-    let base = EnvelopeParams {
-        to: vec![arm.clone()],
-        from: Some(rover),
-        acl_representation: Some(AclRepresentation::BitEfficient),
-        date: Some("20261120T112644481Z".parse().unwrap()),
-        intended_receivers: vec![arm],
-        ..EnvelopeParams::default()
-    };
-    let envelope = Envelope {
-        base,
-        extensions: Vec::new(),
-    };
-    let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
-    letter_parcel(sequence, letter)
-}
-
 /// A platform that reads requests, and writes an answer to each.
 struct Jade {
     location: Location,
@@ -411,7 +385,7 @@ fn letters_leave_in_order_over_one_connection_although_answers_have_no_length() 
     for number in 0..20 {
         let text = number.to_string();
         party
-            .send(number, &jade.location, parcel(number, &text))
+            .send(number, &jade.location, message_parcel(number, &text))
             .unwrap();
     }
     for number in 0..20 {
@@ -433,7 +407,7 @@ fn letters_leave_in_order_over_one_connection_although_answers_have_no_length() 
     }
     // The connection is still open for the next letter.
     party
-        .send(20, &jade.location, parcel(20, "grüße 漢"))
+        .send(20, &jade.location, message_parcel(20, "grüße 漢"))
         .unwrap();
     assert_eq!(party.conclusion(20), Conclusion::Handed);
     let (connection, envelope, message) = jade.request();
@@ -459,7 +433,9 @@ fn letters_leave_in_the_encoding_that_the_location_names() {
     for (number, (name, representation)) in (0..).zip(encodings) {
         let to: Location = format!("{};{name}", jade.location).parse().unwrap();
         let content = "grüße (an \"c\") 漢";
-        party.send(number, &to, parcel(number, content)).unwrap();
+        party
+            .send(number, &to, message_parcel(number, content))
+            .unwrap();
         assert_eq!(party.conclusion(number), Conclusion::Handed);
         let (_, envelope, message) = jade.request();
         assert_eq!(message.content().unwrap(), content);
@@ -475,7 +451,7 @@ fn a_closed_connection_is_replaced_for_the_next_letter() {
     let jade = Jade::new(|_| (KEPT_ANSWER.to_vec(), false));
     for number in 0..5 {
         party
-            .send(number, &jade.location, parcel(number, "x"))
+            .send(number, &jade.location, message_parcel(number, "x"))
             .unwrap();
         assert_eq!(party.conclusion(number), Conclusion::Handed);
         assert_eq!(jade.request().0, number as usize);
@@ -484,7 +460,7 @@ fn a_closed_connection_is_replaced_for_the_next_letter() {
     let closing = Jade::answering(LAST_ANSWER);
     for number in 10..13 {
         party
-            .send(number, &closing.location, parcel(number, "x"))
+            .send(number, &closing.location, message_parcel(number, "x"))
             .unwrap();
         assert_eq!(party.conclusion(number), Conclusion::Handed);
     }
@@ -497,7 +473,7 @@ fn an_answer_other_than_200_is_a_failed_attempt() {
     let jade = Jade::answering(refusal);
     for number in 0..2 {
         party
-            .send(number, &jade.location, parcel(number, "x"))
+            .send(number, &jade.location, message_parcel(number, "x"))
             .unwrap();
         match party.conclusion(number) {
             Conclusion::NotSent(error) => {
@@ -527,7 +503,7 @@ fn a_letter_without_an_answer_is_unconfirmed_and_never_repeated() {
     for number in 0..3 {
         let text = number.to_string();
         party
-            .send(number, &jade.location, parcel(number, &text))
+            .send(number, &jade.location, message_parcel(number, &text))
             .unwrap();
     }
     assert_eq!(party.conclusion(0), Conclusion::Handed);
@@ -540,7 +516,9 @@ fn a_letter_without_an_answer_is_unconfirmed_and_never_repeated() {
     }
     // A silent platform.
     let silent = Jade::new(|_| (Vec::new(), true));
-    party.send(5, &silent.location, parcel(5, "x")).unwrap();
+    party
+        .send(5, &silent.location, message_parcel(5, "x"))
+        .unwrap();
     match party.conclusion(5) {
         Conclusion::Unconfirmed(error) => {
             assert_eq!(error.fault, TransportErrorKind::TimedOut, "{error}")
@@ -585,7 +563,8 @@ fn letters_that_jade_would_lose_are_not_sent() {
 fn large_letters_pass_in_both_directions() {
     let (near, far) = (party(), party());
     let content = "<a & b> \"quoted\" \\ \u{e9}\n".repeat(100_000);
-    near.send(1, far.location(), parcel(1, &content)).unwrap();
+    near.send(1, far.location(), message_parcel(1, &content))
+        .unwrap();
     assert_eq!(near.conclusion(1), Conclusion::Handed);
     let [message] = &messages(&far, 1)[..] else {
         panic!("one message");
@@ -593,7 +572,7 @@ fn large_letters_pass_in_both_directions() {
     assert_eq!(message.content().unwrap(), &content);
     // The answer to the address in it arrives.
     let back = message.sender().unwrap().addresses()[0].parse().unwrap();
-    far.send(1, &back, parcel(1, &content)).unwrap();
+    far.send(1, &back, message_parcel(1, &content)).unwrap();
     assert_eq!(far.conclusion(1), Conclusion::Handed);
     assert_eq!(messages(&near, 1)[0].content().unwrap(), &content);
 }
@@ -604,7 +583,7 @@ fn a_closed_endpoint_concludes_its_letters() {
     let silent = Jade::new(|_| (Vec::new(), true));
     for number in 0..3 {
         party
-            .send(number, &silent.location, parcel(number, "x"))
+            .send(number, &silent.location, message_parcel(number, "x"))
             .unwrap();
     }
     silent.request();
@@ -617,7 +596,9 @@ fn a_closed_endpoint_concludes_its_letters() {
         assert!(matches!(party.conclusion(number), Conclusion::NotSent(_)));
     }
     assert_eq!(client.read_to_end(&mut Vec::new()).unwrap_or(0), 0);
-    let after = party.send(9, &silent.location, parcel(9, "x")).unwrap_err();
+    let after = party
+        .send(9, &silent.location, message_parcel(9, "x"))
+        .unwrap_err();
     assert_eq!(after.fault, TransportErrorKind::Closed);
 }
 

@@ -14,13 +14,11 @@ use std::thread;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, config, letter_parcel};
-use fipa_acl::{
-    AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
-};
+use common::{Party, config, message_parcel};
+use fipa_acl::{AclRepresentation, Envelope, Message};
 use fipa_testbed::until_some;
 use fipa_transport::{
-    AttemptId, Conclusion, Kind, Location, Parcel, Signature, Transport, TransportErrorKind,
+    AttemptId, Conclusion, Kind, Location, Signature, Transport, TransportErrorKind,
 };
 
 /// A legacy peer that accepts connections one after the other, and reads each to its end.
@@ -61,38 +59,16 @@ fn location(listener: &TcpListener, signature: Signature) -> Location {
     plain.with_signature(signature).unwrap()
 }
 
-fn parcel(sequence: u64, content: &str) -> Parcel {
-    let arm = AgentId::new("arm_1").unwrap();
-    let rover = AgentId::new("rover").unwrap();
-    let message = Message::builder(Performative::Inform)
-        .sender(rover.clone())
-        .receiver(arm.clone())
-        .content(content.to_owned())
-        .conversation_id("c-1")
-        .build()
-        .unwrap();
-    let base = EnvelopeParams {
-        to: vec![arm.clone()],
-        from: Some(rover),
-        acl_representation: Some(AclRepresentation::BitEfficient),
-        date: Some("20261120T112644481Z".parse().unwrap()),
-        intended_receivers: vec![arm],
-        ..EnvelopeParams::default()
-    };
-    let envelope = Envelope {
-        base,
-        extensions: Vec::new(),
-    };
-    let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
-    letter_parcel(sequence, letter)
-}
-
 #[test]
 fn fipa_services_gets_one_letter_per_connection_in_order() {
     let (party, peer) = (Party::new(), LegacyPeer::new(Signature::FipaServices));
     for number in 0..20 {
         party
-            .send(number, &peer.location, parcel(number, &number.to_string()))
+            .send(
+                number,
+                &peer.location,
+                message_parcel(number, &number.to_string()),
+            )
             .unwrap();
     }
     for number in 0..20 {
@@ -111,7 +87,9 @@ fn fipa_services_gets_one_letter_per_connection_in_order() {
 #[test]
 fn jade_gets_xml_and_a_string_message_and_can_answer() {
     let (party, peer) = (Party::new(), LegacyPeer::new(Signature::JadeProxy));
-    party.send(1, &peer.location, parcel(1, "hello")).unwrap();
+    party
+        .send(1, &peer.location, message_parcel(1, "hello"))
+        .unwrap();
     assert_eq!(party.conclusion(1), Conclusion::Handed);
     let (envelope, message, bytes) = peer.letter();
     assert!(bytes.starts_with(b"<?xml"));
@@ -134,7 +112,9 @@ fn an_unreachable_peer_is_reported_for_all_waiting_letters() {
     let gone = location(&listener, Signature::FipaServices);
     drop(listener);
     for attempt in 0..10 {
-        party.send(attempt, &gone, parcel(attempt, "x")).unwrap();
+        party
+            .send(attempt, &gone, message_parcel(attempt, "x"))
+            .unwrap();
     }
     for attempt in 0..10 {
         match party.conclusion(attempt) {
@@ -157,10 +137,12 @@ fn a_peer_that_does_not_read_is_given_up_and_others_are_served() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let deaf = location(&listener, Signature::FipaServices);
     party
-        .send(1, &deaf, parcel(1, &"x".repeat(32 << 20)))
+        .send(1, &deaf, message_parcel(1, &"x".repeat(32 << 20)))
         .unwrap();
-    party.send(2, &deaf, parcel(2, "waits")).unwrap();
-    party.send(3, &good.location, parcel(3, "y")).unwrap();
+    party.send(2, &deaf, message_parcel(2, "waits")).unwrap();
+    party
+        .send(3, &good.location, message_parcel(3, "y"))
+        .unwrap();
     assert_eq!(party.conclusion(3), Conclusion::Handed);
     match party.conclusion(1) {
         Conclusion::Unconfirmed(error) => {
@@ -181,14 +163,16 @@ fn waiting_letters_are_bounded_and_concluded_once() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let slow = location(&listener, Signature::FipaServices);
     let large = "x".repeat(32 << 20);
-    party.send(0, &slow, parcel(0, &large)).unwrap();
+    party.send(0, &slow, message_parcel(0, &large)).unwrap();
     let (mut stream, _) = listener.accept().unwrap();
     // The letter has begun now.
     stream.read_exact(&mut [0]).unwrap();
     for attempt in 1..=3 {
-        party.send(attempt, &slow, parcel(attempt, "x")).unwrap();
+        party
+            .send(attempt, &slow, message_parcel(attempt, "x"))
+            .unwrap();
     }
-    let full = party.send(4, &slow, parcel(4, "x")).unwrap_err();
+    let full = party.send(4, &slow, message_parcel(4, "x")).unwrap_err();
     assert_eq!(full.fault, TransportErrorKind::Congested, "{full}");
     party.transport.abandon(AttemptId(2));
     party.transport.close();
@@ -197,7 +181,7 @@ fn waiting_letters_are_bounded_and_concluded_once() {
         assert!(matches!(party.conclusion(attempt), Conclusion::NotSent(_)));
     }
     assert_eq!(party.sink.record.lock().concluded.len(), 3);
-    let closed = party.send(5, &slow, parcel(5, "x")).unwrap_err();
+    let closed = party.send(5, &slow, message_parcel(5, "x")).unwrap_err();
     assert_eq!(closed.fault, TransportErrorKind::Closed, "{closed}");
     drop(stream);
 }

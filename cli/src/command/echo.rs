@@ -1,12 +1,10 @@
 //! `fipa echo`: an agent that answers.
 
-use std::time::Duration;
-
 use clap::Args;
-use fipa::{Agent, AgentId, Config, ErrorChain, Incoming, Message, Performative, RegisterOptions};
+use fipa::{Agent, Config, ErrorChain, Incoming, Message, Performative};
 use fipa_acl::escape;
 
-use crate::membership::{self, Stop};
+use crate::membership::{self, Receiver, Stop};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::{self, Failure};
@@ -31,24 +29,8 @@ Examples:
 In another terminal:
   fipa send --to arm_1 --content hello --wait")]
 pub(crate) struct Arguments {
-    /// Name of the agent
-    name: AgentId,
-
-    /// Type of the agent, for `fipa agents --type`
-    #[arg(long = "type", value_name = "TYPE", default_value = "")]
-    agent_type: String,
-
-    /// Description of the agent, for `fipa agents --description`
-    #[arg(long, value_name = "TEXT", default_value = "")]
-    description: String,
-
-    /// End after this number of messages
-    #[arg(long, short, value_name = "N")]
-    count: Option<u64>,
-
-    /// End after this time, for example 10s
-    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
-    time: Option<Duration>,
+    #[command(flatten)]
+    receiver: Receiver,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -59,20 +41,16 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
-    let options = RegisterOptions {
-        agent_type: arguments.agent_type,
-        description: arguments.description,
-    };
-    let agent = membership::register(&domain, arguments.name.name(), options, config).await?;
+    let agent = arguments.receiver.register(&domain, config).await?;
     output::text(&format!(
         "agent {} of domain {} is ready; press Ctrl-C to stop\n",
         escape(agent.name()),
         config.domain
     ))?;
     let ended = tokio::select! {
-        ended = answer_all(&agent, arguments.count) => ended,
+        ended = answer_all(&agent, arguments.receiver.count) => ended,
         () = stop.requested() => Ok(()),
-        () = options::after(arguments.time) => Ok(()),
+        () = options::after(arguments.receiver.time) => Ok(()),
     };
     Stop::ending();
     drop(agent);

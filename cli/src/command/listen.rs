@@ -1,14 +1,12 @@
 //! `fipa listen`: an agent that prints its letters.
 
-use std::time::Duration;
-
 use clap::Args;
-use fipa::{AgentId, Config, ErrorChain, Incoming, RegisterOptions};
+use fipa::{Config, ErrorChain, Incoming};
 use fipa_acl::escape;
 use fipa_acl::json::message_to_json;
 use serde_json::json;
 
-use crate::membership::{self, Stop};
+use crate::membership::{self, Receiver, Stop};
 use crate::options::{self, Global};
 use crate::output::{self, Reader};
 use crate::report::Failure;
@@ -33,24 +31,8 @@ JSON, one object on each line:
     \"violation\": text, if the message violates its protocol (monitor.check),
     \"message\": the message as `fipa decode` prints it }")]
 pub(crate) struct Arguments {
-    /// Name of the agent
-    name: AgentId,
-
-    /// Type of the agent, for `fipa agents --type`
-    #[arg(long = "type", value_name = "TYPE", default_value = "")]
-    agent_type: String,
-
-    /// Description of the agent, for `fipa agents --description`
-    #[arg(long, value_name = "TEXT", default_value = "")]
-    description: String,
-
-    /// End after this number of messages
-    #[arg(long, short, value_name = "N")]
-    count: Option<u64>,
-
-    /// End after this time, for example 10s
-    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
-    time: Option<Duration>,
+    #[command(flatten)]
+    receiver: Receiver,
 
     /// Print JSON, one object on a line
     #[arg(long)]
@@ -65,11 +47,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
-    let options = RegisterOptions {
-        agent_type: arguments.agent_type,
-        description: arguments.description,
-    };
-    let agent = membership::register(&domain, arguments.name.name(), options, config).await?;
+    let agent = arguments.receiver.register(&domain, config).await?;
     match arguments.json {
         true => output::json_line(&json!({ "agent": agent.name(), "domain": config.domain }))?,
         false => output::text(&format!(
@@ -80,7 +58,11 @@ async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     }
     let print_all = async {
         let mut received = 0;
-        while arguments.count.is_none_or(|count| received < count) {
+        while arguments
+            .receiver
+            .count
+            .is_none_or(|count| received < count)
+        {
             let incoming = agent.receive().await.map_err(|error| {
                 Failure::failed(
                     ErrorChain(&error).to_string(),
@@ -98,7 +80,7 @@ async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         ended = print_all => ended,
         () = stop.requested() => Ok(()),
         () = reader.gone() => Ok(()),
-        () = options::after(arguments.time) => Ok(()),
+        () = options::after(arguments.receiver.time) => Ok(()),
     };
     Stop::ending();
     drop(agent);

@@ -11,13 +11,13 @@ use fipa::locks::{Lock, LockError};
 use fipa::{Agent, AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
 use rustix::process::{Pid, Signal, kill_process_group, test_kill_process_group};
 use tokio::process::{Child, Command};
-use tokio::signal::unix::{SignalKind, signal};
 
 use super::own::Group;
 use crate::complete;
 use crate::membership;
 use crate::options::{self, Global};
 use crate::report::{self, Failure};
+use crate::signals::Signals;
 
 /// Interval of looking for processes that are left in the group.
 const PAUSE: Duration = Duration::from_millis(20);
@@ -245,39 +245,5 @@ fn to_group(group: Option<Pid>, signal: Signal) {
     if let Some(group) = group {
         // Fails if no process is left.
         let _ = kill_process_group(group, signal);
-    }
-}
-
-/// The signals that are passed on to the command.
-struct Signals {
-    interrupt: tokio::signal::unix::Signal,
-    terminate: tokio::signal::unix::Signal,
-    hang_up: tokio::signal::unix::Signal,
-}
-
-impl Signals {
-    fn listen() -> Result<Self, Failure> {
-        let listen = |kind| {
-            signal(kind).map_err(|error: io::Error| {
-                Failure::failed(
-                    format!("cannot listen for signals: {error}"),
-                    "this process",
-                    "check the limit on open files: `ulimit -n`",
-                )
-            })
-        };
-        Ok(Self {
-            interrupt: listen(SignalKind::interrupt())?,
-            terminate: listen(SignalKind::terminate())?,
-            hang_up: listen(SignalKind::hangup())?,
-        })
-    }
-
-    async fn next(&mut self) -> Signal {
-        tokio::select! {
-            _ = self.interrupt.recv() => Signal::INT,
-            _ = self.terminate.recv() => Signal::TERM,
-            _ = self.hang_up.recv() => Signal::HUP,
-        }
     }
 }

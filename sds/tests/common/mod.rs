@@ -3,6 +3,9 @@
 // Each test binary uses only a part of this.
 #![allow(dead_code, unreachable_pub)]
 
+#[cfg(feature = "mdns")]
+pub mod mdns;
+
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};

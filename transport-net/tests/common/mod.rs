@@ -15,7 +15,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use fipa_acl::{Letter, Payload};
+use fipa_acl::{
+    AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Payload, Performative,
+};
 use fipa_testbed::until_some;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
@@ -374,6 +376,33 @@ pub(crate) fn written(parcel: &Parcel) -> Vec<u8> {
     let mut bytes = header.as_bytes().to_vec();
     bytes.extend(pieces.concat());
     bytes
+}
+
+/// A letter with an `inform` of `rover` to `arm_1`, encoded as FIPA00069 and FIPA00088 define.
+pub(crate) fn message_parcel(sequence: u64, content: &str) -> Parcel {
+    let arm = AgentId::new("arm_1").unwrap();
+    let rover = AgentId::new("rover").unwrap();
+    let message = Message::builder(Performative::Inform)
+        .sender(rover.clone())
+        .receiver(arm.clone())
+        .content(content.to_owned())
+        .conversation_id("c-1")
+        .build()
+        .unwrap();
+    let base = EnvelopeParams {
+        to: vec![arm.clone()],
+        from: Some(rover),
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        date: Some("20261120T112644481Z".parse().unwrap()),
+        intended_receivers: vec![arm],
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
+    letter_parcel(sequence, letter)
 }
 
 pub(crate) fn letter_parcel(sequence: u64, letter: Letter) -> Parcel {

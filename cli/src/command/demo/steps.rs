@@ -11,6 +11,7 @@ use tokio::net::TcpStream;
 
 use super::process::{Event, Listed, Order, Received, shown};
 use super::processes::{Process, Processes};
+use crate::membership::Stop;
 use crate::output;
 use crate::report::Failure;
 
@@ -30,6 +31,7 @@ pub(super) struct Report {
 
 /// Runs the demo. If `verbose`, prints each step on standard output.
 pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
+    let mut stop = Stop::listen()?;
     let processes = Processes::new().map_err(|error| {
         Failure::failed(
             error,
@@ -45,7 +47,7 @@ pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
     };
     let interrupted = tokio::select! {
         () = demo.all() => false,
-        () = interrupt() => true,
+        () = stop.requested() => true,
     };
     let left = demo.processes.clear().await;
     if interrupted {
@@ -62,21 +64,6 @@ pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
         measured,
         broken: demo.broken,
     })
-}
-
-/// Waits for SIGINT (Ctrl-C) or SIGTERM.
-async fn interrupt() {
-    let terminated = async {
-        use tokio::signal::unix::{SignalKind, signal};
-        match signal(SignalKind::terminate()) {
-            Ok(mut terminated) => drop(terminated.recv().await),
-            Err(_) => std::future::pending().await,
-        }
-    };
-    tokio::select! {
-        _ = tokio::signal::ctrl_c() => {}
-        () = terminated => {}
-    }
 }
 
 struct Demo {
