@@ -505,3 +505,46 @@ fn a_gateway_that_ends_returns_the_letters_in_its_custody() {
     // Further letters stay with the services before it.
     assert_eq!(gateway.arrive(ms, 9, 74), Verdict::Now(Answer::Busy));
 }
+
+/// Sends letters one after the other. The first attempt of each ends like this, the second one goes into
+/// custody and is reported as delivered. Returns the times between the two attempts, in milliseconds.
+fn delays_of_second_attempts(letters: usize, first: &TransportError) -> Vec<u64> {
+    let mut sender = Service::new(false);
+    let mut ms = 0;
+    let delays = (0..letters).map(|_| {
+        ms += 10_000;
+        sender.send_at(ms);
+        let (attempt, _) = sender.dispatched().unwrap();
+        sender.conclude(ms, attempt, Conclusion::NotSent(first.clone()));
+        let (again, attempt, handed) = sender.wait_for_dispatch(ms, ms + 5000).unwrap();
+        sender.answer(again, attempt, Answer::Custody);
+        let delivered = Outcome::Delivered {
+            via: Kind::Shm,
+            attempts: Vec::new(),
+        };
+        let settled = Body::Report(Report::Settled(delivered));
+        let report = parcel(handed.sequence, handed.transfer, settled);
+        sender.receive_from(again + 1, Kind::Shm, shm(NEXT), report);
+        let outcome = sender.outcome();
+        assert!(
+            matches!(outcome, Some(Outcome::Delivered { .. })),
+            "{outcome:?}"
+        );
+        again - ms
+    });
+    delays.collect()
+}
+
+#[test]
+fn a_full_route_is_waited_for_after_any_number_of_letters_in_custody() {
+    let full = TransportError::new(TransportErrorKind::Congested, "the window is full");
+    let delays = delays_of_second_attempts(100, &full);
+    assert!(delays.iter().all(|delay| *delay == 20), "{delays:?}");
+}
+
+#[test]
+fn pauses_do_not_grow_with_letters_that_were_delivered_from_custody() {
+    let closed = TransportError::new(TransportErrorKind::Unreachable, "closed");
+    let delays = delays_of_second_attempts(100, &closed);
+    assert!(delays.iter().all(|delay| *delay == delays[0]), "{delays:?}");
+}

@@ -97,11 +97,10 @@ impl Lane {
         answer: Answer,
         table: &mut AttemptTable,
     ) {
+        // The route had room.
+        self.congested = 0;
         match answer {
             Answer::Accepted => {
-                self.pauses = 0;
-                self.congested = 0;
-                self.busy = false;
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
                 let outcome = Outcome::Delivered { via, attempts };
@@ -432,13 +431,10 @@ impl Lane {
         let mut attempts = std::mem::take(&mut delivery.progress.attempts);
         attempts.extend_from_slice(outcome.attempts());
         let outcome = match outcome {
-            Outcome::Delivered { via, .. } => {
-                self.busy = false;
-                Outcome::Delivered {
-                    via: route(via),
-                    attempts,
-                }
-            }
+            Outcome::Delivered { via, .. } => Outcome::Delivered {
+                via: route(via),
+                attempts,
+            },
             Outcome::Sent { via, .. } => Outcome::Sent {
                 via: route(via),
                 attempts,

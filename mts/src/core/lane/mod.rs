@@ -112,6 +112,7 @@ pub(crate) struct Lane {
     paused_until: Option<Instant>,
     /// Whether the pause is for a lower letter, with whose end it ends.
     paused_for_lower: bool,
+    /// Number of consecutive pauses, each longer than the one before, since a letter was delivered.
     pauses: u32,
     /// Whether the receiver's queue was full at its last answer.
     busy: bool,
@@ -744,23 +745,28 @@ impl Lane {
         let len = delivery.letter.len();
         table.release(&self.receiver, len);
         self.bytes -= len;
-        if self.letters.is_empty() {
+        let is_last = self.letters.is_empty();
+        if is_last {
             self.pushed = 0;
             self.route = None;
-            self.busy = false;
             self.ended = None;
             self.moving = None;
             self.failed.clear();
-        }
-        if self.paused_for_lower {
-            self.paused_until = None;
-            self.paused_for_lower = false;
-            self.pauses = 0;
         }
         let delivered = matches!(
             settlement,
             Settlement::Outcome(Outcome::Delivered { .. } | Outcome::Sent { .. })
         );
+        if delivered || is_last {
+            self.busy = false;
+            self.pauses = 0;
+            self.congested = 0;
+        }
+        if self.paused_for_lower || is_last {
+            self.paused_until = None;
+            self.paused_for_lower = false;
+            self.pauses = 0;
+        }
         match self.is_custody() {
             _ if delivered => {}
             true => self.predecessor_failed(now, delivery.sequence),
