@@ -13,8 +13,14 @@ use tokio::time::{Instant, sleep, sleep_until};
 
 use crate::domain_dir::{DomainDir, DomainDirError};
 
-/// Time between two checks for removed files. In most cases the kernel reports a removal at once.
+/// Time between two checks for removed files while the kernel reports no removals.
 const CHECK_EVERY: Duration = Duration::from_secs(5);
+
+/// The same while it does. It does not report the removal of a level above the domains.
+const WATCHED_CHECK_EVERY: Duration = Duration::from_secs(60);
+
+/// Time in which removals are collected.
+const GATHERING: Duration = Duration::from_millis(20);
 
 /// Time between two attempts to join again.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
@@ -63,26 +69,30 @@ impl DirMaintenance {
         // The last logged problem, so that each problem is logged once.
         let mut problem: Option<String> = None;
         loop {
-            let pause = match problem {
-                Some(_) => RETRY_AFTER,
-                None => CHECK_EVERY,
-            };
-            tokio::select! {
-                () = self.host.disturbed(), if problem.is_none() => {}
-                () = sleep(pause) => {}
-                () = sleep_until(renewal) => {
-                    renewal = Instant::now() + RENEW_EVERY;
-                    let dir = self.dir.clone();
-                    // There may be many files on a slow SD card.
-                    let _ = tokio::task::spawn_blocking(move || dir.renew()).await;
-                    continue;
-                }
-            }
+            // Watched before the check, so that no removal is missed.
+            let watched = self.watch();
             let Some(missing) = self.missing() else {
                 problem = None;
+                let pause = match watched {
+                    true => WATCHED_CHECK_EVERY,
+                    false => CHECK_EVERY,
+                };
+                tokio::select! {
+                    // A program that removes one file will often remove others.
+                    () = self.host.disturbed() => sleep(GATHERING).await,
+                    () = sleep(pause) => {}
+                    () = sleep_until(renewal) => {
+                        renewal = Instant::now() + RENEW_EVERY;
+                        let dir = self.dir.clone();
+                        // There may be many files on a slow SD card.
+                        let _ = tokio::task::spawn_blocking(move || dir.renew()).await;
+                    }
+                }
                 continue;
             };
-            if problem.is_none() {
+            if problem.is_some() {
+                sleep(RETRY_AFTER).await;
+            } else {
                 tracing::warn!(
                     missing,
                     "another program removed files in {}; joining the domain again (exempt the \
@@ -96,7 +106,6 @@ impl DirMaintenance {
             match joined.await {
                 Ok(Ok(joined)) => {
                     self = joined;
-                    problem = None;
                     tracing::info!("joined the domain in {} again", self.dir.path().display());
                 }
                 Ok(Err(error)) => {
@@ -110,6 +119,15 @@ impl DirMaintenance {
                 Err(_) => return,
             }
         }
+    }
+
+    /// Makes the kernel report the removal of the files. Returns whether it does.
+    fn watch(&self) -> bool {
+        let mut files = Vec::from(self.dir.levels());
+        #[cfg(feature = "shm")]
+        files.extend(self.shm().iter().flat_map(|shm| shm.files()));
+        files.extend(self.unix().and_then(|unix| unix.socket_path()));
+        self.host.watch_files(&files).is_ok()
     }
 
     /// Returns which files of this process are missing, if any are. A file that cannot be examined

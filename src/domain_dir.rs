@@ -138,6 +138,11 @@ impl DomainDir {
         Ok(())
     }
 
+    /// The levels of the directory.
+    pub(crate) fn levels(&self) -> [PathBuf; 2] {
+        [self.base.clone(), self.path()]
+    }
+
     /// Whether the paths still lead to the levels that were locked.
     pub(crate) fn is_there(&self) -> bool {
         self.locks.as_ref().is_none_or(|locks| {

@@ -30,6 +30,7 @@ use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, Trans
 use fipa_transport_net::Refusals;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use self::exchange::{Exchanging, Means};
@@ -332,10 +333,11 @@ impl Gateway {
         Ok(later)
     }
 
-    /// Returns the current problem of the discovery of other hosts, if there is one.
+    /// Returns the current problem of the discovery of other hosts, if there is one, and its changes.
     #[must_use]
-    pub fn discovery_problem(&self) -> Option<String> {
-        self.network.as_ref().and_then(|network| network.problem())
+    pub fn discovery_problem(&self) -> watch::Receiver<Option<String>> {
+        let problem = self.network.as_ref().map(|network| network.problem());
+        problem.unwrap_or_else(|| watch::channel(None).1)
     }
 
     /// Ends the gateway. Announces the end to other hosts, and gives letters in transit a moment to
@@ -474,8 +476,8 @@ fn peers(config: &Config) -> Vec<Peer> {
 /// A directory that is shared with other hosts and announces the agents of this host to them.
 trait Network: Send + Sync {
     fn directory(self: Arc<Self>) -> Arc<dyn Directory>;
-    /// Returns the last error, if there is one.
-    fn problem(&self) -> Option<String>;
+    /// Returns the last error, if there is one, and its changes.
+    fn problem(&self) -> watch::Receiver<Option<String>>;
     /// Checks whether this gateway of another host still runs.
     fn doubt(&self, gateway: Incarnation);
     /// Removes the entries of this gateway of another host, because another one has replaced it.
@@ -492,8 +494,8 @@ impl Network for fipa_sds::MdnsDirectory {
         self
     }
 
-    fn problem(&self) -> Option<String> {
-        self.status().last_error
+    fn problem(&self) -> watch::Receiver<Option<String>> {
+        self.last_error()
     }
 
     fn doubt(&self, gateway: Incarnation) {

@@ -11,6 +11,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 use std::sync::Arc;
+use std::time::Duration;
 
 use common::{conforms, next, registration};
 use fipa_sds::{
@@ -332,7 +333,7 @@ async fn the_end_of_every_process_is_reported() {
     let here = open(&dir);
     let mut departures = here.departures();
     let told = async |departures: &mut fipa_sds::Departures| {
-        let watchdog = std::time::Duration::from_secs(60);
+        let watchdog = Duration::from_secs(60);
         tokio::time::timeout(watchdog, departures.next())
             .await
             .unwrap()
@@ -730,6 +731,44 @@ async fn connections_to_files_that_are_not_sockets_of_this_user_are_refused() {
 }
 
 #[tokio::test]
+async fn the_removal_of_watched_files_is_reported() {
+    let (parent, dir) = fresh_dir();
+    let one = open(&dir);
+    let within = parent.path().join("within");
+    std::fs::create_dir(&within).unwrap();
+    let [removed, moved] = ["removed", "moved"].map(|name| parent.path().join(name));
+    let child = within.join("child");
+    assert!(one.watch_files(std::slice::from_ref(&removed)).is_err());
+    for file in [&removed, &moved, &child] {
+        std::fs::write(file, "").unwrap();
+    }
+    let open_file = std::fs::File::open(&removed).unwrap();
+    let watched = [removed.clone(), moved.clone(), within];
+    one.watch_files(&watched).unwrap();
+    // A second watch of the same file is not reported.
+    one.watch_files(&watched).unwrap();
+    let mut disturbed = Box::pin(one.disturbed());
+    let quiet = tokio::time::timeout(Duration::from_millis(50), &mut disturbed);
+    assert!(quiet.await.is_err());
+    std::fs::remove_file(&removed).unwrap();
+    disturbed.await;
+    drop(open_file);
+    std::fs::rename(&moved, parent.path().join("away")).unwrap();
+    one.disturbed().await;
+    std::fs::remove_file(&child).unwrap();
+    one.disturbed().await;
+    // The watches of the directory itself still work.
+    let mut victim = Process::start(&dir);
+    assert_eq!(victim.ask("register foot"), "ok");
+    assert!(one.lookup("foot").is_some());
+    victim.kill();
+    until_some_async("its end is noticed", || {
+        one.known("foot").is_none().then_some(())
+    })
+    .await;
+}
+
+#[tokio::test]
 async fn a_directory_that_was_removed_is_joined_again() {
     let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
@@ -749,9 +788,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
                 std::fs::remove_file(dir.join(entries.unwrap())).unwrap();
             }
         }
-        if way == "removed" {
-            one.disturbed().await;
-        }
+        one.disturbed().await;
         let rejoined = [&one, &two].map(|directory| directory.rejoin().unwrap());
         let needed = if way == "one file removed" { 1 } else { 2 };
         assert_eq!(rejoined.iter().filter(|it| **it).count(), needed, "{way}");

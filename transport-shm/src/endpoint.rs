@@ -190,6 +190,11 @@ impl Endpoint {
         &self.tally
     }
 
+    /// The files by which other processes find this one.
+    pub(crate) fn files(&self) -> &[PathBuf] {
+        &self.files
+    }
+
     /// Whether all files exist by which other processes find this one.
     pub(crate) fn is_there(&self) -> bool {
         let missing = |file: &PathBuf| {

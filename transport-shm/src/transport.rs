@@ -1,6 +1,7 @@
 //! The [`Transport`] of this crate.
 
 use std::fmt;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 
@@ -87,6 +88,12 @@ impl ShmTransport {
     pub fn is_there(&self) -> bool {
         // The files are examined first, because closing sets the flag before it removes them.
         self.endpoint.load().is_there() || self.closed.load(Ordering::SeqCst)
+    }
+
+    /// The files by which other processes find the mailbox; see [`is_there`](Self::is_there).
+    #[must_use]
+    pub fn files(&self) -> Vec<PathBuf> {
+        self.endpoint.load().files().to_vec()
     }
 
     /// Joins the domain again if its files were removed. Returns whether that was necessary.

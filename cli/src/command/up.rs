@@ -1,7 +1,5 @@
 //! `fipa up`: the gateway of a domain.
 
-use std::time::Duration;
-
 use clap::Args;
 use fipa::keys::{Certificate, Keys};
 use fipa::{Change, Config, Entry, Gateway, Reach};
@@ -46,9 +44,6 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-/// Interval of checks for discovery problems.
-const PROBLEM_CHECK_INTERVAL: Duration = Duration::from_secs(5);
-
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
     options::block_on(serve(&config, arguments.json, global))?
@@ -58,7 +53,8 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     let mut stop = Stop::listen()?;
     let opened = Gateway::open(config).await;
     let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
-    let mut problem = gateway.discovery_problem();
+    let mut problems = gateway.discovery_problem();
+    let mut problem = problems.borrow_and_update().clone();
     let mut changes = gateway.directory().watch();
     if json {
         output::json_line(&ready_json(config, &gateway, problem.as_deref()))?;
@@ -68,7 +64,6 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     for entry in gateway.directory().entries().iter() {
         log_entry("present", entry);
     }
-    let mut problem_check = tokio::time::interval(PROBLEM_CHECK_INTERVAL);
     loop {
         tokio::select! {
             request = stop.next_request() => match request {
@@ -76,8 +71,8 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
                 SignalRequest::Reload => reload(&mut gateway, global),
             },
             Some(change) = changes.next() => log(&change),
-            _ = problem_check.tick() => {
-                let now = gateway.discovery_problem();
+            Ok(()) = problems.changed() => {
+                let now = problems.borrow_and_update().clone();
                 if now != problem {
                     match &now {
                         Some(text) => tracing::warn!("discovery of other hosts may fail: {text}"),

@@ -28,6 +28,7 @@ use std::time::Duration;
 
 use fipa_acl::ErrorChain;
 use fipa_transport::{Forked, Incarnation, OwnerProcess};
+use inotify::{WatchMask, Watches};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
@@ -62,6 +63,8 @@ pub struct HostDirectory {
     owner: OwnerProcess,
     runtime: tokio::runtime::Handle,
     task: Mutex<tokio::task::JoinHandle<()>>,
+    /// Adds watches of files. `None` if the kernel reports no changes.
+    watches: Mutex<Option<Watches>>,
 }
 
 impl HostDirectory {
@@ -91,8 +94,10 @@ impl HostDirectory {
             let _ = shared.close();
             return Err(error);
         }
+        let watches = Mutex::new(watcher.watches());
         let task = runtime.spawn(watcher.run(Arc::clone(&shared), None));
         Ok(Self {
+            watches,
             shared,
             config,
             owner: OwnerProcess::this(),
@@ -229,10 +234,34 @@ impl HostDirectory {
         self.shared.host_dir().connect(socket.0)
     }
 
-    /// Waits until another program may have removed the directory; [`rejoin`](Self::rejoin) checks
-    /// that. Not every removal is reported: also call [`is_there`](Self::is_there) periodically.
+    /// Waits until another program may have removed the directory, a file of this process in it, or
+    /// a [watched](Self::watch_files) file. [`is_there`](Self::is_there) checks the directory. A
+    /// removal of a level above is not always reported.
     pub async fn disturbed(&self) {
         self.shared.disturbed().await;
+    }
+
+    /// Makes [`disturbed`](Self::disturbed) also report when one of these files is removed or moved,
+    /// or a file directly in one of these directories. [`rejoin`](Self::rejoin) may end that.
+    ///
+    /// The watches are part of the directory's inotify instance, of which a user has few.
+    ///
+    /// # Errors
+    /// Fails when the system reports no changes, or a file does not exist.
+    pub fn watch_files(&self, files: &[PathBuf]) -> io::Result<()> {
+        let watches = self.watches.lock().clone();
+        let mut watches = watches.ok_or(io::ErrorKind::Unsupported)?;
+        // The removal of a name changes the attributes of a file that is still open.
+        let mask = WatchMask::ATTRIB
+            | WatchMask::DELETE_SELF
+            | WatchMask::MOVE_SELF
+            | WatchMask::DELETE
+            | WatchMask::MOVED_FROM
+            | WatchMask::DONT_FOLLOW;
+        for file in files {
+            watches.add(file, mask)?;
+        }
+        Ok(())
     }
 
     /// Whether other processes can find the registrations of this one. False when another program
@@ -265,6 +294,7 @@ impl HostDirectory {
             .shared
             .refresh()
             .and_then(|()| self.shared.find_sockets());
+        *self.watches.lock() = watcher.watches();
         let settled = tokio::time::Instant::now() + SETTLING;
         let run = watcher.run(Arc::clone(&self.shared), Some(settled));
         *task = self.runtime.spawn(run);

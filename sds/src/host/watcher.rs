@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use fipa_acl::ErrorChain;
 use futures_core::Stream as _;
-use inotify::{EventMask, EventStream, Inotify, WatchMask};
+use inotify::{EventMask, EventStream, Inotify, WatchDescriptor, WatchMask, Watches};
 use tokio::time::Instant;
 
 use super::HostError;
@@ -29,7 +29,11 @@ pub(super) struct Watcher {
 
 /// Source of changes of the directory.
 enum Events {
-    Inotify(EventStream<Vec<u8>>),
+    Inotify {
+        events: EventStream<Vec<u8>>,
+        /// The watch of the directory; others are of files whose removal is reported.
+        dir: WatchDescriptor,
+    },
     Polling(Poller),
 }
 
@@ -37,7 +41,7 @@ impl Watcher {
     /// Watches from now on. Must be called within a tokio runtime.
     pub(super) fn new(host_dir: &HostDir) -> Self {
         let events = match Self::inotify(host_dir) {
-            Ok(events) => Events::Inotify(events),
+            Ok((events, dir)) => Events::Inotify { events, dir },
             Err(error) => {
                 tracing::warn!(
                     error = %ErrorChain(&error),
@@ -52,16 +56,25 @@ impl Watcher {
         Self { events }
     }
 
-    fn inotify(host_dir: &HostDir) -> io::Result<EventStream<Vec<u8>>> {
+    /// Adds watches of files, if the kernel reports changes.
+    pub(super) fn watches(&self) -> Option<Watches> {
+        match &self.events {
+            Events::Inotify { events, .. } => Some(events.watches()),
+            Events::Polling(_) => None,
+        }
+    }
+
+    fn inotify(host_dir: &HostDir) -> io::Result<(EventStream<Vec<u8>>, WatchDescriptor)> {
         let inotify = Inotify::init()?;
         let mask = WatchMask::CLOSE_WRITE
             | WatchMask::MOVED_TO
             | WatchMask::DELETE
             | WatchMask::DELETE_SELF
+            | WatchMask::MOVE_SELF
             | WatchMask::ONLYDIR;
         let mut watches = inotify.watches();
-        watches.add(host_dir.pinned_path(), mask)?;
-        inotify.into_event_stream(vec![0; 16 * 1024])
+        let dir = watches.add(host_dir.pinned_path(), mask)?;
+        Ok((inotify.into_event_stream(vec![0; 16 * 1024])?, dir))
     }
 
     /// Keeps the view up to date until it is aborted. At `settled`, entries from before a removal
@@ -102,8 +115,8 @@ impl Watcher {
     /// Waits for at least one change, and returns all since the last call.
     async fn changes(&mut self, shared: &Shared) -> Result<DirChanges, HostError> {
         match &mut self.events {
-            Events::Inotify(events) => {
-                next_events(events)
+            Events::Inotify { events, dir } => {
+                next_events(events, dir)
                     .await
                     .map_err(|source| HostError::Watch {
                         path: shared.host_dir().path().to_owned(),
@@ -121,7 +134,10 @@ impl Watcher {
     }
 }
 
-async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<DirChanges> {
+async fn next_events(
+    events: &mut EventStream<Vec<u8>>,
+    dir: &WatchDescriptor,
+) -> io::Result<DirChanges> {
     let mut changes = DirChanges::default();
     poll_fn(|context| {
         // Bounded, so that other tasks can run.
@@ -129,7 +145,13 @@ async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<DirChanges
             match Pin::new(&mut *events).poll_next(context) {
                 Poll::Ready(Some(event)) => {
                     let event = event?;
-                    changes.add(event.mask, event.name.as_deref().and_then(OsStr::to_str));
+                    match event.wd == *dir || event.mask.contains(EventMask::Q_OVERFLOW) {
+                        true => {
+                            let name = event.name.as_deref().and_then(OsStr::to_str);
+                            changes.add(event.mask, name);
+                        }
+                        false => changes.disturbed = true,
+                    }
                 }
                 // The stream does not end.
                 Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
@@ -225,15 +247,25 @@ struct DirChanges {
     wrote: BTreeSet<Id>,
     ended: BTreeSet<Id>,
     sockets: bool,
+    /// Whether events are missing, or the directory was removed or moved.
     lost: bool,
+    /// Whether a watched file may have been removed, or one that only a process that ends removes.
+    disturbed: bool,
 }
 
 impl DirChanges {
     fn add(&mut self, mask: EventMask, name: Option<&str>) {
-        if mask.intersects(EventMask::Q_OVERFLOW | EventMask::DELETE_SELF | EventMask::IGNORED) {
+        let lost = EventMask::Q_OVERFLOW
+            | EventMask::DELETE_SELF
+            | EventMask::MOVE_SELF
+            | EventMask::IGNORED;
+        if mask.intersects(lost) {
             self.lost = true;
         }
         match name.and_then(Name::parse) {
+            Some(Name::Entries(_) | Name::Domain) if mask.contains(EventMask::DELETE) => {
+                self.disturbed = true;
+            }
             Some(Name::Entries(id)) if mask.contains(EventMask::MOVED_TO) => {
                 self.wrote.insert(id);
             }
@@ -248,7 +280,8 @@ impl DirChanges {
     }
 
     fn is_empty(&self) -> bool {
-        self.wrote.is_empty() && self.ended.is_empty() && !self.sockets && !self.lost
+        let none = self.wrote.is_empty() && self.ended.is_empty();
+        none && !self.sockets && !self.lost && !self.disturbed
     }
 }
 
@@ -264,6 +297,9 @@ fn handle(
     changes: DirChanges,
     ending: &mut EndingProcesses,
 ) -> Result<(), HostError> {
+    if changes.disturbed {
+        shared.report_disturbed();
+    }
     // Files that disappear together with the directory do not mean that their processes ended.
     if (changes.lost || ending.rescan || !changes.ended.is_empty()) && !shared.is_there()? {
         return Err(HostError::Removed {

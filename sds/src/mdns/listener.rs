@@ -49,8 +49,7 @@ impl Listener {
         }
         if shared.interfaces_changed.swap(false, Ordering::Relaxed) {
             self.next_beacon = now;
-            self.fast_poll_until = Some(now + beacon::INTERVAL);
-            shared.set_poll_interval(super::FAST_POLL);
+            self.poll_fast(now, shared);
         }
         if self.fast_poll_until.is_some_and(|until| until <= now) {
             self.fast_poll_until = None;
@@ -67,7 +66,9 @@ impl Listener {
                     }
                     // The library notices a removed address only at its next poll, and until then
                     // would use it instead of the new one.
-                    if changed.more && !changed.fewer {
+                    if changed.fewer {
+                        self.poll_fast(now, shared);
+                    } else if changed.more {
                         shared.daemon_adds_interfaces();
                     }
                 }
@@ -107,6 +108,11 @@ impl Listener {
         ];
         let due = due.into_iter().flatten().min();
         due.map_or(self.next_beacon, |due| due.min(self.next_beacon))
+    }
+
+    fn poll_fast(&mut self, now: Instant, shared: &Shared) {
+        self.fast_poll_until = Some(now + super::CHANGING);
+        shared.set_poll_interval(super::FAST_POLL);
     }
 
     fn send(&self, packets: impl IntoIterator<Item = Vec<u8>>) {

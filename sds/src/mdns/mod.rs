@@ -10,6 +10,7 @@
 //! of a record has no meaning between gateways: a label in use by another name is replaced by a
 //! different one.
 
+mod alarm;
 mod beacon;
 mod browse;
 mod coalition_sync;
@@ -34,7 +35,7 @@ use std::time::{Duration, Instant};
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonStatus, IfKind, Receiver, ServiceDaemon, ServiceInfo, TxtProperty};
 use parking_lot::Mutex;
-use tokio::sync::{Notify, broadcast};
+use tokio::sync::{Notify, broadcast, watch};
 
 use self::beacon::Digest;
 use self::coalition_sync::{CoalitionSync, Updates};
@@ -124,7 +125,7 @@ impl MdnsDirectory {
     pub const MAX_BYTES: usize = 16 << 20;
     /// Maximum number of DNS records in the cache of the mDNS library, each of at most 9,000 bytes.
     /// The library keeps records of packets that introduce no service forever. The cache is checked
-    /// every two seconds; beyond this limit the library is restarted, and this gateway's agents are
+    /// every two to three seconds while packets arrive; beyond this limit the library is restarted, and this gateway's agents are
     /// announced again without a goodbye.
     pub const MAX_CACHED: u64 = restart::MAX_CACHED;
 
@@ -151,13 +152,12 @@ impl MdnsDirectory {
             coalition_sync: Mutex::default(),
             coalitions_changed: AtomicBool::new(false),
             closing: AtomicBool::new(false),
-            interfaces_changed: AtomicBool::new(false),
+            // The addresses of a host that starts may not be usable yet.
+            interfaces_changed: AtomicBool::new(true),
             own: Mutex::default(),
             withdrawals: broadcast::channel(64).0,
-            status: Mutex::new(MdnsStatus {
-                last_error: failed,
-                ..MdnsStatus::default()
-            }),
+            status: Mutex::default(),
+            last_error: watch::Sender::new(failed),
             postponed: Notify::new(),
         });
         if let Some(daemon) = &*shared.daemon.lock() {
@@ -181,6 +181,15 @@ impl MdnsDirectory {
         status.announced = self.shared.own.lock().agents.len();
         status.known = self.shared.table.len();
         status
+            .last_error
+            .clone_from(&self.shared.last_error.borrow());
+        status
+    }
+
+    /// Returns the [latest error](MdnsStatus::last_error) and its changes.
+    #[must_use]
+    pub fn last_error(&self) -> watch::Receiver<Option<String>> {
+        self.shared.last_error.subscribe()
     }
 
     /// Queries the network for the record of this name, because letters to it do not arrive.
@@ -324,6 +333,7 @@ struct Shared {
     own: Mutex<OwnAgents>,
     withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
+    last_error: watch::Sender<Option<String>>,
     /// Wakes the task for work that is due later or now.
     postponed: Notify,
 }
@@ -403,9 +413,14 @@ const SETTLING: Duration = Duration::from_secs(3);
 /// gateways have it. It may be announced before the previous record has left all caches.
 const MOVING: Duration = Duration::from_secs(1);
 
-/// Intervals in seconds at which the library polls the interfaces: normally, and while they change.
-const NORMAL_POLL: u32 = mdns_sd::IP_CHECK_INTERVAL_IN_SECS_DEFAULT;
+/// Intervals in seconds at which the library polls the interfaces: normally, and while they change,
+/// which this crate detects.
+const NORMAL_POLL: u32 = 60;
 const FAST_POLL: u32 = 1;
+
+/// Time for which the library polls fast after a change. An IPv6 address takes up to two seconds
+/// until it is usable (RFC 4862 clause 5.4).
+const CHANGING: Duration = Duration::from_secs(5);
 
 /// Time for which a full name rests after a goodbye.
 const REST: Duration = Duration::from_secs(1);
@@ -653,6 +668,7 @@ impl Shared {
         };
         self.choose(&daemon);
         *self.daemon.lock() = Some(daemon);
+        self.interfaces_changed.store(true, Ordering::Relaxed);
         own.while_stopped = None;
         let now = Instant::now();
         let agents = own.agents.values_mut();
@@ -707,13 +723,21 @@ impl Shared {
         }
     }
 
+    fn set_last_error(&self, error: String) {
+        self.last_error.send_if_modified(|last| {
+            let changed = last.as_ref() != Some(&error);
+            *last = Some(error);
+            changed
+        });
+    }
+
     fn failed(&self, error: String) {
         if self.closing.load(Ordering::Relaxed) {
             tracing::debug!(%error, "multicast DNS, while it is closed");
             return;
         }
         tracing::warn!(%error, "multicast DNS");
-        self.status.lock().last_error = Some(error);
+        self.set_last_error(error);
     }
 }
 
@@ -735,6 +759,7 @@ fn fullname(label: &str) -> Arc<str> {
 
 fn choose(daemon: &ServiceDaemon, interfaces: &[String]) -> Result<(), mdns_sd::Error> {
     daemon.set_service_name_len_max(SERVICE_NAME_LEN)?;
+    daemon.set_ip_check_interval(NORMAL_POLL)?;
     if interfaces.is_empty() {
         return Ok(());
     }

@@ -2,8 +2,8 @@
 //!
 //! This crate does not browse with the library ([`super::browse`]), but the library caches received
 //! records all the same, and keeps those of packets that introduce no service forever. Its cache
-//! has no limit and cannot be cleared. The cache size is therefore checked every two seconds. A
-//! library whose cache is too large is stopped without a goodbye, and a new one is started, to
+//! has no limit and cannot be cleared. The cache size is therefore checked every two to three seconds
+//! while the process works ([`CacheCheck`]). A library whose cache is too large is stopped without a goodbye, and a new one is started, to
 //! which this gateway's own agents are registered again. The pause in between grows while the flood
 //! continues, which bounds the memory and the rate of repeated announcements. The entries of other
 //! gateways' agents are not affected.
@@ -11,8 +11,11 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-/// Interval between checks of the cache size.
-pub(super) const INTERVAL: Duration = Duration::from_secs(2);
+/// Minimum time between two checks of the cache size.
+const INTERVAL: Duration = Duration::from_secs(2);
+/// Processor time of the process after which the cache size is checked. In this time, the library can
+/// cache only a part of [`MAX_CACHED`] records.
+const WORK: Duration = Duration::from_millis(10);
 /// Maximum number of cached records. A record is at most as long as its packet, which has at most
 /// [`MAX_PACKET`](super::packet::MAX_PACKET) bytes.
 pub(super) const MAX_CACHED: u64 = 40_000;
@@ -39,6 +42,44 @@ pub(super) fn is_too_much(metrics: &HashMap<String, i64>) -> Option<String> {
         return Some(format!("{cached} records, more than {MAX_CACHED}"));
     }
     (timers > MAX_TIMERS).then(|| format!("{timers} timers, more than {MAX_TIMERS}"))
+}
+
+/// Returns the processor time that this process has used.
+pub(super) fn work() -> Duration {
+    let used = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    Duration::try_from(used).unwrap_or_default()
+}
+
+/// Decides when the cache size is checked. A check wakes two threads, and the cache of an idle process
+/// does not grow. Not all packets that the library caches arrive at the sockets of this crate, so the
+/// processor time decides.
+#[derive(Debug)]
+pub(super) struct CacheCheck {
+    next: Instant,
+    /// Processor time at the last check.
+    work: Duration,
+}
+
+impl CacheCheck {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            next: now + INTERVAL,
+            work: Duration::ZERO,
+        }
+    }
+
+    /// Whether the cache size is to be checked, given the processor time that the process has used.
+    pub(super) fn is_due(&self, now: Instant, work: impl FnOnce() -> Duration) -> bool {
+        now >= self.next && work() >= self.work + WORK
+    }
+
+    /// Records that the library was asked; `work` is `None` if it was too busy.
+    pub(super) fn asked(&mut self, now: Instant, work: Option<Duration>) {
+        self.next = now + INTERVAL;
+        if let Some(work) = work {
+            self.work = work;
+        }
+    }
 }
 
 /// Computes the pauses between stop and restart of the library.
@@ -113,6 +154,32 @@ pub(super) mod tests {
         assert!(is_too_much(&metrics(&[("timer", MAX_TIMERS + 1)])).is_some());
         let negative = HashMap::from([("cached-ptr".to_owned(), -1)]);
         assert_eq!(is_too_much(&negative), None);
+    }
+
+    #[test]
+    fn the_cache_of_an_idle_process_is_not_checked() {
+        let begun = Instant::now();
+        let at = |seconds| begun + Duration::from_secs(seconds);
+        let milliseconds = Duration::from_millis;
+        let mut check = CacheCheck::new(begun);
+        let due = |check: &CacheCheck, now, work| check.is_due(at(now), || milliseconds(work));
+        assert!(!due(&check, 1, 1000), "too early");
+        assert!(due(&check, 2, 1000));
+        check.asked(at(2), Some(milliseconds(1000)));
+        assert!(!due(&check, 3600, 1009), "idle");
+        // Small work adds up.
+        assert!(due(&check, 3600, 1010));
+        check.asked(at(3600), None);
+        assert!(!due(&check, 3601, 1010));
+        assert!(due(&check, 3602, 1010), "a busy library is asked again");
+    }
+
+    #[test]
+    fn the_processor_time_grows_with_work() {
+        let before = work();
+        while work() < before + WORK {
+            std::hint::black_box(Instant::now());
+        }
     }
 
     #[test]

@@ -7,11 +7,12 @@ use fipa_acl::ErrorChain;
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
+use super::alarm::Alarm;
 use super::beacon::Digest;
 use super::browse::{ParsedPacket, label_of};
 use super::listener::Listener;
 use super::record::{self, Properties};
-use super::restart::{self, Pauses};
+use super::restart::{self, CacheCheck, Pauses};
 use super::{MAX_SPOILT, Shared, Withdrawal};
 use crate::Entry;
 
@@ -81,27 +82,27 @@ async fn listen(
     monitor: Option<&Receiver<DaemonEvent>>,
     listener: &mut Listener,
 ) -> String {
-    let mut look = monitor.map(|_| Instant::now() + restart::INTERVAL);
+    let mut cache_check = CacheCheck::new(Instant::now());
     let mut metrics: Option<Receiver<Metrics>> = None;
+    let mut alarm = Alarm::new();
     loop {
         let now = Instant::now();
         shared.show(|coalition_sync| coalition_sync.handle_timeout(now));
-        if look.is_some_and(|look| look <= now) {
-            look = None;
+        let waiting = shared.coalition_sync.lock().poll_timeout();
+        let announcing = shared.announce_due();
+        let sending = listener.send_due(shared);
+        // Without a timer of its own: each packet and each beacon leads here.
+        if monitor.is_some() && metrics.is_none() && cache_check.is_due(now, restart::work) {
             // Requests the cache size; a busy library is asked again later.
             let daemon = shared.daemon.lock().clone();
             metrics = daemon.and_then(|daemon| daemon.get_metrics().ok());
-            if metrics.is_none() {
-                look = Some(now + restart::INTERVAL);
-            }
+            cache_check.asked(now, metrics.is_some().then(restart::work));
         }
-        let waiting = shared.coalition_sync.lock().poll_timeout();
-        let announcing = shared.announce_due();
-        let due = [announcing, Some(listener.send_due(shared)), waiting, look];
+        let due = [announcing, Some(sending), waiting];
         let due = due.into_iter().flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}
-            () = until(due), if due.is_some() => {}
+            () = alarm.until(due) => {}
             received = listener.listen(shared) => handle(shared, listener, received),
             event = next(monitor) => match event {
                 Some(DaemonEvent::NameChange(change)) => renamed(shared, &change.original),
@@ -111,7 +112,6 @@ async fn listen(
             },
             answer = next(metrics.as_ref()) => {
                 metrics = None;
-                look = Some(Instant::now() + restart::INTERVAL);
                 if let Some(kept) = answer.as_ref().and_then(restart::is_too_much) {
                     return format!(
                         "the mDNS library cached {kept}, because a host floods the network; new \
@@ -134,12 +134,6 @@ async fn next<T>(of: Option<&Receiver<T>>) -> Option<T> {
     }
 }
 
-async fn until(due: Option<Instant>) {
-    if let Some(due) = due {
-        tokio::time::sleep_until(due.into()).await;
-    }
-}
-
 fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
     for (fullname, properties) in received.found {
         if let Some(gateway) = found(shared, &fullname, &properties) {
@@ -147,10 +141,9 @@ fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
         }
     }
     if received.refused > 0 {
-        let mut status = shared.status.lock();
-        status.refused += received.refused;
-        status.last_error =
-            Some("refused records of other hosts: too many on the network".to_owned());
+        shared.status.lock().refused += received.refused;
+        let error = "refused records of other hosts: too many on the network";
+        shared.set_last_error(error.to_owned());
     }
 }
 

@@ -145,6 +145,14 @@ impl UnixTransport {
             .is_none_or(|bound| bound.directory.is_there(&self.name(), bound.file))
     }
 
+    /// The path of the socket; see [`is_there`](Self::is_there). `None` while the endpoint does not
+    /// listen.
+    #[must_use]
+    pub fn socket_path(&self) -> Option<PathBuf> {
+        let is_bound = self.bound.lock().is_some();
+        is_bound.then(|| self.path.join(self.name()))
+    }
+
     /// Creates the socket again if it was removed. Returns whether that was necessary. Open
     /// connections stay open.
     ///
