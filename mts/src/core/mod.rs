@@ -120,6 +120,9 @@ pub struct Submission {
 const IDLE_LANES: usize = 1024;
 /// Time for which an empty lane is kept nevertheless.
 const IDLE_TIME: Duration = Duration::from_secs(60);
+/// The same when many lanes are created in a short time. A lane that is dropped too early costs time,
+/// but no letter: its next letter waits longer for a predecessor that failed.
+const IDLE_TIME_IN_A_CROWD: Duration = Duration::from_secs(1);
 
 /// The delivery core. See the module documentation.
 pub struct Core {
@@ -145,6 +148,8 @@ pub struct Core {
     /// Next sequence number of the letters that this service sends in its own name.
     next_sequence: u64,
     next_forget: Option<Instant>,
+    /// Number of lanes at which empty ones are dropped at once.
+    crowd: usize,
 }
 
 impl fmt::Debug for Core {
@@ -218,6 +223,7 @@ impl Core {
             next_send: 1,
             next_sequence: 1,
             next_forget: None,
+            crowd: 2 * IDLE_LANES,
         }
     }
 
@@ -585,6 +591,7 @@ impl Core {
         if let Some(id) = self.lane_ids.get(&key) {
             return *id;
         }
+        self.disperse_crowd(now);
         let id = LaneId(self.next_lane);
         self.next_lane += 1;
         self.lane_ids.insert(key.clone(), id);
@@ -1044,6 +1051,19 @@ impl Core {
             let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME;
             lane.is_idle() && (quiet || !lane.remembers())
         });
+    }
+
+    /// Drops empty lanes when their number has doubled since the last time, because peers can invent
+    /// senders, each with a lane.
+    fn disperse_crowd(&mut self, now: Now) {
+        if self.lanes.len() < self.crowd {
+            return;
+        }
+        self.forget_lanes(|lane| {
+            let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME_IN_A_CROWD;
+            lane.is_idle() && (quiet || !lane.remembers())
+        });
+        self.crowd = 2 * self.lanes.len().max(IDLE_LANES);
     }
 
     fn forget_lanes(&mut self, forget: impl Fn(&Lane) -> bool) {
