@@ -600,12 +600,30 @@ fn letters_of_invented_senders_take_bounded_memory() {
     assert!(lanes <= 4096, "{lanes} lanes");
 }
 
+/// A peer decides how often it connects.
+#[cfg(debug_assertions)]
+#[test]
+fn an_introduction_takes_no_steps_for_letters_to_others() {
+    let mut bench = Bench::new();
+    invent(&mut bench, 0..1000);
+    let stranger = Introduction {
+        name: "stranger".into(),
+        hop: stranger(Incarnation::from_u64(500)),
+        dialled: None,
+        mandate: Mandate::Unproved,
+    };
+    let _earlier = fipa_mts::core::work::taken();
+    bench.core.handle_introduced(bench.now, &stranger);
+    let steps = fipa_mts::core::work::taken();
+    assert!(steps < 100, "{steps} steps");
+}
+
 /// The number of lanes: events that concern all lanes take at least as many steps.
 fn lanes(bench: &mut Bench) -> u64 {
     #[cfg(debug_assertions)]
     {
         let _earlier = fipa_mts::core::work::taken();
-        bench.core.handle_reachable(bench.now, Some(LIAR));
+        bench.core.handle_reachable(bench.now, None);
         fipa_mts::core::work::taken()
     }
     #[cfg(not(debug_assertions))]

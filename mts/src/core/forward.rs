@@ -15,7 +15,7 @@ use fipa_transport::{
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::{ask, link_of};
-use super::lane::{Delivery, Lane, LaneId, LaneKey};
+use super::lane::{Delivery, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
 use crate::gate::{self, LetterParts, Link};
@@ -49,8 +49,8 @@ const MAX_UNFRAMED_PATTERN: usize = 128;
 /// Maximum number of agents that one letter of a legacy peer stands for.
 const MAX_UNFRAMED_COPIES: usize = 1024;
 /// Maximum number of receivers of a legacy peer's letter that are handled in one call. The core takes
-/// 1 µs for the letter to an agent, and 15 µs for a failure message with a long name.
-const UNFRAMED_PORTION: usize = 32;
+/// 1 to 3 µs for the letter to an agent, and 20 µs for a failure message with a long name.
+const UNFRAMED_PORTION: usize = 16;
 
 /// A letter of a legacy peer, parsed as far as the core needs it, with its receivers looked up.
 /// That takes time in proportion to the bytes of the letter and to the agents of this host, so it
@@ -297,7 +297,7 @@ impl Core {
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
         delivery.not_before = self.found_by_peer(now, stream.sender, &entry, parcel.remaining);
         if let Some(until) = delivery.not_before
-            && self.lanes.get(&id).is_some_and(Lane::is_empty)
+            && self.lanes.get(&id).is_some_and(|lane| lane.is_empty())
         {
             let wait = until.saturating_duration_since(now.instant);
             tracing::info!(

@@ -127,7 +127,8 @@ const IDLE_TIME_IN_A_CROWD: Duration = Duration::from_secs(1);
 /// The delivery core. See the module documentation.
 pub struct Core {
     table: AttemptTable,
-    lanes: Map<LaneId, Lane>,
+    /// In boxes: a table that grows moves its values, under the lock.
+    lanes: Map<LaneId, Box<Lane>>,
     lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
@@ -596,7 +597,7 @@ impl Core {
         self.next_lane += 1;
         self.lane_ids.insert(key.clone(), id);
         let lane = Lane::new(now.instant, id, key, Arc::clone(receiver));
-        self.lanes.insert(id, lane);
+        self.lanes.insert(id, Box::new(lane));
         id
     }
 
@@ -1010,9 +1011,12 @@ impl Core {
     /// dispatches the letters that wait because of them.
     pub fn handle_reachable(&mut self, now: Now, service: Option<Incarnation>) {
         let is_meant = |location: &Location| service.is_none_or(|it| it == location.incarnation());
-        self.table.forget_failures(is_meant);
+        let had_failed = self.table.forget_failures(is_meant);
         if service.is_none() {
             self.peers.ask_again(now.instant, &mut self.table);
+        } else if !had_failed {
+            // No letter waits for this service. A peer decides how often it connects.
+            return;
         }
         for lane in self.lanes_in_order() {
             self.with_lane(now, lane, |lane, table| {
