@@ -148,6 +148,7 @@ impl Expiry {
 }
 
 #[cfg(all(test, feature = "secure"))]
+#[expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 mod tests {
     use rcgen::{CertificateParams, KeyPair, SanType};
 
