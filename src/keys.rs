@@ -88,10 +88,10 @@ pub enum Holding {
 }
 
 impl Holding {
-    /// Returns the validity of a certificate now.
+    /// Returns the validity of a certificate at this time.
     #[must_use]
-    pub fn of(certificate: &Certificate) -> Self {
-        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    pub fn at(now: SystemTime, certificate: &Certificate) -> Self {
+        let now = now.duration_since(SystemTime::UNIX_EPOCH);
         let now = now.map_or(0, |since| {
             i64::try_from(since.as_secs()).unwrap_or(i64::MAX)
         });

@@ -9,6 +9,9 @@
 //! ```console
 //! $ FIPA_SIEGE_SECONDS=10 cargo test --release -p fipa-cli --test besieged -- --nocapture --test-threads=1
 //! ```
+//!
+//! With `FIPA_SIEGE_KINDS=silence,letters` there is one hostile peer of each of these kinds instead of fifty
+//! peers. The kinds are the behaviors in `siege/hostile.rs`, in lower case.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 #![allow(clippy::print_stdout, reason = "the test prints its figures")]

@@ -603,10 +603,14 @@ impl World {
         let now = self.clocks();
         let core = &mut self.service(at).core;
         let view = Arc::clone(core.view());
-        if let Ok(unframed) = Unframed::read(letter, Kind::Tcp, source, &*view) {
-            core.handle_unframed(now, Duration::from_secs(5), unframed);
+        let Ok(mut unframed) = Unframed::read(letter, Kind::Tcp, source, &*view) else {
+            return;
+        };
+        while !unframed.is_handled() {
+            let core = &mut self.service(at).core;
+            core.handle_unframed(now, Duration::from_secs(5), &mut unframed);
+            self.carry_out(at);
         }
-        self.carry_out(at);
     }
 
     /// Carries out the actions of a service's core.

@@ -577,18 +577,31 @@ impl Shared {
 
     /// Carries out all actions of the core, then releases the lock.
     fn carry_out(&self, guard: MutexGuard<'_, State>) {
-        let mut refresh = self.perform(guard);
+        self.carry_out_then(guard, drop);
+    }
+
+    /// Carries out all actions of the core, then releases the lock with this function.
+    fn carry_out_then<'a>(
+        &'a self,
+        guard: MutexGuard<'a, State>,
+        release: fn(MutexGuard<'a, State>),
+    ) {
+        let mut refresh = self.perform(guard, release);
         while let Some(number) = refresh {
             self.directory.refresh();
             let mut state = self.lock();
             state.core.handle_refreshed(Now::read(), number);
-            refresh = self.perform(state);
+            refresh = self.perform(state, release);
         }
     }
 
     /// Carries out the actions of the core, then releases the lock. Returns the number of the last
     /// refresh of the directory that the core has requested.
-    fn perform(&self, mut guard: MutexGuard<'_, State>) -> Option<u64> {
+    fn perform<'a>(
+        &self,
+        mut guard: MutexGuard<'a, State>,
+        release: fn(MutexGuard<'a, State>),
+    ) -> Option<u64> {
         let state = &mut *guard;
         let mut refresh = None;
         while let Some(action) = state.core.poll_action() {
@@ -673,7 +686,7 @@ impl Shared {
         let due = state.core.poll_timeout();
         let earlier = due.is_some_and(|due| state.armed.is_none_or(|armed| due < armed));
         let replaced = std::mem::take(&mut state.replaced);
-        drop(guard);
+        release(guard);
         // The last owner of a view frees the memory of all its entries.
         drop(replaced);
         if earlier {

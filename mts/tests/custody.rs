@@ -3,18 +3,20 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod common;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Principal, Report, Stream, Ticket, TransportError, TransportErrorKind,
     Verdict,
 };
+
+use self::common::letter;
 
 const OWN: Incarnation = Incarnation::from_u64(1);
 const ROVER: Incarnation = Incarnation::from_u64(2);
@@ -162,15 +164,6 @@ impl Service {
 fn shm(service: Incarnation) -> Location {
     let text = format!("shm://{service}#{service}");
     text.parse().unwrap()
-}
-
-fn letter() -> Letter {
-    let message = Message::builder(Performative::Inform)
-        .sender(AgentId::new("rover").unwrap())
-        .receiver(AgentId::new("arm").unwrap())
-        .build()
-        .unwrap();
-    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
 }
 
 fn parcel(sequence: u64, transfer: u64, body: Body) -> Parcel {

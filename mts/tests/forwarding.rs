@@ -2,18 +2,21 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod common;
+
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_acl::Letter;
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, Unframed};
-use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
     LegacySource, Location, Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, Verdict,
 };
+
+use self::common::letter;
 
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
@@ -133,16 +136,6 @@ fn shm(of: u64) -> Location {
 fn tcp(of: u64) -> Location {
     let at = Location::new(Kind::Tcp, "192.0.2.1:7788").unwrap();
     at.with_incarnation(Incarnation::from_u64(of))
-}
-
-fn letter() -> Letter {
-    let message = Message::builder(Performative::Inform)
-        .sender(AgentId::new("rover").unwrap())
-        .receiver(AgentId::new("arm").unwrap())
-        .content("hello")
-        .build()
-        .unwrap();
-    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
 }
 
 fn parcel(sequence: u64, letter: Letter) -> Parcel {
@@ -351,7 +344,7 @@ fn a_legacy_peers_letter_goes_to_the_receiver_in_its_envelope() {
     gateway.core.handle_unframed(
         now,
         Duration::from_secs(2),
-        read(&gateway.core, letter(), Kind::Tcp, HERE),
+        &mut read(&gateway.core, letter(), Kind::Tcp, HERE),
     );
     let (attempt, location, parcel) = gateway.dispatched();
     assert_eq!(location, shm(0x9));

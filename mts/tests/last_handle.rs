@@ -1,72 +1,26 @@
 //! The last handle of a service is dropped while a transport calls the service.
 
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+mod common;
+
+use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, Sender};
-use std::sync::{Arc, OnceLock};
-use std::thread::{self, ThreadId};
+use std::thread;
 use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{Contacts, Mts, RuntimeConfig};
 use fipa_sds::MemoryDirectory;
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Hop, Incarnation, Introduction, Kind, ListenError, Location,
-    Mandate, Parcel, Principal, Sink, Ticket, Transport, TransportError, TransportErrorKind,
+    Hop, Incarnation, Introduction, Kind, Location, Mandate, Principal, Transport,
+    TransportErrorKind,
 };
 use parking_lot::Mutex;
 
+use self::common::Silent;
+
 const PATIENCE: Duration = Duration::from_secs(60);
-
-/// A transport that calls its sink with a lock held, and takes this lock when it is closed.
-struct Locked {
-    sink: OnceLock<Arc<dyn Sink>>,
-    /// Sends the ID of the thread that closes it.
-    closing: Mutex<Sender<ThreadId>>,
-    /// Serializes calls of the sink and `close`.
-    turn: Mutex<()>,
-}
-
-impl Locked {
-    fn call(&self, introduction: &Introduction) {
-        let _turn = self.turn.lock();
-        if let Some(sink) = self.sink.get() {
-            sink.introduced(introduction);
-        }
-    }
-}
-
-impl Transport for Locked {
-    fn kind(&self) -> Kind {
-        Kind::Shm
-    }
-
-    fn max_letter(&self) -> usize {
-        0
-    }
-
-    fn answers_at_once(&self) -> bool {
-        true
-    }
-
-    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
-        let _ = self.sink.set(sink);
-        Ok(Vec::new())
-    }
-
-    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
-        Err(TransportError::new(TransportErrorKind::Unreachable, ""))
-    }
-
-    fn abandon(&self, _: AttemptId) -> Abandoned {
-        Abandoned::Unconfirmed
-    }
-
-    fn answer(&self, _: Ticket, _: Answer) {}
-
-    fn close(&self) {
-        let _ = self.closing.lock().send(thread::current().id());
-        drop(self.turn.lock());
-    }
-}
 
 /// Stops in the middle of a call until the test continues it.
 struct Halting {
@@ -96,11 +50,16 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
     let (called, call) = mpsc::channel();
     let (go_on, going_on) = mpsc::channel();
     let (closing, closes) = mpsc::channel();
-    let transport = Arc::new(Locked {
-        sink: OnceLock::new(),
-        closing: Mutex::new(closing),
-        turn: Mutex::default(),
-    });
+    // The transport calls its sink with a lock held, and takes this lock when it is closed.
+    let turn = Arc::new(Mutex::new(()));
+    let closing = Mutex::new(closing);
+    let transport = Arc::new(Silent::closed_with(Kind::Shm, {
+        let turn = turn.clone();
+        move || {
+            let _ = closing.lock().send(thread::current().id());
+            drop(turn.lock());
+        }
+    }));
     let config = RuntimeConfig {
         spin: Duration::ZERO,
         unframed_deadline: Duration::from_secs(1),
@@ -128,7 +87,10 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
         mandate: Mandate::Unproved,
     };
 
-    let caller = thread::spawn(move || transport.call(&introduction));
+    let caller = thread::spawn(move || {
+        let _turn = turn.lock();
+        transport.sink().introduced(&introduction);
+    });
     call.recv_timeout(PATIENCE).unwrap();
     let mts = started.mts;
     let dropping = thread::spawn(move || drop(mts));

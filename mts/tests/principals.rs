@@ -2,12 +2,12 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod common;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_mts::letter_for;
 use fipa_sds::{
     ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration, Role,
 };
@@ -15,6 +15,8 @@ use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
     Kind, Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
 };
+
+use self::common::letter;
 
 const GATEWAY: Incarnation = Incarnation::from_u64(1);
 /// A process of this host, with the agent `arm`.
@@ -56,15 +58,6 @@ fn stranger(service: Incarnation) -> Hop {
         principal: Principal::Unproved,
         ..link(service, LIAR)
     }
-}
-
-fn letter() -> Letter {
-    let message = Message::builder(Performative::Inform)
-        .sender(AgentId::new("rover").unwrap())
-        .receiver(AgentId::new("arm").unwrap())
-        .build()
-        .unwrap();
-    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
 }
 
 impl Bench {
@@ -560,17 +553,107 @@ fn letters_that_one_receiver_leaves_in_custody_do_not_use_up_the_room_of_others(
     }
     let config = CoreConfig {
         forwards: true,
-        custody_bytes: 50 * letter().len(),
+        custody_bytes: 200_000,
         ..CoreConfig::new("mts", GATEWAY, vec![Kind::Shm])
     };
     let mut bench = Bench::new();
     bench.core = Core::new(config, Arc::new(MergedDirectory::new(vec![own])));
     let fill = |bench: &mut Bench, receiver| {
         let verdict = |sequence| bench.letter(link(HONEST, HONEST), (ROVER, receiver), sequence);
-        let verdicts = (1..=100).map(verdict);
+        let verdicts = (1..=1000).map(verdict);
         verdicts.take_while(|it| *it == Verdict::Later).count()
     };
     let (arm, lamp) = (fill(&mut bench, ARM), fill(&mut bench, LAMP));
-    assert!(arm < 100, "the custody is bounded");
+    assert!(arm < 1000, "the custody is bounded");
     assert!(lamp >= arm / 2, "{arm} letters, then {lamp}");
+}
+
+/// Invented senders, each with one small letter, from one link.
+fn invent(bench: &mut Bench, senders: std::ops::Range<u64>) -> Vec<Verdict> {
+    let senders = senders.map(|sender| Incarnation::from_u64(1000 + sender));
+    let letters = senders.map(|sender| bench.letter(link(LIAR, LIAR), (sender, ARM), 1));
+    letters.collect()
+}
+
+/// Each sender has a lane, whose state takes more memory than a small letter.
+#[test]
+fn letters_of_invented_senders_take_bounded_memory() {
+    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    let location = vec![at(PROCESS, "shm://arms")];
+    own.register(Registration::new("arm", ARM, location))
+        .unwrap();
+    let config = CoreConfig {
+        forwards: true,
+        custody_bytes: 16 << 20,
+        ..CoreConfig::new("mts", GATEWAY, vec![Kind::Shm])
+    };
+    let mut bench = Bench::new();
+    bench.core = Core::new(config, Arc::new(MergedDirectory::new(vec![own])));
+    let verdicts = invent(&mut bench, 0..10_000);
+    let taken = verdicts.iter().filter(|it| **it == Verdict::Later).count();
+    // Half of the custody is for other receivers.
+    assert!((1000..=2048).contains(&taken), "{taken} letters");
+    let held_back = |it: &&Verdict| **it == Verdict::Now(Answer::Busy);
+    let held_back = verdicts.iter().filter(held_back).count();
+    assert_eq!(taken + held_back, verdicts.len());
+    let lanes = lanes(&mut bench);
+    assert!(lanes <= 4096, "{lanes} lanes");
+}
+
+/// A peer decides how often it connects.
+#[cfg(debug_assertions)]
+#[test]
+fn an_introduction_takes_no_steps_for_letters_to_others() {
+    let mut bench = Bench::new();
+    invent(&mut bench, 0..1000);
+    let stranger = Introduction {
+        name: "stranger".into(),
+        hop: stranger(Incarnation::from_u64(500)),
+        dialled: None,
+        mandate: Mandate::Unproved,
+    };
+    let _earlier = fipa_mts::core::work::taken();
+    bench.core.handle_introduced(bench.now, &stranger);
+    let steps = fipa_mts::core::work::taken();
+    assert!(steps < 100, "{steps} steps");
+}
+
+/// The number of lanes: events that concern all lanes take at least as many steps.
+fn lanes(bench: &mut Bench) -> u64 {
+    #[cfg(debug_assertions)]
+    {
+        let _earlier = fipa_mts::core::work::taken();
+        bench.core.handle_reachable(bench.now, None);
+        fipa_mts::core::work::taken()
+    }
+    #[cfg(not(debug_assertions))]
+    {
+        let _uncounted = bench;
+        0
+    }
+}
+
+#[test]
+fn lanes_of_invented_senders_are_dropped_with_their_letters() {
+    let mut bench = Bench::new();
+    for round in 0..40 {
+        invent(&mut bench, round * 500..(round + 1) * 500);
+        // The process of `arm` refuses some letters, and takes the others.
+        while let Some(action) = bench.core.poll_action() {
+            if let Action::Dispatch {
+                attempt, parcel, ..
+            } = action
+            {
+                let answer = match parcel.stream.sender.as_u64() % 2 {
+                    0 => Answer::failed(FailureReason::Refused, ""),
+                    _ => Answer::Accepted,
+                };
+                let conclusion = Conclusion::Answered(answer);
+                bench.core.handle_conclusion(bench.now, attempt, conclusion);
+            }
+        }
+        bench.now.instant += Duration::from_millis(100);
+    }
+    let lanes = lanes(&mut bench);
+    assert!(lanes < 8_000, "{lanes} lanes");
 }

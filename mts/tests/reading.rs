@@ -2,10 +2,15 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod common;
+
+use std::fs;
 use std::net::{IpAddr, Ipv4Addr};
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc;
 use std::sync::{Arc, OnceLock};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
@@ -13,49 +18,15 @@ use fipa_mts::core::CoreConfig;
 use fipa_mts::{AccessGate, LetterParts, Link, Mts, RuntimeConfig, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Registration};
 use fipa_transport::{
-    Abandoned, Answer, Arrival, AttemptId, Body, Hop, Incarnation, Kind, LegacySource, ListenError,
-    Location, Parcel, Principal, Signature, Sink, Stream, Ticket, Transport, TransportError,
-    TransportErrorKind, Verdict,
+    Answer, Arrival, Body, Hop, Incarnation, Kind, LegacySource, Location, Parcel, Principal,
+    Signature, Stream, Ticket, Transport, Verdict,
 };
 use parking_lot::Mutex;
 
+use self::common::{Silent, letter};
+
 const PATIENCE: Duration = Duration::from_secs(60);
 const ARM: Incarnation = Incarnation::from_u64(3);
-
-/// A transport without peers, whose sink the test calls.
-#[derive(Default)]
-struct Silent(OnceLock<Arc<dyn Sink>>);
-
-impl Transport for Silent {
-    fn kind(&self) -> Kind {
-        Kind::Tcp
-    }
-
-    fn max_letter(&self) -> usize {
-        usize::MAX
-    }
-
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
-    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
-        let _ = self.0.set(sink);
-        Ok(Vec::new())
-    }
-
-    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
-        Err(TransportError::new(TransportErrorKind::Unreachable, ""))
-    }
-
-    fn abandon(&self, _: AttemptId) -> Abandoned {
-        Abandoned::Unconfirmed
-    }
-
-    fn answer(&self, _: Ticket, _: Answer) {}
-
-    fn close(&self) {}
-}
 
 /// A gate that calls the service on another thread while it reads a letter, and records the receivers
 /// that it is asked about.
@@ -84,51 +55,63 @@ impl AccessGate for Calling {
     }
 }
 
-fn letter() -> Letter {
-    let message = Message::builder(Performative::Inform)
-        .sender(AgentId::new("rover").unwrap())
-        .receiver(AgentId::new("arm").unwrap())
-        .build()
-        .unwrap();
-    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
+/// A started gateway with this gate, its only transport, and its runtime.
+struct Gateway {
+    service: Mts,
+    transport: Arc<Silent>,
+    _runtime: tokio::runtime::Runtime,
 }
+
+impl Gateway {
+    /// A gateway whose directory has these agents. `arm` is in its process.
+    fn start(gate: Arc<dyn AccessGate>, agents: &[(&str, Incarnation)]) -> Self {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
+        let config = RuntimeConfig {
+            spin: Duration::ZERO,
+            unframed_deadline: Duration::from_secs(1),
+            contacts: None,
+            tap: None,
+            gate: Some(gate),
+        };
+        let own = Incarnation::from_u64(1);
+        let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
+        for (name, agent) in agents {
+            let at = "tcp://127.0.0.1:9#0000000000000001".parse().unwrap();
+            let agent = Registration::new(*name, *agent, vec![at]);
+            directory.register(agent).unwrap();
+        }
+        let core = CoreConfig {
+            forwards: true,
+            ..CoreConfig::new("mts", own, vec![Kind::Tcp])
+        };
+        let transport = Arc::new(Silent::new(Kind::Tcp));
+        let transports: Vec<Arc<dyn Transport>> = vec![transport.clone()];
+        let directory = Arc::new(directory);
+        let started = Mts::start(core, config, directory, transports, runtime.handle());
+        started.mts.register("arm".into(), ARM);
+        Self {
+            service: started.mts,
+            transport,
+            _runtime: runtime,
+        }
+    }
+}
+
+const LEGACY_PEER: LegacySource = LegacySource {
+    address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+    signature: Signature::FipaServices,
+};
 
 #[test]
 fn the_service_is_not_locked_while_the_gate_reads_a_letter() {
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()
-        .unwrap();
     let gate = Arc::new(Calling::default());
-    let config = RuntimeConfig {
-        spin: Duration::ZERO,
-        unframed_deadline: Duration::from_secs(1),
-        contacts: None,
-        tap: None,
-        gate: Some(gate.clone()),
-    };
-    let own = Incarnation::from_u64(1);
-    let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
-    let at = "tcp://127.0.0.1:9#0000000000000001".parse().unwrap();
-    let arm = Registration::new("arm", ARM, vec![at]);
-    directory.register(arm).unwrap();
-    let core = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new("mts", own, vec![Kind::Tcp])
-    };
-    let transport = Arc::new(Silent::default());
-    let transports: Vec<Arc<dyn Transport>> = vec![transport.clone()];
-    let started = Mts::start(
-        core,
-        config,
-        Arc::new(directory),
-        transports,
-        runtime.handle(),
-    );
-    started.mts.register("arm".into(), ARM);
-    assert!(gate.service.set(started.mts.clone()).is_ok());
-    let sink = transport.0.get().unwrap();
+    let gateway = Gateway::start(gate.clone(), &[("arm", ARM)]);
+    assert!(gate.service.set(gateway.service.clone()).is_ok());
+    let sink = gateway.transport.sink();
 
     let location: Location = "tcp://192.0.2.1:1#0000000000000002".parse().unwrap();
     let verdict = sink.arrived(Arrival {
@@ -151,10 +134,80 @@ fn the_service_is_not_locked_while_the_gate_reads_a_letter() {
         ticket: Ticket(1),
     });
     assert_eq!(verdict, Verdict::Now(Answer::Accepted));
-    let from = LegacySource {
-        address: IpAddr::V4(Ipv4Addr::LOCALHOST),
-        signature: Signature::FipaServices,
-    };
-    sink.arrived_unframed(letter(), Kind::Tcp, from);
+    sink.arrived_unframed(letter(), Kind::Tcp, LEGACY_PEER);
     assert_eq!(*gate.asked.lock(), ["arm", "arm"]);
+}
+
+/// Number of agents of the host on which another thread waits for the service.
+const AGENTS: usize = 100;
+
+/// A gate that, when it is asked first, has another thread wait for the lock of the service. When it is asked last,
+/// it waits until the other thread has had the lock.
+#[derive(Default)]
+struct Queueing {
+    service: OnceLock<Mts>,
+    asked: AtomicUsize,
+    other: Mutex<Option<JoinHandle<()>>>,
+}
+
+impl AccessGate for Queueing {
+    fn read(&self, _: &Letter) -> LetterParts {
+        LetterParts::default()
+    }
+
+    fn admits(&self, _: Instant, _: &str, _: &LetterParts, _: Link) -> Result<(), String> {
+        match self.asked.fetch_add(1, Ordering::Relaxed) + 1 {
+            1 => {
+                let service = self.service.get().unwrap().clone();
+                let task = Arc::new(OnceLock::new());
+                let name = task.clone();
+                let other = thread::spawn(move || {
+                    name.set(fs::read_link("/proc/thread-self").unwrap())
+                        .unwrap();
+                    service.try_receive(ARM);
+                });
+                *self.other.lock() = Some(other);
+                until(|| task.get().is_some_and(|task| is_asleep(task)));
+            }
+            AGENTS => until(|| self.other.lock().as_ref().unwrap().is_finished()),
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// Whether a thread sleeps, by its name in `/proc`.
+fn is_asleep(task: &Path) -> bool {
+    let stat = fs::read_to_string(Path::new("/proc").join(task).join("stat"));
+    stat.is_ok_and(|stat| stat.contains(") S "))
+}
+
+fn until(mut condition: impl FnMut() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < end, "the condition never holds");
+        thread::yield_now();
+    }
+}
+
+#[test]
+fn a_thread_gets_the_lock_between_portions_of_the_receivers_of_a_legacy_peers_letter() {
+    let gate = Arc::new(Queueing::default());
+    let names: Vec<String> = (1..AGENTS).map(|number| format!("arm_{number}")).collect();
+    let mut agents = vec![("arm", ARM)];
+    for (name, number) in names.iter().zip(1000..) {
+        agents.push((name, Incarnation::from_u64(number)));
+    }
+    let gateway = Gateway::start(gate.clone(), &agents);
+    assert!(gate.service.set(gateway.service.clone()).is_ok());
+
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm.*").unwrap())
+        .build()
+        .unwrap();
+    let letter = letter_for(&message, SystemTime::UNIX_EPOCH).unwrap();
+    let sink = gateway.transport.sink();
+    sink.arrived_unframed(letter, Kind::Tcp, LEGACY_PEER);
+    assert_eq!(gate.asked.load(Ordering::Relaxed), AGENTS);
 }

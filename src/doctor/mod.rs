@@ -75,7 +75,7 @@ pub fn examine(config: &Config) -> Vec<Check> {
     #[cfg(feature = "net")]
     peers::examine(config, &mut checks);
     #[cfg(feature = "net")]
-    security::examine(config, &mut checks);
+    security::examine(std::time::SystemTime::now(), config, &mut checks);
     queues::examine(config, &mut checks);
     checks
 }

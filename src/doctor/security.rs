@@ -1,14 +1,16 @@
 //! Checks the keys that decide which peers on other hosts are accepted.
 
+use std::time::SystemTime;
+
 use super::{Area, Check, Verdict};
 use crate::Config;
 
 const AREA: Area = Area("security");
 const KEYS: &str = "keys";
 
-pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
+pub(super) fn examine(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
     if !config.security.keys.is_empty() {
-        keys(config, checks);
+        keys(now, config, checks);
     } else if config.security.insecure {
         checks.push(AREA.problem(
             KEYS,
@@ -27,7 +29,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
 }
 
 #[cfg(not(feature = "secure"))]
-fn keys(_config: &Config, checks: &mut Vec<Check>) {
+fn keys(_now: SystemTime, _config: &Config, checks: &mut Vec<Check>) {
     checks.push(AREA.problem(
         KEYS,
         Verdict::Bad,
@@ -37,7 +39,7 @@ fn keys(_config: &Config, checks: &mut Vec<Check>) {
 }
 
 #[cfg(feature = "secure")]
-fn keys(config: &Config, checks: &mut Vec<Check>) {
+fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
     use fipa_acl::ErrorChain;
 
     use crate::keys::{Certificate, Holding, Keys, KeysError};
@@ -62,7 +64,7 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
         checks.push(AREA.problem(KEYS, Verdict::Doubtful, found, advice));
     }
     let mut ending = |whose: &str, certificate: &Certificate, renew: &str| {
-        let holding = Holding::of(certificate);
+        let holding = Holding::at(now, certificate);
         let Some(problem) = holding.told() else {
             return;
         };
@@ -90,12 +92,18 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
 
 #[cfg(all(test, feature = "secure"))]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
     use crate::keys::{Keys, VALID};
 
     fn verdicts(config: &Config) -> Vec<(Verdict, String)> {
+        verdicts_at(SystemTime::now(), config)
+    }
+
+    fn verdicts_at(now: SystemTime, config: &Config) -> Vec<(Verdict, String)> {
         let mut checks = Vec::new();
-        examine(config, &mut checks);
+        examine(now, config, &mut checks);
         let verdicts = checks.into_iter().map(|check| (check.verdict, check.found));
         verdicts.collect()
     }
@@ -134,5 +142,45 @@ mod tests {
                 .iter()
                 .any(|found| found.0 == Verdict::Bad)
         );
+    }
+
+    #[test]
+    fn the_validity_of_certificates_is_reported_by_the_clock_of_this_host() {
+        const DAY: Duration = Duration::from_secs(86_400);
+        let mut config = Config::for_host("sherpa");
+        let dir = tempfile::tempdir().unwrap();
+        let keys = Keys::at(dir.path().join("own"));
+        config.security.keys = keys.dir().display().to_string();
+        keys.init(&config.mts.name, &[], VALID).unwrap();
+        // The certificate of the other host ends 100 days from now.
+        let other = Keys::at(dir.path().join("other"));
+        other.init("crex-mts", &[], 100 * DAY).unwrap();
+        keys.trust(&std::fs::read(other.own_file()).unwrap())
+            .unwrap();
+        let made = SystemTime::now();
+        let at = |now| match verdicts_at(now, &config).as_slice() {
+            [(verdict, found)] => (*verdict, found.clone()),
+            found => panic!("{found:?}"),
+        };
+        assert_eq!(at(made + 69 * DAY).0, Verdict::Fine);
+        for days in [71, 99] {
+            let (verdict, found) = at(made + days * DAY);
+            assert_eq!(verdict, Verdict::Doubtful, "after {days} days");
+            assert!(found.contains("crex-mts expires within 30 days"), "{found}");
+        }
+        let (verdict, found) = at(made + 101 * DAY);
+        assert_eq!(verdict, Verdict::Bad);
+        assert!(found.contains("crex-mts has expired"), "{found}");
+        // Keys begin a day before they are made, because clocks differ.
+        assert_eq!(at(made - DAY / 2).0, Verdict::Fine);
+        for wrong in [made - 2 * DAY, SystemTime::UNIX_EPOCH] {
+            let found = verdicts_at(wrong, &config);
+            assert_eq!(found.len(), 2, "{found:?}");
+            for (verdict, found) in found {
+                assert_eq!(verdict, Verdict::Bad);
+                let cause = "the clock of this host is before the start of its validity";
+                assert!(found.contains(cause), "{found}");
+            }
+        }
     }
 }

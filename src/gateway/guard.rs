@@ -1,7 +1,7 @@
 //! The guard reads the gateway's keys when the gateway opens, and again when their directory
 //! changes.
 
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use fipa_acl::ErrorChain;
 use fipa_transport_net::secure::{Credentials, Rules, Security};
@@ -15,14 +15,15 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Logs the certificates that are not valid or expire soon.
 fn warn_about_expiry(credentials: &Credentials) {
-    if let Some(what) = Holding::of(&credentials.own).told() {
+    let now = SystemTime::now();
+    if let Some(what) = Holding::at(now, &credentials.own).told() {
         tracing::warn!(
             "the certificate of this host {what}; peers refuse a host without a valid certificate \
              (renew it with `fipa keys renew`)"
         );
     }
     for trusted in &credentials.trusted {
-        if let Some(what) = Holding::of(trusted).told() {
+        if let Some(what) = Holding::at(now, trusted).told() {
             let peer = trusted.certified().mts();
             tracing::warn!(
                 "the certificate of {peer} {what}; it has to be renewed on that host (`fipa keys renew` \

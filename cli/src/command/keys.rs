@@ -2,7 +2,7 @@
 
 use std::io::{self, IsTerminal};
 use std::path::{self, Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
@@ -359,7 +359,7 @@ fn described(certificate: &Certificate) -> String {
 /// The last day of validity, with a note if the certificate is not valid now or expires soon.
 fn valid_until(certificate: &Certificate) -> String {
     let date = date(certificate.validity().1);
-    match Holding::of(certificate).told() {
+    match Holding::at(SystemTime::now(), certificate).told() {
         Some(note) => format!("{date} ({note})"),
         None => date,
     }

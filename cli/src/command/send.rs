@@ -5,6 +5,7 @@ mod repeat;
 mod settle;
 
 use std::collections::HashSet;
+use std::convert::Infallible;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
@@ -140,6 +141,16 @@ pub(crate) struct Arguments {
 
     #[command(flatten)]
     parameters: Parameters,
+
+    /// Refused with the options to write instead.
+    #[arg(hide = true, value_name = "WORD", value_parser = misplaced)]
+    misplaced: Vec<Infallible>,
+}
+
+fn misplaced(_: &str) -> Result<Infallible, &'static str> {
+    Err(
+        "the receiver follows --to, and the content --content: `fipa send --to NAME --content TEXT`",
+    )
 }
 
 /// The other parameters of a message (FIPA00061).

@@ -36,8 +36,11 @@ pub(crate) enum Vice {
 
 use Vice::*;
 
-/// Number of hostile peers.
-pub(crate) const PEERS: u8 = 50;
+/// Number of hostile peers when no kinds are named.
+const PEERS: usize = 50;
+
+/// Environment variable with the kinds of hostile peers, separated by commas. There is one peer of each.
+const KINDS: &str = "FIPA_SIEGE_KINDS";
 
 /// Behaviors against a gateway with keys. The gateway never reads letters of untrusted peers.
 pub(crate) const AT_KEYS: [Vice; 10] = [
@@ -90,12 +93,28 @@ fn address(peer: u8) -> IpAddr {
     IpAddr::V4(Ipv4Addr::new(127, 0, 1, peer + 1))
 }
 
-/// Starts all hostile peers. They run until the runtime ends.
+/// Starts the hostile peers: one of each kind that the environment variable names, or the same number of
+/// each of these. They run until the runtime ends.
 pub(crate) fn set_off(vices: &[Vice], means: &Arc<Means>) {
-    for peer in 0..PEERS {
-        let vice = vices[usize::from(peer) % vices.len()];
+    let peers = match std::env::var(KINDS) {
+        Ok(kinds) => kinds.split(',').map(|kind| named(kind, vices)).collect(),
+        Err(_) => vices
+            .iter()
+            .copied()
+            .cycle()
+            .take(PEERS)
+            .collect::<Vec<_>>(),
+    };
+    for (peer, vice) in (0..).zip(peers) {
         tokio::spawn(indulge(vice, address(peer), Arc::clone(means)));
     }
+}
+
+/// The behavior with this name, in lower case.
+fn named(name: &str, vices: &[Vice]) -> Vice {
+    let is_named = |vice: &&Vice| format!("{vice:?}").to_lowercase() == name;
+    let found = vices.iter().find(is_named).copied();
+    found.unwrap_or_else(|| panic!("{KINDS}: {name:?} is none of {vices:?}"))
 }
 
 async fn indulge(vice: Vice, from: IpAddr, means: Arc<Means>) {

@@ -677,9 +677,11 @@ impl AttemptTable {
         }
     }
 
-    /// Drops the recorded failures of these routes.
-    pub(super) fn forget_failures(&mut self, which: impl Fn(&Location) -> bool) {
+    /// Drops the recorded failures of these routes. Returns whether there were any.
+    pub(super) fn forget_failures(&mut self, which: impl Fn(&Location) -> bool) -> bool {
+        let before = self.health.len();
         self.health.retain(|location, _| !which(location));
+        self.health.len() < before
     }
 
     pub(crate) fn route_failed(

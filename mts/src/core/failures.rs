@@ -160,7 +160,7 @@ impl Core {
                 receiver: registration_of(&entry),
             };
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
-            if !self.has_room_for_stranger(id, &entry.name, letter.len()) {
+            if !self.has_room_for_stranger(id, letter.len()) {
                 self.failure_limit.leave_out(now.instant);
                 continue;
             }

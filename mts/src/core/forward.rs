@@ -1,5 +1,6 @@
 //! Letters for agents of other processes: the gateway's role, and letters of legacy peers.
 
+use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -14,7 +15,7 @@ use fipa_transport::{
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::{ask, link_of};
-use super::lane::{Delivery, Lane, LaneId, LaneKey};
+use super::lane::{Delivery, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
 use crate::gate::{self, LetterParts, Link};
@@ -45,20 +46,24 @@ const MAX_UNFRAMED_PATTERNS: usize = 1;
 /// compile.
 const MAX_UNFRAMED_PATTERN: usize = 128;
 
-/// Maximum number of agents that one letter of a legacy peer stands for. The core takes 2 µs for the
-/// letter to each.
+/// Maximum number of agents that one letter of a legacy peer stands for.
 const MAX_UNFRAMED_COPIES: usize = 1024;
+/// Maximum number of receivers of a legacy peer's letter that are handled in one call. The core takes
+/// 1 to 3 µs for the letter to an agent, and 20 µs for a failure message with a long name.
+const UNFRAMED_PORTION: usize = 16;
 
 /// A letter of a legacy peer, parsed as far as the core needs it, with its receivers looked up.
-/// That takes time in proportion to the bytes of the letter, so it happens before the core is
-/// locked.
+/// That takes time in proportion to the bytes of the letter and to the agents of this host, so it
+/// happens before the core is locked.
 #[derive(Debug)]
 pub struct Unframed {
     letter: Letter,
     via: Kind,
     from: LegacySource,
-    /// The receivers in the envelope, and the entries that they stand for.
-    receivers: Vec<(Arc<str>, Resolution)>,
+    /// The receivers that the core has not handled yet.
+    receivers: VecDeque<Receiver>,
+    /// Whether the bytes of the letter were counted for failure messages.
+    is_counted: bool,
     /// The name of the sender, and a location that it states as its own.
     sender: Option<(String, Location)>,
     /// The parts that a message about its failure repeats; `None` if there is to be none.
@@ -67,6 +72,15 @@ pub struct Unframed {
     fault: Option<String>,
     /// The parts that the gate has read.
     parts: Option<LetterParts>,
+}
+
+/// A receiver of a legacy peer's letter.
+#[derive(Debug)]
+enum Receiver {
+    /// An agent of this host.
+    Here(Arc<Entry>),
+    /// A name that no agent of this host has.
+    Unknown(Arc<str>),
 }
 
 impl Unframed {
@@ -96,16 +110,21 @@ impl Unframed {
             (None, Err(error)) => (None, Some(cannot_be_decoded(&error))),
         };
         let named = stamp::sender(&letter).unwrap_or_default();
-        let resolved = |name: String| {
-            let resolved = match fault {
-                Some(_) => Ok(Resolution::None),
-                None => fipa_sds::resolve_legacy(view, &name, &named),
+        let first = names.first().cloned();
+        let mut receivers = VecDeque::new();
+        for name in names {
+            let resolution = match fault {
+                Some(_) => Resolution::None,
+                None => {
+                    let resolution = fipa_sds::resolve_legacy(view, &name, &named);
+                    resolution.unwrap_or(Resolution::None)
+                }
             };
-            (name.into(), resolved.unwrap_or(Resolution::None))
-        };
-        let mut receivers: Vec<_> = names.into_iter().map(resolved).collect();
-        if receivers.iter().map(|(_, it)| copies(it)).sum::<usize>() > MAX_UNFRAMED_COPIES {
-            receivers.truncate(1);
+            receivers.extend(receivers_of(name.into(), resolution));
+        }
+        if receivers.len() > MAX_UNFRAMED_COPIES {
+            let first = first.map(|name| Receiver::Unknown(name.into()));
+            receivers = first.into_iter().collect();
             fault = Some(format!(
                 "the receivers of the letter are more than {MAX_UNFRAMED_COPIES} agents"
             ));
@@ -115,11 +134,18 @@ impl Unframed {
             via,
             from,
             receivers,
+            is_counted: false,
             sender,
             failed: failed.map(Arc::new),
             fault,
             parts: None,
         })
+    }
+
+    /// Whether the core has [handled](Core::handle_unframed) the letter for all receivers.
+    #[must_use]
+    pub fn is_handled(&self) -> bool {
+        self.receivers.is_empty()
     }
 
     /// Has the gate read the letter, which otherwise happens while the core is locked.
@@ -132,13 +158,29 @@ impl Unframed {
     }
 }
 
-/// Number of agents, present or missing, that a receiver stands for.
-fn copies(resolution: &Resolution) -> usize {
-    match resolution {
-        Resolution::Exact(_) | Resolution::None => 1,
-        Resolution::Multicast(entries) => entries.len(),
-        Resolution::Coalition { agents, missing } => agents.len() + missing.len(),
+/// The receivers that a name in an envelope stands for.
+fn receivers_of(name: Arc<str>, resolution: Resolution) -> Vec<Receiver> {
+    let (entries, mut missing) = match resolution {
+        Resolution::Exact(entry) => (vec![entry], Vec::new()),
+        Resolution::Multicast(entries) => (entries, Vec::new()),
+        Resolution::Coalition {
+            agents,
+            mut missing,
+        } => {
+            // Members on other hosts cannot be reached from here, which the sender is told.
+            let away = agents.iter().filter(|entry| entry.reach != Reach::Local);
+            missing.extend(away.map(|entry| Arc::clone(&entry.name)));
+            (agents, missing)
+        }
+        Resolution::None => (Vec::new(), Vec::new()),
+    };
+    let here = entries.into_iter();
+    let mut here = here.filter(|entry| entry.reach == Reach::Local).peekable();
+    if here.peek().is_none() && missing.is_empty() {
+        missing.push(name);
     }
+    let missing = missing.into_iter().map(Receiver::Unknown);
+    missing.chain(here.map(Receiver::Here)).collect()
 }
 
 /// The reason why a legacy peer's letter to these receivers is refused, if it is.
@@ -255,7 +297,7 @@ impl Core {
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
         delivery.not_before = self.found_by_peer(now, stream.sender, &entry, parcel.remaining);
         if let Some(until) = delivery.not_before
-            && self.lanes.get(&id).is_some_and(Lane::is_empty)
+            && self.lanes.get(&id).is_some_and(|lane| lane.is_empty())
         {
             let wait = until.saturating_duration_since(now.instant);
             tracing::info!(
@@ -409,135 +451,133 @@ impl Core {
     }
 
     /// Whether this lane has room for a letter whose sender cannot be held back.
-    pub(super) fn has_room_for_stranger(&self, lane: LaneId, receiver: &str, len: usize) -> bool {
-        self.table.has_room(receiver, len) && self.has_room(lane, len)
+    pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
+        let lane = self.lanes.get(&lane);
+        lane.is_some_and(|lane| {
+            lane.has_room(len, &self.table) && lane.fits_into_custody(len, &self.table)
+        })
     }
 
-    /// Handles a legacy peer's letter for the agents of this host in its envelope. If its message
-    /// cannot be decoded, or it has too many receivers, it is refused, and its sender gets a
-    /// failure message.
-    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, unframed: Unframed) {
+    /// Handles a legacy peer's letter for the next agents of this host in its envelope, at most a
+    /// portion of them. Call it until the letter is [handled](Unframed::is_handled), and release the
+    /// lock of the core in between. If its message cannot be decoded, or it has too many receivers,
+    /// the letter is refused, and its sender gets a failure message.
+    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, unframed: &mut Unframed) {
+        if !std::mem::replace(&mut unframed.is_counted, true) {
+            let (from, len) = (unframed.from.address, unframed.letter.len());
+            self.failure_limit.credit(now.instant, from, len);
+            if let Some(fault) = &unframed.fault {
+                tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
+            } else if unframed.parts.is_none() {
+                unframed.parts = self.reader.parts(&unframed.letter);
+            }
+        }
+        for _ in 0..UNFRAMED_PORTION {
+            work::steps(1);
+            let why = match (unframed.receivers.pop_front(), &unframed.fault) {
+                (None, _) => break,
+                (Some(Receiver::Here(entry)), None) => {
+                    self.unframed_arrived(now, deadline, unframed, &entry);
+                    continue;
+                }
+                (Some(Receiver::Here(entry)), Some(fault)) => (
+                    Arc::clone(&entry.name),
+                    FailureReason::Refused,
+                    fault.clone(),
+                ),
+                (Some(Receiver::Unknown(name)), Some(fault)) => {
+                    (name, FailureReason::Refused, fault.clone())
+                }
+                (Some(Receiver::Unknown(name)), None) => {
+                    tracing::info!(receiver = %name, from = %unframed.from.address, "cannot deliver an unframed letter: no agent of this host has the name");
+                    (name, FailureReason::NoSuchAgent, String::new())
+                }
+            };
+            let (receiver, reason, detail) = why;
+            self.unframed_failed(&receiver, unframed, (reason, detail));
+        }
+        self.send_failures(now);
+    }
+
+    /// Handles a legacy peer's letter for an agent of this host.
+    fn unframed_arrived(
+        &mut self,
+        now: Now,
+        deadline: Duration,
+        unframed: &mut Unframed,
+        entry: &Arc<Entry>,
+    ) {
         let Unframed {
             letter,
             via,
             from,
-            receivers,
-            sender: mut located,
+            sender: located,
             failed,
-            fault,
             parts,
+            ..
         } = unframed;
-        let target = failed.clone();
-        let target = target.map(|failed| FailureTarget::LegacyPeer { from, failed });
-        self.failure_limit
-            .credit(now.instant, from.address, letter.len());
-        if let Some(fault) = fault {
-            tracing::info!(from = %from.address, "refused a letter of a legacy peer: {fault}");
-            for (receiver, _) in receivers {
-                let why = (FailureReason::Refused, fault.clone());
-                self.unframed_failed(&receiver, &letter, (via, target.as_ref()), why);
-            }
-            self.send_failures(now);
-            return;
-        }
-        let parts = parts.or_else(|| self.reader.parts(&letter));
-        let stream_sender = self.table.config.incarnation;
+        let (via, from) = (*via, *from);
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
             source: gate::Source::at(from.address),
         };
-        for (receiver, resolution) in receivers {
-            let (entries, missing) = match resolution {
-                Resolution::Exact(entry) => (vec![entry], Vec::new()),
-                Resolution::Multicast(entries) => (entries, Vec::new()),
-                Resolution::Coalition {
-                    agents,
-                    mut missing,
-                } => {
-                    // Members on other hosts cannot be reached from here, which the sender is told.
-                    let away = agents.iter().filter(|entry| entry.reach != Reach::Local);
-                    missing.extend(away.map(|entry| Arc::clone(&entry.name)));
-                    (agents, missing)
-                }
-                Resolution::None => (Vec::new(), Vec::new()),
-            };
-            let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
-            let none_here = here.clone().next().is_none() && missing.is_empty();
-            for name in missing.into_iter().chain(none_here.then_some(receiver)) {
-                tracing::info!(receiver = %name, from = %from.address, "cannot deliver an unframed letter: no agent of this host has the name");
-                let why = (FailureReason::NoSuchAgent, String::new());
-                self.unframed_failed(&name, &letter, (via, target.as_ref()), why);
-            }
-            for entry in here {
-                work::steps(1);
-                if let Err(why) = self.admits(now, &entry.name, parts.as_ref(), unproved) {
-                    let why = (FailureReason::Refused, why);
-                    self.unframed_failed(&entry.name, &letter, (via, target.as_ref()), why);
-                    continue;
-                }
-                if let Some(located) = located.take() {
-                    self.report_legacy_contact(now, located, from.address);
-                }
-                let stream = Stream {
-                    sender: stream_sender,
-                    receiver: entry.incarnation,
-                };
-                let sequence = self.sequence_of(stream_sender);
-                if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
-                    && inbox.push_unframed(letter.clone(), via)
-                {
-                    self.table
-                        .notice(stream, sequence, &entry.name, || News::Taken {
-                            via: Some(via),
-                            letter: letter.clone(),
-                        });
-                    let agent = entry.incarnation;
-                    self.table.actions.push_back(Action::Deliverable { agent });
-                    continue;
-                }
-                self.table
-                    .notice(stream, sequence, &entry.name, || News::Passed {
-                        via,
-                        remote: true,
-                        letter: letter.clone(),
-                    });
-                let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
-                if !self.has_room_for_stranger(lane, &entry.name, letter.len()) {
-                    if let Some(sender) = target.clone() {
-                        self.table.undelivered.push_back(Undelivered {
-                            sender,
-                            receiver: Arc::clone(&entry.name),
-                            letter: letter.clone(),
-                            reason: FailureReason::QueueFull,
-                            detail: String::new(),
-                        });
-                    }
-                    self.table
-                        .notice(stream, sequence, &entry.name, || News::Settled {
-                            outcome: failed_for(FailureReason::QueueFull),
-                            sender: true,
-                        });
-                    continue;
-                }
-                let until = now.instant + deadline.min(MAX_DEADLINE);
-                let failed = failed.clone();
-                let origin = Origin::LegacyPeer { from, failed };
-                let letter_of = (stream.receiver, sequence);
-                let letter = letter.clone();
-                let delivery = Delivery::new(now.instant, origin, letter, letter_of, until);
-                self.put(now, lane, delivery);
-            }
+        if let Err(why) = self.admits(now, &entry.name, parts.as_ref(), unproved) {
+            let why = (FailureReason::Refused, why);
+            self.unframed_failed(&entry.name, unframed, why);
+            return;
         }
-        self.send_failures(now);
+        if let Some(located) = located.take() {
+            self.report_legacy_contact(now, located, from.address);
+        }
+        let stream_sender = self.table.config.incarnation;
+        let stream = Stream {
+            sender: stream_sender,
+            receiver: entry.incarnation,
+        };
+        let sequence = self.sequence_of(stream_sender);
+        if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
+            && inbox.push_unframed(letter.clone(), via)
+        {
+            self.table
+                .notice(stream, sequence, &entry.name, || News::Taken {
+                    via: Some(via),
+                    letter: letter.clone(),
+                });
+            let agent = entry.incarnation;
+            self.table.actions.push_back(Action::Deliverable { agent });
+            return;
+        }
+        self.table
+            .notice(stream, sequence, &entry.name, || News::Passed {
+                via,
+                remote: true,
+                letter: letter.clone(),
+            });
+        let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
+        if !self.has_room_for_stranger(lane, letter.len()) {
+            let reason = FailureReason::QueueFull;
+            self.unframed_undelivered(&entry.name, unframed, (reason, String::new()));
+            self.table
+                .notice(stream, sequence, &entry.name, || News::Settled {
+                    outcome: failed_for(reason),
+                    sender: true,
+                });
+            return;
+        }
+        let until = now.instant + deadline.min(MAX_DEADLINE);
+        let failed = failed.clone();
+        let origin = Origin::LegacyPeer { from, failed };
+        let letter_of = (stream.receiver, sequence);
+        let delivery = Delivery::new(now.instant, origin, letter.clone(), letter_of, until);
+        self.put(now, lane, delivery);
     }
 
     /// Reports that a legacy peer's letter cannot be delivered to this receiver.
     fn unframed_failed(
         &mut self,
         receiver: &Arc<str>,
-        letter: &Letter,
-        (via, target): (Kind, Option<&FailureTarget>),
+        unframed: &Unframed,
         (reason, detail): (FailureReason, String),
     ) {
         let own = self.table.config.incarnation;
@@ -548,24 +588,36 @@ impl Core {
         let sequence = self.sequence_of(own);
         self.table
             .notice(stream, sequence, receiver, || News::Passed {
-                via,
+                via: unframed.via,
                 remote: true,
-                letter: letter.clone(),
+                letter: unframed.letter.clone(),
             });
         self.table
             .notice(stream, sequence, receiver, || News::Settled {
                 outcome: failed_for(reason),
                 sender: true,
             });
-        if let Some(sender) = target.cloned() {
-            self.table.undelivered.push_back(Undelivered {
-                sender,
-                receiver: Arc::clone(receiver),
-                letter: letter.clone(),
-                reason,
-                detail,
-            });
-        }
+        self.unframed_undelivered(receiver, unframed, (reason, detail));
+    }
+
+    /// Has the source of a legacy peer's letter told that this receiver does not get it.
+    fn unframed_undelivered(
+        &mut self,
+        receiver: &Arc<str>,
+        unframed: &Unframed,
+        (reason, detail): (FailureReason, String),
+    ) {
+        let Some(failed) = unframed.failed.clone() else {
+            return;
+        };
+        let from = unframed.from;
+        self.table.undelivered.push_back(Undelivered {
+            sender: FailureTarget::LegacyPeer { from, failed },
+            receiver: Arc::clone(receiver),
+            letter: unframed.letter.clone(),
+            reason,
+            detail,
+        });
     }
 }
 

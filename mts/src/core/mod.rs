@@ -120,11 +120,15 @@ pub struct Submission {
 const IDLE_LANES: usize = 1024;
 /// Time for which an empty lane is kept nevertheless.
 const IDLE_TIME: Duration = Duration::from_secs(60);
+/// The same when many lanes are created in a short time. A lane that is dropped too early costs time,
+/// but no letter: its next letter waits longer for a predecessor that failed.
+const IDLE_TIME_IN_A_CROWD: Duration = Duration::from_secs(1);
 
 /// The delivery core. See the module documentation.
 pub struct Core {
     table: AttemptTable,
-    lanes: Map<LaneId, Lane>,
+    /// In boxes: a table that grows moves its values, under the lock.
+    lanes: Map<LaneId, Box<Lane>>,
     lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
@@ -145,6 +149,8 @@ pub struct Core {
     /// Next sequence number of the letters that this service sends in its own name.
     next_sequence: u64,
     next_forget: Option<Instant>,
+    /// Number of lanes at which empty ones are dropped at once.
+    crowd: usize,
 }
 
 impl fmt::Debug for Core {
@@ -218,6 +224,7 @@ impl Core {
             next_send: 1,
             next_sequence: 1,
             next_forget: None,
+            crowd: 2 * IDLE_LANES,
         }
     }
 
@@ -585,11 +592,12 @@ impl Core {
         if let Some(id) = self.lane_ids.get(&key) {
             return *id;
         }
+        self.disperse_crowd(now);
         let id = LaneId(self.next_lane);
         self.next_lane += 1;
         self.lane_ids.insert(key.clone(), id);
         let lane = Lane::new(now.instant, id, key, Arc::clone(receiver));
-        self.lanes.insert(id, lane);
+        self.lanes.insert(id, Box::new(lane));
         id
     }
 
@@ -1003,9 +1011,12 @@ impl Core {
     /// dispatches the letters that wait because of them.
     pub fn handle_reachable(&mut self, now: Now, service: Option<Incarnation>) {
         let is_meant = |location: &Location| service.is_none_or(|it| it == location.incarnation());
-        self.table.forget_failures(is_meant);
+        let had_failed = self.table.forget_failures(is_meant);
         if service.is_none() {
             self.peers.ask_again(now.instant, &mut self.table);
+        } else if !had_failed {
+            // No letter waits for this service. A peer decides how often it connects.
+            return;
         }
         for lane in self.lanes_in_order() {
             self.with_lane(now, lane, |lane, table| {
@@ -1044,6 +1055,19 @@ impl Core {
             let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME;
             lane.is_idle() && (quiet || !lane.remembers())
         });
+    }
+
+    /// Drops empty lanes when their number has doubled since the last time, because peers can invent
+    /// senders, each with a lane.
+    fn disperse_crowd(&mut self, now: Now) {
+        if self.lanes.len() < self.crowd {
+            return;
+        }
+        self.forget_lanes(|lane| {
+            let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME_IN_A_CROWD;
+            lane.is_idle() && (quiet || !lane.remembers())
+        });
+        self.crowd = 2 * self.lanes.len().max(IDLE_LANES);
     }
 
     fn forget_lanes(&mut self, forget: impl Fn(&Lane) -> bool) {

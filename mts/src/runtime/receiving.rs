@@ -8,6 +8,7 @@ use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
     LegacySource, LoanedContent, Location, Parcel, Sink, Verdict,
 };
+use parking_lot::MutexGuard;
 
 use super::Shared;
 use crate::core::{Now, Unframed};
@@ -51,17 +52,29 @@ impl Sink for TransportSink {
             return;
         };
         shared.directory.refresh();
-        let unframed = match Unframed::read(letter, via, from, &*shared.directory) {
+        let mut unframed = match Unframed::read(letter, via, from, &*shared.directory) {
             Ok(unframed) => unframed.read_by(&shared.reader),
             Err(error) => {
                 tracing::warn!(%error, "dropping an unframed letter: its envelope is malformed");
                 return;
             }
         };
-        let mut state = shared.lock();
-        let deadline = state.unframed_deadline;
-        state.core.handle_unframed(Now::read(), deadline, unframed);
-        shared.carry_out(state);
+        loop {
+            let mut state = shared.lock();
+            if shared.closed.load(Ordering::Acquire) {
+                return;
+            }
+            let deadline = state.unframed_deadline;
+            state
+                .core
+                .handle_unframed(Now::read(), deadline, &mut unframed);
+            if unframed.is_handled() {
+                shared.carry_out(state);
+                return;
+            }
+            // A thread that waits for the lock precedes the next portion.
+            shared.carry_out_then(state, MutexGuard::unlock_fair);
+        }
     }
 
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {

@@ -130,7 +130,21 @@ impl PeerRecords {
         for fullname in asked.into_iter().rev() {
             self.queue.push_front(fullname);
         }
+        self.shorten_queue();
         true
+    }
+
+    /// Drops later copies of queued names when half of the queue may be copies: a gateway that stays silent
+    /// is doubted again and again, and the network decides how many gateways do so.
+    fn shorten_queue(&mut self) {
+        if self.queue.len() <= 2 * (self.records.len() + self.peers.len()) + BATCH {
+            return;
+        }
+        let mut queued = HashSet::new();
+        let (records, peers) = (&self.records, &self.peers);
+        self.queue.retain(|name| {
+            (records.contains_key(name) || peers.contains(name)) && queued.insert(Arc::clone(name))
+        });
     }
 
     /// Ends all records of this gateway, which ended without a goodbye.
@@ -293,5 +307,31 @@ mod tests {
         assert!(!holdings.doubt(start + AGAIN / 2, gateway), "too early");
         assert!(holdings.doubt(start + AGAIN, gateway));
         assert!(!holdings.doubt(start + 2 * AGAIN, gateway), "unchanged");
+    }
+
+    #[test]
+    fn gateways_that_are_doubted_often_take_bounded_memory() {
+        let mut holdings = PeerRecords::default();
+        let start = Instant::now();
+        for number in 0..250 {
+            put(&mut holdings, start, number, 1 + number % 10, true);
+        }
+        for round in 0..100 {
+            let now = start + 2 * DOUBT * round;
+            for gateway in 1..=10 {
+                assert!(holdings.doubt(now, Incarnation::from_u64(gateway)));
+            }
+        }
+        assert!(holdings.queue.len() <= 2 * 250 + BATCH);
+        // Each record is still verified, those of the last doubt first.
+        let mut now = start;
+        let last: HashSet<Arc<str>> = holdings.due(now).into_iter().collect();
+        assert!(last.iter().all(|it| it.parse::<u64>().unwrap() % 10 == 9));
+        let mut verified = last;
+        while let Some(due) = holdings.poll_timeout(now) {
+            now = due;
+            verified.extend(holdings.due(now));
+        }
+        assert_eq!(verified.len(), 250);
     }
 }

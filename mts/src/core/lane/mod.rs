@@ -64,6 +64,10 @@ const ENDED_PATIENCE: Duration = Duration::from_secs(2);
 /// for another kind.
 const KIND_PATIENCE: Duration = Duration::from_secs(2);
 
+/// Bytes that a lane with letters counts as, in addition to the letters, among the letters in custody.
+/// Its state takes about as much memory, and peers can invent senders, each with a lane.
+const LANE_BYTES: usize = 4096;
+
 /// The number of a lane within its core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct LaneId(pub(crate) u64);
@@ -233,12 +237,25 @@ impl Lane {
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
     }
 
+    /// Whether the letters in custody leave room for another one with this many bytes in this lane.
+    pub(crate) fn fits_into_custody(&self, len: usize, table: &AttemptTable) -> bool {
+        table.has_room(&self.receiver, len.saturating_add(self.own_bytes()))
+    }
+
+    /// Bytes that this lane counts as when its first letter comes or its last letter goes.
+    fn own_bytes(&self) -> usize {
+        match self.letters.is_empty() {
+            true => LANE_BYTES,
+            false => 0,
+        }
+    }
+
     /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
     /// limits, up to twice as much.
     pub(crate) fn admits(&self, sequence: u64, len: usize, table: &AttemptTable) -> bool {
         let config = &table.config;
         let held = table.held.saturating_add(len);
-        if self.has_room(len, table) && table.has_room(&self.receiver, len) {
+        if self.has_room(len, table) && self.fits_into_custody(len, table) {
             return true;
         }
         let highest = self.letters.back().map(|delivery| delivery.sequence);
@@ -290,7 +307,7 @@ impl Lane {
         delivery.position = self.pushed;
         self.pushed += 1;
         let len = delivery.letter.len();
-        table.hold(&self.receiver, len);
+        table.hold(&self.receiver, len + self.own_bytes());
         self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
@@ -304,8 +321,12 @@ impl Lane {
         self.predecessor_came(sequence);
     }
 
+    /// Records a service that is held back. It gets a credit when letters have left this lane; while there
+    /// are none, letters of other lanes have to leave, and the service tries again after a pause.
     pub(crate) fn wait_for_credit(&mut self, back: Location) {
-        self.waiting = Some(back);
+        if !self.letters.is_empty() {
+            self.waiting = Some(back);
+        }
     }
 
     /// Dispatches all letters that can be dispatched.
@@ -743,7 +764,7 @@ impl Lane {
             return;
         };
         let len = delivery.letter.len();
-        table.release(&self.receiver, len);
+        table.release(&self.receiver, len + self.own_bytes());
         self.bytes -= len;
         let is_last = self.letters.is_empty();
         if is_last {
