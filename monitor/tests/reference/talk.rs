@@ -148,6 +148,14 @@ impl Talk {
         known.len() == 6 || known.contains(&text)
     }
 
+    /// The `reply-with` of the question before the last message.
+    fn asked_before(&self, initiator: bool) -> Option<&str> {
+        let said = self.said.iter().rev();
+        let own = said
+            .filter(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel);
+        own.skip(1).find_map(|said| said.reply_with.as_deref())
+    }
+
     pub(super) fn cancel(&self) -> Option<&SentMessage> {
         self.said.iter().rev().find(|said| said.cancels)
     }
@@ -440,6 +448,9 @@ pub(super) fn judge_at(
             .and_then(|said| said.reply_with.as_ref());
         if let (true, Some(asked), Some(answer)) = (view.compares, asked, &words.in_reply_to)
             && asked != answer
+            // A message that crossed the not-understood answers the message before it.
+            && !(matches!(talk.spot, Spot::NotUnderstood(_))
+                && talk.asked_before(!view.by_initiator) == Some(answer))
         {
             return match talk.asked_earlier(!view.by_initiator, answer) {
                 true if !view.own => Ok(Step {
@@ -475,7 +486,7 @@ pub(super) fn judge_at(
             _ => false,
         };
         match words.act {
-            "not-understood" if !here.is_final() || received_last => {
+            "not-understood" if !here.is_final() || received_last || (!view.own && !over) => {
                 return Ok(to(Spot::NotUnderstood(id.to_owned())));
             }
             "cancel" if may_cancel && (!over || (received_last && !view.own)) => {
