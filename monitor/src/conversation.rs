@@ -1025,7 +1025,7 @@ mod tests {
     #[test]
     fn a_party_is_found_among_few_and_many() {
         let mut names = Names::new(std::hash::RandomState::new());
-        let mut table = crate::table::Table::new(std::hash::RandomState::new());
+        let mut table = crate::table::Table::new(&std::hash::RandomState::new());
         let at = table.insert("c", NONE, NONE, 0, 1);
         let conversation = &mut table.slot_mut(at).unwrap().conversation;
         for number in 0..40 {

@@ -133,7 +133,7 @@ impl Monitor {
             history: History::Complete,
             agent,
             names: Names::new(hasher.clone()),
-            table: Table::new(hasher.clone()),
+            table: Table::new(&hasher),
             removed: Removed::default(),
             refused: Refused::default(),
             deadlines: Deadlines::default(),
@@ -828,7 +828,7 @@ impl Monitor {
             NONE => 0,
             peer => Names::cost(self.names.text(peer).len()),
         };
-        let bytes = size_of::<crate::table::Slot>() + id.len() + peer_cost;
+        let bytes = crate::table::Slot::COST + id.len() + peer_cost;
         self.evict(parent, peer, 1, bytes);
         let at = self.table.insert(id, parent, peer, machine, now.millis());
         if let Some(slot) = self.table.slot_mut(at) {
@@ -917,9 +917,8 @@ impl Monitor {
             if !full && !heavy && !over {
                 return;
             }
-            let other = |at: &u32| *at != keep;
-            let own = |list| self.table.oldest_of(peer, list).filter(other);
-            let any = |list| self.table.oldest(list).filter(other);
+            let own = |list| self.table.oldest_but(keep, Some(peer), list);
+            let any = |list| self.table.oldest_but(keep, None, list);
             let own = || own(List::Ended).or_else(|| own(List::Open));
             let any = || any(List::Ended).or_else(|| any(List::Open));
             let oldest = match over {
@@ -1316,7 +1315,7 @@ fn size_after(
     });
     let reply_to = header.reply_to_names().iter().map(|agent| name(agent));
     let added = receivers.sum::<usize>() + reply_to.sum::<usize>() + name(observed.sender);
-    size_of::<crate::table::Slot>() + conversation.allocated() + added
+    crate::table::Slot::COST + conversation.allocated() + added
 }
 
 /// Whether the message is another copy of the last one to several receivers. Its receiver then has the

@@ -299,3 +299,24 @@ fn a_report_of_a_service_is_no_violation_and_begins_nothing() {
     stage.right(lost);
     assert_eq!(stage.monitor.len(), 1);
 }
+
+/// Within a second, the list of conversations is not sorted anew.
+#[test]
+fn the_oldest_conversation_of_a_peer_cannot_grow_beyond_its_share() {
+    let mut limits = Limits::default();
+    limits.bytes = 8 << 20;
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    let long = |number: usize| format!("{number}{}", "x".repeat(4_000));
+    let call = |id: usize, number| {
+        let header = say("cfp ann>ben").receivers([long(number)]);
+        header.conversation_id(format!("{id}"))
+    };
+    for id in 0..20 {
+        stage.right(call(id, id));
+    }
+    for number in 20..250 {
+        stage.right(call(0, number));
+        assert!(stage.monitor.bytes() <= 1 << 20);
+    }
+    assert!(stage.monitor.len() < 20);
+}
