@@ -895,7 +895,17 @@ fn by_default(
     match message.act {
         NOT_UNDERSTOOD => {
             // It may have crossed the message that ended the protocol, if others can still follow.
-            let has_crossed = !message.own && !here.is_over();
+            let ended_by = party.acts[side_index(message.side.opposite())].checked_sub(1);
+            let ends = |step: &Transition| {
+                let act = ended_by.map(Act::Standard);
+                step.target == state
+                    && step.from.includes(message.to)
+                    && act.is_some_and(|act| step.acts.contains(act))
+            };
+            let has_crossed = !message.own
+                && !here.is_over()
+                && ended_by.is_some_and(|act| act < 22)
+                && machine.states.iter().flat_map(|it| &it.steps).any(ends);
             let may = !has_ended || answers_last || has_crossed;
             may.then(|| NextState::not_understood_in(state))
         }

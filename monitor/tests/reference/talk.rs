@@ -479,6 +479,19 @@ pub(super) fn judge_at(
     }
     let over = is_over(machine, id);
     let received_last = talk.last_by_initiator() != view.by_initiator;
+    let ended_by = talk.last_of(!view.by_initiator);
+    let ends_crossed = !view.own
+        && !over
+        && ended_by.is_some_and(|said| {
+            let states = machine.states().iter();
+            let mut steps = states.flat_map(|state| super::options(machine, state.id()));
+            steps.any(|step| {
+                machine.target(step) == id
+                    && matches(step.performative(), said.act)
+                    && (step.from() == ".*"
+                        || view.to.iter().any(|role| matches(step.from(), role)))
+            })
+        });
     if view.known && talk.said.iter().any(|said| !said.cancels) {
         let may_cancel = match machine.cancel() {
             Cancel::Initiator => view.by_initiator,
@@ -486,7 +499,7 @@ pub(super) fn judge_at(
             _ => false,
         };
         match words.act {
-            "not-understood" if !here.is_final() || received_last || (!view.own && !over) => {
+            "not-understood" if !here.is_final() || received_last || ends_crossed => {
                 return Ok(to(Spot::NotUnderstood(id.to_owned())));
             }
             "cancel" if may_cancel && (!over || (received_last && !view.own)) => {
