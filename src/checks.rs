@@ -250,6 +250,9 @@ impl Monitored {
         directory: &dyn Directory,
     ) -> Option<Box<Violation>> {
         let mut header = Header::from(&incoming.view());
+        if let Some(agent) = incoming.undelivered_to.as_deref() {
+            header = header.undelivered_to(agent);
+        }
         // Only a message with both begins a conversation.
         if header.protocol_name().is_some() && header.conversation().is_some() {
             let sender = directory.known_incarnation(origin.sender);

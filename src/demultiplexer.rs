@@ -8,7 +8,7 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
-use fipa_acl::{Message, Performative};
+use fipa_acl::Message;
 use fipa_sds::{Entry, Reach, Role};
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
@@ -22,9 +22,6 @@ use crate::{lock_slot, presence};
 /// Maximum number of messages that are set aside for one reader while another reader receives.
 /// Beyond it letters stay in the agent's queue, and their senders wait.
 const MAX_SET_ASIDE: usize = 1_024;
-
-/// The ontology of the messages of a message transport service about undelivered letters (FIPA00067).
-const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
 /// The messages that one reader received for another.
 #[derive(Default)]
@@ -64,7 +61,7 @@ pub(crate) type Opens = Box<dyn Fn(&Message) -> bool + Send + Sync>;
 /// The agents whose messages belong to a conversation.
 #[derive(Debug, Clone)]
 pub(crate) enum Admitted {
-    /// These agents, and the services that deliver to them.
+    /// These agents, and the services that [report](crate::delivery_report) undelivered messages to them.
     Parties(Vec<Party>),
     /// Every agent.
     All,
@@ -76,8 +73,6 @@ pub(crate) struct Party {
     pub(crate) name: Arc<str>,
     /// Its registration; unknown for an agent of a legacy peer.
     pub(crate) agent: Incarnation,
-    /// The service that delivers to it.
-    pub(crate) mts: Incarnation,
 }
 
 impl Party {
@@ -86,7 +81,6 @@ impl Party {
         Self {
             name: name.into(),
             agent: entry.map_or(Incarnation::UNKNOWN, |entry| entry.incarnation),
-            mts: entry.map_or(Incarnation::UNKNOWN, |entry| entry.mts.incarnation),
         }
     }
 }
@@ -426,18 +420,8 @@ impl Admitted {
                 None => party.agent == agent,
             };
         }
-        let reports = view.performative() == Performative::Failure
-            && view
-                .ontology()
-                .is_some_and(|name| name == MANAGEMENT_ONTOLOGY);
-        // The service of this process, of a party, or of a legacy peer if a party is at one.
-        reports
-            && (is_own
-                || parties.iter().any(|party| match agent.is_known() {
-                    true if party.agent.is_known() => party.mts == agent,
-                    true => is_of_gateway,
-                    false => !party.agent.is_known(),
-                }))
+        let lost = incoming.undelivered_to.as_deref();
+        lost.is_some_and(|lost| parties.iter().any(|party| *party.name == *lost))
     }
 }
 
@@ -445,7 +429,7 @@ impl Admitted {
 mod tests {
     use std::time::SystemTime;
 
-    use fipa_acl::AgentId;
+    use fipa_acl::{AgentId, Performative};
     use fipa_mts::core::Received;
     use fipa_mts::letter_for;
     use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
@@ -462,7 +446,6 @@ mod tests {
         let message = Message::builder(act)
             .sender(AgentId::new(sender).unwrap())
             .receiver(AgentId::new("rover").unwrap())
-            .ontology(MANAGEMENT_ONTOLOGY)
             .conversation_id("c")
             .build()
             .unwrap();
@@ -508,7 +491,7 @@ mod tests {
         };
         for (registered, from, sender, act, belongs) in [
             (&relay, gateway, "echo@jade", Performative::Inform, true),
-            (&relay, gateway, "ams@jade", Performative::Failure, true),
+            (&relay, gateway, "ams@jade", Performative::Failure, false),
             (&relay, gateway, "other@jade", Performative::Inform, false),
             (&*mallory, MALLORY, "echo@jade", Performative::Inform, false),
             (&*mallory, MALLORY, "ams@jade", Performative::Failure, false),
@@ -543,9 +526,11 @@ mod tests {
         // A letter of a legacy peer proves nothing.
         let unknown = Incarnation::UNKNOWN;
         state.put(message("arm", unknown, Performative::Inform), None);
-        // A report about a letter is believed from the services involved.
+        // A failure that is no proved report, and a report about another agent.
         state.put(message("mts", MALLORY, Performative::Failure), None);
-        state.put(message("mts", unknown, Performative::Failure), None);
+        let mut about_mallory = message("mts", MALLORY, Performative::Failure);
+        about_mallory.undelivered_to = Some("mallory".into());
+        state.put(about_mallory, None);
         assert!(state.take(Reader::Conversation(&key)).is_none());
         assert_eq!(state.others.len(), 5);
     }
@@ -564,8 +549,11 @@ mod tests {
         let again = entry("arm", MALLORY);
         state.put(message("arm", MALLORY, Performative::Inform), Some(&again));
         state.put(message("legacy", unknown, Performative::Inform), None);
-        state.put(message("mts", ARMS_MTS, Performative::Failure), None);
-        state.put(message("ams", unknown, Performative::Failure), None);
+        for lost in ["arm", "legacy"] {
+            let mut report = message("mts", ARMS_MTS, Performative::Failure);
+            report.undelivered_to = Some(lost.into());
+            state.put(report, None);
+        }
         assert_eq!(state.others.len(), 0);
         let taken = std::iter::from_fn(|| state.take(Reader::Conversation(&key)));
         assert_eq!(taken.count(), 6);

@@ -13,6 +13,8 @@ use fipa_transport::Incarnation;
 
 use crate::checks::{Checks, Origin};
 use crate::delivery::Sent;
+#[cfg(feature = "protocols")]
+use crate::delivery_report;
 use crate::domain::Domain;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
@@ -159,7 +161,8 @@ impl Endpoint {
     /// then gets a failure message.
     pub(crate) fn decode(&self, received: Received) -> Option<Incoming> {
         let origin = Origin::of(&received);
-        let incoming = match Incoming::new(received) {
+        #[cfg_attr(not(feature = "protocols"), expect(unused_mut))]
+        let mut incoming = match Incoming::new(received) {
             Ok(incoming) => incoming,
             Err(refused) => {
                 let (error, received) = *refused;
@@ -173,6 +176,10 @@ impl Endpoint {
             }
         };
         let directory = &*self.domain.inner.service.host;
+        #[cfg(feature = "protocols")]
+        {
+            incoming.undelivered_to = delivery_report::read(&incoming, directory);
+        }
         let answer = |message: &Message, reason| self.not_understood(message, reason);
         Some(self.checks.arrived(incoming, origin, directory, answer))
     }

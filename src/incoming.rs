@@ -27,6 +27,10 @@ pub struct Incoming {
     /// it; unknown for an agent of a legacy peer, and for letters of this process itself.
     #[cfg(feature = "protocols")]
     pub(crate) sender: Incarnation,
+    /// The agent that did not get a letter, if this is the proved report of a service about it: see
+    /// [`crate::delivery_report`].
+    #[cfg(feature = "protocols")]
+    pub(crate) undelivered_to: Option<Box<str>>,
 }
 
 impl Incoming {
@@ -56,6 +60,8 @@ impl Incoming {
             via: received.via,
             #[cfg(feature = "protocols")]
             violation: None,
+            #[cfg(feature = "protocols")]
+            undelivered_to: None,
         })
     }
 

@@ -124,6 +124,8 @@ pub mod config;
 pub mod contact;
 mod delivery;
 #[cfg(feature = "protocols")]
+mod delivery_report;
+#[cfg(feature = "protocols")]
 mod demultiplexer;
 #[cfg(not(feature = "protocols"))]
 #[path = "demultiplexer_disabled.rs"]

@@ -343,10 +343,30 @@ pub(crate) struct Rare {
     pub(crate) alternatives: Vec<(u32, u16)>,
     /// The conversation as the role of the monitored agent sees it.
     pub(crate) local: Option<LocalRun>,
+    /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
+    pub(crate) claimed: bool,
+    /// The last message of the monitored agent in it, until it is known to have arrived.
+    pub(crate) last_sent: Option<LastSent>,
     /// The last messages of which an observer gets each copy by itself.
     pub(crate) copied: Vec<Copied>,
     /// The parties by their peers, if there are more than [`FEW`].
     index: HashTable<(Name, u32)>,
+}
+
+/// The last message of the monitored agent in a conversation that its role sees.
+#[derive(Debug)]
+pub(crate) struct LastSent {
+    /// [`act_number`] of the message.
+    pub(crate) act: u8,
+    pub(crate) reply_with: u64,
+    /// The state before it.
+    pub(crate) state: u16,
+    /// Whether it is a `not-understood`, which the role does not see.
+    pub(crate) ends: bool,
+    /// Number of the role bindings before it.
+    pub(crate) bound: usize,
+    /// Number of the role bindings after it.
+    pub(crate) bound_after: usize,
 }
 
 /// A message of which an observer gets each copy by itself.
@@ -386,6 +406,7 @@ impl Conversation {
                     .map(|copied| 8 * copied.seen.capacity())
                     .sum::<usize>()
                 + rare.index.allocation_size()
+                + rare.local.as_ref().map_or(0, LocalRun::allocated)
         });
         self.id.capacity()
             + parties
@@ -872,7 +893,22 @@ fn by_default(
     // `not-understood`.
     let answers_last = party.last != message.side;
     match message.act {
-        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| NextState::not_understood_in(state)),
+        NOT_UNDERSTOOD => {
+            // It may have crossed the message that ended the protocol, if others can still follow.
+            let ended_by = party.acts[side_index(message.side.opposite())].checked_sub(1);
+            let ends = |step: &Transition| {
+                let act = ended_by.map(Act::Standard);
+                step.target == state
+                    && step.from.includes(message.to)
+                    && act.is_some_and(|act| step.acts.contains(act))
+            };
+            let has_crossed = !message.own
+                && !here.is_over()
+                && ended_by.is_some_and(|act| act < 22)
+                && machine.states.iter().flat_map(|it| &it.steps).any(ends);
+            let may = !has_ended || answers_last || has_crossed;
+            may.then(|| NextState::not_understood_in(state))
+        }
         CANCEL => {
             let may = match machine.cancel {
                 Cancel::Initiator => message.side == Side::Initiator,
@@ -999,7 +1035,7 @@ mod tests {
     #[test]
     fn a_party_is_found_among_few_and_many() {
         let mut names = Names::new(std::hash::RandomState::new());
-        let mut table = crate::table::Table::new(std::hash::RandomState::new());
+        let mut table = crate::table::Table::new(&std::hash::RandomState::new());
         let at = table.insert("c", NONE, NONE, 0, 1);
         let conversation = &mut table.slot_mut(at).unwrap().conversation;
         for number in 0..40 {

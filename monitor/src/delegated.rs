@@ -57,7 +57,7 @@ impl Monitor {
     ) -> Result<(), Denied> {
         let library = Arc::clone(&self.library);
         let protocol = library.machine(machine);
-        let Some(protocol) = protocol.filter(|protocol| protocol.is_answer(observed.act)) else {
+        let Some(protocol) = protocol.filter(|it| it.shows_initiator(observed.act)) else {
             return Ok(());
         };
         let at = self.insert(id, parent, machine, (header, observed), now)?;

@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use fipa_acl::{Message, MessageView, Performative};
 use smallvec::SmallVec;
 
-use crate::act::Act;
+use crate::act::{Act, FAILURE};
 
 /// The parameters of a message that determine whether it fits its conversation.
 ///
@@ -30,6 +30,7 @@ pub struct Header<'a> {
     /// All receivers of the message, if this is the copy for one of them.
     addressed: SmallVec<[Cow<'a, str>; 2]>,
     peer: Option<Cow<'a, str>>,
+    undelivered_to: Option<Cow<'a, str>>,
 }
 
 impl<'a> Header<'a> {
@@ -53,6 +54,7 @@ impl<'a> Header<'a> {
             groups: Vec::new(),
             addressed: SmallVec::new(),
             peer: None,
+            undelivered_to: None,
         }
     }
 
@@ -105,6 +107,18 @@ impl<'a> Header<'a> {
     #[must_use]
     pub fn peer(mut self, peer: impl Into<Cow<'a, str>>) -> Self {
         self.peer = Some(peer.into());
+        self
+    }
+
+    /// Makes this the report of a message transport service that a message was not delivered to this
+    /// agent. The caller has verified that the sender is the service of that agent, or the one that was to
+    /// deliver the message. The monitor does not read the content, and every agent can name itself like a
+    /// service: without this, a `failure` of an agent that takes no part is a violation.
+    ///
+    /// Such a report is never a violation. If it is no `failure`, this has no effect.
+    #[must_use]
+    pub fn undelivered_to(mut self, agent: impl Into<Cow<'a, str>>) -> Self {
+        self.undelivered_to = Some(agent.into());
         self
     }
 
@@ -211,6 +225,11 @@ impl<'a> Header<'a> {
 
     pub(crate) fn peer_name(&self) -> Option<&str> {
         self.peer.as_deref()
+    }
+
+    pub(crate) fn undelivered_name(&self) -> Option<&str> {
+        let name = self.undelivered_to.as_deref();
+        name.filter(|_| self.act() == FAILURE)
     }
 
     pub(crate) fn reply_to_names(&self) -> &[Cow<'a, str>] {

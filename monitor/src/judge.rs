@@ -4,12 +4,12 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
-use crate::act::{Act, FAILURE};
+use crate::act::{Act, FAILURE, INFORM};
 use crate::conversation::{
-    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, FAILED, NONE, NextState, Party,
-    PartyMessage, Side, next_state, side_index,
+    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, ELSEWHERE, FAILED, NONE, NextState,
+    Party, PartyMessage, Side, next_state, side_index,
 };
-use crate::machine::{Guard, Machine, Scope, step};
+use crate::machine::{Cancel, Guard, Machine, Scope, step};
 use crate::names::{Name, Names};
 use crate::verdict::ViolationKind as Kind;
 
@@ -24,6 +24,8 @@ pub(crate) struct ObservedMessage<'a> {
     pub(crate) in_reply_to: u64,
     /// Whether the sender is the monitored agent.
     pub(crate) own: bool,
+    /// The agent that did not get a message, if this is the report of a message transport service.
+    pub(crate) undelivered_to: Option<&'a str>,
     /// Index of the monitored agent in the receivers, if another agent is the sender.
     pub(crate) own_receiver: Option<usize>,
 }
@@ -34,7 +36,7 @@ pub(crate) struct Move {
     pub(crate) target: MoveTarget,
     pub(crate) side: Side,
     pub(crate) next_state: NextState,
-    /// Whether an agent outside the conversation reported a failure, so no party has sent a message.
+    /// Whether a message transport service reported a failure, so no party has sent a message.
     pub(crate) reported: bool,
 }
 
@@ -113,14 +115,18 @@ impl Judge<'_> {
         }
         let known = self.party(sender);
         let known = known.map(|(at, party)| (MoveTarget::Party(at), party));
+        // A service is no member of the multicast.
         let unnamed = self.conversation.unnamed.as_deref();
+        let unnamed = unnamed.filter(|_| self.observed.undelivered_to.is_none());
         let Some((target, party)) = known.or(unnamed.map(|party| (MoveTarget::Sender, party)))
         else {
             if self.conversation.is_designated(self.names, sender) {
                 return self.by_initiator(moves);
             }
-            if self.observed.act == FAILURE && self.all_take_part() {
-                self.reported_failure(moves);
+            if let Some(lost) = self.observed.undelivered_to
+                && self.all_take_part()
+            {
+                self.reported_failure(lost, moves);
                 return Ok(());
             }
             return Err(Fault::plain(Kind::Stranger));
@@ -201,6 +207,10 @@ impl Judge<'_> {
         }
         let next_state = next_state(self.machine, party, &self.message(Side::Other))
             .map_err(|kind| self.fault(kind, party, name))?;
+        let next_state = match self.may_answer_unseen_cancel(party, &next_state) {
+            true => NextState::to(ELSEWHERE),
+            false => next_state,
+        };
         moves.push(Move {
             target,
             side: Side::Other,
@@ -210,16 +220,28 @@ impl Judge<'_> {
         Ok(())
     }
 
-    /// Handles a failure report of an agent outside the conversation, a message transport service: a
-    /// message of the receiver was not delivered.
-    ///
-    /// The content, which is not read, names the agent that did not get the message. If only one
-    /// party is possible, the protocol has ended with it.
-    fn reported_failure(&self, moves: &mut Vec<Move>) {
+    /// Whether a message that fits the protocol may as well be the answer to a cancel that the monitor has
+    /// not seen: the monitored agent has joined the conversation, for example after a restart. An agent
+    /// that waits for the answer to its cancel sends nothing else.
+    fn may_answer_unseen_cancel(&self, party: &Party, next_state: &NextState) -> bool {
+        self.conversation.joined
+            && self.machine.cancel != Cancel::Nobody
+            && [INFORM, FAILURE].contains(&self.observed.act)
+            && self.machine.state(next_state.state).is_some()
+            && !next_state.void
+            && !next_state.answers_cancel
+            && party.acts[side_index(Side::Initiator)] == 0
+    }
+
+    /// Handles the report of a message transport service: a message of the receiver was not delivered to
+    /// the agent `lost`. Until it is sent again, the protocol has ended with it.
+    fn reported_failure(&self, lost: &str, moves: &mut Vec<Move>) {
+        let lost_party = self.party(lost).map(|(at, _)| at);
+        let leads = self.gets_replies(lost);
         for receiver in self.observed.receivers {
             let initiator = self.names.is(self.conversation.initiator, receiver);
             let designated = self.conversation.is_designated(self.names, receiver);
-            let concerns = |(_, party): &(usize, &Party)| {
+            let concerns = |(at, party): &(usize, &Party)| {
                 let side = if !initiator && self.names.is(party.peer, receiver) {
                     Side::Other
                 } else if initiator || designated {
@@ -227,11 +249,15 @@ impl Judge<'_> {
                 } else {
                     return false;
                 };
+                let reached = match side {
+                    Side::Initiator => lost_party == Some(*at),
+                    Side::Other => leads,
+                };
                 let asked = party.asked[side_index(side)];
                 let answers = self.observed.in_reply_to == 0
                     || asked == 0
                     || self.observed.in_reply_to == asked;
-                party.last == side && answers
+                reached && party.last == side && answers
             };
             let mut concerned = self
                 .conversation
@@ -291,13 +317,18 @@ impl Judge<'_> {
             answers: conversation.bound.len() == 2,
             ..self.message(side)
         };
+        if let Some(lost) = self.observed.undelivered_to.filter(|_| has == 0) {
+            if stranger {
+                return Err(Fault::plain(Kind::Stranger));
+            }
+            if self.roles_of(lost) != 0 {
+                moves.push(failed(0, party));
+            }
+            return Ok(());
+        }
         let outside = has == 0 && unbound == 0;
         let next_state = match next_state(self.machine, party, &message) {
             Ok(next_state) => next_state,
-            Err(_) if outside && self.observed.act == FAILURE && !stranger => {
-                moves.push(failed(0, party));
-                return Ok(());
-            }
             Err(kind) => {
                 let kind = match kind {
                     _ if outside => Kind::Stranger,

@@ -24,8 +24,8 @@ pub struct Machine {
     pub(crate) scope: Scope,
     pub(crate) cancel: Cancel,
     /// Whether any party may end the conversation with `failure`, as in fipa_acl. Otherwise, a party
-    /// may send `failure` only in a transition of the machine, and an agent outside the conversation
-    /// (a message transport service) at any time.
+    /// may send `failure` only in a transition of the machine, and a message transport service at any
+    /// time.
     pub(crate) failure_by_parties: bool,
     pub(crate) roles: Vec<String>,
     /// Index of the initiating role.
@@ -274,6 +274,12 @@ impl Machine {
         let answers =
             |state: &State| step(&state.transitions, act, !initiator, initiator).is_some();
         act == NOT_UNDERSTOOD || self.states.iter().any(answers)
+    }
+
+    /// Whether a received message of this performative shows that the receiver leads the conversation: the
+    /// initiator does not send it.
+    pub(crate) fn shows_initiator(&self, act: Act<'_>) -> bool {
+        self.is_answer(act) && (act == NOT_UNDERSTOOD || !self.is_sent_by_initiator(act))
     }
 
     #[inline]

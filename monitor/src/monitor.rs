@@ -22,6 +22,7 @@ use crate::machine::{Machine, Scope, step};
 use crate::memory::{Refused, Removed};
 use crate::names::{Name, Names};
 use crate::report::violation;
+use crate::roles::take_back_local;
 use crate::table::{List, Table};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
 use crate::{Header, History, Library, Limits, Now, Policy};
@@ -132,7 +133,7 @@ impl Monitor {
             history: History::Complete,
             agent,
             names: Names::new(hasher.clone()),
-            table: Table::new(hasher.clone()),
+            table: Table::new(&hasher),
             removed: Removed::default(),
             refused: Refused::default(),
             deadlines: Deadlines::default(),
@@ -226,6 +227,12 @@ impl Monitor {
         match self.take(header, now) {
             Ok(passed) => self.accepted(&passed),
             Err(Denied::Unchecked(why)) => Verdict::Unchecked(why),
+            // A service that reports a failure follows no protocol.
+            Err(Denied::Fault(..) | Denied::NotOpened(_))
+                if header.undelivered_name().is_some() =>
+            {
+                Verdict::Unchecked(Unchecked::UnknownHistory)
+            }
             Err(denied) => {
                 let key = |from, to: &str| self.key_of_refused(header, from, to);
                 let sender = header.sender_name().unwrap_or_default();
@@ -271,17 +278,27 @@ impl Monitor {
                 let machine = self.machine_of(&library, at);
                 let named = header.protocol_name();
                 let called = |machine: &&Machine| named.is_none_or(|name| machine.is_called(name));
+                let agent = self.agent.as_deref();
                 if let Some(machine) = machine.filter(called)
                     && let Some(slot) = self.table.slot_mut(at)
-                    && take_back(
-                        machine,
-                        &mut slot.conversation,
-                        &self.names,
-                        (sender, receiver),
-                        (act_number(act), reply_with),
-                    )
+                    && match slot.conversation.is_local() && agent == Some(sender) {
+                        true => take_back_local(
+                            machine,
+                            &mut slot.conversation,
+                            &mut self.names,
+                            (act_number(act), reply_with),
+                        ),
+                        false => take_back(
+                            machine,
+                            &mut slot.conversation,
+                            &self.names,
+                            (sender, receiver),
+                            (act_number(act), reply_with),
+                        ),
+                    }
                 {
                     self.touch(main, now.millis());
+                    self.charge(at);
                     return;
                 }
                 let Some(slot) = self.table.slot(next) else {
@@ -363,9 +380,13 @@ impl Monitor {
             reply_with_text: header.reply_with_text().unwrap_or_default(),
             in_reply_to: self.fingerprints.of(header.in_reply_to_text()),
             own,
+            undelivered_to: header.undelivered_name(),
             own_receiver,
         };
         let Some(main) = self.place(id, header, &observed) else {
+            if observed.undelivered_to.is_some() {
+                return unchecked(Unchecked::UnknownHistory);
+            }
             let Some(protocol) = header.protocol_name() else {
                 return unchecked(Unchecked::NoProtocol);
             };
@@ -386,10 +407,14 @@ impl Monitor {
             if let Some(projection) = projection
                 && rare.is_some_and(|rare| rare.local.is_some())
             {
-                return self.advance_local(main, &projection, &observed, now);
+                let passed = self.advance_local(main, &projection, &observed, now);
+                return passed.map_err(|denied| self.recheck_local(id, main, denied));
             }
             let passed = self.advance(main, header, &observed, now);
             return passed.map_err(|denied| {
+                if observed.undelivered_to.is_some() {
+                    return denied;
+                }
                 let denied = self.recheck_delegated(main, &observed, denied, now);
                 self.recheck_beginning(main, denied)
             });
@@ -405,6 +430,7 @@ impl Monitor {
         too_long(id)
             || too_long(sender)
             || header.peer_name().is_some_and(too_long)
+            || header.undelivered_name().is_some_and(too_long)
             || header.receiver_count() > self.limits.participants
             || header.addressed().len() > self.limits.participants
             || reply_to.len() > MAX_DESIGNATED
@@ -444,7 +470,11 @@ impl Monitor {
             return Some(*at);
         }
         let ranked = alike.iter().map(|at| {
-            let rank = self.rank(*at, observed);
+            // A service stands for the agent that did not get a message.
+            let rank = match observed.undelivered_to {
+                Some(lost) => self.rank(*at, lost, observed),
+                None => self.rank(*at, observed.sender, observed),
+            };
             let slot = self.table.slot(*at);
             // Other agents may take part in a conversation that began elsewhere.
             let joined = rank == 0 && slot.is_some_and(|slot| slot.conversation.joined);
@@ -463,8 +493,12 @@ impl Monitor {
         if rank == 2 || self.single {
             return Some(at);
         }
+        if observed.undelivered_to.is_some() {
+            return None;
+        }
         let begins = |machine: &Machine| {
             step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
+                || self.begins_for_role(machine, observed)
         };
         let named = header.protocol_name();
         let machine = named.and_then(|name| self.library.find(name));
@@ -478,7 +512,7 @@ impl Monitor {
 
     /// 2 if the sender and a receiver take part in the conversation or in one within it, 1 if the
     /// sender does.
-    fn rank(&self, main: u32, observed: &ObservedMessage<'_>) -> u8 {
+    fn rank(&self, main: u32, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
         let any = |takes_part: &dyn Fn(&Conversation) -> bool| {
             let mut at = main;
             let mut slot = self.table.slot(main);
@@ -498,7 +532,7 @@ impl Monitor {
                 || conversation.is_designated(&self.names, agent)
         };
         let sends = |conversation: &Conversation| {
-            conversation.unnamed.is_some() || has(conversation, observed.sender)
+            conversation.unnamed.is_some() || has(conversation, sender)
         };
         let receives = |conversation: &Conversation| {
             let mut receivers = observed.receivers.iter().take(MAX_LOOKED_AT);
@@ -518,8 +552,8 @@ impl Monitor {
                 conversation.unnamed.is_some() || conversation.party(names, agent).is_some()
             };
             let receivers = || observed.receivers.iter().take(MAX_LOOKED_AT);
-            leads(observed.sender) && receivers().any(|receiver| answers(receiver))
-                || answers(observed.sender) && receivers().any(|receiver| leads(receiver))
+            leads(sender) && receivers().any(|receiver| answers(receiver))
+                || answers(sender) && receivers().any(|receiver| leads(receiver))
         };
         let embeds = self.table.slot(main).is_some_and(|slot| slot.child != NONE);
         if any(&linked) || embeds && any(&sends) && any(&receives) {
@@ -794,7 +828,7 @@ impl Monitor {
             NONE => 0,
             peer => Names::cost(self.names.text(peer).len()),
         };
-        let bytes = size_of::<crate::table::Slot>() + id.len() + peer_cost;
+        let bytes = crate::table::Slot::COST + id.len() + peer_cost;
         self.evict(parent, peer, 1, bytes);
         let at = self.table.insert(id, parent, peer, machine, now.millis());
         if let Some(slot) = self.table.slot_mut(at) {
@@ -827,7 +861,7 @@ impl Monitor {
             return Denied::Refused(Kind::Unsolicited, None);
         }
         // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
-        if protocol.is_answer(observed.act) {
+        if protocol.shows_initiator(observed.act) {
             if let Err(denied) = self.join(id, NONE, machine, (header, observed), now) {
                 return denied;
             }
@@ -883,9 +917,8 @@ impl Monitor {
             if !full && !heavy && !over {
                 return;
             }
-            let other = |at: &u32| *at != keep;
-            let own = |list| self.table.oldest_of(peer, list).filter(other);
-            let any = |list| self.table.oldest(list).filter(other);
+            let own = |list| self.table.oldest_but(keep, Some(peer), list);
+            let any = |list| self.table.oldest_but(keep, None, list);
             let own = || own(List::Ended).or_else(|| own(List::Open));
             let any = || any(List::Ended).or_else(|| any(List::Open));
             let oldest = match over {
@@ -1282,7 +1315,7 @@ fn size_after(
     });
     let reply_to = header.reply_to_names().iter().map(|agent| name(agent));
     let added = receivers.sum::<usize>() + reply_to.sum::<usize>() + name(observed.sender);
-    size_of::<crate::table::Slot>() + conversation.allocated() + added
+    crate::table::Slot::COST + conversation.allocated() + added
 }
 
 /// Whether the message is another copy of the last one to several receivers. Its receiver then has the

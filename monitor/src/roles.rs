@@ -4,7 +4,9 @@
 use std::sync::Arc;
 
 use crate::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
-use crate::conversation::{AFTER_NOT_UNDERSTOOD, Conversation, NONE, Party, RoleBinding};
+use crate::conversation::{
+    AFTER_NOT_UNDERSTOOD, Conversation, LastSent, NONE, Party, RoleBinding, act_number,
+};
 use crate::judge::{Fault, ObservedMessage, unbound};
 use crate::machine::Machine;
 use crate::monitor::{Denied, Monitor, Passed};
@@ -38,18 +40,58 @@ impl Monitor {
                 Denied::Unchecked(Unchecked::UnknownHistory)
             });
         }
+        let is_certain = self.is_certain(id);
         let at = self.insert(id, NONE, index, (header, observed), now)?;
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
             conversation.initiator = conversation.acquire(&mut self.names, observed.sender);
             conversation.add(Party::new(NONE, machine.initial));
             conversation.rare().local = Some(LocalRun::new(projection.locals(), u32::MAX));
+            conversation.rare().may_continue = !is_certain;
         }
         let passed = self.advance_local(at, projection, observed, now);
         passed.map(|passed| Passed {
             opened: true,
             ..passed
         })
+    }
+
+    /// Whether this is the first message of the protocol that a role of the monitored agent sees.
+    pub(crate) fn begins_for_role(
+        &self,
+        machine: &Machine,
+        observed: &ObservedMessage<'_>,
+    ) -> bool {
+        let projection = machine.projection.as_deref();
+        let Some(projection) = projection.filter(|_| self.agent.is_some()) else {
+            return false;
+        };
+        let mut run = LocalRun::new(projection.locals(), u32::MAX);
+        let message = Observed {
+            act: observed.act,
+            own: observed.own,
+            peers: u32::MAX,
+        };
+        run.take(projection.locals(), message).is_ok() && !run.waits()
+    }
+
+    /// A violation is none if the state is uncertain: the conversation may have begun before the monitor, a
+    /// message waits for its turn, or there is another conversation with this identifier. An agent that
+    /// guesses an identifier can cause the last two.
+    pub(crate) fn recheck_local(&self, id: &str, at: u32, denied: Denied) -> Denied {
+        let uncertain = |at: u32| {
+            let slot = self.table.slot(at);
+            let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
+            rare.is_some_and(|rare| {
+                rare.may_continue || rare.local.as_ref().is_some_and(LocalRun::waits)
+            })
+        };
+        match denied {
+            Denied::Fault(..) if uncertain(at) || self.table.find_all(id).count() > 1 => {
+                Denied::Unchecked(Unchecked::UnknownHistory)
+            }
+            denied => denied,
+        }
     }
 
     /// Whether the message fits the conversation as the role of the agent sees it.
@@ -62,7 +104,7 @@ impl Monitor {
         let slot = self
             .table
             .slot(at)
-            .filter(|slot| slot.conversation.is_local());
+            .filter(|slot| slot.conversation.is_local() && observed.undelivered_to.is_none());
         let Some(conversation) = slot.map(|slot| &slot.conversation) else {
             return false;
         };
@@ -89,6 +131,9 @@ impl Monitor {
         observed: &ObservedMessage<'_>,
         now: Now,
     ) -> Result<Passed, Denied> {
+        if observed.undelivered_to.is_some() {
+            return Err(Denied::Unchecked(Unchecked::BegunElsewhere));
+        }
         let library = Arc::clone(&self.library);
         let fault = |kind, state| {
             let fault = Fault {
@@ -115,6 +160,15 @@ impl Monitor {
         }
         let (free, message) = observed_by_role(machine, conversation, &self.names, observed);
         let peers = message.peers;
+        let takes_part = observed.own || conversation.takes_part(&self.names, observed.sender);
+        let sent = LastSent {
+            act: act_number(observed.act),
+            reply_with: observed.reply_with,
+            state,
+            ends: false,
+            bound: conversation.bound.len(),
+            bound_after: 0,
+        };
         let Some(run) = conversation.rare().local.as_mut() else {
             return fault(Kind::NotOpened, state);
         };
@@ -135,8 +189,20 @@ impl Monitor {
                         let agent = conversation.acquire(&mut self.names, name);
                         conversation.bound.push(RoleBinding { role, agent });
                     }
+                    let began = self.names.is(conversation.initiator, observed.sender);
+                    conversation.rare().claimed |= !observed.own && !began;
                 }
                 let complete = local.is_some_and(|local| local.is_final());
+                let bound_after = conversation.bound.len();
+                let rare = conversation.rare();
+                if observed.own {
+                    rare.last_sent = Some(LastSent {
+                        bound_after,
+                        ..sent
+                    });
+                } else if rare.local.as_ref().is_none_or(|run| !run.has_last()) {
+                    rare.last_sent = None;
+                }
                 let passed = Passed {
                     complete,
                     ..Passed::in_state_of(conversation, machine, index)
@@ -146,16 +212,29 @@ impl Monitor {
                 Ok(passed)
             }
             // The rules of all protocols are between two agents, and the others do not see it.
-            Err(_) if observed.act == NOT_UNDERSTOOD => {
+            Err(_) if observed.act == NOT_UNDERSTOOD && takes_part => {
                 if let Some(party) = conversation.parties.first_mut() {
                     party.state = AFTER_NOT_UNDERSTOOD;
                 }
+                conversation.rare().last_sent = observed.own.then_some(LastSent {
+                    ends: true,
+                    bound_after: sent.bound,
+                    ..sent
+                });
                 let passed = Passed::in_state_of(conversation, machine, index);
                 self.touch(at, now.millis());
                 Ok(passed)
             }
-            Err(_) if [CANCEL, FAILURE].contains(&observed.act) => {
+            // An agent without a role yet may have one.
+            Err(_)
+                if (observed.own || peers != 0)
+                    && [CANCEL, FAILURE, NOT_UNDERSTOOD].contains(&observed.act) =>
+            {
                 Err(Denied::Unchecked(Unchecked::BegunElsewhere))
+            }
+            // Another agent may have claimed the role of the sender.
+            Err(_) if peers == 0 && !observed.own && conversation.rare().claimed => {
+                Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
             Err(NotLocal::Ended) => fault(Kind::Ended, state),
             Err(NotLocal::Unexpected) if peers == 0 && !observed.own => {
@@ -167,15 +246,53 @@ impl Monitor {
     }
 }
 
+/// Takes a message of the monitored agent back, if it is its last one in the conversation, and if no
+/// message has shown that it arrived.
+pub(crate) fn take_back_local(
+    machine: &Machine,
+    conversation: &mut Conversation,
+    names: &mut Names,
+    (act, reply_with): (u8, u64),
+) -> bool {
+    let Some(rare) = conversation.rare.as_deref_mut() else {
+        return false;
+    };
+    let is_it = |sent: &mut LastSent| sent.act == act && sent.reply_with == reply_with;
+    let Some((sent, run)) = rare.last_sent.take_if(is_it).zip(rare.local.as_mut()) else {
+        return false;
+    };
+    let mut state = sent.state;
+    if !sent.ends {
+        run.take_back();
+        let locals = machine.projection.as_deref().map(Projection::locals);
+        let local = locals.and_then(|locals| run.state(locals));
+        state = local.map_or(state, |local| local.global_in(machine));
+        // It may be sent to another agent instead.
+        let released = conversation.bound.drain(sent.bound..sent.bound_after);
+        for RoleBinding { agent, .. } in released {
+            let cost = Names::cost(names.text(agent).len());
+            conversation.charged_names = conversation.charged_names.saturating_sub(cost);
+            names.release(agent);
+        }
+    }
+    if let Some(party) = conversation.parties.first_mut() {
+        party.state = state;
+    }
+    true
+}
+
 /// Returns the roles that no agent has, and the message with the roles that the other side may have. An
-/// agent with a role has no other one.
+/// agent with a role has no other one, and no other agent has the role of the monitored one.
 fn observed_by_role<'a>(
     machine: &Machine,
     conversation: &Conversation,
     names: &Names,
     observed: &ObservedMessage<'a>,
 ) -> (u32, Observed<'a>) {
-    let free = unbound(machine, conversation);
+    let run = conversation.rare.as_deref();
+    let run = run.and_then(|rare| rare.local.as_ref());
+    let own_role = run.and_then(LocalRun::role).map_or(0, |role| 1 << role);
+    let free = unbound(machine, conversation) & !own_role;
     let may = |name: &str| {
         let bound = conversation.bound.iter();
         let held = bound.filter(|bound| names.is(bound.agent, name));

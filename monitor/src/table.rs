@@ -6,6 +6,7 @@
 use std::hash::{BuildHasher, RandomState};
 
 use hashbrown::HashTable;
+use siphasher::sip128::SipHasher13;
 use smallvec::SmallVec;
 
 use crate::conversation::{Conversation, NONE};
@@ -29,14 +30,24 @@ const PRECISION: u64 = 1_000;
 pub(crate) struct Table {
     slots: Vec<Slot>,
     free: Vec<u32>,
-    by_id: HashTable<u32>,
-    hasher: RandomState,
+    by_id: HashTable<Indexed>,
+    keys: [u64; 2],
     /// The lists of all conversations.
     ends: [Ends; 2],
     accounts: HashTable<Account>,
     len: usize,
     bytes: usize,
     begun: u64,
+}
+
+/// A main conversation in the index: the fingerprint of its identifier, and its slot.
+///
+/// The fingerprint has 128 bits and a secret random key, so that equal fingerprints are equal
+/// identifiers. A search reads neither the slot nor the text, which are in other cache lines.
+#[derive(Debug)]
+struct Indexed {
+    id: [u64; 2],
+    at: u32,
 }
 
 /// The conversations of one peer.
@@ -102,18 +113,22 @@ const EMPTY: Ends = Ends {
 };
 
 impl Slot {
+    /// Bytes of a conversation with its entry in the index, which may be half empty, but without its
+    /// allocations.
+    pub(crate) const COST: usize = size_of::<Self>() + 2 * size_of::<Indexed>();
+
     pub(crate) fn list(&self) -> List {
         self.list
     }
 }
 
 impl Table {
-    pub(crate) fn new(hasher: RandomState) -> Self {
+    pub(crate) fn new(random: &RandomState) -> Self {
         Self {
             slots: Vec::new(),
             free: Vec::new(),
             by_id: HashTable::new(),
-            hasher,
+            keys: ["first", "second"].map(|key| random.hash_one(key)),
             ends: [EMPTY; 2],
             accounts: HashTable::new(),
             len: 0,
@@ -141,11 +156,17 @@ impl Table {
     /// The conversations with this identifier, at most [`MAX_ALIKE`](crate::limits::MAX_ALIKE).
     #[inline]
     pub(crate) fn find_all<'t>(&'t self, id: &'t str) -> impl Iterator<Item = u32> + 't {
-        let hash = self.hasher.hash_one(id);
-        self.by_id.iter_hash(hash).copied().filter(move |at| {
-            self.slot(*at)
-                .is_some_and(|slot| slot.conversation.id == id)
-        })
+        let id = self.fingerprint(id);
+        let [hash, _] = id;
+        let alike = self.by_id.iter_hash(hash).filter(move |one| one.id == id);
+        alike.map(|one| one.at)
+    }
+
+    fn fingerprint(&self, id: &str) -> [u64; 2] {
+        let [first, second] = self.keys;
+        let hasher = SipHasher13::new_with_keys(first, second);
+        let found = hasher.hash(id.as_bytes());
+        [found.h1, found.h2]
     }
 
     #[cfg(test)]
@@ -180,6 +201,20 @@ impl Table {
             .filter(|at| *at != NONE)
     }
 
+    /// The least recently active conversation in a list except `keep`, of a peer if one is given. A list is
+    /// not sorted within [`PRECISION`], so `keep` may be the first in it.
+    pub(crate) fn oldest_but(&self, keep: u32, peer: Option<Name>, list: List) -> Option<u32> {
+        let (oldest, kind) = match peer {
+            Some(peer) => (self.oldest_of(peer, list)?, PEERS),
+            None => (self.oldest(list)?, ALL),
+        };
+        if oldest != keep {
+            return Some(oldest);
+        }
+        let newer = self.slot(keep)?.links[kind].newer;
+        Some(newer).filter(|at| *at != NONE)
+    }
+
     /// Inserts a new conversation of this peer, with a parent or [`NONE`]. The caller holds a reference
     /// to the name of the peer for it.
     pub(crate) fn insert(
@@ -204,11 +239,10 @@ impl Table {
         self.begun += 1;
         self.account(peer).len += 1;
         if parent == NONE {
-            let (slots, hasher) = (&self.slots, &self.hasher);
-            self.by_id.insert_unique(hasher.hash_one(id), at, |at| {
-                let slot = slots.get(*at as usize);
-                hasher.hash_one(slot.map_or("", |slot| slot.conversation.id.as_str()))
-            });
+            let id = self.fingerprint(id);
+            let [hash, _] = id;
+            let entry = Indexed { id, at };
+            self.by_id.insert_unique(hash, entry, |one| one.id[0]);
             self.append(at, List::Open);
         } else {
             let first = self.slot(parent).map_or(NONE, |slot| slot.child);
@@ -228,7 +262,7 @@ impl Table {
         let Some(slot) = self.slot_mut(at) else {
             return false;
         };
-        let cost = size_of::<Slot>() + slot.conversation.allocated();
+        let cost = Slot::COST + slot.conversation.allocated();
         if cost == slot.cost {
             return false;
         }
@@ -311,8 +345,8 @@ impl Table {
         };
         let (parent, peer, cost) = (slot.parent, slot.peer, slot.cost);
         if parent == NONE {
-            let hash = self.hasher.hash_one(slot.conversation.id.as_str());
-            if let Ok(found) = self.by_id.find_entry(hash, |other| *other == at) {
+            let [hash, _] = self.fingerprint(&slot.conversation.id);
+            if let Ok(found) = self.by_id.find_entry(hash, |one| one.at == at) {
                 found.remove();
             }
             self.unlink(at);
@@ -445,7 +479,7 @@ mod tests {
 
     #[test]
     fn conversations_are_listed_by_age_and_slots_are_reused() {
-        let mut table = Table::new(RandomState::new());
+        let mut table = Table::new(&RandomState::new());
         let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, NONE, 7, 0, 1));
         assert_eq!(order(&table, List::Open), ["a", "b", "c"]);
         table.touch(a, List::Open, 2_000);
@@ -471,7 +505,7 @@ mod tests {
 
     #[test]
     fn each_peer_has_a_list_and_is_charged() {
-        let mut table = Table::new(RandomState::new());
+        let mut table = Table::new(&RandomState::new());
         let a = table.insert("a", NONE, 1, 0, 1);
         let b = table.insert("b", NONE, 2, 0, 2);
         let c = table.insert("a", NONE, 1, 0, 3);
@@ -499,7 +533,7 @@ mod tests {
     #[test]
     fn buffers_of_long_ids_are_not_kept() {
         for (len, kept) in [(100, true), (128, true), (129, false), (1_000, false)] {
-            let mut table = Table::new(RandomState::new());
+            let mut table = Table::new(&RandomState::new());
             let at = table.insert(&"x".repeat(len), NONE, 7, 0, 1);
             table.remove(at);
             let left = table.slots[at as usize].conversation.id.capacity();
@@ -509,7 +543,7 @@ mod tests {
 
     #[test]
     fn embedded_conversations_are_linked_to_their_parent() {
-        let mut table = Table::new(RandomState::new());
+        let mut table = Table::new(&RandomState::new());
         let main = table.insert("main", NONE, 7, 0, 1);
         let children = [0; 3].map(|_| table.insert("main", main, 7, 1, 1));
         let chain = |table: &Table| {

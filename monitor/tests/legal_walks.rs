@@ -63,6 +63,17 @@ struct Talk<'l> {
     views: Vec<[View; 2]>,
     /// Whether its agents write `in-reply-to`.
     replies: bool,
+    /// The participants that have sent a message which only one of them may send, such as a token.
+    only: HashMap<&'static str, usize>,
+    token: Token,
+}
+
+/// The agent that has the token of a lock. Without it, the initiator does not enter (`confirm`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Token {
+    None,
+    OfInitiator,
+    OfParticipant,
 }
 
 struct World<'l> {
@@ -102,6 +113,14 @@ fn matches(pattern: &str, text: &str) -> bool {
             let known = known.entry(pattern.to_owned()).or_insert_with(compiled);
             known.is_match(text)
         })
+}
+
+/// Whether its messages are repeated without `reply-with`.
+fn is_of_locks(machine: &Machine) -> bool {
+    let of_locks = ["dlm_", "ricart_agrawala", "suzuki_kasami"];
+    of_locks
+        .iter()
+        .any(|prefix| machine.name().starts_with(prefix))
 }
 
 /// Whether both sides may send in one state, so that messages cross.
@@ -185,10 +204,7 @@ impl<'l> World<'l> {
     }
 
     fn begin(&mut self) {
-        // Requests of locks are repeated without `reply-with`; `locking/tests/simulation.rs` checks them.
-        let of_locks = ["dlm_", "ricart_agrawala", "suzuki_kasami"];
-        let other = |it: &&Machine| !of_locks.iter().any(|prefix| it.name().starts_with(prefix));
-        let machines: Vec<&'l Machine> = self.library.iter().filter(other).collect();
+        let machines: Vec<&'l Machine> = self.library.iter().collect();
         let machine = machines[self.rng.usize(..machines.len())];
         let embeds = machine
             .states()
@@ -216,7 +232,13 @@ impl<'l> World<'l> {
             initiator,
             views: vec![[view.clone(), view]; participants.len()],
             participants,
-            replies: is_mixed(machine) || self.rng.bool(),
+            replies: !is_of_locks(machine) && (is_mixed(machine) || self.rng.bool()),
+            only: HashMap::new(),
+            token: match machine.name().starts_with("suzuki_kasami") {
+                false => Token::None,
+                true if self.rng.bool() => Token::OfInitiator,
+                true => Token::OfParticipant,
+            },
         });
         let everyone: Vec<usize> = (0..self.talks[number].participants.len()).collect();
         self.speak(number, &everyone, true);
@@ -234,6 +256,25 @@ impl<'l> World<'l> {
         let mut choices: Vec<(&'static str, String)> = Vec::new();
         if first.canceled.is_none() {
             for step in options(machine, &first.state) {
+                let passes = |act: &str| {
+                    let other = talk.only.get(act).is_some_and(|at| *at != to[0]);
+                    let has_token = match (talk.token, act) {
+                        (Token::OfInitiator, "request") => talk.only.contains_key("propagate"),
+                        (Token::OfInitiator, "propagate") => {
+                            by_initiator
+                                || machine.name() != "suzuki_kasami"
+                                    && talk.only.contains_key("propagate")
+                        }
+                        (Token::OfParticipant, "confirm") => false,
+                        // In the basic variant, the token is passed once.
+                        (Token::OfParticipant, "propagate") => {
+                            machine.name() != "suzuki_kasami"
+                                || !talk.only.contains_key("propagate")
+                        }
+                        _ => true,
+                    };
+                    has_token && (by_initiator || step.at_most() != Some(1) || !other)
+                };
                 let own = (step.from() == machine.initiator()) == by_initiator;
                 let full = step.at_most().is_some_and(|most| {
                     let there = |views: &&[View; 2]| views[0].state == machine.target(step);
@@ -241,16 +282,19 @@ impl<'l> World<'l> {
                 });
                 if own && !full {
                     let fits = ACTS.iter().filter(|act| matches(step.performative(), act));
+                    let fits = fits.filter(|act| passes(act));
                     choices.extend(fits.map(|act| (*act, machine.target(step).to_owned())));
                 }
             }
         }
         let begun = first.state != machine.initial().id();
         let ended = options(machine, &first.state).is_empty();
+        let mut states = machine.states().iter();
+        let is_final = states.any(|state| state.id() == first.state && state.is_final());
         let cancels = machine.cancel() != fipa_monitor::Cancel::Nobody && by_initiator;
         if cancels && begun && !ended && first.canceled.is_none() && self.rng.u8(..) < 25 {
             choices = vec![("cancel", first.state.clone())];
-        } else if !by_initiator && begun && !ended && self.rng.u8(..) < 3 {
+        } else if !by_initiator && begun && !ended && !is_final && self.rng.u8(..) < 3 {
             choices = vec![("not-understood", first.state.clone())];
         }
         if choices.is_empty() {
@@ -318,6 +362,9 @@ impl<'l> World<'l> {
             self.log
                 .push(format!("lost: in {:?}", self.talks[number].id));
             return;
+        }
+        if !by_initiator {
+            self.talks[number].only.insert(act, to[0]);
         }
         for (at, receiver) in to.iter().zip(&receivers) {
             let view = &mut self.talks[number].views[*at][side];
@@ -394,6 +441,9 @@ impl<'l> World<'l> {
             // Without `in-reply-to`, the agent takes the first answer for that to its cancel.
             view.over = letter.act == "inform" || !talk.replies;
             return;
+        }
+        if letter.act == "propagate" && !by_initiator {
+            talk.token = Token::OfInitiator;
         }
         // An answer to an earlier message is void.
         if letter.in_reply_to.is_some() && view.sent.is_some() && letter.in_reply_to != view.sent {

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fastrand::Rng;
+use fipa_acl::Performative;
 use fipa_monitor::projection::{Defect, Local, Projection};
 use fipa_monitor::{
     Header, History, Library, Machine, Monitor, Scope, Unchecked, Verdict, ViolationKind as Kind,
@@ -194,16 +195,21 @@ fn stage(agent: &str) -> Stage {
     }
 }
 
+/// The message and its receiver.
+fn header_of(words: &'static str) -> (Header<'static>, &'static str) {
+    let (act, agents) = words.split_once(' ').unwrap();
+    let (from, to) = agents.split_once('>').unwrap();
+    let header = Header::new(act.parse().unwrap())
+        .sender(from)
+        .receivers([to])
+        .protocol("own")
+        .conversation_id("c");
+    (header, to)
+}
+
 impl Stage {
     fn check(&mut self, words: &'static str) -> Verdict<'_> {
-        let (act, agents) = words.split_once(' ').unwrap();
-        let (from, to) = agents.split_once('>').unwrap();
-        let header = Header::new(act.parse().unwrap())
-            .sender(from)
-            .receivers([to])
-            .protocol("own")
-            .conversation_id("c");
-        self.monitor.check(&header, self.now)
+        self.monitor.check(&header_of(words).0, self.now)
     }
 
     fn right(&mut self, all: &[&'static str]) {
@@ -211,6 +217,12 @@ impl Stage {
             let verdict = self.check(words);
             assert!(verdict.is_accepted(), "{words}: {verdict:?}");
         }
+    }
+
+    /// A message of the agent was not delivered.
+    fn lost(&mut self, words: &'static str) {
+        let (header, receiver) = header_of(words);
+        self.monitor.undelivered(&header, receiver, self.now);
     }
 
     fn wrong(&mut self, words: &'static str) -> Kind {
@@ -264,7 +276,8 @@ fn a_message_may_overtake_one_of_another_sender() {
     stage.monitor = Monitor::agent(Arc::new(library), "ben");
     // The inform of cid overtakes the request of ann.
     stage.right(&["inform cid>ben"]);
-    assert_eq!(stage.wrong("agree ben>ann"), Kind::Unexpected);
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_eq!(stage.check("agree ben>ann"), unknown);
     stage.right(&["request ann>ben"]);
     stage.right(&["agree ben>ann"]);
     assert_eq!(stage.wrong("inform cid>ben"), Kind::Ended);
@@ -290,7 +303,86 @@ fn the_rules_of_all_protocols_and_unknown_history_apply() {
     assert_eq!(drone.check("inform dro>sta"), unknown);
 }
 
-/// Random runs of the roles with slow routes: no monitor refuses a message.
+#[test]
+fn an_undelivered_message_can_be_sent_again() {
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    assert_eq!(drone.wrong("request dro>med"), Kind::Unexpected);
+    drone.lost("request dro>med");
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    // It had arrived after all.
+    drone.right(&["agree med>dro"]);
+    assert_eq!(drone.wrong("request dro>med"), Kind::Unexpected);
+    // An answered message has arrived.
+    drone.lost("request dro>med");
+    assert_eq!(drone.wrong("request dro>med"), Kind::Unexpected);
+    // The mediator knows that the station has the message.
+    drone.right(&["inform dro>sta", "inform med>dro"]);
+    drone.lost("inform dro>sta");
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Ended);
+    // Another station has the role instead.
+    let mut mediator = stage("med");
+    mediator.right(&["request dro>med", "query-if med>sta"]);
+    assert_eq!(mediator.wrong("query-if med>old"), Kind::WrongReceiver);
+    mediator.lost("query-if med>sta");
+    mediator.right(&["query-if med>old"]);
+    assert_eq!(mediator.wrong("confirm sta>med"), Kind::Stranger);
+    mediator.right(&["confirm old>med", "agree med>dro"]);
+    mediator.lost("agree med>dro");
+    mediator.right(&["agree med>dro"]);
+    // A `not-understood` that was not delivered ends nothing.
+    mediator.right(&["not-understood med>old"]);
+    assert_eq!(mediator.wrong("agree med>dro"), Kind::Ended);
+    mediator.lost("not-understood med>old");
+    mediator.right(&["inform old>med", "inform med>dro"]);
+}
+
+#[test]
+fn a_message_of_another_role_leaves_the_last_one_open() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="a" to="c" target="3"/>
+            <transition performative="inform" from="b" to="a" target="4"/></state>
+        <state id="3"><transition performative="inform" from="b" to="a" target="5"/></state>
+        <state id="4"><transition performative="request" from="a" to="c" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    let joint = machine(text);
+    assert!(joint.projection().is_some());
+    library.add(joint).unwrap();
+    let mut stage = stage("ann");
+    stage.monitor = Monitor::agent(Arc::new(library), "ann");
+    stage.right(&["request ann>ben", "request ann>cid", "inform ben>ann"]);
+    stage.lost("request ann>cid");
+    stage.right(&["request ann>cid"]);
+    assert_eq!(stage.wrong("request ann>cid"), Kind::Ended);
+}
+
+#[test]
+fn an_outsider_ends_no_conversation_of_roles() {
+    for act in ["not-understood", "failure", "cancel"] {
+        let mut mediator = stage("med");
+        mediator.right(&["request dro>med", "query-if med>sta"]);
+        let words: &'static str = format!("{act} mallory>med").leak();
+        assert_eq!(mediator.wrong(words), Kind::Stranger, "{act}");
+        mediator.right(&["confirm sta>med", "agree med>dro"]);
+    }
+    // The station does not know the agent that is the drone.
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    let mut station = stage("sta");
+    station.right(&["query-if med>sta", "confirm sta>med", "inform mallory>sta"]);
+    assert_eq!(station.check("inform dro>sta"), unknown);
+    station.right(&["inform sta>med"]);
+    let mut station = stage("sta");
+    station.right(&["query-if med>sta"]);
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(station.check("not-understood mallory>sta"), elsewhere);
+    station.right(&["confirm sta>med", "inform dro>sta", "inform sta>med"]);
+}
+
+/// Random runs of the roles with slow routes, undelivered messages, restarts and an intruder: no monitor
+/// refuses a message.
 #[test]
 fn no_message_of_a_projected_protocol_is_refused() {
     let number = |name: &str| {
@@ -306,16 +398,30 @@ fn no_message_of_a_projected_protocol_is_refused() {
     let library = Arc::new(library);
     let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
     let names = ["dro", "med", "sta"];
-    let (mut said, mut ended) = (0, 0);
+    let (mut said, mut ended, mut lost, mut unchecked) = (0, 0, 0, 0);
     for seed in 0..runs {
         let mut rng = Rng::with_seed(seed);
         let mut monitors = names.map(|name| Monitor::agent(Arc::clone(&library), name));
+        // In every second run, monitors restart, evict conversations and get messages of an intruder.
+        let disturbed = seed % 2 == 1;
+        let mut log = Vec::new();
         let mut states = [0; 3];
         let mut queues: Vec<VecDeque<String>> = vec![VecDeque::new(); 9];
         let mut idle = 0;
         while idle < 600 {
             idle += 1;
             let role = rng.usize(..3);
+            if disturbed && rng.u8(..) < 3 {
+                let monitor = Monitor::agent(Arc::clone(&library), names[role]);
+                monitors[role] = monitor.with_history(History::Unknown);
+                log.push(format!("restart of {}", names[role]));
+            } else if disturbed && rng.u8(..) < 6 {
+                let act = rng.choice(&Performative::STANDARD).unwrap().clone();
+                let header = Header::new(act).sender("mallory").receivers([names[role]]);
+                let header = header.protocol("own").conversation_id("c");
+                log.push(format!("{} mallory>{}", header.performative(), names[role]));
+                monitors[role].check(&header, now);
+            }
             let state = &locals[role].states()[states[role]];
             let Some(step) = rng.choice(state.steps()) else {
                 continue;
@@ -331,6 +437,25 @@ fn no_message_of_a_projected_protocol_is_refused() {
             if from != role && queue.front().map(String::as_str) != Some(step.performative()) {
                 continue;
             }
+            let header = Header::new(step.performative().parse().unwrap())
+                .sender(names[from])
+                .receivers([names[to]])
+                .protocol("own")
+                .conversation_id("c");
+            let verdict = monitors[role].check(&header, now);
+            log.push(format!("{}: {}", names[role], header.performative()));
+            let is_unchecked = disturbed && matches!(verdict, Verdict::Unchecked(_));
+            assert!(
+                verdict.is_accepted() || is_unchecked,
+                "seed {seed}: {header:?}: {verdict:?}\n{log:#?}"
+            );
+            unchecked += u64::from(is_unchecked);
+            if from == role && rng.u8(..) < 12 {
+                monitors[role].undelivered(&header, names[to], now);
+                lost += 1;
+                continue;
+            }
+            let queue = &mut queues[from * 3 + to];
             match from == role {
                 true => queue.push_back(step.performative().to_owned()),
                 false => drop(queue.pop_front()),
@@ -338,16 +463,6 @@ fn no_message_of_a_projected_protocol_is_refused() {
             states[role] = step.target();
             idle = 0;
             said += 1;
-            let header = Header::new(step.performative().parse().unwrap())
-                .sender(names[from])
-                .receivers([names[to]])
-                .protocol("own")
-                .conversation_id("c");
-            let verdict = monitors[role].check(&header, now);
-            assert!(
-                verdict.is_accepted(),
-                "seed {seed}: {header:?}: {verdict:?}"
-            );
         }
         ended += usize::from(
             locals
@@ -357,5 +472,5 @@ fn no_message_of_a_projected_protocol_is_refused() {
         );
     }
     assert_eq!(ended as u64, runs);
-    assert!(said > runs * 4);
+    assert!(said > runs * 4 && lost > runs / 8 && unchecked > runs / 8);
 }

@@ -128,6 +128,7 @@ impl Walk<'_> {
             reply_with: None,
             in_reply_to: None,
             reply_to: Vec::new(),
+            undelivered_to: None,
             reply_by: None,
         };
         if self.rng.u8(..) < 230 {
@@ -143,6 +144,10 @@ impl Walk<'_> {
         }
         if self.rng.u8(..) < 40 {
             words.reply_to = vec![self.pick(&AGENTS[..5])];
+        }
+        // Often the report of a service.
+        if words.act == "failure" && (words.from == "host-mts" || self.rng.u8(..) < 10) {
+            words.undelivered_to = self.rng.bool().then(|| self.pick(&AGENTS));
         }
         if self.rng.u8(..) < 60 {
             words.reply_by = Some(self.now + self.rng.u64(1..8_000));
@@ -269,6 +274,9 @@ fn header(words: &Words) -> Header<'_> {
     }
     if let Some(text) = &words.in_reply_to {
         header = header.in_reply_to(text.as_str());
+    }
+    if let Some(agent) = words.undelivered_to {
+        header = header.undelivered_to(agent);
     }
     if let Some(due) = words.reply_by {
         header = header.reply_by(Time::from_system_time(at(due)).unwrap());

@@ -215,7 +215,7 @@ impl Dialogue {
             return Err(DialogueError::NotOpening(Box::new(first.clone())));
         }
         let mut speaker = Speaker::new(core, first.protocol().unwrap_or_default(), id.to_owned());
-        match speaker.check(first) {
+        match speaker.check(first, None) {
             Ok(meaning) if meaning.opened => {}
             Ok(_) => return Err(DialogueError::NotOpening(Box::new(first.clone()))),
             Err(CheckFailure::Violation(violation))
@@ -461,6 +461,8 @@ impl Dialogue {
     }
 
     fn interpret(&mut self, incoming: Incoming) -> Result<Interpreted, DialogueError> {
+        let mut incoming = incoming;
+        let undelivered_to = incoming.undelivered_to.take();
         let (message, violation) = incoming.into_parts();
         if let Some(sender) = message.sender() {
             self.partners.handle_message(sender.name());
@@ -469,8 +471,13 @@ impl Dialogue {
             let message = Box::new(message);
             return Err(DialogueError::Violation { violation, message });
         }
-        let meaning = self.speaker.check(&message);
-        let meaning = meaning.map_err(|failure| failure.on_received(&message))?;
+        let meaning = match self.speaker.check(&message, undelivered_to.as_deref()) {
+            // Of a message to a party that the monitor does not have any more.
+            Err(CheckFailure::Unchecked(_)) if undelivered_to.is_some() => {
+                return Err(DialogueError::Undelivered(Box::new(message)));
+            }
+            meaning => meaning.map_err(|failure| failure.on_received(&message))?,
+        };
         self.follow_delegates(&message);
         match meaning.state {
             DialogueState::NotUnderstood => Err(DialogueError::NotUnderstood(Box::new(message))),
@@ -616,7 +623,7 @@ impl Speaker {
             }
         }
         let message = message.build()?;
-        self.check(&message).map_err(CheckFailure::on_sent)?;
+        self.check(&message, None).map_err(CheckFailure::on_sent)?;
         self.replies += 1;
         self.last = header_of_outcomes(&message);
         let letter = letter_for(&message, SystemTime::now());
@@ -657,15 +664,25 @@ impl Speaker {
         }
     }
 
-    fn check(&mut self, message: &Message) -> Result<Meaning, CheckFailure> {
+    /// Checks a message. `undelivered_to` is the agent that did not get a message, if this is the report
+    /// of a service.
+    fn check(
+        &mut self,
+        message: &Message,
+        undelivered_to: Option<&str>,
+    ) -> Result<Meaning, CheckFailure> {
         let now = SystemTime::now();
+        let mut header = Header::from(message);
+        if let Some(agent) = undelivered_to {
+            header = header.undelivered_to(agent);
+        }
         let own = Meaning {
             state: DialogueState::Own,
             over: false,
             void: false,
             opened: false,
         };
-        match self.monitor.check(&Header::from(message), now) {
+        match self.monitor.check(&header, now) {
             Verdict::Accepted(accepted) => {
                 if message.protocol().is_none_or(|name| name == self.protocol) {
                     accepted.state.clone_into(&mut self.state);

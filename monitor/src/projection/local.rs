@@ -149,14 +149,16 @@ pub(crate) enum NotLocal {
 /// tells them apart.
 #[derive(Debug, Clone)]
 pub(crate) struct LocalRun {
-    pub(crate) parts: Vec<Part>,
+    parts: Vec<Part>,
+    /// The parts without the last message of the agent, as long as it may not have arrived.
+    without_last: Vec<Part>,
 }
 
 /// A possible role of the agent, and its state.
-#[derive(Debug, Clone)]
-pub(crate) struct Part {
-    pub(crate) role: u8,
-    pub(crate) state: u16,
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Part {
+    role: u8,
+    state: u16,
     /// Messages that came before their turn, because messages of other senders are under way.
     early: Vec<(u8, Performed)>,
 }
@@ -177,7 +179,52 @@ impl LocalRun {
         };
         Self {
             parts: parts.map(part).collect(),
+            without_last: Vec::new(),
         }
+    }
+
+    /// The role of the agent, if it is certain.
+    pub(crate) fn role(&self) -> Option<u8> {
+        let first = self.parts.first()?.role;
+        let mut parts = self.parts.iter();
+        parts.all(|part| part.role == first).then_some(first)
+    }
+
+    /// Whether a message waits for its turn.
+    pub(crate) fn waits(&self) -> bool {
+        self.parts.iter().any(|part| !part.early.is_empty())
+    }
+
+    /// Bytes that the run has allocated.
+    pub(crate) fn allocated(&self) -> usize {
+        let parts = self.parts.iter().chain(&self.without_last);
+        let early = parts.flat_map(|part| {
+            let acts = part.early.iter().map(|(_, act)| match act {
+                Performed::Standard(_) => 0,
+                Performed::Other(name) => name.capacity(),
+            });
+            let buffer = part.early.capacity() * size_of::<(u8, Performed)>();
+            std::iter::once(buffer).chain(acts)
+        });
+        let parts = self.parts.capacity() + self.without_last.capacity();
+        parts * size_of::<Part>() + early.sum::<usize>()
+    }
+
+    /// Adds the possibility that the last message of the agent has not arrived. The next message shows
+    /// whether it has.
+    pub(crate) fn take_back(&mut self) {
+        let mut parts = std::mem::take(&mut self.without_last);
+        for part in self.parts.drain(..) {
+            if !parts.contains(&part) {
+                parts.push(part);
+            }
+        }
+        self.parts = parts;
+    }
+
+    /// Whether the last message of the agent may not have arrived: no message has answered it.
+    pub(crate) fn has_last(&self) -> bool {
+        !self.without_last.is_empty()
     }
 
     /// Takes a message. Returns the role of the agent and that of the other side, if they are certain.
@@ -187,18 +234,7 @@ impl LocalRun {
         message: Observed<'_>,
     ) -> Result<(Option<u8>, Option<u8>), NotLocal> {
         let local = |part: &Part| locals.iter().find(|local| local.role == part.role);
-        let mut taken: Vec<(Part, u8)> = Vec::new();
-        for part in &self.parts {
-            let Some(local) = local(part) else { continue };
-            taken.extend(part.after(local, message));
-        }
-        // An early message waits only if it fits no role now.
-        if taken.is_empty() && !message.own {
-            for part in &self.parts {
-                let Some(local) = local(part) else { continue };
-                taken.extend(part.keeping(local, message));
-            }
-        }
+        let taken = after(&self.parts, locals, message);
         if taken.is_empty() {
             let over = |part: &Part| {
                 let state = local(part).and_then(|local| local.state(part.state));
@@ -214,7 +250,16 @@ impl LocalRun {
             first.filter(|first| taken.iter().all(|part| one(part) == *first))
         };
         let roles = (same(&|(part, _)| part.role), same(&|(_, peer)| *peer));
-        self.parts = taken.into_iter().map(|(part, _)| part).collect();
+        let taken = taken.into_iter().map(|(part, _)| part).collect();
+        let before = std::mem::replace(&mut self.parts, taken);
+        self.without_last = match message.own {
+            true => before,
+            // A message that does not fit without the last one shows that it has arrived.
+            false => {
+                let without = after(&self.without_last, locals, message);
+                without.into_iter().map(|(part, _)| part).collect()
+            }
+        };
         Ok(roles)
     }
 
@@ -224,6 +269,24 @@ impl LocalRun {
         let local = locals.iter().find(|local| local.role == part.role)?;
         local.state(part.state)
     }
+}
+
+/// The parts after a message, and the roles of the other side.
+fn after(parts: &[Part], locals: &[Local], message: Observed<'_>) -> Vec<(Part, u8)> {
+    let with_local = || {
+        parts.iter().filter_map(|part| {
+            let local = locals.iter().find(|local| local.role == part.role);
+            Some((part, local?))
+        })
+    };
+    let taken = with_local().filter_map(|(part, local)| part.after(local, message));
+    let taken: Vec<(Part, u8)> = taken.collect();
+    if !taken.is_empty() || message.own {
+        return taken;
+    }
+    // An early message waits only if it fits no role now.
+    let kept = with_local().filter_map(|(part, local)| part.keeping(local, message));
+    kept.collect()
 }
 
 impl Part {

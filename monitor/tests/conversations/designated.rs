@@ -125,7 +125,9 @@ fn a_continuing_agent_receives_failure_reports() {
     stage.right(say("cfp ann>ben").reply_to(["dan"]));
     stage.right(say("propose ben>dan").reply_with("b"));
     stage.right(say("accept-proposal dan>ben").reply_with("d"));
-    let lost = say("failure host-mts>dan").in_reply_to("d");
+    let lost = say("failure host-mts>dan")
+        .undelivered_to("ben")
+        .in_reply_to("d");
     assert_eq!(stage.right(lost), "undelivered");
     assert_eq!(stage.right(say("accept-proposal dan>ben")), "accepted");
     assert_eq!(
@@ -298,7 +300,8 @@ fn an_answer_that_may_lead_to_several_states_is_not_checked() {
     let stranger = stage.wrong(own("confirm dan>cid"));
     assert_eq!(stranger.kind, Kind::WrongReceiver);
     // The same holds after an undelivered message.
-    assert_eq!(stage.right(own("failure host-mts>dan")), "elsewhere");
+    let lost = own("failure host-mts>dan").undelivered_to("ben");
+    assert_eq!(stage.right(lost), "elsewhere");
     assert_eq!(stage.check(&own("confirm dan>ben")), elsewhere);
 }
 

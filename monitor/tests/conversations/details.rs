@@ -24,9 +24,9 @@ fn expected_messages_are_those_of_the_concerned_participant() {
     stage.right(say("cfp ann>ben,cid"));
     stage.right(say("propose ben>ann"));
     // A message to each participant was not delivered, in different states.
-    stage.right(say("failure ams>ben"));
+    stage.right(say("failure ams>ben").undelivered_to("ann"));
     stage.right(say("refuse cid>ann"));
-    stage.right(say("failure ams>cid"));
+    stage.right(say("failure ams>cid").undelivered_to("ann"));
     let violation = stage.wrong(say("confirm ben>ann"));
     assert_eq!(violation.state.as_deref(), Some("undelivered"));
     assert_eq!(
@@ -151,7 +151,7 @@ fn an_answer_that_crossed_an_undelivered_cancel_is_accepted() {
     stage.right(request("cancel ann>ben"));
     // This may be the result or the answer to the cancel.
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
-    stage.right(request("failure ams>ben"));
+    stage.right(request("failure ams>ben").undelivered_to("ann"));
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
     assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
 }

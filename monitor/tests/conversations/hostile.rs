@@ -237,3 +237,86 @@ fn a_message_to_many_agents_is_judged_in_linear_steps() {
     let all = names("other ").chain(names("agent "));
     stage.right(say("reject-proposal ann>ben").receivers(all));
 }
+
+#[test]
+fn an_outsider_reports_no_undelivered_message() {
+    let of_dan = || {
+        let agent = Stage::new(Monitor::agent(library(), "dan"));
+        [agent, Stage::observer()]
+    };
+    for mut stage in of_dan() {
+        stage.right(say("cfp dan>cid"));
+        stage.right(say("cancel dan>cid"));
+        let forged = stage.wrong(say("failure mallory>dan"));
+        assert_eq!(forged.kind, Kind::Stranger);
+        assert_eq!(stage.right(say("refuse cid>dan")), "cancelling");
+        assert_eq!(stage.right(say("inform cid>dan")), "cancelled");
+    }
+    for mut stage in of_dan() {
+        stage.right(say("cfp dan>cid"));
+        stage.wrong(say("failure mallory>dan"));
+        assert_eq!(stage.wrong(say("cfp dan>cid")).kind, Kind::Unexpected);
+        assert_eq!(stage.right(say("propose cid>dan")), "proposed");
+        stage.wrong(say("failure mallory>cid"));
+        assert_eq!(stage.right(say("accept-proposal dan>cid")), "accepted");
+        // The service of an outsider reports messages to the outsider only.
+        stage.check(&say("failure mts>dan").undelivered_to("mallory"));
+        assert_eq!(stage.right(say("inform cid>dan")), "done");
+    }
+    // With a state for all participants.
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="i" to="B" target="2"/></state>
+        <state id="2"><transition performative="agree" from="B" to="i" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    let mut all = Library::standard();
+    all.add(Machine::read("plain", text).unwrap()).unwrap();
+    let own = |words| say_in("plain", words);
+    let mut stage = Stage::new(Monitor::observer(Arc::new(all)));
+    stage.right(own("request ann>ben"));
+    let forged = stage.wrong(own("failure mallory>ann"));
+    assert_eq!(forged.kind, Kind::Stranger);
+    let of_mallory = own("failure mts>ann").undelivered_to("mallory");
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_eq!(stage.check(&of_mallory), unknown);
+    assert_eq!(stage.right(own("agree ben>ann")), "3");
+    let lost = own("failure mts>ben").undelivered_to("ann");
+    assert_eq!(stage.right(lost), "undelivered");
+}
+
+#[test]
+fn a_report_of_a_service_is_no_violation_and_begins_nothing() {
+    let mut strict = Policy::default();
+    strict.unsolicited = true;
+    let monitor = Monitor::agent(library(), "ann").with_policy(strict);
+    let mut stage = Stage::new(monitor);
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    let lost = || request("failure mts>ann").undelivered_to("ben");
+    assert_eq!(stage.check(&lost()), unknown);
+    assert!(stage.monitor.is_empty());
+    // A service is no member of a multicast.
+    stage.right(say("cfp ann>arm_.*"));
+    let lost = say("failure mts>ann").undelivered_to("arm_1");
+    stage.right(lost);
+    assert_eq!(stage.monitor.len(), 1);
+}
+
+/// Within a second, the list of conversations is not sorted anew.
+#[test]
+fn the_oldest_conversation_of_a_peer_cannot_grow_beyond_its_share() {
+    let mut limits = Limits::default();
+    limits.bytes = 8 << 20;
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    let long = |number: usize| format!("{number}{}", "x".repeat(4_000));
+    let call = |id: usize, number| {
+        let header = say("cfp ann>ben").receivers([long(number)]);
+        header.conversation_id(format!("{id}"))
+    };
+    for id in 0..20 {
+        stage.right(call(id, id));
+    }
+    for number in 20..250 {
+        stage.right(call(0, number));
+        assert!(stage.monitor.bytes() <= 1 << 20);
+    }
+    assert!(stage.monitor.len() < 20);
+}

@@ -341,7 +341,11 @@ fn an_undelivered_letter_can_be_sent_again() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_with("1"));
     assert_eq!(
-        stage.right(request("failure host-mts>ann").in_reply_to("1")),
+        stage.right(
+            request("failure host-mts>ann")
+                .undelivered_to("ben")
+                .in_reply_to("1")
+        ),
         "undelivered"
     );
     assert_eq!(
@@ -349,22 +353,26 @@ fn an_undelivered_letter_can_be_sent_again() {
         "requested"
     );
     // The report does not name a message: it concerns the last one.
-    assert_eq!(stage.right(request("failure host-mts>ann")), "undelivered");
+    let lost = request("failure host-mts>ann").undelivered_to("ben");
+    assert_eq!(stage.right(lost), "undelivered");
     assert_eq!(
         stage.right(request("agree ben>ann")),
         "agreed",
         "it had arrived after all"
     );
-    // With several participants, only the content names the concerned one, so no state changes.
+    // With several participants, it concerns one of them.
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben,cid"));
-    stage.right(say("failure host-mts>ann"));
+    let lost = |receiver| say("failure host-mts>ann").undelivered_to(receiver);
+    assert_eq!(stage.right(lost("cid")), "undelivered");
     stage.right(say("propose ben>ann"));
+    assert_eq!(stage.right(say("cfp ann>cid")), "called");
+    // A report about an agent that takes no part changes nothing, and neither does a report to one.
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_eq!(stage.check(&lost("dan")), unknown);
+    let to_outsider = say("failure host-mts>dan").undelivered_to("cid");
+    assert_eq!(stage.check(&to_outsider), unknown);
     stage.right(say("propose cid>ann"));
-    assert_eq!(
-        stage.wrong(say("failure host-mts>dan")).kind,
-        Kind::Stranger
-    );
 }
 
 #[test]

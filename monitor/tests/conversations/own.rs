@@ -60,11 +60,12 @@ fn answers_are_not_checked_for_an_agent_that_a_reply_to_names() {
     for words in ["agree ben>dan", "agree ben>dan", "not-understood cid>dan"] {
         assert_eq!(stage.check(&say_in("fipa-query", words)), elsewhere);
     }
+    // It follows the earlier message of ben, or answers a cancel of ann.
     let answer = say_in("fipa-query", "inform ben>dan");
     let Verdict::Accepted(accepted) = stage.check(&answer) else {
         panic!("it follows the earlier message of ben");
     };
-    assert_eq!((accepted.state, accepted.elsewhere), ("answered", true));
+    assert_eq!((accepted.state, accepted.elsewhere), ("elsewhere", true));
     let bid = say_in("fipa-contract-net", "propose ben>dan");
     assert_eq!(stage.check(&bid.conversation_id("d")), elsewhere);
     assert_eq!(stage.monitor.len(), 2);
@@ -102,4 +103,27 @@ fn answers_are_not_checked_for_an_agent_that_a_reply_to_names() {
     let mut stage = Stage::observer();
     let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
     assert_eq!(wrong.kind, Kind::NotOpened);
+}
+
+#[test]
+fn after_a_restart_a_failure_may_answer_a_cancel_of_before() {
+    let subscribe = |words| say_in("fipa-subscribe", words);
+    let joined = || {
+        let monitor = Monitor::agent(library(), "ben").with_history(History::Unknown);
+        let mut stage = Stage::new(monitor);
+        let agree = subscribe("agree dan>ben").reply_with("2").in_reply_to("1");
+        stage.check(&agree);
+        stage
+    };
+    let mut stage = joined();
+    let answer = subscribe("failure dan>ben").in_reply_to("unseen");
+    assert_eq!(stage.right(answer), "elsewhere");
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    let informed = subscribe("inform dan>ben").reply_with("3");
+    assert_eq!(stage.check(&informed), elsewhere);
+    assert_eq!(stage.check(&subscribe("cancel ben>dan")), elsewhere);
+    // The agent knows its own cancel.
+    let mut stage = joined();
+    assert_eq!(stage.right(subscribe("cancel ben>dan")), "cancelling");
+    assert_eq!(stage.right(subscribe("inform dan>ben")), "cancelled");
 }

@@ -21,6 +21,8 @@ pub(crate) struct Words {
     pub(crate) reply_with: Option<String>,
     pub(crate) in_reply_to: Option<String>,
     pub(crate) reply_to: Vec<&'static str>,
+    /// The agent that did not get a message, if this is the report of a service.
+    pub(crate) undelivered_to: Option<&'static str>,
     /// Milliseconds.
     pub(crate) reply_by: Option<u64>,
 }
@@ -101,6 +103,7 @@ impl<'l> Reference<'l> {
     pub(crate) fn check(&mut self, words: &Words, now: u64) -> ReferenceVerdict {
         let mut own = words.clone();
         own.to = Vec::new();
+        own.undelivered_to = words.undelivered_to.filter(|_| words.act == "failure");
         for name in &words.to {
             if !own.to.contains(name) {
                 own.to.push(name);
@@ -114,6 +117,9 @@ impl<'l> Reference<'l> {
             own.to = vec![agent];
         }
         let verdict = self.check_own(&own, now);
+        if own.undelivered_to.is_some() && matches!(verdict, ReferenceVerdict::Violation(_)) {
+            return ReferenceVerdict::Unchecked;
+        }
         if !matches!(verdict, ReferenceVerdict::Violation(_)) {
             return verdict;
         }
@@ -151,6 +157,7 @@ impl<'l> Reference<'l> {
             .max();
         let at = match best {
             Some((2, .., at)) => Some(at),
+            _ if words.undelivered_to.is_some() => return ReferenceVerdict::Unchecked,
             Some((.., at)) if !words.begins_in(library) => {
                 Some(at).filter(|_| !self.removed.contains(&words.id))
             }
@@ -194,7 +201,7 @@ impl<'l> Reference<'l> {
         }
         match self.agent {
             Some(agent) if agent != words.from => {
-                if is_answer(machine, words.act) {
+                if shows_initiator(machine, words.act) {
                     evict_alike(alike, &mut self.removed, words, self.agent);
                     let joined = Conversation::joined(machine, agent, words, now);
                     alike.push(joined);
@@ -304,6 +311,25 @@ fn begins(machine: &Machine, act: &str) -> bool {
     first.iter().any(|first| matches(first.performative(), act))
 }
 
+/// Whether the performative is an answer, and no message of the initiator.
+fn shows_initiator(machine: &Machine, act: &str) -> bool {
+    act == "not-understood" || is_answer(machine, act) && !is_sent_by_initiator(machine, act)
+}
+
+/// Whether the initiator sends the performative to another agent in any state.
+fn is_sent_by_initiator(machine: &Machine, act: &str) -> bool {
+    let states = machine.states().iter();
+    let mut all = states.flat_map(|state| state.transitions());
+    let initiator = machine.initiator();
+    act == "cancel"
+        || all.any(|step| {
+            let mut others = machine.roles().iter().filter(|role| *role != initiator);
+            matches(step.performative(), act)
+                && matches(step.from(), initiator)
+                && others.any(|role| matches(step.to(), role))
+        })
+}
+
 /// Whether the performative is an answer in any state.
 fn is_answer(machine: &Machine, act: &str) -> bool {
     let mut all = machine
@@ -347,19 +373,20 @@ impl<'l> Conversation<'l> {
     fn rank(&self, words: &Words) -> u8 {
         let all = || std::iter::once(self).chain(&self.inner);
         let has = |one: &Self, name: &str| one.takes_part(name) || one.designated.contains(&name);
-        if !all().any(|one| one.multicast.is_some() || has(one, words.from)) {
+        let from = words.undelivered_to.unwrap_or(words.from);
+        if !all().any(|one| one.multicast.is_some() || has(one, from)) {
             return 0;
         }
         let receives = |one: &Self| words.to.iter().any(|name| has(one, name));
         let linked = |one: &Self| {
             let multicast = one.multicast.is_some();
             if one.machine.scope() == Scope::Conversation {
-                return (multicast || has(one, words.from)) && receives(one);
+                return (multicast || has(one, from)) && receives(one);
             }
             let leads = |name: &str| one.initiator == name || one.designated.contains(&name);
             let answers = |name: &str| multicast || one.place(name).is_some();
-            leads(words.from) && words.to.iter().any(|name| answers(name))
-                || answers(words.from) && words.to.iter().any(|name| leads(name))
+            leads(from) && words.to.iter().any(|name| answers(name))
+                || answers(from) && words.to.iter().any(|name| leads(name))
         };
         let across = !self.inner.is_empty() && all().any(receives);
         1 + u8::from(all().any(linked) || across)
@@ -436,19 +463,8 @@ impl<'l> Conversation<'l> {
             false
         } else if self.agent == Some(words.from) {
             let mut unknown = self.talks.iter().filter(|(_, talk)| talk.is_unknown());
-            let mut all = machine
-                .states()
-                .iter()
-                .flat_map(|state| state.transitions());
-            let initiator = machine.initiator();
             unknown.any(|(peer, _)| peer.is_empty() || words.to.contains(peer))
-                && (["cancel", "not-understood"].contains(&words.act)
-                    || all.any(|step| {
-                        let mut others = machine.roles().iter().filter(|role| *role != initiator);
-                        matches(step.performative(), words.act)
-                            && matches(step.from(), initiator)
-                            && others.any(|role| matches(step.to(), role))
-                    }))
+                && (words.act == "not-understood" || is_sent_by_initiator(machine, words.act))
         } else if is_answer(machine, words.act) {
             self.learn(words, now);
             true
@@ -478,7 +494,10 @@ impl<'l> Conversation<'l> {
             }
             _ => {
                 let verdict = self.check(words, now);
-                let verdict = verdict.or_else(|wrong| self.elsewhere(words, wrong, now));
+                let verdict = verdict.or_else(|wrong| match words.undelivered_to {
+                    Some(_) => Ok(ReferenceVerdict::Unchecked),
+                    None => self.elsewhere(words, wrong, now),
+                });
                 return verdict.map_err(|wrong| (wrong, true));
             }
         };
@@ -539,7 +558,7 @@ impl<'l> Conversation<'l> {
                 && self.others_may_begin(library, name, agent)
             {
                 let machine = library.find(name).filter(|_| words.from != agent);
-                let machine = machine.filter(|machine| is_answer(machine, words.act));
+                let machine = machine.filter(|machine| shows_initiator(machine, words.act));
                 if let Some(machine) = machine.filter(|_| self.inner.len() < 64) {
                     let joined = Conversation::joined(machine, agent, words, now);
                     self.touched = now;
@@ -723,7 +742,9 @@ impl Conversation<'_> {
         let designated = self.designated.contains(&words.from);
         if words.from == self.initiator {
             self.check_initiator(words, now)
-        } else if self.multicast.is_some() || self.place(words.from).is_some() {
+        } else if self.place(words.from).is_some()
+            || self.multicast.is_some() && words.undelivered_to.is_none()
+        {
             match self.check_participant(words, now) {
                 // The other of the two parts of the sender may fit.
                 Err(wrong) if designated => {
@@ -758,7 +779,18 @@ impl Conversation<'_> {
         if words.to.iter().any(addressed) {
             return Err("wrong-receiver");
         }
-        let step = judge(machine, &talk, &self.view(words, false))?;
+        let mut step = judge(machine, &talk, &self.view(words, false))?;
+        // It may answer a cancel of before the monitored agent joined.
+        if self.joined
+            && machine.cancel() != Cancel::Nobody
+            && ["inform", "failure"].contains(&words.act)
+            && matches!(step.spot, Spot::At(_))
+            && !step.void
+            && !step.answers_cancel
+            && talk.last_of(true).is_none()
+        {
+            step = talk::to(Spot::Elsewhere);
+        }
         if let Some(at) = known {
             self.guards(&[(self.talks[at].0, &step)], words, false)?;
         }
@@ -902,15 +934,19 @@ impl Conversation<'_> {
         }
     }
 
-    /// Checks a message of an outside agent: a failure report of a message transport service, or a
-    /// violation.
+    /// Checks a message of an outside agent: the report of a message transport service, or a violation.
     fn reported_from_outside(&mut self, words: &Words) -> Result<ReferenceVerdict, &'static str> {
         let takes_part = |name: &str| {
             name == self.initiator || self.designated.contains(&name) || self.place(name).is_some()
         };
-        if words.act != "failure" || !words.to.iter().all(|name| takes_part(name)) {
+        let Some(lost) = words.undelivered_to else {
+            return Err("stranger");
+        };
+        if !words.to.iter().all(|name| takes_part(name)) {
             return Err("stranger");
         }
+        let lost_place = self.place(lost);
+        let leads = lost == self.initiator || self.designated.contains(&lost);
         let (mut first, mut failed) = (None, Vec::new());
         let before: Vec<(&str, Talk)> = self.talks.clone();
         for name in &words.to {
@@ -930,7 +966,8 @@ impl Conversation<'_> {
                     let answers = words.in_reply_to.is_none()
                         || asked.is_none()
                         || asked == words.in_reply_to;
-                    talk.last_by_initiator() == side && answers
+                    let reached = if side { lost_place == Some(*at) } else { leads };
+                    reached && talk.last_by_initiator() == side && answers
                 })
                 .collect();
             if let [only] = concerned[..] {
@@ -976,6 +1013,17 @@ impl Conversation<'_> {
         let by_initiator = words.from == self.initiator || goes_on;
         let knows = |name: &str| !held(name).is_empty();
         let unknown = |name: &str| may(name).is_empty();
+        if let Some(lost) = words.undelivered_to
+            && held(words.from).is_empty()
+        {
+            if words.to.iter().any(|name| may(name).is_empty()) {
+                return Err("stranger");
+            }
+            if !held(lost).is_empty() {
+                self.talks[0].1.fail();
+            }
+            return Ok(self.verdict(Some(0), false, false));
+        }
         let view = View {
             from: may(words.from),
             to: to_roles,
@@ -986,10 +1034,6 @@ impl Conversation<'_> {
         let strange = words.to.iter().any(|name| unknown(name));
         let step = match judge(machine, &self.talks[0].1, &view) {
             Ok(step) => step,
-            Err(_) if unknown(words.from) && words.act == "failure" && !strange => {
-                self.talks[0].1.fail();
-                return Ok(self.verdict(Some(0), false, false));
-            }
             Err(_) if unknown(words.from) => return Err("stranger"),
             Err("unexpected" | "out-of-order") if strange => return Err("wrong-receiver"),
             Err(wrong) => return Err(wrong),

@@ -148,6 +148,14 @@ impl Talk {
         known.len() == 6 || known.contains(&text)
     }
 
+    /// The `reply-with` of the question before the last message.
+    fn asked_before(&self, initiator: bool) -> Option<&str> {
+        let said = self.said.iter().rev();
+        let own = said
+            .filter(|said| said.by_initiator == initiator && !said.cancels && !said.answers_cancel);
+        own.skip(1).find_map(|said| said.reply_with.as_deref())
+    }
+
     pub(super) fn cancel(&self) -> Option<&SentMessage> {
         self.said.iter().rev().find(|said| said.cancels)
     }
@@ -440,6 +448,9 @@ pub(super) fn judge_at(
             .and_then(|said| said.reply_with.as_ref());
         if let (true, Some(asked), Some(answer)) = (view.compares, asked, &words.in_reply_to)
             && asked != answer
+            // A message that crossed the not-understood answers the message before it.
+            && !(matches!(talk.spot, Spot::NotUnderstood(_))
+                && talk.asked_before(!view.by_initiator) == Some(answer))
         {
             return match talk.asked_earlier(!view.by_initiator, answer) {
                 true if !view.own => Ok(Step {
@@ -468,6 +479,19 @@ pub(super) fn judge_at(
     }
     let over = is_over(machine, id);
     let received_last = talk.last_by_initiator() != view.by_initiator;
+    let ended_by = talk.last_of(!view.by_initiator);
+    let ends_crossed = !view.own
+        && !over
+        && ended_by.is_some_and(|said| {
+            let states = machine.states().iter();
+            let mut steps = states.flat_map(|state| super::options(machine, state.id()));
+            steps.any(|step| {
+                machine.target(step) == id
+                    && matches(step.performative(), said.act)
+                    && (step.from() == ".*"
+                        || view.to.iter().any(|role| matches(step.from(), role)))
+            })
+        });
     if view.known && talk.said.iter().any(|said| !said.cancels) {
         let may_cancel = match machine.cancel() {
             Cancel::Initiator => view.by_initiator,
@@ -475,7 +499,7 @@ pub(super) fn judge_at(
             _ => false,
         };
         match words.act {
-            "not-understood" if !here.is_final() || received_last => {
+            "not-understood" if !here.is_final() || received_last || ends_crossed => {
                 return Ok(to(Spot::NotUnderstood(id.to_owned())));
             }
             "cancel" if may_cancel && (!over || (received_last && !view.own)) => {

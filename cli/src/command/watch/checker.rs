@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use fipa::watch::{Fate, Passage};
-use fipa::{DirectoryView, Message, Outcome};
+use fipa::{DeliveryFailure, DirectoryView, Message, Outcome};
 use fipa_monitor::{
     Event, Header, History, Library, LibraryError, Monitor, Unchecked, Verdict, Violation,
 };
@@ -97,11 +97,17 @@ impl<'a> Letter<'a> {
             message: passage.message.as_ref(),
             receiver: &passage.receiver,
             at: passage.at,
-            from_service: passage.from_service,
+            from_service: passage.from_service || is_report_of_elsewhere(passage),
             undelivered: matches!(passage.fate, Fate::Settled(Outcome::Failed { .. })),
             may_continue: earlier.may_have_begun(passage),
         }
     }
+}
+
+/// Whether a service of another host, which sends no records, probably wrote the letter.
+fn is_report_of_elsewhere(passage: &Passage) -> bool {
+    let message = passage.message.as_ref().filter(|_| passage.from_elsewhere);
+    message.and_then(DeliveryFailure::read).is_some()
 }
 
 /// The agents that were registered before the observation began: conversations among them may have begun
