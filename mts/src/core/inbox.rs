@@ -215,14 +215,15 @@ impl Inbox {
     }
 
     fn remember(&mut self, now: Instant, sender: Incarnation, sequence: u64) -> Result<(), Answer> {
-        if self.senders.len() >= MAX_SENDERS && !self.senders.contains_key(&sender) {
+        // Not for each letter while there are too many senders: it visits all of them.
+        if self.next_sweep.is_none_or(|due| due <= now) {
             self.forget_old(now);
-            if self.senders.len() >= MAX_SENDERS {
-                return Err(Answer::failed(
-                    FailureReason::Refused,
-                    format!("{MAX_SENDERS} senders have written within the longest deadline"),
-                ));
-            }
+        }
+        if self.senders.len() >= MAX_SENDERS && !self.senders.contains_key(&sender) {
+            return Err(Answer::failed(
+                FailureReason::Refused,
+                format!("{MAX_SENDERS} senders have written within the longest deadline"),
+            ));
         }
         let taken = self.senders.entry(sender).or_insert_with(|| SenderState {
             last: 0,
@@ -234,9 +235,6 @@ impl Inbox {
             taken.recent.pop_front();
         }
         taken.recent.push_back(sequence);
-        if self.next_sweep.is_none_or(|due| due <= now) {
-            self.forget_old(now);
-        }
         Ok(())
     }
 
@@ -349,6 +347,34 @@ mod tests {
         assert_eq!(offer(&mut inbox, 3, 0), Answer::Accepted);
         assert_eq!(offer(&mut inbox, 9, 5), Answer::Accepted);
         assert_eq!(inbox.len(), 3);
+    }
+
+    #[test]
+    fn letters_of_too_many_senders_visit_them_once_a_minute() {
+        let mut inbox = inbox(2 * MAX_SENDERS);
+        let began = Instant::now();
+        let mut offer = |sender: usize, seconds: u64| {
+            let mut parcel = parcel(1, 0);
+            parcel.stream.sender = Incarnation::from_u64(1 + sender as u64);
+            let at = began + Duration::from_secs(seconds);
+            let hop = (Kind::Shm, &back());
+            inbox.accept(at, &parcel, Letter::default(), hop, None)
+        };
+        let refused = |answer| matches!(answer, Answer::Failed { .. });
+        for sender in 0..MAX_SENDERS {
+            assert_eq!(offer(sender, 0), Answer::Accepted);
+        }
+        assert!(refused(offer(MAX_SENDERS, 61)));
+        work::taken();
+        for sender in 0..1000 {
+            assert!(refused(offer(MAX_SENDERS + sender, 62)));
+        }
+        assert!(work::taken() < 1000);
+        // Known senders are not refused, and new ones are accepted when old ones are forgotten.
+        assert_eq!(offer(7, 62), Answer::Accepted);
+        let forgotten = MAX_DEADLINE.as_secs() * 2;
+        assert_eq!(offer(MAX_SENDERS, forgotten), Answer::Accepted);
+        assert!(!refused(offer(7, forgotten)));
     }
 
     #[test]
