@@ -3,6 +3,7 @@
 //! With [`Scope::Participant`], each participant has a [`Party`] with a state of its own. With
 //! [`Scope::Conversation`], there is one party without a participant, and a list of role bindings.
 
+use fipa_acl::Performative;
 use hashbrown::HashTable;
 use smallvec::SmallVec;
 
@@ -895,16 +896,14 @@ fn by_default(
     match message.act {
         NOT_UNDERSTOOD => {
             // It may have crossed the message that ended the protocol, if others can still follow.
-            let ended_by = party.acts[side_index(message.side.opposite())].checked_sub(1);
+            let ended_by = standard_act(party.acts[side_index(message.side.opposite())]);
             let ends = |step: &Transition| {
-                let act = ended_by.map(Act::Standard);
                 step.target == state
                     && step.from.includes(message.to)
-                    && act.is_some_and(|act| step.acts.contains(act))
+                    && ended_by.is_some_and(|act| step.acts.contains(act))
             };
             let has_crossed = !message.own
                 && !here.is_over()
-                && ended_by.is_some_and(|act| act < 22)
                 && machine.states.iter().flat_map(|it| &it.steps).any(ends);
             let may = !has_ended || answers_last || has_crossed;
             may.then(|| NextState::not_understood_in(state))
@@ -983,6 +982,12 @@ pub(crate) fn act_number(act: Act<'_>) -> u8 {
         Act::Standard(number) => number + 1,
         Act::Other(_) => u8::MAX,
     }
+}
+
+/// Returns the standard performative with this [`act_number`].
+fn standard_act(number: u8) -> Option<Act<'static>> {
+    let index = number.checked_sub(1)?;
+    (usize::from(index) < Performative::STANDARD.len()).then_some(Act::Standard(index))
 }
 
 fn wrong(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_>) -> Kind {

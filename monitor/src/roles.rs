@@ -161,13 +161,14 @@ impl Monitor {
         let (free, message) = observed_by_role(machine, conversation, &self.names, observed);
         let peers = message.peers;
         let takes_part = observed.own || conversation.takes_part(&self.names, observed.sender);
-        let sent = LastSent {
+        let bound = conversation.bound.len();
+        let last_sent = |ends, bound_after| LastSent {
             act: act_number(observed.act),
             reply_with: observed.reply_with,
             state,
-            ends: false,
-            bound: conversation.bound.len(),
-            bound_after: 0,
+            ends,
+            bound,
+            bound_after,
         };
         let Some(run) = conversation.rare().local.as_mut() else {
             return fault(Kind::NotOpened, state);
@@ -196,10 +197,7 @@ impl Monitor {
                 let bound_after = conversation.bound.len();
                 let rare = conversation.rare();
                 if observed.own {
-                    rare.last_sent = Some(LastSent {
-                        bound_after,
-                        ..sent
-                    });
+                    rare.last_sent = Some(last_sent(false, bound_after));
                 } else if rare.local.as_ref().is_none_or(|run| !run.has_last()) {
                     rare.last_sent = None;
                 }
@@ -216,11 +214,7 @@ impl Monitor {
                 if let Some(party) = conversation.parties.first_mut() {
                     party.state = AFTER_NOT_UNDERSTOOD;
                 }
-                conversation.rare().last_sent = observed.own.then_some(LastSent {
-                    ends: true,
-                    bound_after: sent.bound,
-                    ..sent
-                });
+                conversation.rare().last_sent = observed.own.then(|| last_sent(true, bound));
                 let passed = Passed::in_state_of(conversation, machine, index);
                 self.touch(at, now.millis());
                 Ok(passed)

@@ -758,7 +758,12 @@ async fn the_removal_of_watched_files_is_reported() {
     std::fs::remove_file(&child).unwrap();
     one.disturbed().await;
     // The watches of the directory itself still work.
-    let mut victim = Process::start(&dir);
+    notices_a_killed_process(&one, &dir).await;
+}
+
+/// Starts a process with an agent in this directory, kills it, and waits until the agent has left.
+async fn notices_a_killed_process(one: &HostDirectory, dir: &Path) {
+    let mut victim = Process::start(dir);
     assert_eq!(victim.ask("register foot"), "ok");
     assert!(one.lookup("foot").is_some());
     victim.kill();
@@ -804,14 +809,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
         assert!(one.lookup(way).is_some());
         drop(newcomer);
         // The watcher of the new directory.
-        let mut victim = Process::start(&dir);
-        assert_eq!(victim.ask("register foot"), "ok");
-        assert!(one.lookup("foot").is_some());
-        victim.kill();
-        until_some_async("its end is noticed", || {
-            one.known("foot").is_none().then_some(())
-        })
-        .await;
+        notices_a_killed_process(&one, &dir).await;
     }
     one.deregister("arm", arm.incarnation).unwrap();
     drop(one);

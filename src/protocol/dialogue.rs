@@ -460,8 +460,7 @@ impl Dialogue {
         }
     }
 
-    fn interpret(&mut self, incoming: Incoming) -> Result<Interpreted, DialogueError> {
-        let mut incoming = incoming;
+    fn interpret(&mut self, mut incoming: Incoming) -> Result<Interpreted, DialogueError> {
         let undelivered_to = incoming.undelivered_to.take();
         let (message, violation) = incoming.into_parts();
         if let Some(sender) = message.sender() {

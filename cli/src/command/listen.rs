@@ -57,12 +57,8 @@ async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         ))?,
     }
     let print_all = async {
-        let mut received = 0;
-        while arguments
-            .receiver
-            .count
-            .is_none_or(|count| received < count)
-        {
+        let (mut received, count) = (0, arguments.receiver.count);
+        while count.is_none_or(|count| received < count) {
             let incoming = agent.receive().await.map_err(|error| {
                 Failure::failed(
                     ErrorChain(&error).to_string(),

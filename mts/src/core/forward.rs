@@ -83,6 +83,15 @@ enum Receiver {
     Unknown(Arc<str>),
 }
 
+impl Receiver {
+    fn name(&self) -> &Arc<str> {
+        match self {
+            Self::Here(entry) => &entry.name,
+            Self::Unknown(name) => name,
+        }
+    }
+}
+
 impl Unframed {
     /// Parses the letter, which came from this source, and looks up its receivers. Refresh the
     /// directory before, and do not lock the core.
@@ -473,28 +482,22 @@ impl Core {
             }
         }
         for _ in 0..UNFRAMED_PORTION {
+            let Some(receiver) = unframed.receivers.pop_front() else {
+                break;
+            };
             work::steps(1);
-            let why = match (unframed.receivers.pop_front(), &unframed.fault) {
-                (None, _) => break,
-                (Some(Receiver::Here(entry)), None) => {
-                    self.unframed_arrived(now, deadline, unframed, &entry);
+            let why = match (&receiver, &unframed.fault) {
+                (_, Some(fault)) => (FailureReason::Refused, fault.clone()),
+                (Receiver::Here(entry), None) => {
+                    self.unframed_arrived(now, deadline, unframed, entry);
                     continue;
                 }
-                (Some(Receiver::Here(entry)), Some(fault)) => (
-                    Arc::clone(&entry.name),
-                    FailureReason::Refused,
-                    fault.clone(),
-                ),
-                (Some(Receiver::Unknown(name)), Some(fault)) => {
-                    (name, FailureReason::Refused, fault.clone())
-                }
-                (Some(Receiver::Unknown(name)), None) => {
+                (Receiver::Unknown(name), None) => {
                     tracing::info!(receiver = %name, from = %unframed.from.address, "cannot deliver an unframed letter: no agent of this host has the name");
-                    (name, FailureReason::NoSuchAgent, String::new())
+                    (FailureReason::NoSuchAgent, String::new())
                 }
             };
-            let (receiver, reason, detail) = why;
-            self.unframed_failed(&receiver, unframed, (reason, detail));
+            self.unframed_failed(receiver.name(), unframed, why);
         }
         self.send_failures(now);
     }

@@ -1,4 +1,4 @@
-//! What several test files use: a letter, and a transport without peers.
+//! Support for the tests of the core and its runtime: a letter, and a transport without peers.
 
 #![allow(dead_code, reason = "each test file uses a part")]
 

@@ -125,8 +125,8 @@ impl MdnsDirectory {
     pub const MAX_BYTES: usize = 16 << 20;
     /// Maximum number of DNS records in the cache of the mDNS library, each of at most 9,000 bytes.
     /// The library keeps records of packets that introduce no service forever. The cache is checked
-    /// every two to three seconds while packets arrive; beyond this limit the library is restarted, and this gateway's agents are
-    /// announced again without a goodbye.
+    /// every two to three seconds while packets arrive; beyond this limit the library is restarted,
+    /// and this gateway's agents are announced again without a goodbye.
     pub const MAX_CACHED: u64 = restart::MAX_CACHED;
 
     /// Opens the directory; a task of the current tokio runtime keeps the view up to date. Failing

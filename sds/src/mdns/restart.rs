@@ -3,10 +3,10 @@
 //! This crate does not browse with the library ([`super::browse`]), but the library caches received
 //! records all the same, and keeps those of packets that introduce no service forever. Its cache
 //! has no limit and cannot be cleared. The cache size is therefore checked every two to three seconds
-//! while the process works ([`CacheCheck`]). A library whose cache is too large is stopped without a goodbye, and a new one is started, to
-//! which this gateway's own agents are registered again. The pause in between grows while the flood
-//! continues, which bounds the memory and the rate of repeated announcements. The entries of other
-//! gateways' agents are not affected.
+//! while the process works ([`CacheCheck`]). A library whose cache is too large is stopped without a
+//! goodbye, and a new one is started, to which this gateway's own agents are registered again. The
+//! pause in between grows while the flood continues, which bounds the memory and the rate of repeated
+//! announcements. The entries of other gateways' agents are not affected.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
