@@ -171,7 +171,7 @@ async fn send_all(rover: Arc<Agent>, moved: Arc<AtomicUsize>) -> BTreeMap<usize,
         });
     }
     drop(room.acquire_many(UNDER_WAY as u32).await.unwrap());
-    Arc::into_inner(outcomes).unwrap().into_inner()
+    std::mem::take(&mut outcomes.lock())
 }
 
 fn check(outcomes: &BTreeMap<usize, Outcome>, taken: &[usize]) {
