@@ -9,8 +9,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Abandoned, AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, TransportError,
-    TransportErrorKind,
+    Abandoned, AttemptId, Incarnation, Location, Parcel, Sink, TransportError, TransportErrorKind,
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
@@ -26,9 +25,9 @@ use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
 use crate::loan::ShmLoan;
 use crate::memory::{Budget, SHM};
-use crate::outbox::{MemoryLock, Opening, Outbox};
+use crate::outbox::{AnswerLook, MemoryLock, Opening, Outbox};
 use crate::peer_segments::PeerSegments;
-use crate::peers::{BacklogLimits, BacklogStep, Dispatched, OpenOutbox, Peer};
+use crate::peers::{BacklogLimits, BacklogStep, Concluded, Dispatched, OpenOutbox, Peer};
 use crate::pool::Pool;
 use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, wait_for_polls};
 use crate::storage::{self, Shortage};
@@ -236,7 +235,10 @@ impl Endpoint {
             let polling = presence.page().words().begin_polling();
             // Several times, so that the page states "polling" most of the time in a caller's loop.
             // A round after the first one has a reason to look into the mailbox.
-            found |= (0..POLLS_PER_ROUND).any(|poll| self.work(round > 0 && poll == 0));
+            found |= (0..POLLS_PER_ROUND).any(|poll| match poll {
+                0 => self.look(round > 0, AnswerLook::Thorough),
+                _ => self.look(false, AnswerLook::Quick),
+            });
             self.wait_for_answered();
             drop(polling);
             // Work that arrived meanwhile is done in the next round, in which the page states
@@ -319,19 +321,29 @@ impl Endpoint {
     /// into the mailbox if a parcel was announced, or with `unannounced` in any case. If another
     /// thread works, that one makes another pass instead.
     pub(crate) fn work(self: &Arc<Self>, unannounced: bool) -> bool {
+        self.look(unannounced, AnswerLook::Thorough)
+    }
+
+    fn look(self: &Arc<Self>, unannounced: bool, answers: AnswerLook) -> bool {
         self.inbox.work(|inbox| match (inbox, self.sink.get()) {
-            (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink, unannounced),
+            (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink, unannounced, answers),
             _ => false,
         })
     }
 
-    fn work_once(self: &Arc<Self>, inbox: &mut Inbox, sink: &dyn Sink, unannounced: bool) -> bool {
+    fn work_once(
+        self: &Arc<Self>,
+        inbox: &mut Inbox,
+        sink: &dyn Sink,
+        unannounced: bool,
+        answers: AnswerLook,
+    ) -> bool {
         let mut found = inbox.drain(sink, &self.answered, unannounced);
         if self.ended.swap(false, Ordering::SeqCst) || self.waits_for_answers() {
-            let mut concluded = Vec::new();
+            let mut concluded = Concluded::new();
             let mut ended = Vec::new();
             for peer in self.peers.read().values() {
-                if peer.collect(&mut concluded) {
+                if peer.collect(answers, &mut concluded) {
                     ended.push(peer.incarnation());
                 }
             }
@@ -405,7 +417,7 @@ impl Endpoint {
     fn serve_backlog(&self, peer: &Peer) {
         let mut lock = None;
         loop {
-            let mut concluded = Vec::new();
+            let mut concluded = Concluded::new();
             let step = peer.send_next(lock.take(), &mut concluded);
             match step {
                 BacklogStep::Sent => self.wake_for_parcel(peer),
@@ -671,7 +683,7 @@ impl Endpoint {
         });
     }
 
-    fn report(&self, concluded: Vec<(AttemptId, Conclusion)>) {
+    fn report(&self, concluded: Concluded) {
         if let Some(sink) = self.sink.get() {
             report_conclusions(&**sink, concluded);
         }
@@ -691,7 +703,7 @@ impl Endpoint {
         peers.iter().for_each(|peer| peer.retire());
         wait_for_polls(peers.iter().filter_map(|peer| peer.untaken()), || false);
         drop(peers);
-        let mut concluded = Vec::new();
+        let mut concluded = Concluded::new();
         let peers = {
             let mut inbox = self.inbox.lock();
             // First the mailbox closes, then peers detect the end, then the own letters are
@@ -720,7 +732,7 @@ const POLLS_PER_ROUND: usize = 8;
 /// Maximum number of rounds of [`Endpoint::drive`] while there is work.
 const MAX_ROUNDS: usize = 4;
 
-fn report_conclusions(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) {
+fn report_conclusions(sink: &dyn Sink, concluded: Concluded) {
     for (attempt, conclusion) in concluded {
         sink.concluded(attempt, conclusion);
     }

@@ -29,6 +29,7 @@ use crate::layout::{
 };
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
+use crate::peers::Concluded;
 use crate::pool::Pool;
 use crate::presence::StatusPage;
 use crate::storage;
@@ -129,6 +130,17 @@ pub(crate) enum Posted {
     Retired,
     /// The parcel needs more memory, and another process is allocating some.
     Contended,
+}
+
+/// The way of looking for answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum AnswerLook {
+    /// For answers on the connections that are open.
+    Quick,
+    /// Also for new connections, and for parcels that were dropped without an answer.
+    Thorough,
+    /// As `Thorough`, after the end of the process: no further answer will come.
+    Ended,
 }
 
 /// The lock under which memory is allocated.
@@ -572,21 +584,21 @@ impl Outbox {
 
     /// Collects the available answers. `ended` states that the other process has ended, so that no
     /// further answer comes.
-    pub(crate) fn collect(&self, ended: bool, concluded: &mut Vec<(AttemptId, Conclusion)>) {
+    pub(crate) fn collect(&self, look: AnswerLook, concluded: &mut Concluded) {
         if self.waiting() == 0 {
             return;
         }
         // The receiver answers in order, or drops parcels unanswered.
-        while let Some((sent, conclusion)) = self.concluded(ended) {
+        while let Some((sent, conclusion)) = self.concluded(look) {
             sent.forget();
             concluded.push((sent.attempt, conclusion));
             // Dropped outside of the lock: this may be the last owner of a letter.
         }
     }
 
-    fn concluded(&self, ended: bool) -> Option<(Sent, Conclusion)> {
+    fn concluded(&self, look: AnswerLook) -> Option<(Sent, Conclusion)> {
         let mut state = self.state.lock();
-        let conclusion = state.queue.front()?.conclusion(ended)?;
+        let conclusion = state.queue.front()?.conclusion(look)?;
         let sent = state.queue.pop_front()?;
         self.waiting.decrement();
         Some((sent, conclusion))
@@ -664,15 +676,19 @@ impl Sent {
         }
     }
 
-    fn conclusion(&self, ended: bool) -> Option<Conclusion> {
-        let look = |pending: &Pending| self.conclusion_of(pending, ended);
+    fn conclusion(&self, look: AnswerLook) -> Option<Conclusion> {
+        let look = |pending: &Pending| self.conclusion_of(pending, look);
         match &self.memory {
             SentMemory::Own(pending) | SentMemory::Referring { pending, .. } => look(pending),
             SentMemory::Loaned(loan) => loan.with_pending(look).flatten(),
         }
     }
 
-    fn conclusion_of(&self, pending: &Pending, ended: bool) -> Option<Conclusion> {
+    fn conclusion_of(&self, pending: &Pending, look: AnswerLook) -> Option<Conclusion> {
+        if look == AnswerLook::Quick && !pending.has_response() {
+            return None;
+        }
+        let ended = look == AnswerLook::Ended;
         let broken = |detail: String| {
             Some(Conclusion::Unconfirmed(TransportError::new(
                 TransportErrorKind::Broken,

@@ -9,12 +9,16 @@ use fipa_transport::{
     Abandoned, AttemptId, Body, Conclusion, Incarnation, Parcel, TransportError, TransportErrorKind,
 };
 use parking_lot::Mutex;
+use smallvec::SmallVec;
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
 use crate::errors::{closed, opening, retired};
-use crate::outbox::{MemoryLock, Outbox, Posted};
+use crate::outbox::{AnswerLook, MemoryLock, Outbox, Posted};
 use crate::presence::{PeerProcess, SharedFd, StatusPage, has_ended};
+
+/// Attempts that have ended. Most polls end few.
+pub(crate) type Concluded = SmallVec<[(AttemptId, Conclusion); 4]>;
 
 /// A value that the count of polls does not reach.
 const NEVER: u64 = u64::MAX;
@@ -168,7 +172,7 @@ impl Peer {
     pub(crate) fn send_next(
         &self,
         lock: Option<OwnedFd>,
-        concluded: &mut Vec<(AttemptId, Conclusion)>,
+        concluded: &mut Concluded,
     ) -> BacklogStep {
         let mut guard = self.line.lock();
         let line = &mut *guard;
@@ -203,21 +207,13 @@ impl Peer {
     }
 
     /// Concludes the first parcel of the backlog as not sent.
-    pub(crate) fn fail_next(
-        &self,
-        error: TransportError,
-        concluded: &mut Vec<(AttemptId, Conclusion)>,
-    ) {
+    pub(crate) fn fail_next(&self, error: TransportError, concluded: &mut Concluded) {
         let failed = self.line.lock().backlog.pop();
         concluded.extend(failed.map(|(attempt, _)| (attempt, Conclusion::NotSent(error))));
     }
 
     /// Concludes all parcels of the backlog as not sent, and ends the claim to serve it.
-    pub(crate) fn fail_backlog(
-        &self,
-        error: &TransportError,
-        concluded: &mut Vec<(AttemptId, Conclusion)>,
-    ) {
+    pub(crate) fn fail_backlog(&self, error: &TransportError, concluded: &mut Concluded) {
         let mut line = self.line.lock();
         line.is_served = false;
         let failed = line.backlog.take();
@@ -241,13 +237,14 @@ impl Peer {
     }
 
     /// Collects the available answers. Returns whether the process has ended and nothing is left.
-    pub(crate) fn collect(&self, concluded: &mut Vec<(AttemptId, Conclusion)>) -> bool {
+    pub(crate) fn collect(&self, look: AnswerLook, concluded: &mut Concluded) -> bool {
         // Read first: an answer from before the end is then found below.
         let ended = self.ended.load(Ordering::SeqCst);
+        let look = if ended { AnswerLook::Ended } else { look };
         let mut line = self.line.lock();
         let is_over = match &line.outbox {
             Some(outbox) => {
-                outbox.collect(ended, concluded);
+                outbox.collect(look, concluded);
                 ended && outbox.is_retired() && outbox.waiting() == 0
             }
             None => ended,
@@ -267,13 +264,13 @@ impl Peer {
     }
 
     /// Concludes all unanswered letters, for a transport that closes.
-    pub(crate) fn close(&self, concluded: &mut Vec<(AttemptId, Conclusion)>) {
+    pub(crate) fn close(&self, concluded: &mut Concluded) {
         self.end();
         let mut line = self.line.lock();
         let (outbox, unsent) = (line.outbox.take(), line.backlog.take());
         drop(line);
         if let Some(outbox) = outbox {
-            outbox.collect(true, concluded);
+            outbox.collect(AnswerLook::Ended, concluded);
         }
         conclude_unsent(&unsent, &closed(), concluded);
     }
@@ -455,7 +452,7 @@ fn letter_len(parcel: &Parcel) -> usize {
 fn conclude_unsent(
     unsent: &VecDeque<(AttemptId, Parcel)>,
     error: &TransportError,
-    concluded: &mut Vec<(AttemptId, Conclusion)>,
+    concluded: &mut Concluded,
 ) {
     let unsent = unsent.iter();
     concluded.extend(unsent.map(|(attempt, _)| (*attempt, Conclusion::NotSent(error.clone()))));
