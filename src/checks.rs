@@ -120,7 +120,8 @@ pub(crate) struct Origin {
 /// An accepted message whose outcomes are unknown.
 pub(crate) struct Unsettled {
     monitored: Arc<Monitored>,
-    header: Header<'static>,
+    /// In a box, because the future of each sent message has room for it.
+    header: Box<Header<'static>>,
 }
 
 impl Checks {
@@ -365,7 +366,7 @@ impl Unsettled {
         let header = header_of_outcomes(message)?;
         Some(Self {
             monitored: Arc::clone(monitored),
-            header,
+            header: Box::new(header),
         })
     }
 

@@ -15,7 +15,7 @@ use crate::incoming::Incoming;
 /// Letters of legacy peers prove nothing. A report that arrives like them counts for agents of legacy
 /// peers only.
 pub(crate) fn read(incoming: &Incoming, directory: &dyn Directory) -> Option<Box<str>> {
-    if incoming.view().performative() != Performative::Failure {
+    if !incoming.is(&Performative::Failure) {
         return None;
     }
     let lost = DeliveryFailure::read(incoming.message())?.receiver?;

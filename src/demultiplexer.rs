@@ -205,7 +205,11 @@ impl Demultiplexer {
                 }
                 state.has_room()
             };
-            self.put(endpoint, room.then(|| endpoint.letter_now())??);
+            let received = room.then(|| endpoint.letter_now())??;
+            let own = self.put(endpoint, received, Reader::Conversation(key));
+            if own.is_some() {
+                return own;
+            }
         }
     }
 
@@ -233,7 +237,12 @@ impl Demultiplexer {
             }
             match endpoint.letter_now() {
                 None => return Ok(None),
-                Some(received) => self.put(endpoint, received),
+                Some(received) => {
+                    let own = self.put(endpoint, received, Reader::Others);
+                    if own.is_some() {
+                        return Ok(own);
+                    }
+                }
             }
         }
     }
@@ -274,22 +283,33 @@ impl Demultiplexer {
             tokio::select! {
                 biased;
                 () = changed => {}
-                received = endpoint.next_letter(), if room => self.put(endpoint, received?),
+                received = endpoint.next_letter(), if room => {
+                    if let Some(own) = self.put(endpoint, received?, reader) {
+                        return Ok(own);
+                    }
+                }
                 () = endpoint.closed(), if !room => return Err(ReceiveError::Closed),
             }
         }
     }
 
-    fn put(&self, endpoint: &Endpoint, received: Incoming) {
+    /// Hands a message to its reader: returns it if that is the caller, and otherwise sets it aside.
+    fn put(&self, endpoint: &Endpoint, received: Incoming, caller: Reader<'_>) -> Option<Incoming> {
         let sender = received.sender;
-        let is_led = self.state.lock().leads(&received);
-        // Outside of the lock, because a miss reads the files of the directory.
-        let registered = match is_led && sender.is_known() {
-            true => endpoint.domain.directory().by_incarnation(sender),
-            false => None,
-        };
-        self.state.lock().put(received, registered.as_deref());
-        self.changed.notify_waiters();
+        let mut state = self.state.lock();
+        let mut registered = None;
+        if sender.is_known() && state.leads(&received) {
+            // Outside of the lock, because a miss reads the files of the directory.
+            drop(state);
+            registered = endpoint.domain.directory().by_incarnation(sender);
+            state = self.state.lock();
+        }
+        let own = state.put(received, registered.as_deref(), caller);
+        drop(state);
+        if own.is_none() {
+            self.changed.notify_waiters();
+        }
+        own
     }
 }
 
@@ -324,7 +344,6 @@ impl State {
         // Most agents lead none.
         !self.led.is_empty()
             && received
-                .view()
                 .conversation_id()
                 .is_some_and(|id| self.led.contains_key(&*id.as_str()))
     }
@@ -338,7 +357,7 @@ impl State {
         if self.led.is_empty() {
             return None;
         }
-        let id = received.view().conversation_id()?;
+        let id = received.conversation_id()?;
         let conversations = self.led.get_mut(&*id.as_str())?;
         // The conversation that began last is the first choice.
         let mut admitting = conversations.iter_mut().rev();
@@ -357,24 +376,31 @@ impl State {
         others.max(longest) < MAX_SET_ASIDE
     }
 
-    /// Adds a message to the queue of its reader. `registered` is the directory's entry of the sender.
-    fn put(&mut self, received: Incoming, registered: Option<&Entry>) {
+    /// Adds a message to the queue of its reader, or returns it if the reader is the caller, for which no
+    /// earlier message waits. `registered` is the directory's entry of the sender.
+    fn put(
+        &mut self,
+        received: Incoming,
+        registered: Option<&Entry>,
+        caller: Reader<'_>,
+    ) -> Option<Incoming> {
         if let Some(conversation) = self.conversation_of(&received, registered) {
-            conversation.queue.push_back(received);
-            return;
+            let is_own =
+                matches!(caller, Reader::Conversation(key) if key.number == conversation.number);
+            return put_unless(is_own, received, &mut conversation.queue);
         }
         // An answer of the gateway, or the report of an undelivered question, after the end of the call.
         if is_about_presence(&received) {
-            return;
+            return None;
         }
         let mut served = self.served.iter_mut();
         let is_legal = received.violation().is_none();
         if let Some(server) = served.find(|server| is_legal && (server.opens)(received.message())) {
-            server.queue.push_back(received);
-            return;
+            let is_own = matches!(caller, Reader::Server(key) if key.number == server.number);
+            return put_unless(is_own, received, &mut server.queue);
         }
         if lock_slot::is_for_locks(&received) {
-            return;
+            return None;
         }
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {
             let dropped = self.others.pop_front();
@@ -384,15 +410,29 @@ impl State {
                  Agent::receive to read them"
             );
         }
-        self.others.push_back(received);
+        let is_own = matches!(caller, Reader::Others);
+        put_unless(is_own, received, &mut self.others)
     }
+}
+
+/// Returns the message if it is the caller's own and the queue is empty; otherwise adds it to the queue.
+fn put_unless(
+    is_own: bool,
+    received: Incoming,
+    queue: &mut VecDeque<Incoming>,
+) -> Option<Incoming> {
+    if is_own && queue.is_empty() {
+        return Some(received);
+    }
+    queue.push_back(received);
+    None
 }
 
 /// Whether a message is about the presence of agents.
 fn is_about_presence(received: &Incoming) -> bool {
-    let view = received.view();
-    let id = view.conversation_id();
-    view.ontology()
+    let id = received.conversation_id();
+    received
+        .ontology()
         .is_some_and(|name| name == presence::ONTOLOGY)
         || id.is_some_and(|id| id.as_str().starts_with(presence::CONVERSATION))
 }
@@ -441,6 +481,16 @@ mod tests {
     const MALLORY: Incarnation = Incarnation::from_u64(8);
     const ARMS_MTS: Incarnation = Incarnation::from_u64(9);
 
+    /// Adds a message for a reader other than the caller.
+    fn set_aside(state: &mut State, received: Incoming, registered: Option<&Entry>) {
+        let another = ReaderKey {
+            id: "".into(),
+            number: 0,
+        };
+        let own = state.put(received, registered, Reader::Server(&another));
+        assert!(own.is_none());
+    }
+
     /// Creates a received message with the conversation id `c`.
     fn message(sender: &str, from: Incarnation, act: Performative) -> Incoming {
         let message = Message::builder(act)
@@ -473,6 +523,26 @@ mod tests {
         (demultiplexer, key)
     }
 
+    #[test]
+    fn a_message_for_the_caller_is_set_aside_only_behind_an_earlier_one() {
+        let (demultiplexer, key) = state();
+        let arm = entry("arm", ARM);
+        let mut state = demultiplexer.state.lock();
+        let inform = || message("arm", ARM, Performative::Inform);
+        let conversation = Reader::Conversation(&key);
+        // Of the led conversation, for its own reader and for another one.
+        assert!(state.put(inform(), Some(&arm), conversation).is_some());
+        assert!(state.put(inform(), Some(&arm), Reader::Others).is_none());
+        assert!(state.put(inform(), Some(&arm), conversation).is_none());
+        assert_eq!(state.conversation(&key).unwrap().queue.len(), 2);
+        // Of no conversation.
+        let other = || message("mallory", MALLORY, Performative::Inform);
+        assert!(state.put(other(), None, Reader::Others).is_some());
+        assert!(state.put(other(), None, conversation).is_none());
+        assert!(state.put(other(), None, Reader::Others).is_none());
+        assert_eq!(state.others.len(), 2);
+    }
+
     /// The gateway of the host is the sender of the stream in which their letters arrive.
     #[test]
     fn messages_of_a_legacy_peer_belong_to_their_conversation() {
@@ -503,7 +573,7 @@ mod tests {
                 false,
             ),
         ] {
-            state.put(message(sender, from, act), Some(registered));
+            set_aside(&mut state, message(sender, from, act), Some(registered));
             let conversation = state.conversation(&key).unwrap();
             let found = conversation.queue.pop_front().is_some();
             assert_eq!(found, belongs, "{sender} by {}", registered.name);
@@ -515,22 +585,32 @@ mod tests {
         let (demultiplexer, key) = state();
         let mut state = demultiplexer.state.lock();
         let mallory = entry("mallory", MALLORY);
-        state.put(
+        set_aside(
+            &mut state,
             message("mallory", MALLORY, Performative::Inform),
             Some(&mallory),
         );
-        state.put(
+        set_aside(
+            &mut state,
             message("arm", MALLORY, Performative::Inform),
             Some(&mallory),
         );
         // A letter of a legacy peer proves nothing.
         let unknown = Incarnation::UNKNOWN;
-        state.put(message("arm", unknown, Performative::Inform), None);
+        set_aside(
+            &mut state,
+            message("arm", unknown, Performative::Inform),
+            None,
+        );
         // A failure that is no proved report, and a report about another agent.
-        state.put(message("mts", MALLORY, Performative::Failure), None);
+        set_aside(
+            &mut state,
+            message("mts", MALLORY, Performative::Failure),
+            None,
+        );
         let mut about_mallory = message("mts", MALLORY, Performative::Failure);
         about_mallory.undelivered_to = Some("mallory".into());
-        state.put(about_mallory, None);
+        set_aside(&mut state, about_mallory, None);
         assert!(state.take(Reader::Conversation(&key)).is_none());
         assert_eq!(state.others.len(), 5);
     }
@@ -542,17 +622,29 @@ mod tests {
         let mut state = demultiplexer.state.lock();
         let unknown = Incarnation::UNKNOWN;
         let arm = entry("arm", ARM);
-        state.put(message("arm", ARM, Performative::Inform), Some(&arm));
+        set_aside(
+            &mut state,
+            message("arm", ARM, Performative::Inform),
+            Some(&arm),
+        );
         // The registration has left the directory.
-        state.put(message("arm", ARM, Performative::Inform), None);
+        set_aside(&mut state, message("arm", ARM, Performative::Inform), None);
         // A new registration of the name.
         let again = entry("arm", MALLORY);
-        state.put(message("arm", MALLORY, Performative::Inform), Some(&again));
-        state.put(message("legacy", unknown, Performative::Inform), None);
+        set_aside(
+            &mut state,
+            message("arm", MALLORY, Performative::Inform),
+            Some(&again),
+        );
+        set_aside(
+            &mut state,
+            message("legacy", unknown, Performative::Inform),
+            None,
+        );
         for lost in ["arm", "legacy"] {
             let mut report = message("mts", ARMS_MTS, Performative::Failure);
             report.undelivered_to = Some(lost.into());
-            state.put(report, None);
+            set_aside(&mut state, report, None);
         }
         assert_eq!(state.others.len(), 0);
         let taken = std::iter::from_fn(|| state.take(Reader::Conversation(&key)));
@@ -568,8 +660,13 @@ mod tests {
         {
             let mut state = demultiplexer.state.lock();
             let arm = entry("arm", ARM);
-            state.put(message("arm", ARM, Performative::Inform), Some(&arm));
-            state.put(
+            set_aside(
+                &mut state,
+                message("arm", ARM, Performative::Inform),
+                Some(&arm),
+            );
+            set_aside(
+                &mut state,
                 message("leg", MALLORY, Performative::Inform),
                 Some(&leg_entry),
             );
@@ -582,7 +679,8 @@ mod tests {
         }
         demultiplexer.end(&with_arm);
         let mut state = demultiplexer.state.lock();
-        state.put(
+        set_aside(
+            &mut state,
             message("leg", MALLORY, Performative::Inform),
             Some(&leg_entry),
         );
@@ -598,10 +696,10 @@ mod tests {
         let other = || message("arm", ARM, Performative::Inform);
         for _ in 0..MAX_SET_ASIDE + 10 {
             assert!(state.has_room());
-            state.put(other(), None);
+            set_aside(&mut state, other(), None);
         }
         assert_eq!(state.others.len(), MAX_SET_ASIDE);
-        state.put(message("arm", ARM, Performative::QueryIf), None);
+        set_aside(&mut state, message("arm", ARM, Performative::QueryIf), None);
         assert!(state.take(Reader::Server(&key)).is_some());
         state.is_read = true;
         assert!(!state.has_room());

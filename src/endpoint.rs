@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Letter, Message, MessageBuilder, Performative};
-use fipa_mts::core::{Received, Submission};
+use fipa_mts::core::Received;
 use fipa_mts::{Mts, PostError, letter_for};
 use fipa_sds::{DeregisterError, Directory};
 use fipa_transport::Incarnation;
@@ -116,13 +116,9 @@ impl Endpoint {
             }
             Checked::No => None,
         };
-        let receivers = message.receivers().iter();
-        let sending = self.mts().send(Submission {
-            sender: self.incarnation,
-            letter,
-            receivers: receivers.map(|id| id.name().into()).collect(),
-            deadline,
-        });
+        let receivers = message.receivers();
+        let mts = self.mts();
+        let sending = mts.send_to_agents(self.incarnation, letter, receivers, deadline);
         Ok(Sent::new(sending, unsettled))
     }
 

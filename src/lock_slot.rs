@@ -20,8 +20,7 @@ pub(crate) fn is_of_locks(message: &Message) -> bool {
 
 /// Whether a received message is one of locks; does not decode it.
 pub(crate) fn is_for_locks(incoming: &Incoming) -> bool {
-    let view = incoming.view();
-    let protocol = view.protocol();
+    let protocol = incoming.protocol();
     protocol.is_some_and(|name| is_lock_protocol(&name.as_str()))
 }
 

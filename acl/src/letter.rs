@@ -95,6 +95,14 @@ impl Letter {
         self
     }
 
+    /// Returns the letter with other content: bytes of the length that the payload announces. Nothing
+    /// is copied.
+    #[must_use]
+    pub fn with_content(mut self, content: Bytes) -> Self {
+        self.payload.content = content;
+        self
+    }
+
     /// The encoded envelope with all stamps. It is copied if a stamp was added to the letter.
     #[must_use]
     pub fn envelope(&self) -> Bytes {

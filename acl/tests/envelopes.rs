@@ -5,7 +5,7 @@
 use bytes::Bytes;
 use fipa_acl::{
     AclRepresentation, AgentId, EncodeError, Envelope, EnvelopeParams, EnvelopeView, Letter,
-    Problem, Received, Time,
+    Message, Performative, Problem, Received, Time,
 };
 
 const DATE: &[u8] = b"\x20\x31\x11\x16\x19\x15\x37\x62\x59\x20";
@@ -292,8 +292,7 @@ fn envelopes_with_missing_or_invalid_parameters_are_refused() {
 }
 
 #[test]
-fn encode_around_writes_the_same_bytes_as_encode_standard() {
-    let representation = AclRepresentation::BitEfficient;
+fn a_letter_of_a_message_has_the_envelope_that_encode_standard_writes() {
     let plain = agent("rover");
     let reachable = agent("arm_1").with_address("tcp://10.0.0.2:7788").unwrap();
     let many: Vec<AgentId> = (0..3000)
@@ -305,17 +304,33 @@ fn encode_around_writes_the_same_bytes_as_encode_standard() {
         (Vec::new(), Some(plain.clone())),
         (many, Some(plain)),
     ] {
-        let whole = Envelope {
-            base: EnvelopeParams {
-                to: to.clone(),
-                from: from.clone(),
-                payload_length: Some(4711),
-                intended_receivers: to.clone(),
-                ..base()
-            },
-            extensions: Vec::new(),
-        };
-        let quick = Envelope::encode_around(&to, from.as_ref(), &representation, 4711, date());
-        assert_eq!(quick.unwrap(), whole.encode_standard().unwrap());
+        for content in [None, Some(Bytes::from_static(b"lift"))] {
+            let mut message = Message::builder(Performative::Inform).receivers(to.clone());
+            if let Some(from) = &from {
+                message = message.sender(from.clone());
+            }
+            if let Some(content) = &content {
+                message = message.content(content.clone());
+            }
+            let message = message.build().unwrap();
+            let payload = message.to_payload();
+            let whole = Envelope {
+                base: EnvelopeParams {
+                    to: to.clone(),
+                    from: from.clone(),
+                    payload_length: Some(payload.len() as u64),
+                    intended_receivers: to.clone(),
+                    ..base()
+                },
+                extensions: Vec::new(),
+            };
+            let letter = message.to_letter(date()).unwrap();
+            assert_eq!(letter.envelope(), whole.encode_standard().unwrap());
+            assert_eq!(*letter.payload(), payload);
+            if let Some(content) = content {
+                let around = message.to_letter_around(content.len(), date()).unwrap();
+                assert_eq!(around.with_content(content), letter);
+            }
+        }
     }
 }

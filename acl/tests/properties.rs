@@ -4,10 +4,12 @@
 
 mod arbitrary;
 
+use std::time::SystemTime;
+
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{
     AgentId, DecodeError, Dialect, Envelope, EnvelopeView, Explanation, Letter, Message,
-    MessageIndex, MessageView, Payload, Performative, Representation, bitefficient, explain,
+    MessageIndex, MessageView, Payload, Performative, Representation, Time, bitefficient, explain,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -165,8 +167,9 @@ proptest! {
         prop_assert_eq!(&whole.head, &payload.to_bytes());
         prop_assert_eq!(&Message::decode(&whole).unwrap(), &message);
         if let Some(content) = message.content() {
-            let (head, tail) = message.around_content(content.len()).unwrap();
-            prop_assert_eq!((head, tail), (payload.head, payload.tail));
+            let date = Time::from_system_time(SystemTime::UNIX_EPOCH).unwrap();
+            let letter = message.to_letter_around(content.len(), date).unwrap();
+            prop_assert_eq!(letter.with_content(content.clone()).into_payload(), payload);
         }
     }
 

@@ -128,10 +128,12 @@ fn errors_name_other_encodings_and_code_tables() {
 #[test]
 fn content_of_the_maximum_length_is_encoded_and_decoded() {
     let longest = u32::MAX as usize;
-    let (head, tail) = message().around_content(longest).unwrap();
+    let date = "20000508T042651481".parse().unwrap();
+    let letter = message().to_letter_around(longest, date).unwrap();
+    let Payload { head, tail, .. } = letter.into_payload();
     assert!(head.ends_with(b"\x04\x19\xff\xff\xff\xff"));
     assert_eq!(&tail[..], b"\x01");
-    let too_long = message().around_content(longest + 1);
+    let too_long = message().to_letter_around(longest + 1, date);
     assert_eq!(too_long, Err(EncodeError::ContentTooLong(longest + 1)));
 
     // The kernel reserves more memory than is available, but not much more.

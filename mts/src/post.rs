@@ -3,9 +3,7 @@
 use std::time::SystemTime;
 
 use bytes::Bytes;
-use fipa_acl::{
-    AclRepresentation, EncodeError, Envelope, Letter, Message, Payload, Time, TimeError,
-};
+use fipa_acl::{EncodeError, Letter, Message, Time, TimeError};
 
 /// Error of [`letter_for`] and [`LetterDraft`].
 #[derive(Debug, thiserror::Error)]
@@ -25,9 +23,7 @@ pub enum PostError {
 /// # Errors
 /// Fails when the message or its envelope cannot be encoded.
 pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostError> {
-    let payload = message.to_payload();
-    let envelope = envelope_for(message, payload.len(), utc)?;
-    Ok(Letter::new(envelope, payload))
+    Ok(message.to_letter(Time::from_system_time(utc)?)?)
 }
 
 /// A letter whose content is written later, into memory that is loaned for it. The message is
@@ -35,11 +31,9 @@ pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostErro
 #[derive(Debug)]
 pub struct LetterDraft {
     message: Message,
-    /// The encoded message before and after the content.
-    head: Bytes,
-    tail: Bytes,
+    /// The letter without the content.
+    frame: Letter,
     content_len: usize,
-    envelope: Bytes,
 }
 
 impl LetterDraft {
@@ -49,15 +43,11 @@ impl LetterDraft {
     /// # Errors
     /// Fails when the message or its envelope cannot be encoded.
     pub fn new(message: Message, content_len: usize, utc: SystemTime) -> Result<Self, PostError> {
-        let (head, tail) = message.around_content(content_len)?;
-        let payload_len = head.len() + content_len + tail.len();
-        let envelope = envelope_for(&message, payload_len, utc)?;
+        let frame = message.to_letter_around(content_len, Time::from_system_time(utc)?)?;
         Ok(Self {
             message,
-            head,
-            tail,
+            frame,
             content_len,
-            envelope,
         })
     }
 
@@ -69,13 +59,13 @@ impl LetterDraft {
     /// Length of envelope and message before the content, in bytes.
     #[must_use]
     pub fn head_len(&self) -> usize {
-        self.envelope.len() + self.head.len()
+        self.frame.envelope_len() + self.frame.payload().head.len()
     }
 
     /// Length of the message behind the content, in bytes.
     #[must_use]
     pub fn tail_len(&self) -> usize {
-        self.tail.len()
+        self.frame.payload().tail.len()
     }
 
     /// Completes the letter. The content is shared, not copied; it has the length given before.
@@ -85,25 +75,6 @@ impl LetterDraft {
     #[must_use]
     pub fn complete(self, content: Bytes) -> (Message, Letter) {
         assert_eq!(content.len(), self.content_len, "the length of the content");
-        let payload = Payload {
-            head: self.head,
-            content,
-            tail: self.tail,
-        };
-        (self.message, Letter::new(self.envelope, payload))
+        (self.message, self.frame.with_content(content))
     }
-}
-
-fn envelope_for(
-    message: &Message,
-    payload_len: usize,
-    utc: SystemTime,
-) -> Result<Bytes, PostError> {
-    Ok(Envelope::encode_around(
-        message.receivers(),
-        message.sender(),
-        &AclRepresentation::BitEfficient,
-        payload_len as u64,
-        Time::from_system_time(utc)?,
-    )?)
 }

@@ -10,6 +10,7 @@
 //! A task that waits for an outcome or a letter first drives the transports for a short time on its
 //! own thread, and then sleeps until it is woken.
 
+mod clocks;
 mod loans;
 mod receiving;
 
@@ -19,6 +20,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
+use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, Pattern, View};
 use fipa_transport::{
     Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
@@ -29,6 +31,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 
+use self::clocks::Clocks;
 use self::receiving::TransportSink;
 use crate::AccessGate;
 use crate::Map;
@@ -155,6 +158,7 @@ struct Shared {
 
 struct State {
     core: Core,
+    clocks: Clocks,
     /// Generation of the directory before the core's view was taken.
     generation: u64,
     /// Replaced views, which are freed after the lock was released.
@@ -190,7 +194,6 @@ impl AgentWaiter {
 }
 
 /// Collects the outcomes of one letter.
-#[derive(Default)]
 struct Slot {
     outcomes: Mutex<Outcomes>,
     complete: Notify,
@@ -199,7 +202,6 @@ struct Slot {
 /// Number of expected outcomes of a letter whose receivers are not resolved yet.
 const UNRESOLVED: usize = usize::MAX;
 
-#[derive(Default)]
 struct Outcomes {
     expected: usize,
     known: Vec<(Arc<str>, Outcome)>,
@@ -243,6 +245,7 @@ impl Mts {
         let reader = core.reader().clone();
         let state = State {
             core,
+            clocks: Clocks::new(),
             generation,
             replaced: Vec::new(),
             unframed_deadline: config.unframed_deadline,
@@ -328,7 +331,8 @@ impl Mts {
     pub fn deregister(&self, incarnation: Incarnation) -> Vec<Received> {
         let mut state = self.shared.lock();
         let unread = std::iter::from_fn(|| state.core.take(incarnation)).collect();
-        state.core.deregister(Now::read(), incarnation);
+        let now = state.clocks.now();
+        state.core.deregister(now, incarnation);
         if let Some(waiter) = state.agents.remove(&incarnation) {
             waiter.close();
         }
@@ -349,17 +353,60 @@ impl Mts {
     /// a transport offers that ([`Transport::loan_for_many`]).
     pub fn send(&self, mut submission: Submission) -> Sending {
         if let Some(content) = self.content_for_many(&submission) {
-            submission.letter = loans::with_content(submission.letter, content);
+            submission.letter = submission.letter.with_content(content);
         }
-        self.begin(|core| core.send(Now::read(), submission))
+        self.begin(|core, now| core.send(now, submission))
     }
 
-    fn begin(&self, send: impl FnOnce(&mut Core) -> (SendId, Option<usize>)) -> Sending {
-        let slot = Arc::new(Slot::default());
+    /// Sends a letter to agents, as [`send`](Self::send) does.
+    pub fn send_to_agents(
+        &self,
+        sender: Incarnation,
+        mut letter: Letter,
+        receivers: &[AgentId],
+        deadline: Duration,
+    ) -> Sending {
+        // Most letters have one receiver, whose name the view shows.
+        if let [receiver] = receivers {
+            let mut state = self.shared.lock();
+            let now = state.clocks.now();
+            let name = receiver.name();
+            match state.core.send_to_name(now, sender, letter, name, deadline) {
+                Ok(id) => return self.begun(state, id, Some(1)),
+                Err(back) => letter = back,
+            }
+        }
+        self.send(Submission {
+            sender,
+            letter,
+            receivers: receivers.iter().map(|id| id.name().into()).collect(),
+            deadline,
+        })
+    }
+
+    fn begin(&self, send: impl FnOnce(&mut Core, Now) -> (SendId, Option<usize>)) -> Sending {
         let mut state = self.shared.lock();
-        let (id, expected) = send(&mut state.core);
+        let now = state.clocks.now();
+        let (id, expected) = send(&mut state.core, now);
+        self.begun(state, id, expected)
+    }
+
+    /// Carries out the actions of a letter that was submitted, with this number of outcomes.
+    fn begun(
+        &self,
+        mut state: MutexGuard<'_, State>,
+        id: SendId,
+        expected: Option<usize>,
+    ) -> Sending {
         let expected = expected.unwrap_or(UNRESOLVED);
-        slot.outcomes.lock().expected = expected;
+        let outcomes = Outcomes {
+            expected,
+            known: Vec::new(),
+        };
+        let slot = Arc::new(Slot {
+            outcomes: Mutex::new(outcomes),
+            complete: Notify::new(),
+        });
         if expected > 0 {
             state.sends.insert(id, Arc::clone(&slot));
         }
@@ -372,7 +419,7 @@ impl Mts {
 
     /// Sends a letter to exactly this incarnation of an agent; see [`Core::send_to`].
     pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
-        self.begin(|core| (core.send_to(Now::read(), submission, entry), Some(1)))
+        self.begin(|core, now| (core.send_to(now, submission, entry), Some(1)))
     }
 
     /// Replaces the orders of transports and the deadline of legacy peers' letters; see
@@ -385,7 +432,8 @@ impl Mts {
     ) {
         let mut state = self.shared.lock();
         state.unframed_deadline = unframed_deadline;
-        state.core.reorder(Now::read(), order, routes);
+        let now = state.clocks.now();
+        state.core.reorder(now, order, routes);
         self.shared.carry_out(state);
     }
 
@@ -397,14 +445,17 @@ impl Mts {
     /// Sets the services to keep in touch with; see [`Core::keep_in_touch`].
     pub fn keep_in_touch(&self, peers: Vec<Peer>) {
         let mut state = self.shared.lock();
-        state.core.keep_in_touch(Now::read(), peers);
+        let now = state.clocks.now();
+        state.core.keep_in_touch(now, peers);
         self.shared.carry_out(state);
     }
 
     /// Returns the states of the services to keep in touch with.
     #[must_use]
     pub fn peers(&self) -> Vec<PeerState> {
-        self.shared.lock().core.peers(Now::read())
+        let mut state = self.shared.lock();
+        let now = state.clocks.now();
+        state.core.peers(now)
     }
 
     /// Returns the routes that letters from here to these agents would take now.
@@ -412,8 +463,8 @@ impl Mts {
     pub fn routes(&self, to: &[Arc<Entry>]) -> Vec<Route> {
         // In several parts, so that letters are not blocked meanwhile.
         let parts = to.chunks(ROUTES_AT_ONCE).flat_map(|part| {
-            let state = self.shared.lock();
-            let now = Now::read();
+            let mut state = self.shared.lock();
+            let now = state.clocks.now();
             let routes = part.iter().map(|entry| state.core.route(now, entry));
             routes.collect::<Vec<_>>()
         });
@@ -423,7 +474,9 @@ impl Mts {
     /// Returns the health and counters of each route; see [`Core::ways`].
     #[must_use]
     pub fn ways(&self) -> Vec<RouteState> {
-        self.shared.lock().core.ways(Now::read())
+        let mut state = self.shared.lock();
+        let now = state.clocks.now();
+        state.core.ways(now)
     }
 
     /// Waits for the next letter for this agent; `None` when the agent was deregistered or the
@@ -482,9 +535,8 @@ impl Mts {
         // The sender may have been registered just now.
         self.shared.directory.refresh();
         let mut state = self.shared.lock();
-        state
-            .core
-            .handle_undecodable(Now::read(), receiver, received, why);
+        let now = state.clocks.now();
+        state.core.handle_undecodable(now, receiver, received, why);
         self.shared.carry_out(state);
     }
 
@@ -516,7 +568,8 @@ impl Mts {
 
     fn give_up(&self) {
         let mut state = self.shared.lock();
-        state.core.give_up(Now::read());
+        let now = state.clocks.now();
+        state.core.give_up(now);
         for waiter in state.agents.values() {
             waiter.close();
         }
@@ -590,7 +643,8 @@ impl Shared {
         while let Some(number) = refresh {
             self.directory.refresh();
             let mut state = self.lock();
-            state.core.handle_refreshed(Now::read(), number);
+            let now = state.clocks.now();
+            state.core.handle_refreshed(now, number);
             refresh = self.perform(state, release);
         }
     }
@@ -617,9 +671,8 @@ impl Shared {
                     };
                     if let Err(error) = result {
                         let conclusion = Conclusion::NotSent(error);
-                        state
-                            .core
-                            .handle_conclusion(Now::read(), attempt, conclusion);
+                        let now = state.clocks.now();
+                        state.core.handle_conclusion(now, attempt, conclusion);
                     }
                 }
                 Action::Abandon {
@@ -632,9 +685,8 @@ impl Shared {
                         None => Abandoned::Unconfirmed,
                     };
                     let conclusion = end.conclusion(error);
-                    state
-                        .core
-                        .handle_conclusion(Now::read(), attempt, conclusion);
+                    let now = state.clocks.now();
+                    state.core.handle_conclusion(now, attempt, conclusion);
                 }
                 Action::Answer {
                     kind,
@@ -697,7 +749,7 @@ impl Shared {
 
     /// Waits until `look` finds something: drives the transports for a while, then sleeps.
     async fn wait<T>(&self, notify: &Notify, mut look: impl FnMut() -> Option<T>) -> T {
-        let started = Instant::now();
+        let mut started = None;
         loop {
             if let Some(found) = look() {
                 return found;
@@ -706,6 +758,7 @@ impl Shared {
             if !self.config.spin.is_zero() && self.drive() {
                 continue;
             }
+            let started = *started.get_or_insert_with(Instant::now);
             if started.elapsed() < self.config.spin {
                 std::hint::spin_loop();
                 continue;
@@ -817,7 +870,8 @@ async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
                 return;
             };
             let mut state = shared.lock();
-            state.core.handle_timeout(Now::read());
+            let now = state.clocks.now();
+            state.core.handle_timeout(now);
             state.armed = state.core.poll_timeout();
             let due = state.armed;
             shared.carry_out(state);
@@ -847,8 +901,8 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
         {
             changes.push(change);
         }
-        let now = Now::read();
         let mut state = shared.lock();
+        let now = state.clocks.now();
         for change in changes.iter().flat_map(Change::single) {
             match change {
                 Change::Left(entry) => state.core.handle_departure(now, entry),

@@ -11,10 +11,8 @@ use crate::{AgentId, Message, Payload};
 /// Length of the encoded message in the standard's dialect, in bytes.
 #[must_use]
 pub fn encoded_len(message: &Message) -> usize {
-    let mut counter = Counter(0);
     let content_len = message.content.as_ref().map(Bytes::len);
-    write_head(message, content_len, &mut counter);
-    counter.0 + content_len.unwrap_or(0) + TAIL.len()
+    head_len(message, content_len) + content_len.unwrap_or(0) + TAIL.len()
 }
 
 /// Writes the encoded message, [`encoded_len`] bytes, in the standard's dialect.
@@ -42,40 +40,34 @@ impl Message {
                 out.freeze().into()
             }
             Some(content) => Payload {
-                head: head(self, content.len()),
+                head: {
+                    let content_len = Some(content.len());
+                    let mut out = BytesMut::with_capacity(head_len(self, content_len));
+                    append_head(self, content_len, &mut out);
+                    out.freeze()
+                },
                 content: content.clone(),
                 tail: Bytes::from_static(TAIL),
             },
         }
     }
-
-    /// Encodes the message (FIPA00069) without its content. Returns the bytes in front of content
-    /// of `content_len` bytes, including its length, and the bytes behind it.
-    ///
-    /// This is for content that the application writes in place. The content of the message itself
-    /// is ignored.
-    ///
-    /// # Errors
-    /// `content_len` exceeds [`Message::MAX_CONTENT`].
-    pub fn around_content(&self, content_len: usize) -> Result<(Bytes, Bytes), EncodeError> {
-        if content_len as u64 > Self::MAX_CONTENT {
-            return Err(EncodeError::ContentTooLong(content_len));
-        }
-        Ok((head(self, content_len), Bytes::from_static(TAIL)))
-    }
 }
 
 /// The bytes behind the content: the end of the message.
-const TAIL: &[u8] = &[code::END];
+pub(crate) const TAIL: &[u8] = &[code::END];
 
-fn head(message: &Message, content_len: usize) -> Bytes {
+/// Length of the bytes in front of the content, including its length field.
+pub(crate) fn head_len(message: &Message, content_len: Option<usize>) -> usize {
     let mut counter = Counter(0);
-    write_head(message, Some(content_len), &mut counter);
-    let mut out = BytesMut::with_capacity(counter.0);
-    let mut sink = Sink::new(&mut out);
-    write_head(message, Some(content_len), &mut sink);
+    write_head(message, content_len, &mut counter);
+    counter.0
+}
+
+/// Appends the bytes in front of the content, including its length field.
+pub(crate) fn append_head(message: &Message, content_len: Option<usize>, out: &mut impl BufMut) {
+    let mut sink = Sink::new(out);
+    write_head(message, content_len, &mut sink);
     sink.flush();
-    out.freeze()
 }
 
 /// Receives encoded bytes: a buffer, or a counter of their number. One code path serves both, so
@@ -515,12 +507,27 @@ fn two_digits(number: u16) -> u8 {
 
 /// Writes a number as `Digits` (FIPA00069 2.4, note 5).
 pub(crate) fn write_digits(number: u64, out: &mut impl Output) {
-    let text = number.to_string();
-    for pair in text.as_bytes().chunks(2) {
-        let nibble = |index: usize| pair.get(index).map_or(0, |digit| digit - b'0' + 1);
-        out.byte(nibble(0) << 4 | nibble(1));
+    // The codes of at most 20 digits, the last digit first.
+    let mut nibbles = [0; 20];
+    let mut len = 0;
+    let mut rest = number;
+    for nibble in &mut nibbles {
+        *nibble = (rest % 10) as u8 + 1;
+        len += 1;
+        rest /= 10;
+        if rest == 0 {
+            break;
+        }
     }
-    if text.len().is_multiple_of(2) {
+    let digits = nibbles.get(..len).unwrap_or_default();
+    for pair in digits.rchunks(2) {
+        out.byte(match *pair {
+            [second, first] => first << 4 | second,
+            [last] => last << 4,
+            _ => 0,
+        });
+    }
+    if len.is_multiple_of(2) {
         out.byte(0x00);
     }
 }
@@ -537,6 +544,12 @@ mod tests {
             (42, &[0x53, 0x00]),
             (100, &[0x21, 0x10]),
             (65536, &[0x76, 0x64, 0x70]),
+            (
+                u64::MAX,
+                &[
+                    0x29, 0x55, 0x78, 0x55, 0x18, 0x48, 0x1a, 0x66, 0x27, 0x26, 0x00,
+                ],
+            ),
         ] {
             let mut out = Vec::new();
             write_digits(number, &mut out);

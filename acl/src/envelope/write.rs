@@ -11,14 +11,16 @@ use crate::bitefficient::code;
 use crate::bitefficient::reader::{Form, string_form};
 use crate::bitefficient::without_x;
 use crate::bitefficient::write::{
-    Output, TextWriter, write_agent_id_by, write_agent_set_by, write_date_time, write_digits,
-    write_local_date_time,
+    Output, TAIL, TextWriter, append_head, head_len, write_agent_id_by, write_agent_set_by,
+    write_date_time, write_digits, write_local_date_time,
 };
 use crate::dialect::local_time;
 use crate::envelope::present;
 use crate::error::EncodeError;
 use crate::word::{self, is_token};
-use crate::{AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, Received, Time};
+use crate::{
+    AclRepresentation, Dialect, Envelope, EnvelopeParams, Letter, Message, Payload, Received, Time,
+};
 
 const BASE: &str = "a base envelope";
 const EXTENSION: &str = "an extension envelope";
@@ -53,46 +55,6 @@ impl Envelope {
         encode(self, Dialect::Standard)
     }
 
-    /// Encodes the envelope of a new letter bit-efficiently (FIPA00088) in the standard's dialect,
-    /// without an [`Envelope`] value.
-    ///
-    /// `receivers` become `to` and `intended-receiver`. `payload_length` is in bytes.
-    ///
-    /// # Errors
-    /// The encoding cannot represent a value.
-    pub fn encode_around(
-        receivers: &[AgentId],
-        from: Option<&AgentId>,
-        representation: &AclRepresentation,
-        payload_length: u64,
-        date: Time,
-    ) -> Result<Bytes, EncodeError> {
-        let mut writer = Writer::new(Dialect::Standard);
-        // Enough for names of usual length, so that the buffer rarely grows.
-        writer.out.reserve(128 + 96 * receivers.len().min(16));
-        let start = writer.begin(code::envelope::BASE);
-        writer.acl_representation(representation)?;
-        writer.time("date", date)?;
-        let to = writer.out.len();
-        write_agent_set_by(&mut writer, code::envelope::TO, receivers)?;
-        let list = to..writer.out.len();
-        if let Some(from) = from {
-            writer.out.byte(code::envelope::FROM);
-            write_agent_id_by(&mut writer, from)?;
-        }
-        writer.out.byte(code::envelope::PAYLOAD_LENGTH);
-        writer.payload_length(payload_length)?;
-        // The same list with another code.
-        let intended = writer.out.len();
-        writer.out.extend_from_within(list);
-        if let Some(parameter) = writer.out.get_mut(intended) {
-            *parameter = code::envelope::INTENDED_RECEIVER;
-        }
-        writer.out.byte(code::END);
-        writer.end(start)?;
-        Ok(writer.out.into())
-    }
-
     /// Encodes one extension envelope bit-efficiently (FIPA00088) in the standard's dialect.
     /// [`Letter::stamped`](crate::Letter::stamped) adds it to a letter.
     ///
@@ -103,6 +65,94 @@ impl Envelope {
         writer.extension(params)?;
         Ok(writer.out.into())
     }
+}
+
+impl Message {
+    /// Encodes the message as a new letter: a bit-efficient message (FIPA00069) in a bit-efficient
+    /// envelope (FIPA00088), both in the standard's dialect.
+    ///
+    /// The receivers of the message become `to` and `intended-receiver` of the envelope, and `date`
+    /// its date. Envelope and message share one allocation. The content is shared, not copied.
+    ///
+    /// # Errors
+    /// The envelope cannot represent a value.
+    pub fn to_letter(&self, date: Time) -> Result<Letter, EncodeError> {
+        let content = self.content.clone();
+        let letter = enclose(self, content.as_ref().map(Bytes::len), date)?;
+        Ok(match content {
+            Some(content) => letter.with_content(content),
+            None => letter,
+        })
+    }
+
+    /// Encodes the message as a new letter, as [`to_letter`](Self::to_letter) does, around content of
+    /// `content_len` bytes. [`Letter::with_content`] adds the content.
+    ///
+    /// This is for content that the application writes in place. The content of the message itself
+    /// is ignored.
+    ///
+    /// # Errors
+    /// `content_len` exceeds [`Message::MAX_CONTENT`], or the envelope cannot represent a value.
+    pub fn to_letter_around(&self, content_len: usize, date: Time) -> Result<Letter, EncodeError> {
+        if content_len as u64 > Self::MAX_CONTENT {
+            return Err(EncodeError::ContentTooLong(content_len));
+        }
+        enclose(self, Some(content_len), date)
+    }
+}
+
+/// Encodes a letter without its content.
+fn enclose(
+    message: &Message,
+    content_len: Option<usize>,
+    date: Time,
+) -> Result<Letter, EncodeError> {
+    let receivers = &message.receivers;
+    let head_len = head_len(message, content_len);
+    let payload_len = head_len + content_len.unwrap_or(0) + TAIL.len();
+    let mut writer = Writer::new(Dialect::Standard);
+    // Enough for names of usual length, so that the buffer rarely grows.
+    writer
+        .out
+        .reserve(128 + 96 * receivers.len().min(16) + head_len + TAIL.len());
+    let start = writer.begin(code::envelope::BASE);
+    writer.out.byte(code::representation::BIT_EFFICIENT);
+    writer.time("date", date)?;
+    let to = writer.out.len();
+    write_agent_set_by(&mut writer, code::envelope::TO, receivers)?;
+    let list = to..writer.out.len();
+    if let Some(from) = &message.sender {
+        writer.out.byte(code::envelope::FROM);
+        write_agent_id_by(&mut writer, from)?;
+    }
+    writer.out.byte(code::envelope::PAYLOAD_LENGTH);
+    writer.payload_length(payload_len as u64)?;
+    // The same list with another code.
+    let intended = writer.out.len();
+    writer.out.extend_from_within(list);
+    if let Some(parameter) = writer.out.get_mut(intended) {
+        *parameter = code::envelope::INTENDED_RECEIVER;
+    }
+    writer.out.byte(code::END);
+    writer.end(start)?;
+    let mut out = writer.out;
+    let envelope_len = out.len();
+    append_head(message, content_len, &mut out);
+    let tail = match content_len {
+        Some(_) => Bytes::from_static(TAIL),
+        None => {
+            out.slice(TAIL);
+            Bytes::new()
+        }
+    };
+    let mut envelope = Bytes::from(out);
+    let head = envelope.split_off(envelope_len);
+    let payload = Payload {
+        head,
+        content: Bytes::new(),
+        tail,
+    };
+    Ok(Letter::new(envelope, payload))
 }
 
 struct Writer {
@@ -358,11 +408,11 @@ impl Writer {
     /// otherwise take it for a text in another form, for the end of a list (01), or for the code
     /// (0a) that JADE writes in front of stamps.
     fn string(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
-        if text.contains('\0') {
+        if memchr::memchr(0, text.as_bytes()).is_some() {
             return Err(EncodeError::Nul(what));
         }
-        let bare =
-            string_form(text.as_bytes()).0 == Form::Bare && !text.starts_with(['\x01', '\n']);
+        let bare = string_form(text.as_bytes()).0 == Form::Bare
+            && !matches!(text.as_bytes(), [0x01 | b'\n', ..]);
         match self.dialect {
             Dialect::FipaServices => {
                 self.out.slice(format!("#{}\"", text.len()).as_bytes());

@@ -7,7 +7,7 @@ use crate::error::DecodeError;
 use crate::view::agent_id::Set;
 use crate::view::text::Repr;
 use crate::view::{AgentIdView, AgentIds, Content, Encoding, PerformativeView, Text, UserDefined};
-use crate::{Message, MessageView, Payload, Time, xml};
+use crate::{Message, MessageView, Payload, Performative, Time, xml};
 
 /// The positions of the parameters in an encoded message.
 ///
@@ -126,10 +126,28 @@ impl MessageIndex {
         Some(super::shared(payload, content))
     }
 
+    /// Whether the message has this communicative act of the standard (FIPA00037).
+    #[must_use]
+    pub fn is(&self, performative: &Performative) -> bool {
+        matches!(self.performative, Act::Standard(code) if performative.code() == Some(code))
+    }
+
     /// Returns the conversation identifier.
     #[must_use]
     pub fn conversation_id<'a>(&self, payload: &'a Payload) -> Option<Text<'a>> {
         Some(Pieces::of(payload).text(self.conversation_id?))
+    }
+
+    /// Returns the protocol.
+    #[must_use]
+    pub fn protocol<'a>(&self, payload: &'a Payload) -> Option<Text<'a>> {
+        Some(Pieces::of(payload).text(self.protocol?))
+    }
+
+    /// Returns the ontology.
+    #[must_use]
+    pub fn ontology<'a>(&self, payload: &'a Payload) -> Option<Text<'a>> {
+        Some(Pieces::of(payload).text(self.ontology?))
     }
 }
 

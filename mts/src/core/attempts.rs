@@ -485,7 +485,7 @@ impl AttemptTable {
     /// Reports the end of a letter to its sender, or to the services that handed it over.
     pub(crate) fn settle(
         &mut self,
-        delivery: Delivery,
+        delivery: Box<Delivery>,
         stream: Stream,
         receiver: Arc<str>,
         settlement: Settlement,
@@ -495,7 +495,7 @@ impl AttemptTable {
             sequence,
             deadline,
             ..
-        } = delivery;
+        } = *delivery;
         if let Settlement::Outcome(outcome) = &settlement {
             self.notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),

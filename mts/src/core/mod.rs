@@ -288,6 +288,13 @@ impl Core {
             receivers,
             deadline,
         } = submission;
+        let letter = match &receivers[..] {
+            [receiver] => match self.send_to_name(now, sender, letter, receiver, deadline) {
+                Ok(send) => return (send, Some(1)),
+                Err(letter) => letter,
+            },
+            _ => letter,
+        };
         let send = SendId(self.next_send);
         self.next_send += 1;
         if self.closed {
@@ -307,7 +314,7 @@ impl Core {
             receivers,
             deadline,
         };
-        if self.waiting.is_empty() || !self.waiting.has_any_of(sender) {
+        if self.is_in_turn(sender) {
             match self.resolve(now, unresolved, false) {
                 Ok(outcomes) => return (send, Some(outcomes)),
                 Err(back) => unresolved = back,
@@ -323,6 +330,45 @@ impl Core {
         self.fail_receivers(unresolved, FailureReason::QueueFull);
         self.send_failures(now);
         (send, Some(outcomes))
+    }
+
+    /// Sends a letter to the agent with exactly this name. One outcome follows.
+    ///
+    /// # Errors
+    /// Returns the letter if it must be submitted to [`send`](Self::send), for example because the view
+    /// shows no such agent.
+    #[expect(
+        clippy::result_large_err,
+        reason = "the letter is moved in and back; a box would cost an allocation"
+    )]
+    pub fn send_to_name(
+        &mut self,
+        now: Now,
+        sender: Incarnation,
+        letter: Letter,
+        receiver: &str,
+        deadline: Duration,
+    ) -> Result<SendId, Letter> {
+        if self.closed || !self.is_in_turn(sender) {
+            return Err(letter);
+        }
+        let is_agent = |entry: &Arc<Entry>| {
+            entry.incarnation.is_known() && !matches!(entry.role, Role::Coalition(_))
+        };
+        let Some(entry) = self.table.view.named(receiver).filter(is_agent) else {
+            return Err(letter);
+        };
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let deadline = now.instant + deadline.min(MAX_DEADLINE);
+        self.send_one(now, (send, sender), &entry, letter, deadline);
+        self.send_failures(now);
+        Ok(send)
+    }
+
+    /// Whether no earlier letter of this sender waits to be resolved.
+    fn is_in_turn(&self, sender: Incarnation) -> bool {
+        self.waiting.is_empty() || !self.waiting.has_any_of(sender)
     }
 
     /// Resolves the receivers of a letter in the view, and sends it to them. Returns the number of
@@ -345,21 +391,10 @@ impl Core {
             .get(&sender)
             .map(|inbox| Arc::clone(&inbox.name));
         let own = sender_name.as_deref().unwrap_or_default();
-        let send = unresolved.send;
-        let deadline = unresolved.deadline;
         let mut resolved = Vec::new();
         for receiver in &unresolved.receivers {
             let resolution = fipa_sds::resolve(&*view, receiver, own);
             match resolution {
-                // The common case, without the data structures that several receivers need.
-                Ok(Resolution::Exact(entry))
-                    if unresolved.receivers.len() == 1 && entry.incarnation.is_known() =>
-                {
-                    let letter = unresolved.letter;
-                    self.send_one(now, (send, sender), &entry, letter, deadline);
-                    self.send_failures(now);
-                    return Ok(1);
-                }
                 Ok(resolution) if !is_fresh && !resolution.is_complete() => {
                     return Err(unresolved);
                 }
@@ -369,7 +404,11 @@ impl Core {
             }
         }
         let Unresolved {
-            letter, receivers, ..
+            send,
+            letter,
+            receivers,
+            deadline,
+            ..
         } = unresolved;
         let mut reached: Vec<Incarnation> = Vec::new();
         let mut count = 0;
@@ -580,7 +619,7 @@ impl Core {
     }
 
     /// Puts a letter into its lane and dispatches what can be dispatched.
-    fn put(&mut self, now: Now, lane: LaneId, delivery: Delivery) {
+    fn put(&mut self, now: Now, lane: LaneId, delivery: Box<Delivery>) {
         self.with_lane(now, lane, |lane, table| {
             lane.push(delivery, table);
             lane.pump(now.instant, table);
@@ -1087,12 +1126,8 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
-        let others = [
-            self.peers.due(),
-            self.failure_limit.due(),
-            self.waiting.due(),
-        ];
-        others.into_iter().chain([lanes, notes]).flatten().min()
+        let others = earlier(self.peers.due(), self.failure_limit.due());
+        earlier(earlier(lanes, notes), earlier(others, self.waiting.due()))
     }
 
     /// Returns the next action to perform.
@@ -1150,5 +1185,13 @@ fn own_lane(sender: Incarnation, entry: &Entry) -> LaneKey {
             sender,
             receiver: attempts::registration_of(entry),
         }),
+    }
+}
+
+/// Returns the earlier one of two times.
+fn earlier(one: Option<Instant>, other: Option<Instant>) -> Option<Instant> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
     }
 }

@@ -1,13 +1,12 @@
 //! Memory for contents, allocated by the transport that will carry them.
 
 use bytes::Bytes;
-use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Arriving, Incarnation, Kind, LoanedContent, Location, Transport, TransportError,
 };
 
 use super::{Mts, Shared};
-use crate::core::{Now, Submission};
+use crate::core::Submission;
 
 type Loaned = Option<Box<dyn LoanedContent>>;
 
@@ -44,7 +43,8 @@ impl Mts {
             self.shared.directory.refresh();
             state = self.shared.lock();
         }
-        state.core.first_way(Now::read(), receiver)
+        let now = state.clocks.now();
+        state.core.first_way(now, receiver)
     }
 
     fn loan_for_many<'a>(
@@ -56,8 +56,9 @@ impl Mts {
         // Receivers may have been registered just now.
         self.shared.directory.refresh();
         let kind = {
-            let state = self.shared.lock();
-            state.core.kind_for_many(Now::read(), sender, receivers)?
+            let mut state = self.shared.lock();
+            let now = state.clocks.now();
+            state.core.kind_for_many(now, sender, receivers)?
         };
         self.shared
             .loan_from(kind, |transport| transport.loan_for_many(len))
@@ -102,9 +103,8 @@ impl Shared {
                 self.directory.refresh();
                 state = self.lock();
             }
-            state
-                .core
-                .first_way_onwards(Now::read(), registration, receiver)?
+            let now = state.clocks.now();
+            state.core.first_way_onwards(now, registration, receiver)?
         };
         self.loan_from(route.kind(), |transport| {
             transport.loan(&route, front.saturating_add(stamp), len, tail)
@@ -125,16 +125,6 @@ impl Shared {
             }
         }
     }
-}
-
-/// Replaces the content of the letter without copying.
-pub(super) fn with_content(letter: Letter, content: Bytes) -> Letter {
-    let envelope = letter.envelope();
-    let payload = Payload {
-        content,
-        ..letter.into_payload()
-    };
-    Letter::new(envelope, payload)
 }
 
 struct OnTheHeap(Vec<u8>);

@@ -11,7 +11,7 @@ use fipa_transport::{
 use parking_lot::MutexGuard;
 
 use super::Shared;
-use crate::core::{Now, Unframed};
+use crate::core::Unframed;
 
 /// The sink of one transport.
 pub(super) struct TransportSink {
@@ -39,10 +39,10 @@ impl Sink for TransportSink {
             state = shared.lock();
         }
         let at_once = self.answers_at_once;
-        let verdict =
-            state
-                .core
-                .handle_read_arrival(Now::read(), self.kind, at_once, arrival, read);
+        let now = state.clocks.now();
+        let verdict = state
+            .core
+            .handle_read_arrival(now, self.kind, at_once, arrival, read);
         shared.carry_out(state);
         verdict
     }
@@ -65,9 +65,8 @@ impl Sink for TransportSink {
                 return;
             }
             let deadline = state.unframed_deadline;
-            state
-                .core
-                .handle_unframed(Now::read(), deadline, &mut unframed);
+            let now = state.clocks.now();
+            state.core.handle_unframed(now, deadline, &mut unframed);
             if unframed.is_handled() {
                 shared.carry_out(state);
                 return;
@@ -82,9 +81,8 @@ impl Sink for TransportSink {
             return;
         };
         let mut state = shared.lock();
-        state
-            .core
-            .handle_conclusion(Now::read(), attempt, conclusion);
+        let now = state.clocks.now();
+        state.core.handle_conclusion(now, attempt, conclusion);
         shared.carry_out(state);
     }
 
@@ -116,7 +114,8 @@ impl Sink for TransportSink {
         };
         shared.locate(self.kind, locations, true);
         let mut state = shared.lock();
-        state.core.handle_reachable(Now::read(), None);
+        let now = state.clocks.now();
+        state.core.handle_reachable(now, None);
         shared.carry_out(state);
     }
 
@@ -136,7 +135,8 @@ impl Sink for TransportSink {
             contacts.introduced(peer);
         }
         let mut state = shared.lock();
-        state.core.handle_introduced(Now::read(), peer);
+        let now = state.clocks.now();
+        state.core.handle_introduced(now, peer);
         shared.carry_out(state);
     }
 
@@ -148,7 +148,8 @@ impl Sink for TransportSink {
             contacts.parted(peer);
         }
         let mut state = shared.lock();
-        state.core.handle_parted(Now::read(), peer);
+        let now = state.clocks.now();
+        state.core.handle_parted(now, peer);
         shared.carry_out(state);
     }
 }

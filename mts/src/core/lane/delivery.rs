@@ -133,7 +133,7 @@ impl Delivery {
         letter: Letter,
         (registration, sequence): (Incarnation, u64),
         deadline: Instant,
-    ) -> Self {
+    ) -> Box<Self> {
         let progress = Progress {
             state: State::Waiting,
             attempts: Vec::new(),
@@ -147,7 +147,7 @@ impl Delivery {
             hold: None,
             departure: None,
         };
-        Self {
+        Box::new(Self {
             origin,
             letter,
             sequence,
@@ -159,7 +159,7 @@ impl Delivery {
             custody_due: None,
             not_before: None,
             progress,
-        }
+        })
     }
 
     pub(super) fn is_waiting(&self) -> bool {

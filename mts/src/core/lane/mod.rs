@@ -93,7 +93,8 @@ pub(crate) struct Lane {
     receiver: Arc<str>,
     /// The location that the receiver stated itself, if it is not in the directory.
     stated: Option<Arc<Entry>>,
-    letters: VecDeque<Delivery>,
+    /// In boxes, because letters enter and leave in the middle.
+    letters: VecDeque<Box<Delivery>>,
     /// Number of letters that were pushed since the lane was empty.
     pushed: u64,
     bytes: usize,
@@ -303,7 +304,7 @@ impl Lane {
     }
 
     /// Inserts a letter at its position in the order.
-    pub(crate) fn push(&mut self, mut delivery: Delivery, table: &mut AttemptTable) {
+    pub(crate) fn push(&mut self, mut delivery: Box<Delivery>, table: &mut AttemptTable) {
         delivery.position = self.pushed;
         self.pushed += 1;
         let len = delivery.letter.len();
