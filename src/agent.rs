@@ -3,12 +3,12 @@
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use fipa_acl::{
     AgentId, AgentIdError, BuildError, ErrorChain, Message, MessageBuilder, Performative,
 };
-use fipa_mts::{LetterDraft, letter_for};
+use fipa_mts::LetterDraft;
 use fipa_sds::{Cancellation, DeregisterError, RegisterError, Registration};
 use fipa_transport::{Incarnation, LoanedContent};
 
@@ -230,7 +230,7 @@ impl Agent {
         M: TryInto<Message, Error: Into<BuildError>>,
     {
         let sending = self.built(message).and_then(|message| {
-            let letter = letter_for(&message, SystemTime::now());
+            let letter = self.core.endpoint.letter(&message);
             self.core.endpoint.send(&message, letter, deadline)
         });
         async move { Ok(deliveries(sending?).await) }
@@ -275,7 +275,7 @@ impl Agent {
         if len as u64 > limit {
             return Err(too_large(len));
         }
-        let draft = LetterDraft::new(message, len, SystemTime::now())?;
+        let draft = self.core.endpoint.draft(message, len)?;
         let letter_len = draft.head_len() + len + draft.tail_len();
         if letter_len as u64 > limit {
             return Err(too_large(letter_len));

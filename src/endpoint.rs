@@ -5,11 +5,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{AgentId, ErrorChain, Letter, Message, MessageBuilder, Performative};
+use fipa_acl::{
+    AgentId, EnvelopeTemplate, ErrorChain, Letter, Message, MessageBuilder, Performative,
+};
 use fipa_mts::core::Received;
-use fipa_mts::{Mts, PostError, letter_for};
+use fipa_mts::{LetterDraft, Mts, PostError, letter_by};
 use fipa_sds::{DeregisterError, Directory};
 use fipa_transport::Incarnation;
+use parking_lot::Mutex;
 
 use crate::checks::{Checks, Origin};
 use crate::delivery::Sent;
@@ -28,6 +31,8 @@ pub(crate) struct Endpoint {
     /// Number of unique texts issued so far.
     unique_ids: AtomicU64,
     pub(crate) checks: Checks,
+    /// The envelope of the latest letter.
+    template: Mutex<EnvelopeTemplate>,
 }
 
 /// Whether a message is checked against its protocol before it is sent.
@@ -56,6 +61,7 @@ impl Endpoint {
             name,
             incarnation,
             unique_ids: AtomicU64::new(0),
+            template: Mutex::default(),
         }
     }
 
@@ -88,6 +94,21 @@ impl Endpoint {
             }),
             None => Err(SendError::NoSender),
         }
+    }
+
+    /// Encodes a message as a letter, dated now.
+    pub(crate) fn letter(&self, message: &Message) -> Result<Letter, PostError> {
+        letter_by(&mut self.template.lock(), message, SystemTime::now())
+    }
+
+    /// Encodes a message, dated now, around content of this length in bytes.
+    pub(crate) fn draft(
+        &self,
+        message: Message,
+        content_len: usize,
+    ) -> Result<LetterDraft, PostError> {
+        let template = &mut self.template.lock();
+        LetterDraft::new(message, content_len, SystemTime::now(), template)
     }
 
     /// Sends a message. The letter is sent before this returns; dropping the result does not stop it.
@@ -189,7 +210,7 @@ impl Endpoint {
         let sent = answer
             .map_err(|error| error.to_string())
             .and_then(|answer| {
-                let letter = letter_for(&answer, SystemTime::now());
+                let letter = self.letter(&answer);
                 let deadline = self.domain.inner.deadline;
                 let sent = self
                     .submit(&answer, letter, deadline, Checked::No)

@@ -9,6 +9,7 @@ mod services;
 use std::time::{Duration, SystemTime};
 
 use fipa::{AgentId, Kind, Message, Performative};
+use fipa_acl::EnvelopeTemplate;
 use fipa_mts::LetterDraft;
 use fipa_mts::core::{Received, Submission};
 use fipa_transport_net::Counters;
@@ -57,7 +58,9 @@ async fn only_the_kernel_copies_large_content() {
     let message = message();
     for number in 0..LETTERS {
         let len = LEN + number;
-        let draft = LetterDraft::new(message.clone(), len, SystemTime::now()).unwrap();
+        let mut template = EnvelopeTemplate::default();
+        let draft = LetterDraft::new(message.clone(), len, SystemTime::now(), &mut template);
+        let draft = draft.unwrap();
         let room = "arm".len() + draft.head_len();
         let mut loan = rovers
             .mts

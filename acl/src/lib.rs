@@ -64,7 +64,8 @@ pub use bitefficient::CodeTable;
 pub use builder::{BuildError, MessageBuilder};
 pub use dialect::Dialect;
 pub use envelope::{
-    Envelope, EnvelopeParams, EnvelopeView, Received, ReceiverNames, StampView, Stamps,
+    Envelope, EnvelopeParams, EnvelopeTemplate, EnvelopeView, Received, ReceiverNames, StampView,
+    Stamps,
 };
 pub use error::{DecodeError, EncodeError, Problem};
 pub use error_chain::ErrorChain;

@@ -4,8 +4,8 @@
 
 use bytes::Bytes;
 use fipa_acl::{
-    AclRepresentation, AgentId, EncodeError, Envelope, EnvelopeParams, EnvelopeView, Letter,
-    Message, Performative, Problem, Received, Time,
+    AclRepresentation, AgentId, EncodeError, Envelope, EnvelopeParams, EnvelopeTemplate,
+    EnvelopeView, Letter, Message, Performative, Problem, Received, Time,
 };
 
 const DATE: &[u8] = b"\x20\x31\x11\x16\x19\x15\x37\x62\x59\x20";
@@ -331,6 +331,75 @@ fn a_letter_of_a_message_has_the_envelope_that_encode_standard_writes() {
                 let around = message.to_letter_around(content.len(), date()).unwrap();
                 assert_eq!(around.with_content(content), letter);
             }
+        }
+    }
+}
+
+#[test]
+fn a_template_gives_the_letters_that_messages_give_alone() {
+    let date = |text: &str| -> Time { text.parse().unwrap() };
+    let reachable = agent("arm_1").with_address("tcp://10.0.0.2:7788").unwrap();
+    let many: Vec<AgentId> = (0..3000).map(|n| agent(&format!("arm_{n}"))).collect();
+    let mut template = EnvelopeTemplate::default();
+    for (from, to, content, at) in [
+        (Some("rover"), vec![agent("arm_1")], 0, "20000508T042651481"),
+        // Another date, and another length of as many digits.
+        (
+            Some("rover"),
+            vec![agent("arm_1")],
+            9,
+            "20261124T235959999Z",
+        ),
+        (
+            Some("rover"),
+            vec![agent("arm_1")],
+            8,
+            "20261125T000000000Z",
+        ),
+        // More digits, and fewer.
+        (
+            Some("rover"),
+            vec![agent("arm_1")],
+            70_000,
+            "20261125T000000000Z",
+        ),
+        (
+            Some("rover"),
+            vec![agent("arm_1")],
+            1,
+            "20261125T000000001Z",
+        ),
+        // Another receiver, another address of it, and another sender.
+        (
+            Some("rover"),
+            vec![reachable.clone()],
+            1,
+            "20261125T000000001Z",
+        ),
+        (
+            Some("drone"),
+            vec![reachable.clone()],
+            1,
+            "20261125T000000001Z",
+        ),
+        (None, vec![reachable], 1, "20261125T000000001Z"),
+        (None, Vec::new(), 1, "20261125T000000001Z"),
+        // Too long to be kept, twice.
+        (Some("rover"), many.clone(), 1, "20261125T000000001Z"),
+        (Some("rover"), many, 2, "20261125T000000002Z"),
+    ] {
+        let mut message = Message::builder(Performative::Inform).receivers(to);
+        if let Some(from) = from {
+            message = message.sender(agent(from));
+        }
+        let bare = message.clone().build().unwrap();
+        let message = message.content(vec![7; content]).build().unwrap();
+        for message in [bare, message] {
+            let alone = message.to_letter(date(at)).unwrap();
+            assert_eq!(template.to_letter(&message, date(at)).unwrap(), alone);
+            let around = message.to_letter_around(content, date(at)).unwrap();
+            let copied = template.to_letter_around(&message, content, date(at));
+            assert_eq!(copied.unwrap(), around);
         }
     }
 }

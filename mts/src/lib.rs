@@ -22,5 +22,5 @@ type Set<K> = std::collections::HashSet<K, foldhash::fast::RandomState>;
 
 pub use failure::DeliveryFailure;
 pub use gate::{AccessGate, LetterParts, Link, Source};
-pub use post::{LetterDraft, PostError, letter_for};
+pub use post::{LetterDraft, PostError, letter_by, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};

@@ -3,7 +3,7 @@
 use std::time::SystemTime;
 
 use bytes::Bytes;
-use fipa_acl::{EncodeError, Letter, Message, Time, TimeError};
+use fipa_acl::{EncodeError, EnvelopeTemplate, Letter, Message, Time, TimeError};
 
 /// Error of [`letter_for`] and [`LetterDraft`].
 #[derive(Debug, thiserror::Error)]
@@ -26,6 +26,18 @@ pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostErro
     Ok(message.to_letter(Time::from_system_time(utc)?)?)
 }
 
+/// Encodes a message as [`letter_for`] does, with the envelope of the sender's latest letter as a template.
+///
+/// # Errors
+/// See [`letter_for`].
+pub fn letter_by(
+    template: &mut EnvelopeTemplate,
+    message: &Message,
+    utc: SystemTime,
+) -> Result<Letter, PostError> {
+    Ok(template.to_letter(message, Time::from_system_time(utc)?)?)
+}
+
 /// A letter whose content is written later, into memory that is loaned for it. The message is
 /// encoded once, before, and its envelope has that date.
 #[derive(Debug)]
@@ -38,12 +50,18 @@ pub struct LetterDraft {
 
 impl LetterDraft {
     /// Encodes the message around content of this length, in bytes, and an envelope dated `utc`. The
-    /// message's own content is ignored.
+    /// message's own content is ignored. The envelope of the sender's latest letter is a template.
     ///
     /// # Errors
     /// Fails when the message or its envelope cannot be encoded.
-    pub fn new(message: Message, content_len: usize, utc: SystemTime) -> Result<Self, PostError> {
-        let frame = message.to_letter_around(content_len, Time::from_system_time(utc)?)?;
+    pub fn new(
+        message: Message,
+        content_len: usize,
+        utc: SystemTime,
+        template: &mut EnvelopeTemplate,
+    ) -> Result<Self, PostError> {
+        let date = Time::from_system_time(utc)?;
+        let frame = template.to_letter_around(&message, content_len, date)?;
         Ok(Self {
             message,
             frame,

@@ -10,6 +10,7 @@ mod write;
 use std::collections::HashSet;
 
 pub use view::{EnvelopeView, ReceiverNames, StampView, Stamps};
+pub use write::EnvelopeTemplate;
 pub(crate) use write::encode;
 
 use crate::error::EncodeError;

@@ -5,6 +5,8 @@
 //! envelopes: fipa_services requires a byte count in front of every text, a code in front of numbers
 //! and the oldest extension first. JADE reads a byte count as part of the text.
 
+use std::ops::Range;
+
 use bytes::Bytes;
 
 use crate::bitefficient::code;
@@ -19,7 +21,8 @@ use crate::envelope::present;
 use crate::error::EncodeError;
 use crate::word::{self, is_token};
 use crate::{
-    AclRepresentation, Dialect, Envelope, EnvelopeParams, Letter, Message, Payload, Received, Time,
+    AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, Letter, Message, Payload,
+    Received, Time,
 };
 
 const BASE: &str = "a base envelope";
@@ -107,52 +110,136 @@ fn enclose(
     content_len: Option<usize>,
     date: Time,
 ) -> Result<Letter, EncodeError> {
-    let receivers = &message.receivers;
-    let head_len = head_len(message, content_len);
-    let payload_len = head_len + content_len.unwrap_or(0) + TAIL.len();
-    let mut writer = Writer::new(Dialect::Standard);
-    // Enough for names of usual length, so that the buffer rarely grows.
-    writer
-        .out
-        .reserve(128 + 96 * receivers.len().min(16) + head_len + TAIL.len());
-    let start = writer.begin(code::envelope::BASE);
-    writer.out.byte(code::representation::BIT_EFFICIENT);
-    writer.time("date", date)?;
-    let to = writer.out.len();
-    write_agent_set_by(&mut writer, code::envelope::TO, receivers)?;
-    let list = to..writer.out.len();
-    if let Some(from) = &message.sender {
-        writer.out.byte(code::envelope::FROM);
-        write_agent_id_by(&mut writer, from)?;
+    EnvelopeTemplate::default().enclose(message, content_len, date, false)
+}
+
+/// The envelope of the latest letter that was encoded with it.
+///
+/// Most letters of an agent have the receivers of its letter before. Their envelopes differ in the date
+/// and in the payload length, and are copied.
+#[derive(Debug, Default)]
+pub struct EnvelopeTemplate {
+    sender: Option<AgentId>,
+    receivers: Vec<AgentId>,
+    /// Empty before the first letter.
+    envelope: Vec<u8>,
+    date: Range<usize>,
+    payload_length: Range<usize>,
+}
+
+/// Maximum length of an envelope that is kept, in bytes.
+const MAX_TEMPLATE: usize = 512;
+
+impl EnvelopeTemplate {
+    /// Encodes a message as [`Message::to_letter`] does.
+    ///
+    /// # Errors
+    /// See [`Message::to_letter`].
+    pub fn to_letter(&mut self, message: &Message, date: Time) -> Result<Letter, EncodeError> {
+        let content = message.content.clone();
+        let letter = self.enclose(message, content.as_ref().map(Bytes::len), date, true)?;
+        Ok(match content {
+            Some(content) => letter.with_content(content),
+            None => letter,
+        })
     }
-    writer.out.byte(code::envelope::PAYLOAD_LENGTH);
-    writer.payload_length(payload_len as u64)?;
-    // The same list with another code.
-    let intended = writer.out.len();
-    writer.out.extend_from_within(list);
-    if let Some(parameter) = writer.out.get_mut(intended) {
-        *parameter = code::envelope::INTENDED_RECEIVER;
-    }
-    writer.out.byte(code::END);
-    writer.end(start)?;
-    let mut out = writer.out;
-    let envelope_len = out.len();
-    append_head(message, content_len, &mut out);
-    let tail = match content_len {
-        Some(_) => Bytes::from_static(TAIL),
-        None => {
-            out.slice(TAIL);
-            Bytes::new()
+
+    /// Encodes a message as [`Message::to_letter_around`] does.
+    ///
+    /// # Errors
+    /// See [`Message::to_letter_around`].
+    pub fn to_letter_around(
+        &mut self,
+        message: &Message,
+        content_len: usize,
+        date: Time,
+    ) -> Result<Letter, EncodeError> {
+        if content_len as u64 > Message::MAX_CONTENT {
+            return Err(EncodeError::ContentTooLong(content_len));
         }
-    };
-    let mut envelope = Bytes::from(out);
-    let head = envelope.split_off(envelope_len);
-    let payload = Payload {
-        head,
-        content: Bytes::new(),
-        tail,
-    };
-    Ok(Letter::new(envelope, payload))
+        self.enclose(message, Some(content_len), date, true)
+    }
+
+    /// Encodes a letter without its content. Keeps its envelope if `is_kept`.
+    fn enclose(
+        &mut self,
+        message: &Message,
+        content_len: Option<usize>,
+        date: Time,
+        is_kept: bool,
+    ) -> Result<Letter, EncodeError> {
+        let head_len = head_len(message, content_len);
+        let payload_len = (head_len + content_len.unwrap_or(0) + TAIL.len()) as u64;
+        let mut out = Vec::new();
+        // Enough for names of usual length, so that the buffer rarely grows.
+        let names = 96 * message.receivers.len().min(16);
+        out.reserve(128 + names + head_len + TAIL.len());
+        if !self.copy(message, payload_len, date, &mut out) {
+            let mut writer = Writer {
+                out,
+                dialect: Dialect::Standard,
+            };
+            let (date, payload_length) = writer.envelope_of(message, payload_len, date)?;
+            out = writer.out;
+            if is_kept && out.len() <= MAX_TEMPLATE {
+                self.sender.clone_from(&message.sender);
+                self.receivers.clone_from(&message.receivers);
+                self.envelope.clone_from(&out);
+                (self.date, self.payload_length) = (date, payload_length);
+            }
+        }
+        let envelope_len = out.len();
+        append_head(message, content_len, &mut out);
+        let tail = match content_len {
+            Some(_) => Bytes::from_static(TAIL),
+            None => {
+                out.slice(TAIL);
+                Bytes::new()
+            }
+        };
+        let mut envelope = Bytes::from(out);
+        let head = envelope.split_off(envelope_len);
+        let payload = Payload {
+            head,
+            content: Bytes::new(),
+            tail,
+        };
+        Ok(Letter::new(envelope, payload))
+    }
+
+    /// Writes the envelope of this message as a changed copy. Returns false and writes nothing if sender,
+    /// receivers or the length of a parameter differ.
+    fn copy(&self, message: &Message, payload_len: u64, date: Time, out: &mut Vec<u8>) -> bool {
+        if self.envelope.is_empty()
+            || self.sender != message.sender
+            || self.receivers != message.receivers
+        {
+            return false;
+        }
+        out.slice(&self.envelope);
+        // Each parameter is written behind the envelope first, and replaces the old one if it has
+        // the same length.
+        let end = out.len();
+        write_date_time(date, out);
+        let is_replaced = replace(out, end, &self.date) && {
+            write_digits(payload_len, out);
+            replace(out, end, &self.payload_length)
+        };
+        if !is_replaced {
+            out.clear();
+        }
+        is_replaced
+    }
+}
+
+/// Moves the bytes from `end` to this range, if they have its length.
+fn replace(out: &mut Vec<u8>, end: usize, range: &Range<usize>) -> bool {
+    let fits = out.len() - end == range.len() && range.end <= end;
+    if fits {
+        out.copy_within(end.., range.start);
+        out.truncate(end);
+    }
+    fits
 }
 
 struct Writer {
@@ -164,6 +251,39 @@ impl Writer {
     fn new(dialect: Dialect) -> Self {
         let out = Vec::new();
         Self { out, dialect }
+    }
+
+    /// Writes the envelope of a new letter with a bit-efficient message. Returns the positions of its
+    /// date and its payload length; a longer envelope than [`MAX_TEMPLATE`] may have others.
+    fn envelope_of(
+        &mut self,
+        message: &Message,
+        payload_len: u64,
+        date: Time,
+    ) -> Result<(Range<usize>, Range<usize>), EncodeError> {
+        let start = self.begin(code::envelope::BASE);
+        self.out.byte(code::representation::BIT_EFFICIENT);
+        let date_at = self.out.len();
+        self.time("date", date)?;
+        let to = self.out.len();
+        write_agent_set_by(self, code::envelope::TO, &message.receivers)?;
+        let list = to..self.out.len();
+        if let Some(from) = &message.sender {
+            self.out.byte(code::envelope::FROM);
+            write_agent_id_by(self, from)?;
+        }
+        self.out.byte(code::envelope::PAYLOAD_LENGTH);
+        let length_at = self.out.len();
+        self.payload_length(payload_len)?;
+        let intended = self.out.len();
+        // The same list with another code.
+        self.out.extend_from_within(list);
+        if let Some(parameter) = self.out.get_mut(intended) {
+            *parameter = code::envelope::INTENDED_RECEIVER;
+        }
+        self.out.byte(code::END);
+        self.end(start)?;
+        Ok((date_at..to, length_at..intended))
     }
 
     fn for_fipa_services(&self) -> bool {
