@@ -25,8 +25,9 @@ type Path = (&'static str, fn(&Pair));
 const PATHS: &[Path] = &[
     ("agents/copied/1KB", |pair| pair.copied(1)),
     ("agents/copied/1KB/16-in-flight", |pair| pair.copied(16)),
-    ("agents/loaned/1KB", |pair| pair.loaned(1)),
-    ("agents/loaned/1KB/8-in-flight", |pair| pair.loaned(8)),
+    ("agents/loaned/1KB", |pair| pair.loaned(1024, 1)),
+    ("agents/loaned/4KB", |pair| pair.loaned(4096, 1)),
+    ("agents/loaned/4KB/8-in-flight", |pair| pair.loaned(4096, 8)),
     ("agents/poll", |pair| {
         for _ in 0..LETTERS {
             assert!(pair.arm.try_receive().unwrap().is_none());
@@ -133,18 +134,18 @@ impl Pair {
 
     /// Letters with content that the transport copies, this many in flight at once.
     fn copied(&self, in_flight: usize) {
-        self.letters(in_flight, || self.rover.send(self.message.clone()));
+        self.letters(1024, in_flight, || self.rover.send(self.message.clone()));
     }
 
-    /// Letters with content in loaned memory, this many in flight at once.
-    fn loaned(&self, in_flight: usize) {
-        self.letters(in_flight, || {
-            let loan = self.rover.loan(self.message.clone(), 1024).unwrap();
+    /// Letters with content of this length in loaned memory, this many in flight at once.
+    fn loaned(&self, len: usize, in_flight: usize) {
+        self.letters(len, in_flight, || {
+            let loan = self.rover.loan(self.message.clone(), len).unwrap();
             self.rover.send_loan(loan)
         });
     }
 
-    fn letters<S>(&self, in_flight: usize, mut send: impl FnMut() -> S)
+    fn letters<S>(&self, len: usize, in_flight: usize, mut send: impl FnMut() -> S)
     where
         S: Future<Output = Result<fipa::Deliveries, fipa::SendError>>,
     {
@@ -152,7 +153,7 @@ impl Pair {
             let sent: Vec<_> = (0..in_flight).map(|_| send()).collect();
             for _ in 0..in_flight {
                 let incoming = self.arm.try_receive().unwrap().unwrap();
-                assert_eq!(black_box(incoming.content()).unwrap().len(), 1024);
+                assert_eq!(black_box(incoming.content()).unwrap().len(), len);
             }
             for sent in sent {
                 let outcomes = self.runtime.block_on(sent);

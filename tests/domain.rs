@@ -286,6 +286,15 @@ async fn loaned_content_is_not_copied() {
         );
         assert!(is_shared_memory(content), "{len} bytes were copied");
     }
+    // A loan of shared memory takes longer than a copy of short content.
+    for (len, is_shared) in [(4095, false), (4096, true)] {
+        let mut loan = rover.loan(inform(&rover, "arm", []), len).unwrap();
+        loan.content_mut().fill(9);
+        assert_eq!(is_shared_memory(loan.content_mut()), is_shared, "{len}");
+        assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
+        let incoming = arm.receive().await.unwrap();
+        assert_eq!(incoming.message().content().unwrap(), &vec![9; len]);
+    }
     // Short content for several receivers is copied for each of them.
     let other = there.register("arm_2").await.unwrap();
     for len in [5000, 1 << 20] {

@@ -10,10 +10,14 @@ use crate::core::Submission;
 
 type Loaned = Option<Box<dyn LoanedContent>>;
 
+/// Minimum length in bytes of content that is loaned to an application from a transport. A loan of
+/// shared memory takes longer than a copy of shorter content.
+const LOAN_FROM: usize = 4096;
+
 impl Mts {
     /// Allocates memory for the content of a letter from this agent to these receivers (names or
     /// patterns), to be filled in place: shared memory if the letter's first route is shared
-    /// memory, otherwise heap memory. `head_room` and `tail_room` are the lengths of the encoded
+    /// memory and the content is not [short](LOAN_FROM), otherwise heap memory. `head_room` and `tail_room` are the lengths of the encoded
     /// data before and after the content.
     pub fn loan(
         &self,
@@ -23,13 +27,17 @@ impl Mts {
         len: usize,
         tail_room: usize,
     ) -> Box<dyn LoanedContent> {
+        let on_the_heap = || Box::new(OnTheHeap(vec![0; len]));
+        if len < LOAN_FROM {
+            return on_the_heap();
+        }
         let loaned = match self.route_to_one(receivers) {
             Some(route) => self.shared.loan_from(route.kind(), |transport| {
                 transport.loan(&route, head_room, len, tail_room)
             }),
             None => self.loan_for_many(sender, receivers.iter().copied(), len),
         };
-        loaned.unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
+        loaned.unwrap_or_else(|| on_the_heap())
     }
 
     /// Returns the first route of a letter to the only receiver.
