@@ -167,7 +167,16 @@ impl AccessGate for Queueing {
                     service.try_receive(ARM);
                 });
                 *self.other.lock() = Some(other);
-                until(|| task.get().is_some_and(|task| is_asleep(task)));
+                // A thread may also sleep for a moment before it waits for this lock, when another
+                // test of the process wakes up.
+                let mut looks = 0;
+                until(|| {
+                    looks = match task.get().is_some_and(|task| is_asleep(task)) {
+                        true => looks + 1,
+                        false => 0,
+                    };
+                    looks > 1000
+                });
             }
             AGENTS => until(|| self.other.lock().as_ref().unwrap().is_finished()),
             _ => {}

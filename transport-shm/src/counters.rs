@@ -52,3 +52,9 @@ tally!(arrived in_place copied_small copied_full borrowed sent referring loans_s
 pub(crate) fn count(counter: &AtomicU64) {
     counter.fetch_add(1, Ordering::Relaxed);
 }
+
+/// Increments by one a counter that only the thread that drains the mailbox writes.
+pub(crate) fn count_alone(counter: &AtomicU64) {
+    let before = counter.load(Ordering::Relaxed);
+    counter.store(before.wrapping_add(1), Ordering::Relaxed);
+}

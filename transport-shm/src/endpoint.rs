@@ -16,6 +16,7 @@ use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
 use parking_lot::{Condvar, Mutex, RwLock};
 use tokio::runtime::Handle;
 
+use crate::answered::Answered;
 use crate::combiner::Combiner;
 use crate::counters::{Tally, count};
 use crate::domain_files::{DomainFiles, file_error};
@@ -46,8 +47,7 @@ pub(crate) struct Endpoint {
     inbox: Combiner<Option<Inbox>>,
     /// Number of unanswered parcels.
     waiting: Arc<AtomicUsize>,
-    /// Senders that have an answer and have not been woken for it.
-    answered: Mutex<Vec<Incarnation>>,
+    answered: Answered,
     /// Whether a peer has ended and is still in `peers`.
     ended: AtomicBool,
     peers: RwLock<BTreeMap<Incarnation, Arc<Peer>>>,
@@ -146,7 +146,7 @@ impl Endpoint {
             closed: AtomicBool::new(false),
             inbox: Combiner::new(Some(inbox)),
             waiting: Arc::default(),
-            answered: Mutex::default(),
+            answered: Answered::default(),
             ended: AtomicBool::new(false),
             peers: RwLock::default(),
             uses: AtomicU64::new(0),
@@ -272,15 +272,16 @@ impl Endpoint {
     /// Gives answered senders a moment to poll by themselves or to send more.
     fn wait_for_answered(&self) {
         let mut began = None;
-        loop {
-            let mut answered = self.answered.lock();
+        while self.answered.has_any() {
             let peers = self.peers.read();
-            let polled_recently = |one| peers.get(one).is_some_and(|peer| peer.was_polling());
-            answered.retain(|one| !peers.get(one).is_some_and(|peer| peer.is_awake()));
-            if !answered.iter().any(polled_recently) {
+            let polled_recently = self.answered.retain(
+                |one| !peers.get(one).is_some_and(|peer| peer.is_awake()),
+                |one| peers.get(one).is_some_and(|peer| peer.was_polling()),
+            );
+            drop(peers);
+            if !polled_recently {
                 return;
             }
-            drop((peers, answered));
             let waited = began.get_or_insert_with(Instant::now).elapsed();
             if waited > POLL_GRACE || self.has_work(false) {
                 return;
@@ -290,14 +291,7 @@ impl Endpoint {
 
     /// Wakes the answered senders that are not polling.
     fn wake_answered(self: &Arc<Self>) {
-        let mut answered = self.answered.lock();
-        if answered.is_empty() {
-            // Keeps its memory for the next letter.
-            return;
-        }
-        let senders = std::mem::take(&mut *answered);
-        drop(answered);
-        for sender in senders {
+        for sender in self.answered.take() {
             self.wake(sender);
         }
     }
@@ -339,7 +333,9 @@ impl Endpoint {
         answers: AnswerLook,
     ) -> bool {
         let mut found = inbox.drain(sink, &self.answered, unannounced);
-        if self.ended.swap(false, Ordering::SeqCst) || self.waits_for_answers() {
+        let has_ended =
+            self.ended.load(Ordering::SeqCst) && self.ended.swap(false, Ordering::SeqCst);
+        if has_ended || self.waits_for_answers() {
             let mut concluded = Concluded::new();
             let mut ended = Vec::new();
             for peer in self.peers.read().values() {

@@ -15,7 +15,8 @@ use iceoryx2::prelude::{BackpressureStrategy, Node, PortFactory, ServiceName};
 use parking_lot::Mutex;
 
 use crate::ShmConfig;
-use crate::counters::{Tally, count};
+use crate::answered::Answered;
+use crate::counters::{Tally, count, count_alone};
 use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
 use crate::memory::MappedPtr;
 use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
@@ -133,7 +134,7 @@ impl Inbox {
     pub(crate) fn drain(
         &mut self,
         sink: &dyn Sink,
-        answered: &Mutex<Vec<Incarnation>>,
+        answered: &Answered,
         unannounced: bool,
     ) -> bool {
         for done in 0..BATCH {
@@ -145,10 +146,7 @@ impl Inbox {
             match self.receive() {
                 Ok(Some(active)) => {
                     if let Some(sender) = self.take(active, sink) {
-                        let mut answered = answered.lock();
-                        if !answered.contains(&sender) {
-                            answered.push(sender);
-                        }
+                        answered.add(sender);
                     }
                 }
                 Ok(None) => {
@@ -191,7 +189,7 @@ impl Inbox {
     }
 
     fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
-        count(&self.tally.arrived);
+        count_alone(&self.tally.arrived);
         // A copy in private memory: the sender could still change the original.
         let header: Header = *active.user_header();
         let sender = header.sender();
@@ -331,10 +329,10 @@ impl Inbox {
                 ReadError::NoRoom => Answer::Busy,
             })?;
         if !self.borrows.begin_segment() {
-            count(&self.tally.copied_full);
+            count_alone(&self.tally.copied_full);
             return Ok(Bytes::copy_from_slice(content.as_ref()));
         }
-        count(&self.tally.in_place);
+        count_alone(&self.tally.in_place);
         Ok(Bytes::from_owner(BorrowedSegmentContent {
             content,
             borrows: self.borrows.clone(),
@@ -348,7 +346,7 @@ impl Inbox {
             return true;
         }
         if len > 0 {
-            count(if small {
+            count_alone(if small {
                 &self.tally.copied_small
             } else {
                 &self.tally.copied_full
@@ -360,7 +358,7 @@ impl Inbox {
     /// Hands out content in place. It must lie in the payload of `active`, and
     /// [`Self::try_begin_borrow`] must have returned true for it.
     fn borrow_content(&self, content: NonNull<[u8]>, active: Active) -> Bytes {
-        count(&self.tally.in_place);
+        count_alone(&self.tally.in_place);
         Bytes::from_owner(BorrowedContent {
             bytes: MappedPtr(content),
             sender: active.origin().value(),

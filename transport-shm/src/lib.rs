@@ -36,6 +36,7 @@
 //! poll more slowly; its own parcels may then be found late, and those of others by the next wake-up
 //! or the next poll without work.
 
+mod answered;
 mod combiner;
 mod config;
 mod counters;

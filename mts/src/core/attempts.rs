@@ -615,6 +615,11 @@ impl AttemptTable {
         }
     }
 
+    /// Whether lanes wait for room on a route.
+    pub(crate) fn has_lanes_without_room(&self) -> bool {
+        !self.waiting_for_room.is_empty()
+    }
+
     /// Returns the lane that may use this location now that an attempt there has ended.
     pub(crate) fn room_for(&mut self, location: &Location) -> Option<LaneId> {
         if self.waiting_for_room.is_empty() {

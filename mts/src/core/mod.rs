@@ -532,16 +532,18 @@ impl Core {
             sender,
             receiver: attempts::registration_of(entry),
         };
-        let name = Arc::clone(&entry.name);
+        let name = &entry.name;
         if self.closed {
-            return self.undeliverable(send, sender, name, letter, FailureReason::Closed);
+            let reason = FailureReason::Closed;
+            return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
         }
-        let lane = self.lane(now, own_lane(sender, entry), &name);
+        let lane = self.lane(now, own_lane(sender, entry), name);
         if !self.has_room(lane, letter.len()) {
-            return self.undeliverable(send, sender, name, letter, FailureReason::QueueFull);
+            let reason = FailureReason::QueueFull;
+            return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
         }
         let sequence = self.sequence_of(sender);
-        self.table.notice(stream, sequence, &name, || News::Sent {
+        self.table.notice(stream, sequence, name, || News::Sent {
             send: Some(send),
             letter: letter.clone(),
         });
@@ -857,7 +859,9 @@ impl Core {
                     Conclusion::NotSent(error) if error.fault.waits_for_room()
                 );
                 self.with_lane(now, id, |lane, table| {
-                    route = lane.route_of(sequence).filter(|_| made_room).cloned();
+                    if made_room && table.has_lanes_without_room() {
+                        route = lane.route_of(sequence).cloned();
+                    }
                     lane.concluded(now.instant, sequence, attempt, conclusion, table);
                 });
                 // The attempt that ended has made room.

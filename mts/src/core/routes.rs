@@ -106,8 +106,10 @@ pub(super) struct Tallies(Map<Location, Arc<Tally>>);
 const MAX_TALLIES: usize = 4096;
 
 impl Tally {
+    /// Increments a counter by one. Only the core writes its counters, which its caller has locked.
     pub(super) fn add(counter: &AtomicU64) {
-        counter.fetch_add(1, Ordering::Relaxed);
+        let before = counter.load(Ordering::Relaxed);
+        counter.store(before.wrapping_add(1), Ordering::Relaxed);
     }
 
     pub(super) fn fail(&self, now: Instant, error: &impl std::fmt::Display) {

@@ -30,17 +30,19 @@ impl Lane {
         let Some(index) = self.index(sequence) else {
             return;
         };
-        let location = match &self.letters[index].progress.state {
-            State::UnderWay {
-                attempt: current,
-                location,
-                ..
-            } if *current == attempt => location.clone(),
-            _ => return,
+        let state = &mut self.letters[index].progress.state;
+        let is_current = matches!(
+            state,
+            State::UnderWay { attempt: current, .. } if *current == attempt
+        );
+        if !is_current {
+            return;
+        }
+        let State::UnderWay { location, .. } = std::mem::replace(state, State::Waiting) else {
+            return;
         };
         self.back();
         self.record_event(now, index);
-        self.letters[index].progress.state = State::Waiting;
         // The timer visits the letter again, also if its deadline passed in the meantime.
         self.due_at(match self.returning {
             true => now,
