@@ -158,7 +158,7 @@ struct Shared {
     owner: OwnerProcess,
 }
 
-/// What actions of the core leave to be done without the lock.
+/// Work that actions of the core leave to be done without the lock.
 #[derive(Default)]
 struct Unlocked {
     /// Whether contacts are to be published before the directory is refreshed.

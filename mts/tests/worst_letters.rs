@@ -408,13 +408,13 @@ fn crowded(agents: u64) -> (Core, Arc<dyn Directory>, Instant) {
             Verdict::Later => lanes += 1,
             verdict => assert_eq!(verdict, Verdict::Now(Answer::Busy)),
         }
-    }
-    assert!(lanes > LANES / 2, "{lanes} lanes");
-    while let Some(action) = core.poll_action() {
-        if let Action::Refresh { number } = action {
-            core.handle_refreshed(came, number);
+        while let Some(action) = core.poll_action() {
+            if let Action::Refresh { number } = action {
+                core.handle_refreshed(came, number);
+            }
         }
     }
+    assert!(lanes > LANES / 2, "{lanes} lanes");
     (core, directory, came.instant)
 }
 
