@@ -35,6 +35,8 @@ const MOST_STEPS_OF_A_LANE: u64 = MOST_STEPS + 4 * 1024;
 const LANES: u64 = 70_000;
 /// Time that letters have left.
 const DEADLINE: Duration = Duration::from_secs(5);
+/// Maximum number of actions that one call leaves to be carried out while the core is locked.
+const MOST_ACTIONS: usize = 128;
 const PEER: Incarnation = Incarnation::from_u64(2);
 const PROCESS: Incarnation = Incarnation::from_u64(3);
 
@@ -428,7 +430,9 @@ fn timeouts(core: &mut Core, (most, what): (u64, &str), at: Instant) -> Vec<Acti
             ..now()
         };
         bounded_by(most, what, 0, || core.handle_timeout(at));
+        let before = actions.len();
         actions.extend(std::iter::from_fn(|| core.poll_action()));
+        assert!(actions.len() - before <= MOST_ACTIONS, "{what}");
     }
     actions
 }
@@ -507,8 +511,10 @@ fn the_receiver_of_a_full_lane_leaves() {
     // The runtime refreshes the directory without the core locked.
     let mut ended = 0;
     loop {
-        let mut refresh = None;
+        let (mut refresh, mut actions) = (None, 0);
         while let Some(action) = core.poll_action() {
+            actions += 1;
+            assert!(actions <= MOST_ACTIONS, "{what}");
             match action {
                 Action::Refresh { number } => refresh = Some(number),
                 Action::Answer { .. } => ended += 1,
