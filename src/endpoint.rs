@@ -187,8 +187,7 @@ impl Endpoint {
                     agent = %self.name, error = %ErrorChain(&error),
                     "ignored a received letter: its message cannot be decoded"
                 );
-                self.mts()
-                    .handle_undecodable(&self.name, &received, error.to_string());
+                self.mts().handle_undecodable(&self.name, &received, &error);
                 return None;
             }
         };

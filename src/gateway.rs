@@ -17,6 +17,7 @@ mod publisher;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use fipa_acl::ErrorChain;
@@ -547,21 +548,23 @@ struct KnownPeers {
     directory: Arc<ContactDirectory>,
     publisher: Mutex<Option<Arc<Publisher>>>,
     network: Mutex<Option<Arc<dyn Network>>>,
+    /// Number of new agents in the directory so far.
+    heard: AtomicU64,
+    /// The number of them that are published. Locked while they are.
+    published: Mutex<u64>,
 }
 
 impl KnownPeers {
-    /// Records an agent of another host, and publishes it on this host.
+    /// Records an agent of another host.
     fn record(
         &self,
+        now: Instant,
         name: &str,
         agent: Incarnation,
         location: Location,
     ) -> Result<(), fipa_sds::EntryError> {
-        let is_new = self
-            .directory
-            .heard(Instant::now(), name, agent, location)?;
-        if is_new && let Some(publisher) = &*self.publisher.lock() {
-            publisher.publish();
+        if self.directory.heard(now, name, agent, location)? {
+            self.heard.fetch_add(1, Ordering::AcqRel);
         }
         Ok(())
     }
@@ -569,9 +572,23 @@ impl KnownPeers {
 
 impl Contacts for KnownPeers {
     fn heard(&self, name: &str, agent: Incarnation, location: Location) {
-        if let Err(error) = self.record(name, agent, location) {
+        if let Err(error) = self.record(Instant::now(), name, agent, location) {
             tracing::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
         }
+    }
+
+    fn publish(&self) {
+        let wanted = self.heard.load(Ordering::Acquire);
+        let mut published = self.published.lock();
+        if *published >= wanted {
+            return;
+        }
+        let heard = self.heard.load(Ordering::Acquire);
+        let publisher = self.publisher.lock().clone();
+        if let Some(publisher) = publisher {
+            publisher.publish();
+        }
+        *published = heard;
     }
 
     fn doubtful(&self, location: &Location, fault: TransportErrorKind) {

@@ -27,7 +27,15 @@ use fipa_transport::wire::truncated;
 pub use self::read::DeliveryFailure;
 use crate::letter_for;
 
-/// The parts of a letter that a message about its failure repeats.
+/// Maximum number of addresses of the sender in a failure message.
+const MAX_ADDRESSES: usize = 16;
+/// Maximum length in bytes of a text that a failure message repeats. A longer one is left out.
+const MAX_REPEATED: usize = 4096;
+/// Maximum number of services in the path of a letter, of which the last ones count.
+const MAX_PATH: usize = 64;
+
+/// The parts of a letter that a message about its failure repeats. Their length is bounded, because the message
+/// is written while the core is locked.
 #[derive(Debug)]
 pub(crate) struct Failed {
     /// Receiver of the failure message.
@@ -55,10 +63,10 @@ impl Failed {
             return None;
         }
         Some(Self {
-            sender: sender_of(message, letter)?,
-            protocol: message.protocol().map(str::to_owned),
-            conversation_id: message.conversation_id().map(str::to_owned),
-            reply_with: message.reply_with().map(str::to_owned),
+            sender: brief(&sender_of(message, letter)?)?,
+            protocol: repeated(message.protocol()),
+            conversation_id: repeated(message.conversation_id()),
+            reply_with: repeated(message.reply_with()),
             path: path(letter),
         })
     }
@@ -66,7 +74,7 @@ impl Failed {
     /// The same for a message that cannot be decoded.
     pub(crate) fn of_envelope(letter: &Letter) -> Option<Self> {
         Some(Self {
-            sender: letter.parse_envelope().ok()?.effective().from?,
+            sender: brief(&letter.parse_envelope().ok()?.effective().from?)?,
             protocol: None,
             conversation_id: None,
             reply_with: None,
@@ -170,11 +178,26 @@ pub(crate) fn sender_of(message: &Message, letter: &Letter) -> Option<AgentId> {
     Some(sender.clone())
 }
 
+/// Returns the name of an agent and its first addresses.
+fn brief(agent: &AgentId) -> Option<AgentId> {
+    let mut brief = AgentId::new(agent.name()).ok()?;
+    let addresses = agent.addresses().iter().take(MAX_ADDRESSES);
+    for address in addresses.filter(|it| it.len() <= MAX_REPEATED) {
+        brief = brief.with_address(address).ok()?;
+    }
+    Some(brief)
+}
+
+fn repeated(text: Option<&str>) -> Option<String> {
+    let text = text.filter(|text| text.len() <= MAX_REPEATED)?;
+    Some(text.to_owned())
+}
+
 fn path(letter: &Letter) -> Vec<String> {
     let envelope = letter.envelope();
     let mut path: Vec<String> = match EnvelopeView::parse(&envelope) {
         Ok(view) => {
-            let stamps = view.stamps();
+            let stamps = view.stamps().take(MAX_PATH);
             stamps
                 .map(|stamp| stamp.by().as_str().into_owned())
                 .collect()

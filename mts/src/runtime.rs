@@ -37,7 +37,7 @@ use crate::AccessGate;
 use crate::Map;
 use crate::core::{
     Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
-    RouteState, SendId, Submission,
+    RouteState, SendId, Submission, Undecodable,
 };
 
 /// Configuration of the runtime, in addition to that of the core.
@@ -68,8 +68,13 @@ impl fmt::Debug for RuntimeConfig {
 /// Receives news about other hosts: services with an open connection, and agents that are in no
 /// directory.
 pub trait Contacts: Send + Sync {
-    /// A letter from an agent behind this location has arrived; see [`Action::Heard`].
+    /// A letter from an agent behind this location has arrived; see [`Action::Heard`]. Called with the service
+    /// locked; must not block.
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
+
+    /// Publishes the agents of [`heard`](Self::heard) to the processes of this host. Called without the service
+    /// locked, because it may write files.
+    fn publish(&self);
 
     /// A service may be gone; see [`Action::Doubtful`].
     fn doubtful(&self, location: &Location, fault: TransportErrorKind);
@@ -154,6 +159,15 @@ struct Shared {
     locations: Mutex<Vec<(Kind, Vec<Location>)>>,
     located: watch::Sender<Arc<[Location]>>,
     owner: OwnerProcess,
+}
+
+/// Work that actions of the core leave to be done without the lock.
+#[derive(Default)]
+struct Unlocked {
+    /// Whether contacts are to be published before the directory is refreshed.
+    has_heard: bool,
+    /// Number of the last refresh of the directory that the core has requested.
+    refresh: Option<u64>,
 }
 
 struct State {
@@ -531,12 +545,20 @@ impl Mts {
 
     /// Reports that an agent took a letter whose message cannot be decoded; see
     /// [`Core::handle_undecodable`].
-    pub fn handle_undecodable(&self, receiver: &Arc<str>, received: &Received, why: String) {
+    pub fn handle_undecodable(
+        &self,
+        receiver: &Arc<str>,
+        received: &Received,
+        why: &dyn fmt::Display,
+    ) {
+        let Some(undecodable) = Undecodable::read(received, why) else {
+            return;
+        };
         // The sender may have been registered just now.
         self.shared.directory.refresh();
         let mut state = self.shared.lock();
         let now = state.clocks.now();
-        state.core.handle_undecodable(now, receiver, received, why);
+        state.core.handle_undecodable(now, receiver, undecodable);
         self.shared.carry_out(state);
     }
 
@@ -639,25 +661,29 @@ impl Shared {
         guard: MutexGuard<'a, State>,
         release: fn(MutexGuard<'a, State>),
     ) {
-        let mut refresh = self.perform(guard, release);
-        while let Some(number) = refresh {
+        let mut rest = self.perform(guard, release);
+        while let Some(number) = rest.refresh {
+            if rest.has_heard
+                && let Some(contacts) = &self.config.contacts
+            {
+                contacts.publish();
+            }
             self.directory.refresh();
             let mut state = self.lock();
             let now = state.clocks.now();
             state.core.handle_refreshed(now, number);
-            refresh = self.perform(state, release);
+            rest = self.perform(state, release);
         }
     }
 
-    /// Carries out the actions of the core, then releases the lock. Returns the number of the last
-    /// refresh of the directory that the core has requested.
+    /// Carries out the actions of the core, then releases the lock. Returns what is to be done without the lock.
     fn perform<'a>(
         &self,
         mut guard: MutexGuard<'a, State>,
         release: fn(MutexGuard<'a, State>),
-    ) -> Option<u64> {
+    ) -> Unlocked {
         let state = &mut *guard;
-        let mut refresh = None;
+        let mut rest = Unlocked::default();
         while let Some(action) = state.core.poll_action() {
             match action {
                 Action::Dispatch {
@@ -717,10 +743,11 @@ impl Shared {
                     if let Some(contacts) = &self.config.contacts {
                         contacts.heard(&name, agent, location);
                         state.update_view(&*self.directory);
+                        rest.has_heard = true;
                     }
                 }
                 // One refresh is enough for all that were requested before it.
-                Action::Refresh { number } => refresh = Some(number),
+                Action::Refresh { number } => rest.refresh = Some(number),
                 Action::Resolved { send, outcomes } => state.resolved(send, outcomes),
                 Action::Notice(notice) => {
                     if let Some(tap) = &self.config.tap {
@@ -744,7 +771,7 @@ impl Shared {
         if earlier {
             self.timer.notify_one();
         }
-        refresh
+        rest
     }
 
     /// Waits until `look` finds something: drives the transports for a while, then sleeps.
@@ -874,7 +901,8 @@ async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
             state.core.handle_timeout(now);
             state.armed = state.core.poll_timeout();
             let due = state.armed;
-            shared.carry_out(state);
+            // More may be due at once. A thread that waits for the lock precedes it.
+            shared.carry_out_then(state, MutexGuard::unlock_fair);
             due
         };
         match due {

@@ -4,6 +4,7 @@
 
 mod common;
 
+use std::collections::VecDeque;
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -33,6 +34,8 @@ const ARM: Incarnation = Incarnation::from_u64(0xa53);
 
 struct Gateway {
     core: Core,
+    /// Actions that were not looked at yet.
+    actions: VecDeque<Action>,
     start: Instant,
 }
 
@@ -49,6 +52,7 @@ impl Gateway {
         };
         Self {
             core: Core::new(config, Arc::new(directory)),
+            actions: VecDeque::new(),
             start: Instant::now(),
         }
     }
@@ -75,8 +79,22 @@ impl Gateway {
             ticket: Ticket(7),
         };
         let now = self.at(ms);
-        self.core
-            .handle_arrival(now, via, via == Kind::Shm, arrival)
+        let verdict = self
+            .core
+            .handle_arrival(now, via, via == Kind::Shm, arrival);
+        // As the runtime does, also for the refresh that follows a contact.
+        while let Some(action) = self.core.poll_action() {
+            match action {
+                Action::Refresh { number } => self.core.handle_refreshed(now, number),
+                other => self.actions.push_back(other),
+            }
+        }
+        verdict
+    }
+
+    fn poll_action(&mut self) -> Option<Action> {
+        let earlier = self.actions.pop_front();
+        earlier.or_else(|| self.core.poll_action())
     }
 
     fn conclude(&mut self, ms: u64, attempt: AttemptId, answer: Answer) {
@@ -92,8 +110,8 @@ impl Gateway {
 
     /// The next action except contacts.
     fn next(&mut self) -> Option<Action> {
-        match self.core.poll_action() {
-            Some(Action::Heard { .. } | Action::Doubtful { .. }) => self.core.poll_action(),
+        match self.poll_action() {
+            Some(Action::Heard { .. } | Action::Doubtful { .. }) => self.poll_action(),
             other => other,
         }
     }
@@ -110,7 +128,7 @@ impl Gateway {
     }
 
     fn answered(&mut self) -> Answer {
-        match self.core.poll_action() {
+        match self.poll_action() {
             Some(Action::Answer {
                 kind: Kind::Tcp,
                 ticket: Ticket(7),
@@ -121,7 +139,7 @@ impl Gateway {
     }
 
     fn nothing_to_do(&mut self) {
-        let action = self.core.poll_action();
+        let action = self.poll_action();
         assert!(action.is_none(), "{action:?}");
     }
 }
@@ -430,7 +448,7 @@ fn an_unknown_sender_becomes_a_contact() {
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
         Verdict::Later
     );
-    match gateway.core.poll_action() {
+    match gateway.poll_action() {
         Some(Action::Heard {
             name,
             agent,
@@ -441,13 +459,13 @@ fn an_unknown_sender_becomes_a_contact() {
         other => panic!("{other:?}"),
     }
     assert!(matches!(
-        gateway.core.poll_action(),
+        gateway.poll_action(),
         Some(Action::Dispatch { .. })
     ));
     // Senders of this host are in its directory, or must not be.
     gateway.arrive(0, Kind::Shm, parcel(2, letter()));
     assert!(matches!(
-        gateway.core.poll_action(),
+        gateway.poll_action(),
         Some(Action::Dispatch { .. })
     ));
 }

@@ -31,6 +31,8 @@ struct Halting {
 impl Contacts for Halting {
     fn heard(&self, _: &str, _: Incarnation, _: Location) {}
 
+    fn publish(&self) {}
+
     fn doubtful(&self, _: &Location, _: TransportErrorKind) {}
 
     fn introduced(&self, _: &Introduction) {

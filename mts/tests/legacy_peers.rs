@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Undecodable, Unframed};
 use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{
     ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
@@ -64,14 +64,17 @@ fn now() -> Now {
 
 /// The next letter that the core dispatches.
 fn dispatched(core: &mut Core) -> Option<(AttemptId, Location, Parcel)> {
-    let mut actions = std::iter::from_fn(|| core.poll_action());
-    match actions.find(|action| !matches!(action, Action::Heard { .. }))? {
-        Action::Dispatch {
-            attempt,
-            location,
-            parcel,
-        } => Some((attempt, location, parcel)),
-        other => panic!("{other:?}"),
+    loop {
+        match core.poll_action()? {
+            Action::Heard { .. } => {}
+            Action::Refresh { number } => core.handle_refreshed(now(), number),
+            Action::Dispatch {
+                attempt,
+                location,
+                parcel,
+            } => return Some((attempt, location, parcel)),
+            other => panic!("{other:?}"),
+        }
     }
 }
 
@@ -458,7 +461,8 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_gets_a_failure_message()
         service: Incarnation::UNKNOWN,
         remote: false,
     };
-    core.handle_undecodable(now(), &arm, &received(rover), "for a test".to_owned());
+    let read = |received: &Received| Undecodable::read(received, &"for a test").unwrap();
+    core.handle_undecodable(now(), &arm, read(&received(rover)));
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.kind(), Kind::Shm);
     assert_eq!(&*parcel.receiver, "rover");
@@ -469,7 +473,7 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_gets_a_failure_message()
 
     // A letter of another agent under this name causes no failure message.
     let other = received(Incarnation::from_u64(66));
-    core.handle_undecodable(now(), &arm, &other, "for a test".to_owned());
+    core.handle_undecodable(now(), &arm, read(&other));
     assert!(core.poll_action().is_none());
 }
 

@@ -7,7 +7,9 @@ mod common;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
 use fipa_sds::{
     ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration, Role,
 };
@@ -598,6 +600,56 @@ fn letters_of_invented_senders_take_bounded_memory() {
     assert_eq!(taken + held_back, verdicts.len());
     let lanes = lanes(&mut bench);
     assert!(lanes <= 4096, "{lanes} lanes");
+}
+
+/// Each agent that becomes known by a letter is published to all processes of the host.
+#[test]
+fn a_peer_that_invents_senders_makes_few_of_them_known() {
+    let mut bench = Bench::new();
+    let heard = |bench: &mut Bench, number: u64| {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new(format!("invented_{number}")).unwrap())
+            .receiver(AgentId::new("arm").unwrap());
+        let letter = letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap();
+        let stream = (Incarnation::from_u64(1000 + number), ARM);
+        let verdict = bench.arrives(link(LIAR, LIAR), stream, (1, Body::Letter(letter)));
+        assert_eq!(verdict, Verdict::Later);
+        let actions = std::iter::from_fn(|| bench.core.poll_action());
+        actions
+            .filter(|action| matches!(action, Action::Heard { .. }))
+            .count()
+    };
+    let at_once: usize = (0..1000).map(|number| heard(&mut bench, number)).sum();
+    assert_eq!(at_once, 128);
+    bench.now.instant += Duration::from_secs(1);
+    let later: usize = (1000..2000).map(|number| heard(&mut bench, number)).sum();
+    assert_eq!(later, 20);
+}
+
+/// The state of a small letter takes more memory than its bytes.
+#[test]
+fn small_letters_take_bounded_memory() {
+    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    let location = vec![at(PROCESS, "shm://arms")];
+    own.register(Registration::new("arm", ARM, location))
+        .unwrap();
+    let config = CoreConfig {
+        forwards: true,
+        custody_bytes: 16 << 20,
+        ..CoreConfig::new("mts", GATEWAY, vec![Kind::Shm])
+    };
+    let mut bench = Bench::new();
+    bench.core = Core::new(config, Arc::new(MergedDirectory::new(vec![own])));
+    let mut taken = 0;
+    for sender in 0..100 {
+        let stream = (Incarnation::from_u64(1000 + sender), ARM);
+        for sequence in 1..=1000 {
+            let verdict = bench.letter(link(LIAR, LIAR), stream, sequence);
+            taken += usize::from(verdict == Verdict::Later);
+        }
+    }
+    // A letter has 71 bytes, and half of the custody is for other receivers.
+    assert!((1000..=8192).contains(&taken), "{taken} letters");
 }
 
 /// A peer decides how often it connects.

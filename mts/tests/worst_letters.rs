@@ -12,23 +12,31 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{
-    AgentId, Envelope, EnvelopeParams, Letter, Message, MessageView, Performative, Received, Time,
+    AgentId, Envelope, EnvelopeParams, Letter, Message, MessageView, Performative, Time,
 };
 #[cfg(debug_assertions)]
 use fipa_mts::core::work;
-use fipa_mts::core::{Action, Core, CoreConfig, Now, Unframed};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Undecodable, Unframed};
 use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Arrival, Body, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel, Principal,
-    Report, Signature, Stream, Ticket, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
+    Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, TransportError,
+    TransportErrorKind, Verdict,
 };
 use rustix::time::{ClockId, clock_gettime};
 
 const AGENTS: u64 = 1000;
 /// Maximum number of steps of the core under one lock.
-#[cfg(debug_assertions)]
 const MOST_STEPS: u64 = 128;
+/// The same for visits of a full lane, which look at each of its letters.
+const MOST_STEPS_OF_A_LANE: u64 = MOST_STEPS + 4 * 1024;
+/// More lanes than custody has room for.
+const LANES: u64 = 70_000;
+/// Time that letters have left.
+const DEADLINE: Duration = Duration::from_secs(5);
+/// Maximum number of actions that one call leaves to be carried out while the core is locked.
+const MOST_ACTIONS: usize = 128;
 const PEER: Incarnation = Incarnation::from_u64(2);
 const PROCESS: Incarnation = Incarnation::from_u64(3);
 
@@ -77,6 +85,11 @@ fn letter(receivers: &[String], parameters: usize) -> Letter {
 /// Performs the work on one arrival that was read, or on a portion of it, while the core is locked. The number of
 /// its steps has one bound for all letters.
 fn bounded<R>(what: &str, bytes: usize, work: impl FnOnce() -> R) -> R {
+    bounded_by(MOST_STEPS, what, bytes, work)
+}
+
+/// The same with this bound.
+fn bounded_by<R>(most: u64, what: &str, bytes: usize, work: impl FnOnce() -> R) -> R {
     #[cfg(debug_assertions)]
     let _earlier = work::taken();
     let before = processor_time();
@@ -86,11 +99,10 @@ fn bounded<R>(what: &str, bytes: usize, work: impl FnOnce() -> R) -> R {
     {
         let steps = work::taken();
         println!("{what}: {bytes} bytes, {steps} steps");
-        assert!(
-            steps <= MOST_STEPS,
-            "{what}: {steps} steps for {bytes} bytes"
-        );
+        assert!(steps <= most, "{what}: {steps} steps for {bytes} bytes");
     }
+    #[cfg(not(debug_assertions))]
+    let _ = most;
     println!("{what}: {bytes} bytes, {took:?}");
     result
 }
@@ -119,7 +131,7 @@ fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
             sequence,
             after: sequence - 1,
             transfer: sequence,
-            remaining: Duration::from_secs(5),
+            remaining: DEADLINE,
             body,
         },
         from: Hop {
@@ -260,7 +272,7 @@ fn a_letter_with_the_maximum_of_stamps() {
     for stamps in [1, 100, 5000] {
         let (mut core, _) = core();
         let mut letter = letter(&["arm_0".to_owned()], 0);
-        let received = Received {
+        let received = fipa_acl::Received {
             by: "another".into(),
             date: Time::from_system_time(SystemTime::UNIX_EPOCH).unwrap(),
             from: None,
@@ -277,6 +289,83 @@ fn a_letter_with_the_maximum_of_stamps() {
         let what = format!("{stamps} stamps");
         framed(&mut core, &what, letter);
     }
+}
+
+/// The failure message about a letter repeats parts of it.
+#[test]
+fn a_letter_whose_failure_message_repeats_long_parts() {
+    let message =
+        || Message::builder(Performative::Inform).receiver(AgentId::new("nobody").unwrap());
+    let at_home = |agent: AgentId| agent.with_address("tcp://127.0.0.1:6789").unwrap();
+    let liar = || at_home(AgentId::new("liar").unwrap());
+    let mut addresses = liar();
+    for number in 0..50_000 {
+        addresses = addresses
+            .with_address(format!("tcp://192.0.2.1:{number}"))
+            .unwrap();
+    }
+    let long = "x".repeat(1 << 20);
+    for (what, message) in [
+        ("many addresses", message().sender(addresses)),
+        (
+            "a long address",
+            message().sender(liar().with_address(&long).unwrap()),
+        ),
+        (
+            "a long conversation identifier",
+            message().sender(liar()).conversation_id(&long),
+        ),
+        ("a long protocol", message().sender(liar()).protocol(&long)),
+        (
+            "a long reply-with",
+            message().sender(liar()).reply_with(&long),
+        ),
+        (
+            "a long user-defined parameter",
+            message().sender(liar()).user_defined("x-y", &long),
+        ),
+    ] {
+        let (mut core, directory) = core();
+        let letter = letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap();
+        let bytes = letter.len();
+        let from = LegacySource {
+            address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+            signature: Signature::FipaServices,
+        };
+        let read = Unframed::read(letter, Kind::Tcp, from, &*directory).unwrap();
+        let what = format!("a failure message about a letter with {what}");
+        let actions = in_portions(&mut core, &what, (bytes, read)).into_iter();
+        let told = actions.filter(|action| matches!(action, Action::Dispatch { .. }));
+        assert_eq!(told.count(), 1, "{what}");
+    }
+}
+
+/// A letter of an agent of this host whose message cannot be decoded.
+#[test]
+fn a_long_letter_that_cannot_be_decoded() {
+    let (mut core, directory) = core();
+    let sender = directory.lookup("arm_7").unwrap();
+    let letter = letter(&["arm_0".to_owned()], 0);
+    let mut envelope = letter.parse_envelope().unwrap();
+    envelope.base.from = Some(AgentId::new("arm_7").unwrap());
+    for number in 0..50_000 {
+        let parameter = (format!("x-{number}"), "value".to_owned());
+        envelope.base.user_defined.push(parameter);
+    }
+    let envelope = envelope.encode_standard().unwrap();
+    let received = Received {
+        letter: Letter::new(envelope, Bytes::from(vec![b'('; 1 << 20])),
+        sender: sender.incarnation,
+        via: Some(Kind::Shm),
+        service: PROCESS,
+        remote: false,
+    };
+    let bytes = received.letter.len();
+    let undecodable = Undecodable::read(&received, &"for a test").unwrap();
+    bounded("a letter that cannot be decoded", bytes, || {
+        core.handle_undecodable(now(), &"arm_0".into(), undecodable);
+    });
+    assert!(matches!(core.poll_action(), Some(Action::Dispatch { .. })));
 }
 
 /// A full lane in which every letter waits for the one before it.
@@ -303,6 +392,166 @@ fn a_letter_for_a_full_lane() {
         ("a report", Body::Report(report)),
     ] {
         bounded(what, 64, || arrives(&mut core, (9, 100), 1023, body));
+    }
+}
+
+/// A core with as many lanes as peers can have it keep, each with a letter of an invented sender. All letters came at
+/// this time, and have the same deadline.
+fn crowded(agents: u64) -> (Core, Arc<dyn Directory>, Instant) {
+    let (mut core, directory) = core_with(agents);
+    let letter = letter(&["arm_0".to_owned()], 0);
+    let came = now();
+    let mut lanes = 0;
+    for sender in 0..LANES {
+        let stream = (1_000_000 + sender, 100 + sender % agents);
+        let arrival = arrival(stream, 1, Body::Letter(letter.clone()));
+        let read = core.reader().read_arrival(&arrival);
+        match core.handle_read_arrival(came, Kind::Tcp, false, arrival, read) {
+            Verdict::Later => lanes += 1,
+            verdict => assert_eq!(verdict, Verdict::Now(Answer::Busy)),
+        }
+        while let Some(action) = core.poll_action() {
+            if let Action::Refresh { number } = action {
+                core.handle_refreshed(came, number);
+            }
+        }
+    }
+    assert!(lanes > LANES / 2, "{lanes} lanes");
+    (core, directory, came.instant)
+}
+
+/// Handles timeouts as the runtime does, with the core locked for one call at a time, until none is due at this time.
+/// Returns the actions.
+fn timeouts(core: &mut Core, (most, what): (u64, &str), at: Instant) -> Vec<Action> {
+    let mut actions = Vec::new();
+    while core.poll_timeout().is_some_and(|due| due <= at) {
+        let at = Now {
+            instant: at,
+            ..now()
+        };
+        bounded_by(most, what, 0, || core.handle_timeout(at));
+        let before = actions.len();
+        actions.extend(std::iter::from_fn(|| core.poll_action()));
+        assert!(actions.len() - before <= MOST_ACTIONS, "{what}");
+    }
+    actions
+}
+
+/// The letters of many senders pass their deadlines at once.
+#[test]
+fn deadlines_of_many_lanes() {
+    let (mut core, _, came) = crowded(AGENTS);
+    let ended = timeouts(
+        &mut core,
+        (MOST_STEPS, "deadlines of many lanes"),
+        came + DEADLINE,
+    );
+    let ended = ended.into_iter();
+    let ended = ended.filter(|action| matches!(action, Action::Abandon { .. }));
+    assert!(ended.count() as u64 > LANES / 2);
+}
+
+/// A full lane, whose letters came from another gateway to `arm_0` at this time and have the same deadline.
+/// Also returns the attempts under way.
+fn full_lane() -> (Core, Arc<dyn Directory>, Instant, Vec<AttemptId>) {
+    let (mut core, directory) = core();
+    let letter = letter(&["arm_0".to_owned()], 0);
+    let came = now();
+    for sequence in 1..1025 {
+        let arrival = arrival((9, 100), sequence, Body::Letter(letter.clone()));
+        let read = core.reader().read_arrival(&arrival);
+        let verdict = core.handle_read_arrival(came, Kind::Tcp, false, arrival, read);
+        assert_eq!(verdict, Verdict::Later);
+    }
+    let mut sent = Vec::new();
+    while let Some(action) = core.poll_action() {
+        match action {
+            Action::Dispatch { attempt, .. } => sent.push(attempt),
+            Action::Refresh { number } => core.handle_refreshed(came, number),
+            _ => {}
+        }
+    }
+    (core, directory, came.instant, sent)
+}
+
+/// All letters of a full lane pass their deadline at once.
+#[test]
+fn deadlines_of_a_full_lane() {
+    let (mut core, _, came, sent) = full_lane();
+    let what = (MOST_STEPS_OF_A_LANE, "deadlines of a full lane");
+    let ended = timeouts(&mut core, what, came + DEADLINE);
+    let answers = ended.iter();
+    let answers = answers.filter(|action| matches!(action, Action::Answer { .. }));
+    assert_eq!(answers.count(), 1024);
+    let abandoned = ended.iter();
+    let abandoned = abandoned.filter(|action| matches!(action, Action::Abandon { .. }));
+    assert_eq!(abandoned.count(), sent.len());
+}
+
+/// The receiver of all letters of a full lane leaves, and its process refuses the letters that were sent.
+#[test]
+fn the_receiver_of_a_full_lane_leaves() {
+    let (mut core, directory, came, sent) = full_lane();
+    directory
+        .deregister("arm_0", Incarnation::from_u64(100))
+        .unwrap();
+    drop(core.set_view(directory.view()));
+    let now = Now {
+        instant: came,
+        ..now()
+    };
+    let what = "the receiver of a full lane leaves";
+    bounded_by(MOST_STEPS_OF_A_LANE, what, 0, || {
+        core.handle_directory_change(now);
+    });
+    for attempt in sent {
+        let gone = TransportError::new(TransportErrorKind::WrongIncarnation, "");
+        core.handle_conclusion(now, attempt, Conclusion::NotSent(gone));
+    }
+    // The runtime refreshes the directory without the core locked.
+    let mut ended = 0;
+    loop {
+        let (mut refresh, mut actions) = (None, 0);
+        while let Some(action) = core.poll_action() {
+            actions += 1;
+            assert!(actions <= MOST_ACTIONS, "{what}");
+            match action {
+                Action::Refresh { number } => refresh = Some(number),
+                Action::Answer { .. } => ended += 1,
+                _ => {}
+            }
+        }
+        let Some(number) = refresh else { break };
+        bounded_by(MOST_STEPS_OF_A_LANE, what, 0, || {
+            core.handle_refreshed(now, number);
+        });
+    }
+    assert_eq!(ended, 1024);
+}
+
+/// A peer can announce and withdraw agents while many lanes have letters.
+#[test]
+fn changes_of_the_directory_with_many_lanes() {
+    let (mut core, directory, came) = crowded(AGENTS);
+    for (name, agent) in [("arm_0", 100), ("arm_1", 101)] {
+        let agent = Incarnation::from_u64(agent);
+        let left = directory.lookup(name).unwrap();
+        directory.deregister(name, agent).unwrap();
+        drop(core.set_view(directory.view()));
+        bounded("a change of the directory", 0, || {
+            let now = Now {
+                instant: came,
+                ..now()
+            };
+            core.handle_departure(now, &left);
+            core.handle_directory_change(now);
+        });
+        while core.poll_action().is_some() {}
+        timeouts(
+            &mut core,
+            (MOST_STEPS, "a change of the directory, continued"),
+            came,
+        );
     }
 }
 

@@ -5,6 +5,7 @@ use std::hash::Hash;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use arc_swap::ArcSwap;
 use fipa_transport::Incarnation;
 use parking_lot::RwLock;
 
@@ -55,6 +56,8 @@ macro_rules! reads_its_table {
 #[derive(Debug)]
 pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
+    /// The holders of names for views, which do not wait for a large update.
+    published: ArcSwap<Snapshot>,
     generation: AtomicU64,
     subscribers: Subscribers,
 }
@@ -66,7 +69,7 @@ struct Index<O> {
     /// Names that more than one proved origin claims.
     contested: BTreeSet<Arc<str>>,
     is_proved: fn(&O) -> bool,
-    /// The entries that hold their names. Copied for a change while a view has them.
+    /// The entries that hold their names. Copied for a change, because a view has them.
     holders: Arc<Snapshot>,
     /// The latest name claimed by each origin of a single entry.
     #[cfg(feature = "mdns")]
@@ -89,6 +92,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
                 #[cfg(feature = "mdns")]
                 origins: HashMap::new(),
             }),
+            published: ArcSwap::default(),
             generation: AtomicU64::new(0),
             subscribers: Subscribers::default(),
         }
@@ -121,6 +125,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
     pub(crate) fn set_lost(&self, lost: impl IntoIterator<Item = Arc<Entry>>) {
         let mut index = self.index.write();
         Arc::make_mut(&mut index.holders).set_lost(lost);
+        self.publish(&index);
         self.touch();
     }
 
@@ -143,12 +148,18 @@ impl<O: Clone + Eq + Hash> Table<O> {
     /// entries changed.
     pub(crate) fn notify_reread(&self) {
         let _index = self.index.write();
-        self.notify(Some(Change::Lagged));
+        self.notify(Change::Lagged);
     }
 
-    /// Returns a view of the entries that hold their names.
+    /// Returns a view of the entries that hold their names. Does not wait for an update: the delivery
+    /// core is locked when it takes a view.
     pub(crate) fn view(&self) -> Arc<dyn View> {
-        Arc::clone(&self.index.read().holders) as Arc<dyn View>
+        self.published.load_full()
+    }
+
+    /// Makes the entries visible to later views. Precedes the notifications of their changes.
+    fn publish(&self, index: &Index<O>) {
+        self.published.store(Arc::clone(&index.holders));
     }
 
     /// Changes the generation, because data beside the entries changed.
@@ -202,23 +213,21 @@ impl<O: Clone + Eq + Hash> Table<O> {
     #[cfg(feature = "mdns")]
     pub(crate) fn replace(&self, updates: impl IntoIterator<Item = (O, Option<Arc<Entry>>)>) {
         let mut index = self.index.write();
-        let mut coalitions = Vec::new();
+        let mut changes = Vec::new();
         for (origin, entry) in updates {
             let before = index.origins.remove(&origin);
             if let Some(name) = before
                 && entry.as_ref().is_none_or(|entry| entry.name != name)
             {
-                let change = index.change(origin.clone(), name, None);
-                self.notify_or_collect(change, &mut coalitions);
+                changes.extend(index.change(origin.clone(), name, None));
             }
             if let Some(entry) = entry {
                 let name = entry.name.clone();
                 index.origins.insert(origin.clone(), name.clone());
-                let change = index.change(origin, name, Some(entry));
-                self.notify_or_collect(change, &mut coalitions);
+                changes.extend(index.change(origin, name, Some(entry)));
             }
         }
-        self.notify(Change::together(coalitions));
+        self.changed(&index, changes);
     }
 
     /// Number of origins that have an entry by [`replace`](Self::replace).
@@ -233,33 +242,37 @@ impl<O: Clone + Eq + Hash> Table<O> {
         updates: impl IntoIterator<Item = (O, Arc<str>, Option<Arc<Entry>>)>,
     ) {
         let mut index = self.index.write();
-        let mut coalitions = Vec::new();
+        let mut changes = Vec::new();
         for (origin, name, entry) in updates {
-            let change = index.change(origin, name, entry);
-            self.notify_or_collect(change, &mut coalitions);
+            changes.extend(index.change(origin, name, entry));
         }
-        self.notify(Change::together(coalitions));
+        self.changed(&index, changes);
     }
 
-    /// Collects changes of coalitions, which are reported as one change so that a merger has no
-    /// intermediate state; reports other changes at once.
-    fn notify_or_collect(&self, change: Option<Change>, coalitions: &mut Vec<Change>) {
-        match change {
-            Some(change) if change.of_coalition() => coalitions.push(change),
-            change => self.notify(change),
-        }
-    }
-
-    /// Notifies watchers under the lock, so that they receive changes in order.
     fn apply(&self, index: &mut Index<O>, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) {
-        self.notify(index.change(origin, name, entry));
+        let change = index.change(origin, name, entry);
+        self.changed(index, change);
     }
 
-    fn notify(&self, change: Option<Change>) {
-        if let Some(change) = change {
-            self.generation.fetch_add(1, Ordering::Release);
-            self.subscribers.tell(&change);
+    /// Publishes the entries, and notifies watchers under the lock, so that they receive changes in order. Changes
+    /// of coalitions are reported as one, so that a merger has no intermediate state.
+    fn changed(&self, index: &Index<O>, changes: impl IntoIterator<Item = Change>) {
+        self.publish(index);
+        let mut coalitions = Vec::new();
+        for change in changes {
+            match change.of_coalition() {
+                true => coalitions.push(change),
+                false => self.notify(change),
+            }
         }
+        if let Some(change) = Change::together(coalitions) {
+            self.notify(change);
+        }
+    }
+
+    fn notify(&self, change: Change) {
+        self.touch();
+        self.subscribers.tell(&change);
     }
 }
 
@@ -341,6 +354,24 @@ mod tests {
         arm.registered = std::time::UNIX_EPOCH;
         let gateway = Mts::new("theirs", Incarnation::from_u64(gateway));
         Arc::new(arm.into_entry(&gateway, Source::Mdns).unwrap())
+    }
+
+    #[test]
+    fn a_view_does_not_wait_for_an_update_and_is_as_new_as_its_generation() {
+        let table = Table::new();
+        let (first, second) = (entry(1, 7, "10.99.0.51"), entry(2, 8, "10.99.0.52"));
+        table.put("first", Arc::clone(&first));
+        let generation = table.generation();
+        let updates = std::iter::once(()).map(|()| {
+            // The update has begun.
+            let seen = table.view().named("arm");
+            assert_eq!(seen.as_ref(), Some(&first));
+            assert_eq!(table.generation(), generation);
+            ("first", second.name.clone(), Some(Arc::clone(&second)))
+        });
+        table.update(updates);
+        assert_ne!(table.generation(), generation);
+        assert_eq!(table.view().named("arm"), Some(second));
     }
 
     #[test]

@@ -647,6 +647,86 @@ fn entries_that_arrived_too_early_are_requested_again() {
     assert!(world.agrees());
 }
 
+/// A peer can connect under many incarnations, and send letters that arrive before these are reported as connected.
+#[test]
+fn gateways_that_never_become_neighbors_keep_no_others_from_being_asked() {
+    let mut world = World::new(2, 6);
+    world.join(0, "arm");
+    let now = world.now;
+    let again = br#"{"version":1,"tell":"again"}"#;
+    for stranger in 0..10_000 {
+        let stranger = Incarnation::from_u64(1_000_000 + stranger);
+        let told = world.gateways[1]
+            .exchange
+            .handle_letter(now, stranger, again);
+        assert!(matches!(told, Err(ExchangeError::Stranger)));
+    }
+    let present = [Present::unproved(
+        world.gateways[1].mts.clone(),
+        vec![location(1)],
+    )];
+    world.gateways[0].exchange.handle_neighbours(now, &present);
+    world.run(Duration::from_millis(200));
+    assert!(!world.agrees());
+    world.connect();
+    world.run(Duration::from_millis(1500));
+    assert!(world.agrees());
+}
+
+/// A small letter costs no copy of all agents of its sender.
+#[test]
+fn the_agents_of_a_gateway_are_bounded_also_by_changes() {
+    let mut exchange = with_neighbour();
+    let from = Incarnation::from_u64(7);
+    let agent = |number: usize| {
+        format!(
+            r#"{{"name":"agent_{number}","id":"{:016x}","registered":0}}"#,
+            100 + number
+        )
+    };
+    let tell = |exchange: &mut Exchange, text: String| {
+        exchange.handle_letter(Instant::now(), from, text.as_bytes())
+    };
+    let first =
+        r#"{"version":1,"tell":{"full":{"version":0,"first":true,"last":true,"agents":[]}}}"#;
+    tell(&mut exchange, first.to_owned()).unwrap();
+    let mut version = 0;
+    let mut change = |exchange: &mut Exchange, joined: &[usize], left: &[usize]| {
+        let joined: Vec<String> = joined.iter().map(|number| agent(*number)).collect();
+        let left: Vec<String> = left.iter().map(|it| format!(r#""agent_{it}""#)).collect();
+        let (joined, left, next) = (joined.join(","), left.join(","), version + 1);
+        let told = tell(
+            exchange,
+            format!(
+                r#"{{"version":1,"tell":{{"changes":{{"from":{version},"to":{next},"agents":[{joined}],"left":[{left}]}}}}}}"#
+            ),
+        );
+        if told.is_ok() {
+            version = next;
+        }
+        told
+    };
+    let all: Vec<usize> = (0..Exchange::MAX_AGENTS).collect();
+    for part in all.chunks(1000) {
+        change(&mut exchange, part, &[]).unwrap();
+    }
+    let too_many = |told| matches!(told, Err(ExchangeError::TooMany));
+    assert!(too_many(change(
+        &mut exchange,
+        &[Exchange::MAX_AGENTS],
+        &[]
+    )));
+    // One that leaves and returns, one that is named twice, and unknown ones.
+    change(&mut exchange, &[3, 4, 4], &[3, 3, 1_000_000]).unwrap();
+    assert!(too_many(change(&mut exchange, &[3, 20_000], &[3])));
+    change(&mut exchange, &[20_000], &[5, 1_000_000]).unwrap();
+    let directory = exchange.directory();
+    assert_eq!(directory.entries().len(), Exchange::MAX_AGENTS);
+    assert!(directory.known("agent_5").is_none());
+    assert!(directory.known("agent_3").is_some());
+    assert!(directory.known("agent_20000").is_some());
+}
+
 #[test]
 fn the_agents_of_a_gateway_follow_its_location() {
     let mut world = World::new(2, 5);

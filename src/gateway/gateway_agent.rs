@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::{Received, Submission};
-use fipa_mts::letter_for;
+use fipa_mts::{Contacts as _, letter_for};
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
 use fipa_transport::Incarnation;
 use fipa_transport_net::Refusals;
@@ -149,10 +149,12 @@ impl GatewayAgent {
         {
             return Err("the directory lists another agent of this name".to_owned());
         }
-        let recorded = self
-            .contacts
-            .record(&name, Incarnation::UNKNOWN, location.clone());
-        recorded.map_err(|error| ErrorChain(&error).to_string())
+        let (now, agent) = (Instant::now(), Incarnation::UNKNOWN);
+        self.contacts
+            .record(now, &name, agent, location.clone())
+            .map_err(|error| ErrorChain(&error).to_string())?;
+        self.contacts.publish();
+        Ok(())
     }
 
     /// Logs a notice about a name that another gateway sent to the operator of this one. At most

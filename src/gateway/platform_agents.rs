@@ -371,7 +371,7 @@ impl Task {
             Err(error) => {
                 tracing::info!(error = %ErrorChain(&error), agent = %self.name, "cannot decode a letter to an agent of the gateway");
                 let mts = &self.means.service.mts;
-                return mts.handle_undecodable(&self.name, received, error.to_string());
+                return mts.handle_undecodable(&self.name, received, &error);
             }
         };
         let Some(asker) = self.means.asker(&message, received) else {

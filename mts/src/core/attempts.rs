@@ -62,7 +62,8 @@ pub enum Action {
     },
     /// An agent of another host that is not in the directory has sent a letter. Letters to it can
     /// be sent to this location, from which its letter came or which a legacy peer states as its
-    /// own. Precedes the forwarding of the letter.
+    /// own. The letter waits for the [refresh](Self::Refresh) that follows: the contacts are published to the
+    /// processes of this host before it.
     Heard {
         /// Its name in the letter.
         name: String,
@@ -147,8 +148,8 @@ pub(crate) enum Settlement {
 pub(crate) enum FailureTarget {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An agent of another service.
-    Remote,
+    /// An agent of another service, which sent a letter with these parts.
+    Remote(Arc<Failed>),
     /// The source of a legacy peer's letter.
     LegacyPeer {
         from: LegacySource,

@@ -4,7 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{AgentId, Dialect, ErrorChain};
+use fipa_acl::{AgentId, Dialect, ErrorChain, Letter};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
 use fipa_transport::{FailureReason, Incarnation, Kind, LegacySource, Location, Signature, Stream};
 
@@ -13,42 +13,65 @@ use super::inbox::Received;
 use super::lane::Delivery;
 use super::{Core, News, Now, own_lane, work};
 use crate::failure::{Failed, Failure};
-use crate::stamp;
 
 /// Deadline of a failure message to a legacy peer's agent.
 const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
+
+/// A letter whose message cannot be decoded, as far as its sender is told about it. Reading it takes time in
+/// proportion to the bytes of the letter, so it happens before the core is locked.
+#[derive(Debug)]
+pub struct Undecodable {
+    letter: Letter,
+    sender: Incarnation,
+    failed: Arc<Failed>,
+    why: String,
+}
+
+impl Undecodable {
+    /// Reads the envelope of a letter that an agent of this process took and whose message cannot be decoded
+    /// for this reason. `None` if its sender is not told.
+    #[must_use]
+    pub fn read(received: &Received, why: &dyn std::fmt::Display) -> Option<Self> {
+        if received.via.is_none() || !received.sender.is_known() {
+            return None;
+        }
+        Some(Self {
+            failed: Arc::new(Failed::of_envelope(&received.letter)?),
+            letter: received.letter.clone(),
+            sender: received.sender,
+            why: cannot_be_decoded(why),
+        })
+    }
+}
 
 impl Core {
     /// Handles a letter that an agent of this process took and whose message cannot be decoded. The
     /// sender gets a failure message if it is an agent of this process, or one that the directory
     /// has under the name in the envelope. Nothing else proves a name in an envelope.
-    pub fn handle_undecodable(
-        &mut self,
-        now: Now,
-        receiver: &Arc<str>,
-        received: &Received,
-        why: String,
-    ) {
-        let registration = received.sender;
-        if received.via.is_none() || !registration.is_known() {
-            return;
-        }
+    pub fn handle_undecodable(&mut self, now: Now, receiver: &Arc<str>, undecodable: Undecodable) {
+        let Undecodable {
+            letter,
+            sender: registration,
+            failed,
+            why,
+        } = undecodable;
         let sender = if self.agents.contains_key(&registration) {
             FailureTarget::Ours(registration)
         } else {
-            let named = stamp::sender(&received.letter);
             let known = self.table.view.registered(registration);
             match known {
-                Some(entry) if named.as_deref() == Some(&*entry.name) => FailureTarget::Remote,
+                Some(entry) if failed.sender.name() == &*entry.name => {
+                    FailureTarget::Remote(failed)
+                }
                 _ => return,
             }
         };
         self.table.undelivered.push_back(Undelivered {
             sender,
             receiver: Arc::clone(receiver),
-            letter: received.letter.clone(),
+            letter,
             reason: FailureReason::Refused,
-            detail: cannot_be_decoded(&why),
+            detail: why,
         });
         self.send_failures(now);
     }
@@ -67,29 +90,25 @@ impl Core {
             let name = &*name;
             let from = match &sender {
                 FailureTarget::LegacyPeer { from, .. } => Some(*from),
-                FailureTarget::Ours(_) | FailureTarget::Remote => None,
+                FailureTarget::Ours(_) | FailureTarget::Remote(_) => None,
             };
-            if !matches!(sender, FailureTarget::Ours(_)) {
-                // Before a message is decoded, by the name in the envelope.
-                let named = stamp::sender(&letter).unwrap_or_default();
-                let address = from.map(|from| from.address);
-                if !self.failure_limit.allows(now.instant, address, &named) {
-                    continue;
-                }
-                // Failure messages are encoded only in proportion to the received bytes.
-                if !self
-                    .failure_limit
-                    .covers(now.instant, address, letter.len())
-                {
-                    continue;
-                }
-            }
             let failed = match &sender {
-                FailureTarget::LegacyPeer { failed, .. } => Some(Arc::clone(failed)),
-                FailureTarget::Ours(_) | FailureTarget::Remote => {
-                    work::steps(letter.len() / 512);
-                    Failed::of(&letter).map(Arc::new)
+                FailureTarget::LegacyPeer { failed, .. } | FailureTarget::Remote(failed) => {
+                    let address = from.map(|from| from.address);
+                    let named = failed.sender.name();
+                    if !self.failure_limit.allows(now.instant, address, named) {
+                        continue;
+                    }
+                    // Failure messages are encoded only in proportion to the received bytes.
+                    if !self
+                        .failure_limit
+                        .covers(now.instant, address, letter.len())
+                    {
+                        continue;
+                    }
+                    Some(Arc::clone(failed))
                 }
+                FailureTarget::Ours(_) => Failed::of(&letter).map(Arc::new),
             };
             let Some(failed) = failed else {
                 continue;
@@ -149,6 +168,7 @@ impl Core {
                     continue;
                 }
             };
+            work::steps(letter.len() / 512);
             if !self
                 .failure_limit
                 .debit(now.instant, from.map(|from| from.address), letter.len())

@@ -66,6 +66,8 @@ pub struct Unframed {
     is_counted: bool,
     /// The name of the sender, and a location that it states as its own.
     sender: Option<(String, Location)>,
+    /// Whether the sender was reported as a contact for the present portion of the receivers.
+    is_contact: bool,
     /// The parts that a message about its failure repeats; `None` if there is to be none.
     failed: Option<Arc<Failed>>,
     /// The reason why the letter is refused, if it is.
@@ -145,6 +147,7 @@ impl Unframed {
             receivers,
             is_counted: false,
             sender,
+            is_contact: false,
             failed: failed.map(Arc::new),
             fault,
             parts: None,
@@ -287,8 +290,10 @@ impl Core {
         if let Err(why) = self.admits(now, &entry.name, parts.as_ref(), link_of(via, &from)) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
-        if from.is_remote() {
-            self.report_contact(stream.sender, envelope, &from);
+        let is_contact =
+            from.is_remote() && self.report_contact(now.instant, stream.sender, envelope, &from);
+        if is_contact {
+            self.await_publication(id);
         }
         self.table
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
@@ -399,37 +404,59 @@ impl Core {
     }
 
     /// Reports the sender of a letter with this envelope as a contact if it is unknown, so that it can
-    /// be answered.
-    fn report_contact(&mut self, agent: Incarnation, envelope: EnvelopeParts, from: &Hop) {
+    /// be answered. Returns whether it did.
+    fn report_contact(
+        &mut self,
+        now: Instant,
+        agent: Incarnation,
+        envelope: EnvelopeParts,
+        from: &Hop,
+    ) -> bool {
         let view = &self.table.view;
         if !agent.is_known() || view.registered(agent).is_some() {
-            return;
+            return false;
         }
         // A letter that was forwarded by the receiver's previous gateway does not come from the
         // sender's location.
-        if let Some(name) = envelope.sender
-            && envelope.stamps <= 1
-            && view.named(&name).is_none()
-        {
-            let location = from.location.clone();
-            self.table.actions.push_back(Action::Heard {
-                name,
-                agent,
-                location,
-            });
+        let Some(name) = envelope.sender.filter(|_| envelope.stamps <= 1) else {
+            return false;
+        };
+        if view.named(&name).is_some() {
+            return false;
+        }
+        let address = from.location.authority().parse::<SocketAddr>();
+        let address = address.ok().map(|it| it.ip().to_canonical());
+        if !self.contact_limit.take(now, address, &name) {
+            tracing::debug!(at = %from.location, "rate limit of new agents exceeded; this one cannot be answered");
+            return false;
+        }
+        let location = from.location.clone();
+        self.table.actions.push_back(Action::Heard {
+            name,
+            agent,
+            location,
+        });
+        true
+    }
+
+    /// Makes the letters of a lane wait until the contacts were published to the processes of this host, so that
+    /// their receivers can answer.
+    fn await_publication(&mut self, lane: LaneId) {
+        if let Some(lane) = self.lanes.get_mut(&lane) {
+            lane.want_refresh(&mut self.table);
         }
     }
 
     /// Reports an agent of a legacy peer as a contact, at the location that it states as its own.
-    /// Only for an agent that is unknown, or known as a contact that sends from the same host.
+    /// Only for an agent that is unknown, or known as a contact that sends from the same host. Returns whether it did.
     fn report_legacy_contact(
         &mut self,
         now: Now,
         (name, location): (String, Location),
         from: IpAddr,
-    ) {
+    ) -> bool {
         if !self.table.config.forwards {
-            return;
+            return false;
         }
         if let Some(known) = self.table.view.named(&name) {
             let at = known.locations.first();
@@ -439,18 +466,22 @@ impl Core {
             let is_due = at != Some(&location) || age.is_ok_and(|age| age >= HEARD_AGAIN_AFTER);
             let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
             if !(is_contact && same && is_due) {
-                return;
+                return false;
             }
         }
-        if !self.contact_limit.take(now.instant, Some(from), &name) {
+        if !self
+            .legacy_contact_limit
+            .take(now.instant, Some(from), &name)
+        {
             tracing::debug!(%from, "rate limit of new agents of legacy peers exceeded; this one cannot be answered");
-            return;
+            return false;
         }
         self.table.actions.push_back(Action::Heard {
             name,
             agent: Incarnation::UNKNOWN,
             location,
         });
+        true
     }
 
     /// Whether this lane has room for another letter.
@@ -481,6 +512,7 @@ impl Core {
                 unframed.parts = self.reader.parts(&unframed.letter);
             }
         }
+        unframed.is_contact = false;
         for _ in 0..UNFRAMED_PORTION {
             let Some(receiver) = unframed.receivers.pop_front() else {
                 break;
@@ -517,6 +549,7 @@ impl Core {
             sender: located,
             failed,
             parts,
+            is_contact,
             ..
         } = unframed;
         let (via, from) = (*via, *from);
@@ -531,7 +564,7 @@ impl Core {
             return;
         }
         if let Some(located) = located.take() {
-            self.report_legacy_contact(now, located, from.address);
+            *is_contact = self.report_legacy_contact(now, located, from.address);
         }
         let stream_sender = self.table.config.incarnation;
         let stream = Stream {
@@ -570,6 +603,9 @@ impl Core {
         }
         let until = now.instant + deadline.min(MAX_DEADLINE);
         let failed = failed.clone();
+        if *is_contact {
+            self.await_publication(lane);
+        }
         let origin = Origin::LegacyPeer { from, failed };
         let letter_of = (stream.receiver, sequence);
         let delivery = Delivery::new(now.instant, origin, letter.clone(), letter_of, until);

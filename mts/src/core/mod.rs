@@ -16,6 +16,7 @@
 //! * `routes`: reports of the routes of letters, and counters of each route.
 //! * `attempts`: state that lanes share: attempts, health of routes, pending actions.
 //! * `notice`: notifications for watchers.
+//! * `passes`: visits of all lanes, in portions.
 //! * `waiting`: letters that wait for a refresh of the directory.
 //!
 //! The core looks up receivers in a [`View`] of the directory, which does not change and takes no
@@ -36,6 +37,7 @@ mod inbox;
 mod lane;
 mod limits;
 mod notice;
+mod passes;
 mod peers;
 mod principals;
 mod reading;
@@ -47,7 +49,7 @@ mod waiting;
 pub mod work;
 
 use std::cmp::Reverse;
-use std::collections::BinaryHeap;
+use std::collections::{BTreeSet, BinaryHeap};
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -63,12 +65,14 @@ use fipa_transport::{
 pub use attempts::Action;
 use attempts::{AttemptTable, FailureTarget, Note, Origin, Purpose, Undelivered};
 pub use config::{CoreConfig, MAX_DEADLINE};
+pub use failures::Undecodable;
 pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey};
 use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
+use passes::{Concern, Passes, Step};
 pub use reading::{LetterReader, ReadLetter};
 
 use waiting::{Unresolved, WaitingLetters};
@@ -116,6 +120,12 @@ pub struct Submission {
     pub deadline: Duration,
 }
 
+/// Maximum number of lanes that one call visits for one cause. Peers can have tens of thousands of lanes kept, and
+/// the service is locked during a call.
+const LANES_AT_ONCE: usize = 16;
+/// Maximum number of notes that one call repeats or ends.
+const NOTES_AT_ONCE: usize = 64;
+
 /// Empty lanes are dropped when there are more lanes than this.
 const IDLE_LANES: usize = 1024;
 /// Time for which an empty lane is kept nevertheless.
@@ -129,6 +139,9 @@ pub struct Core {
     table: AttemptTable,
     /// In boxes: a table that grows moves its values, under the lock.
     lanes: Map<LaneId, Box<Lane>>,
+    /// In the order of creation, so that runs with one seed are equal.
+    lane_order: BTreeSet<LaneId>,
+    passes: Passes,
     lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
@@ -138,8 +151,9 @@ pub struct Core {
     principals: Principals,
     reader: LetterReader,
     failure_limit: FailureLimit,
-    /// Limits the rate at which agents of legacy peers become known by their letters.
+    /// Limit the rates at which agents of other gateways, and of legacy peers, become known by their letters.
     contact_limit: SenderLimit,
+    legacy_contact_limit: SenderLimit,
     /// Whether letters of others are no longer accepted.
     ending: bool,
     /// Whether the service has ended, and so sends nothing.
@@ -208,6 +222,8 @@ impl Core {
         Self {
             table: AttemptTable::new(config, view),
             lanes: Map::default(),
+            lane_order: BTreeSet::new(),
+            passes: Passes::default(),
             lane_ids: Map::default(),
             agents: Map::default(),
             timers: BinaryHeap::new(),
@@ -218,6 +234,7 @@ impl Core {
             reader,
             failure_limit: FailureLimit::default(),
             contact_limit: forward::contact_limit(),
+            legacy_contact_limit: forward::contact_limit(),
             ending: false,
             closed: false,
             next_lane: 1,
@@ -639,15 +656,14 @@ impl Core {
         self.lane_ids.insert(key.clone(), id);
         let lane = Lane::new(now.instant, id, key, Arc::clone(receiver));
         self.lanes.insert(id, Box::new(lane));
+        self.lane_order.insert(id);
         id
     }
 
-    /// All lanes in the order of creation, so that runs with one seed are equal.
+    /// All lanes in the order of creation. Not for events that peers cause; see [`Passes`].
     fn lanes_in_order(&self) -> Vec<LaneId> {
         work::steps(self.lanes.len());
-        let mut lanes: Vec<LaneId> = self.lanes.keys().copied().collect();
-        lanes.sort_unstable();
-        lanes
+        self.lane_order.iter().copied().collect()
     }
 
     /// Returns the lane with letters of this stream for the receiver of this name.
@@ -933,16 +949,56 @@ impl Core {
         }
     }
 
-    /// Handles a change of the directory, after [`set_view`](Self::set_view).
+    /// Handles a change of the directory, after [`set_view`](Self::set_view). Of many lanes, this call
+    /// visits a portion, and calls of [`handle_timeout`](Self::handle_timeout) visit the others.
     pub fn handle_directory_change(&mut self, now: Now) {
-        for lane in self.lanes_in_order() {
-            self.with_lane(now, lane, |lane, table| {
+        self.passes.begin(now.instant, Concern::Directory);
+        self.visit_lanes(now);
+        self.send_failures(now);
+    }
+
+    /// Visits the next lanes that an event concerns.
+    fn visit_lanes(&mut self, now: Now) {
+        for _ in 0..LANES_AT_ONCE {
+            work::steps(1);
+            match self.passes.next(now.instant, &self.lane_order) {
+                Some(Step::Visit(concern, id)) => self.visit_lane(now, id, concern),
+                Some(Step::End(Concern::Crowd)) => {
+                    self.crowd = 2 * self.lanes.len().max(IDLE_LANES);
+                }
+                Some(Step::End(_)) => {}
+                None => break,
+            }
+        }
+    }
+
+    fn visit_lane(&mut self, now: Now, id: LaneId, concern: Concern) {
+        match concern {
+            Concern::Directory => self.with_lane(now, id, |lane, table| {
                 if !lane.is_empty() {
                     lane.directory_changed(now.instant, table);
                 }
-            });
+            }),
+            Concern::Reachable(service) => self.with_lane(now, id, |lane, table| {
+                if lane.is_paused_towards(table, |location| is_at(service, location)) {
+                    lane.resume(now.instant, table);
+                }
+            }),
+            Concern::Idle => self.forget_idle_lane(now, id, IDLE_TIME),
+            Concern::Crowd => self.forget_idle_lane(now, id, IDLE_TIME_IN_A_CROWD),
         }
-        self.send_failures(now);
+    }
+
+    fn forget_idle_lane(&mut self, now: Now, id: LaneId, memory: Duration) {
+        let Some(lane) = self.lanes.get(&id) else {
+            return;
+        };
+        let quiet = now.instant.saturating_duration_since(lane.active) > memory;
+        if lane.is_idle() && (quiet || !lane.remembers()) {
+            self.lane_ids.remove(lane.key());
+            self.lanes.remove(&id);
+            self.lane_order.remove(&id);
+        }
     }
 
     /// Handles an entry that left the directory or was replaced by another of the same name. Must
@@ -956,14 +1012,19 @@ impl Core {
     }
 
     /// Handles elapsed time; call it at the time that [`poll_timeout`](Self::poll_timeout) returns.
+    /// Peers can make much work due at once; this call does a portion of it, and the next timeout is
+    /// due at once then.
     pub fn handle_timeout(&mut self, now: Now) {
         // Collected first, because work on a lane may set its timer again; that one is for a later
         // call.
         let mut lanes = Vec::new();
-        while let Some(Reverse((due, id))) = self.timers.peek().copied() {
-            if due > now.instant {
+        for _ in 0..LANES_AT_ONCE {
+            let due = self.timers.peek().copied();
+            let Some(Reverse((due, id))) = due.filter(|Reverse((due, _))| *due <= now.instant)
+            else {
                 break;
-            }
+            };
+            work::steps(1);
             self.timers.pop();
             if let Some(lane) = self.lanes.get_mut(&id)
                 && lane.scheduled == Some(due)
@@ -975,6 +1036,7 @@ impl Core {
         for id in lanes {
             self.with_lane(now, id, |lane, table| lane.pump(now.instant, table));
         }
+        self.visit_lanes(now);
         if !self.waiting.is_empty() {
             let late = |letter: &Unresolved| letter.deadline <= now.instant;
             for letter in self.waiting.remove(late) {
@@ -982,11 +1044,10 @@ impl Core {
             }
         }
         let mut notes = Vec::new();
-        while self
-            .notes
-            .peek()
-            .is_some_and(|Reverse(late)| late.0 <= now.instant)
-        {
+        let is_due =
+            |late: Option<&Reverse<LateNote>>| late.is_some_and(|it| it.0.0 <= now.instant);
+        while notes.len() < NOTES_AT_ONCE && is_due(self.notes.peek()) {
+            work::steps(1);
             notes.extend(self.notes.pop());
         }
         for Reverse(LateNote(_, late)) in notes {
@@ -1053,21 +1114,17 @@ impl Core {
     /// the recorded failures of routes to the service, or of all routes if `service` is `None`, and
     /// dispatches the letters that wait because of them.
     pub fn handle_reachable(&mut self, now: Now, service: Option<Incarnation>) {
-        let is_meant = |location: &Location| service.is_none_or(|it| it == location.incarnation());
-        let had_failed = self.table.forget_failures(is_meant);
+        let had_failed = self
+            .table
+            .forget_failures(|location| is_at(service, location));
         if service.is_none() {
             self.peers.ask_again(now.instant, &mut self.table);
         } else if !had_failed {
             // No letter waits for this service. A peer decides how often it connects.
             return;
         }
-        for lane in self.lanes_in_order() {
-            self.with_lane(now, lane, |lane, table| {
-                if lane.is_paused_towards(table, is_meant) {
-                    lane.resume(now.instant, table);
-                }
-            });
-        }
+        self.passes.begin(now.instant, Concern::Reachable(service));
+        self.visit_lanes(now);
         self.send_failures(now);
     }
 
@@ -1094,32 +1151,31 @@ impl Core {
             return;
         }
         self.next_forget = Some(now.instant + IDLE_TIME / 4);
-        self.forget_lanes(|lane| {
-            let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME;
-            lane.is_idle() && (quiet || !lane.remembers())
-        });
+        self.passes.begin(now.instant, Concern::Idle);
     }
 
     /// Drops empty lanes when their number has doubled since the last time, because peers can invent
     /// senders, each with a lane.
     fn disperse_crowd(&mut self, now: Now) {
-        if self.lanes.len() < self.crowd {
+        let is_under_way = self.passes.has(Concern::Crowd);
+        if self.lanes.len() < self.crowd && !is_under_way {
             return;
         }
-        self.forget_lanes(|lane| {
-            let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME_IN_A_CROWD;
-            lane.is_idle() && (quiet || !lane.remembers())
-        });
-        self.crowd = 2 * self.lanes.len().max(IDLE_LANES);
+        if !is_under_way {
+            self.passes.begin(now.instant, Concern::Crowd);
+        }
+        self.visit_lanes(now);
     }
 
     fn forget_lanes(&mut self, forget: impl Fn(&Lane) -> bool) {
         work::steps(self.lanes.len());
         let ids = &mut self.lane_ids;
-        self.lanes.retain(|_, lane| {
+        let order = &mut self.lane_order;
+        self.lanes.retain(|id, lane| {
             let goes = forget(lane);
             if goes {
                 ids.remove(lane.key());
+                order.remove(id);
             }
             !goes
         });
@@ -1131,6 +1187,7 @@ impl Core {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
         let others = earlier(self.peers.due(), self.failure_limit.due());
+        let others = earlier(others, self.passes.due());
         earlier(earlier(lanes, notes), earlier(others, self.waiting.due()))
     }
 
@@ -1169,6 +1226,11 @@ impl Core {
         }
         self.table.undelivered.clear();
     }
+}
+
+/// Whether this service is at the location; `None` stands for all services.
+fn is_at(service: Option<Incarnation>, location: &Location) -> bool {
+    service.is_none_or(|it| it == location.incarnation())
 }
 
 /// Whether the custodian answered that it does not have the letter, or is gone.

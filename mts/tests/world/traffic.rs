@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative};
-use fipa_mts::core::{SendId, Submission};
+use fipa_mts::core::{SendId, Submission, Undecodable};
 use fipa_mts::letter_for;
 use fipa_sds::Directory;
 use fipa_transport::{Incarnation, Outcome};
@@ -297,7 +297,9 @@ impl World {
             Err(error) => {
                 let (now, receiver) = (self.clocks(), Arc::clone(&self.names[&agent]));
                 let core = &mut self.processes[at].core;
-                core.handle_undecodable(now, &receiver, &received, error.to_string());
+                if let Some(undecodable) = Undecodable::read(&received, &error) {
+                    core.handle_undecodable(now, &receiver, undecodable);
+                }
                 None
             }
         };

@@ -1,6 +1,6 @@
 //! The back end with the entries that neighbors sent.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
@@ -24,6 +24,9 @@ pub struct ExchangeDirectory {
     mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
     /// Agents of each gateway. The lock is held while the table is updated.
     agents_of: Mutex<HashMap<Incarnation, Agents>>,
+    /// The gateways among `agents_of`, for views, which do not wait for an update. A gateway is one of them
+    /// only while the table has its entries.
+    gateways: ArcSwap<HashSet<Incarnation>>,
     /// DF entries of these agents. Locked after `agents_of`.
     df: Mutex<ReceivedDf>,
     df_changed: Notify,
@@ -35,6 +38,7 @@ impl Default for ExchangeDirectory {
             table: Table::proved_by(|origin| origin.is_proved),
             mandates: ArcSwap::default(),
             agents_of: Mutex::default(),
+            gateways: ArcSwap::default(),
             df: Mutex::default(),
             df_changed: Notify::new(),
         }
@@ -130,11 +134,7 @@ impl ExchangeDirectory {
         if total + entries.len() > Exchange::MAX_TOTAL {
             return Err(ExchangeError::TooMany);
         }
-        let before = agents_of.insert(gateway, entries);
-        if before.is_none() {
-            self.table.touch();
-        }
-        let before = before.unwrap_or_default();
+        let before = agents_of.insert(gateway, entries).unwrap_or_default();
         let now = agents_of.get(&gateway);
         let left = before
             .into_keys()
@@ -144,6 +144,7 @@ impl ExchangeDirectory {
         let here = here.map(|(name, entry)| (origin, Arc::clone(name), Some(Arc::clone(entry))));
         let updates: Vec<Update> = left.chain(here).collect();
         self.table.update(updates);
+        self.show(gateway);
         self.update_df(|all| all.replace(gateway, principal, df));
         Ok(())
     }
@@ -158,33 +159,50 @@ impl ExchangeDirectory {
         let origin = self.origin(gateway);
         let mut agents_of = self.agents_of.lock();
         let total: usize = agents_of.values().map(Agents::len).sum();
-        let of_gateway = agents_of.entry(gateway).or_insert_with(|| {
-            // Readers of the new number wait for the lock that is held here.
-            self.table.touch();
-            Agents::new()
-        });
-        let mut after = of_gateway.clone();
+        let of_gateway = agents_of.entry(gateway).or_default();
+        // A small letter does not cost a copy of all agents.
+        let left: BTreeSet<Arc<str>> = left
+            .iter()
+            .filter_map(|name| Some(Arc::clone(of_gateway.get_key_value(name.as_str())?.0)))
+            .collect();
+        let is_new = |name: &Arc<str>| left.contains(name) || !of_gateway.contains_key(name);
+        let names = joined.iter().map(|(entry, _)| &entry.name);
+        let new: BTreeSet<&Arc<str>> = names.filter(|name| is_new(name)).collect();
+        let stay = of_gateway.len() - left.len();
+        let after = stay + new.len();
+        let total = total - of_gateway.len() + after;
+        if after > Exchange::MAX_AGENTS || total > Exchange::MAX_TOTAL {
+            return Err(ExchangeError::TooMany);
+        }
         let mut updates: Vec<Update> = Vec::new();
         let mut df = Vec::new();
         for name in left {
-            if let Some((name, _)) = after.remove_entry(name.as_str()) {
-                df.push((Arc::clone(&name), None));
-                updates.push((origin, name, None));
-            }
+            of_gateway.remove(&name);
+            df.push((Arc::clone(&name), None));
+            updates.push((origin, name, None));
         }
         for (entry, of_entry) in joined {
             df.push((Arc::clone(&entry.name), of_entry));
-            after.insert(Arc::clone(&entry.name), Arc::clone(&entry));
+            of_gateway.insert(Arc::clone(&entry.name), Arc::clone(&entry));
             updates.push((origin, Arc::clone(&entry.name), Some(entry)));
         }
-        let total = total - of_gateway.len() + after.len();
-        if after.len() > Exchange::MAX_AGENTS || total > Exchange::MAX_TOTAL {
-            return Err(ExchangeError::TooMany);
-        }
-        *of_gateway = after;
         self.table.update(updates);
+        self.show(gateway);
         self.update_df(|all| all.change(gateway, principal, df));
         Ok(())
+    }
+
+    /// Adds a gateway whose entries the table has.
+    fn show(&self, gateway: Incarnation) {
+        if self.gateways.load().contains(&gateway) {
+            return;
+        }
+        self.gateways.rcu(|gateways| {
+            let mut gateways = HashSet::clone(gateways);
+            gateways.insert(gateway);
+            gateways
+        });
+        self.table.touch();
     }
 
     /// Sets new locations of the gateway and all its agents.
@@ -250,7 +268,12 @@ impl ExchangeDirectory {
         let mut agents_of = self.agents_of.lock();
         let removed = agents_of.remove(&gateway);
         self.update_df(|all| all.forget(gateway));
-        if removed.is_some() {
+        if self.gateways.load().contains(&gateway) {
+            self.gateways.rcu(|gateways| {
+                let mut gateways = HashSet::clone(gateways);
+                gateways.remove(&gateway);
+                gateways
+            });
             self.table.touch();
         }
         let names = removed.unwrap_or_default().into_keys();
@@ -261,7 +284,7 @@ impl ExchangeDirectory {
 /// The agents that neighbors had sent at one time.
 struct ExchangeView {
     entries: Arc<dyn View>,
-    gateways: HashSet<Incarnation>,
+    gateways: Arc<HashSet<Incarnation>>,
     mandates: Arc<HashMap<Incarnation, Mandate>>,
 }
 
@@ -295,10 +318,11 @@ impl Directory for ExchangeDirectory {
     reads_its_table!(table);
 
     fn view(&self) -> Arc<dyn View> {
-        let agents_of = self.agents_of.lock();
+        // The gateways first: each of them has its entries in the table.
+        let gateways = self.gateways.load_full();
         Arc::new(ExchangeView {
             entries: self.table.view(),
-            gateways: agents_of.keys().copied().collect(),
+            gateways,
             mandates: self.mandates.load_full(),
         })
     }

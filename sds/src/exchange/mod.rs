@@ -24,7 +24,7 @@ mod df;
 mod directory;
 mod wire;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::ops::Bound;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -51,9 +51,9 @@ type Agents = BTreeMap<Arc<str>, Arc<Entry>>;
 pub struct Exchange {
     own: LocalAgents,
     neighbors: HashMap<Incarnation, Neighbor>,
-    /// Gateways that sent a letter before they were reported as neighbors; they are asked for all
-    /// entries later.
-    early: HashSet<Incarnation>,
+    /// Gateways that sent a letter before they were reported as neighbors, the latest last; they are asked
+    /// for all entries later.
+    early: VecDeque<Incarnation>,
     directory: Arc<ExchangeDirectory>,
     /// The agents of neighbors that fell silent, the latest last.
     lost: VecDeque<LostGateway>,
@@ -220,7 +220,7 @@ impl Exchange {
         Self {
             own: LocalAgents::default(),
             neighbors: HashMap::new(),
-            early: HashSet::new(),
+            early: VecDeque::new(),
             directory: Arc::default(),
             lost: VecDeque::new(),
             random: seed,
@@ -329,7 +329,8 @@ impl Exchange {
             neighbor.mandate = mandate.clone();
             neighbor.principal = *principal;
             self.directory.prove(mts.incarnation, mandate);
-            if self.early.remove(&mts.incarnation) {
+            if let Some(place) = self.early.iter().position(|it| *it == mts.incarnation) {
+                self.early.remove(place);
                 neighbor.request_all(now);
             }
             self.neighbors.insert(mts.incarnation, neighbor);
@@ -429,8 +430,12 @@ impl Exchange {
             return Err(ExchangeError::TooLarge(content.len()));
         }
         if !self.neighbors.contains_key(&from) {
-            if self.early.len() < Self::MAX_NEIGHBOURS {
-                self.early.insert(from);
+            if !self.early.contains(&from) {
+                // A peer can connect under many incarnations, which never become neighbors.
+                if self.early.len() >= Self::MAX_NEIGHBOURS {
+                    self.early.pop_front();
+                }
+                self.early.push_back(from);
             }
             return Err(ExchangeError::Stranger);
         }

@@ -7,14 +7,16 @@ use fipa_transport::{FailureReason, TransportError, TransportErrorKind};
 use super::super::attempts::AttemptTable;
 use super::super::work;
 use super::delivery::{Holding, State};
-use super::{ENDED_PATIENCE, Lane};
+use super::{ENDED_AT_ONCE, ENDED_PATIENCE, Lane};
 
 impl Lane {
-    /// Handles everything that is due: deadlines, attempts without an answer, custody reports, and
-    /// letters to return.
-    pub(super) fn expire(&mut self, now: Instant, table: &mut AttemptTable) {
+    /// Handles what is due: deadlines, attempts without an answer, custody reports, and letters to
+    /// return. Returns false if more letters end than one visit handles; the lane is due at once then, and
+    /// nothing may be dispatched.
+    #[must_use]
+    pub(super) fn expire(&mut self, now: Instant, table: &mut AttemptTable) -> bool {
         if self.due.is_none_or(|due| due > now) {
-            return;
+            return true;
         }
         self.ask_custodians(now, table);
         let ended = self
@@ -22,12 +24,20 @@ impl Lane {
             .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
         // Once for due timers, and once for the next ones.
         work::steps(2 * self.letters.len());
-        let mut index = 0;
-        while let Some(delivery) = self.letters.get_mut(index) {
+        let (mut index, mut answered, before) = (0, 0, self.letters.len());
+        while index < self.letters.len() {
+            if answered + before - self.letters.len() >= ENDED_AT_ONCE {
+                self.due = Some(now);
+                return false;
+            }
+            let Some(delivery) = self.letters.get_mut(index) else {
+                break;
+            };
             let expired = delivery.deadline <= now;
             let abandoned = ended.is_some_and(|(gone, _)| gone == delivery.registration);
             if delivery.custody_due.is_some_and(|due| due <= now) {
                 delivery.custody_taken(table);
+                answered += 1;
             }
             match &mut delivery.progress.state {
                 State::UnderWay {
@@ -84,6 +94,7 @@ impl Lane {
             self.notice_end(now, table);
         }
         self.due = self.next_due(now);
+        true
     }
 
     fn next_due(&self, now: Instant) -> Option<Instant> {

@@ -66,7 +66,13 @@ const KIND_PATIENCE: Duration = Duration::from_secs(2);
 
 /// Bytes that a lane with letters counts as, in addition to the letters, among the letters in custody.
 /// Its state takes about as much memory, and peers can invent senders, each with a lane.
-const LANE_BYTES: usize = 4096;
+const LANE_BYTES: usize = 2560;
+/// Minimum number of bytes that a letter counts as there. Its state, its stamp and the header of its parcel take
+/// about as much memory, and peers can send letters of 71 bytes.
+const LETTER_BYTES: usize = 1536;
+/// Maximum number of letters that one visit of a lane ends or answers for because of a timeout, or because their
+/// receiver has left. The next visit follows at once.
+const ENDED_AT_ONCE: usize = 64;
 
 /// The number of a lane within its core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -240,22 +246,24 @@ impl Lane {
 
     /// Whether the letters in custody leave room for another one with this many bytes in this lane.
     pub(crate) fn fits_into_custody(&self, len: usize, table: &AttemptTable) -> bool {
-        table.has_room(&self.receiver, len.saturating_add(self.own_bytes()))
+        table.has_room(&self.receiver, self.counted(len))
     }
 
-    /// Bytes that this lane counts as when its first letter comes or its last letter goes.
-    fn own_bytes(&self) -> usize {
-        match self.letters.is_empty() {
+    /// Bytes that count in custody when a letter of this many bytes comes or goes: its own and, when it is the only
+    /// letter, those of the lane.
+    fn counted(&self, len: usize) -> usize {
+        let of_lane = match self.letters.is_empty() {
             true => LANE_BYTES,
             false => 0,
-        }
+        };
+        len.max(LETTER_BYTES).saturating_add(of_lane)
     }
 
     /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
     /// limits, up to twice as much.
     pub(crate) fn admits(&self, sequence: u64, len: usize, table: &AttemptTable) -> bool {
         let config = &table.config;
-        let held = table.held.saturating_add(len);
+        let held = table.held.saturating_add(len.max(LETTER_BYTES));
         if self.has_room(len, table) && self.fits_into_custody(len, table) {
             return true;
         }
@@ -308,7 +316,7 @@ impl Lane {
         delivery.position = self.pushed;
         self.pushed += 1;
         let len = delivery.letter.len();
-        table.hold(&self.receiver, len + self.own_bytes());
+        table.hold(&self.receiver, self.counted(len));
         self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
@@ -333,7 +341,9 @@ impl Lane {
     /// Dispatches all letters that can be dispatched.
     pub(crate) fn pump(&mut self, now: Instant, table: &mut AttemptTable) {
         self.active = now;
-        self.expire(now, table);
+        if !self.expire(now, table) {
+            return;
+        }
         if self.recovering && self.under_way == 0 {
             self.recovering = false;
             self.route = None;
@@ -350,7 +360,7 @@ impl Lane {
     }
 
     fn dispatch_waiting(&mut self, now: Instant, table: &mut AttemptTable) {
-        let mut index = 0;
+        let (mut index, mut left) = (0, 0);
         while index < self.letters.len() && self.under_way < table.config.window {
             work::steps(1);
             let registration = self.letters[index].registration;
@@ -377,10 +387,15 @@ impl Lane {
                     self.want_refresh(table);
                     break;
                 }
-                if self.receiver_left(now, index, table) {
-                    continue;
+                if !self.receiver_left(now, index, table) {
+                    break;
                 }
-                break;
+                left += 1;
+                if left >= ENDED_AT_ONCE {
+                    self.want_refresh(table);
+                    break;
+                }
+                continue;
             };
             if self.letters[index].progress.uncertain && !entry.incarnation.is_known() {
                 // An earlier gateway may have sent it, and a legacy peer would take a copy for a new
@@ -765,7 +780,7 @@ impl Lane {
             return;
         };
         let len = delivery.letter.len();
-        table.release(&self.receiver, len + self.own_bytes());
+        table.release(&self.receiver, self.counted(len));
         self.bytes -= len;
         let is_last = self.letters.is_empty();
         if is_last {
@@ -836,5 +851,21 @@ impl Lane {
         self.letters
             .binary_search_by_key(&sequence, |delivery| delivery.sequence)
             .ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A queue has room for up to twice its letters. A stamp, the header of a parcel and the allocations take less
+    /// than 256 bytes.
+    #[test]
+    fn the_state_of_a_letter_takes_no_more_memory_than_it_counts_as() {
+        let state = size_of::<Delivery>();
+        assert!(2 * state + 256 <= LETTER_BYTES, "{state} bytes");
+        // A queue has room for at least four letters.
+        let state = size_of::<Lane>() + 4 * state + 512;
+        assert!(state <= LANE_BYTES + LETTER_BYTES, "{state} bytes");
     }
 }
