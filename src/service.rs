@@ -302,7 +302,7 @@ fn transports(
     for kind in used(config, role) {
         let made = match kind {
             #[cfg(feature = "shm")]
-            Kind::Shm => shm(config, maintenance, incarnation, handle),
+            Kind::Shm => shm(config, role, maintenance, incarnation, handle),
             Kind::Unix => unix(config, role, maintenance, incarnation, handle),
             #[cfg(feature = "net")]
             Kind::Tcp => tcp(config, role, &maintenance.dir, incarnation, handle),
@@ -344,6 +344,7 @@ fn transports(
 #[cfg(feature = "shm")]
 fn shm(
     config: &Config,
+    role: &Role<'_>,
     maintenance: &mut DirMaintenance,
     incarnation: Incarnation,
     handle: &Handle,
@@ -353,6 +354,7 @@ fn shm(
     let config = ShmConfig {
         capacity: settings.capacity,
         max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
+        answers_late: role.gateway,
         ..ShmConfig::new(
             maintenance.dir.part("shm"),
             maintenance.dir.prefix(),

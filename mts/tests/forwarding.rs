@@ -33,6 +33,8 @@ const ARM: Incarnation = Incarnation::from_u64(0xa53);
 
 struct Gateway {
     core: Core,
+    /// Whether arrivals over shared memory may be answered later.
+    late: bool,
     start: Instant,
 }
 
@@ -49,6 +51,7 @@ impl Gateway {
         };
         Self {
             core: Core::new(config, Arc::new(directory)),
+            late: false,
             start: Instant::now(),
         }
     }
@@ -72,11 +75,10 @@ impl Gateway {
         let arrival = Arrival {
             parcel,
             from,
-            ticket: Ticket(7),
+            ticket: (via != Kind::Shm || self.late).then_some(Ticket(7)),
         };
         let now = self.at(ms);
-        self.core
-            .handle_arrival(now, via, via == Kind::Shm, arrival)
+        self.core.handle_arrival(now, via, arrival)
     }
 
     fn conclude(&mut self, ms: u64, attempt: AttemptId, answer: Answer) {
@@ -174,6 +176,26 @@ fn the_answer_to_a_peer_waits_for_the_outcome() {
 }
 
 #[test]
+fn the_answer_to_a_process_of_the_host_names_the_transport() {
+    let mut gateway = Gateway::new(true);
+    gateway.late = true;
+    let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
+    assert_eq!(verdict, Verdict::Later);
+    let (attempt, ..) = gateway.dispatched();
+    gateway.nothing_to_do();
+    gateway.conclude(1, attempt, Answer::Accepted);
+    match gateway.core.poll_action() {
+        Some(Action::Answer {
+            kind: Kind::Shm,
+            answer: Answer::Delivered { via: Kind::Shm },
+            ..
+        }) => {}
+        other => panic!("{other:?}"),
+    }
+    gateway.nothing_to_do();
+}
+
+#[test]
 fn a_slow_receiver_causes_custody_and_a_report() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
@@ -196,7 +218,7 @@ fn a_slow_receiver_causes_custody_and_a_report() {
 }
 
 #[test]
-fn over_shared_memory_custody_is_answered_at_once() {
+fn an_arrival_without_a_ticket_is_answered_at_once_with_custody() {
     let mut gateway = Gateway::new(true);
     let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
     assert_eq!(verdict, Verdict::Now(Answer::Custody));

@@ -103,7 +103,7 @@ fn processor_time() -> Duration {
 fn arrives(core: &mut Core, stream: (u64, u64), sequence: u64, body: Body) -> Verdict {
     let arrival = arrival(stream, sequence, body);
     let read = core.reader().read_arrival(&arrival);
-    core.handle_read_arrival(now(), Kind::Tcp, false, arrival, read)
+    core.handle_read_arrival(now(), Kind::Tcp, arrival, read)
 }
 
 fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
@@ -126,7 +126,7 @@ fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
             location: location.with_incarnation(PEER),
             principal: Principal::Unproved,
         },
-        ticket: Ticket(sequence),
+        ticket: Some(Ticket(sequence)),
     }
 }
 
@@ -136,7 +136,7 @@ fn framed(core: &mut Core, what: &str, letter: Letter) -> Verdict {
     let arrival = arrival((9, 100), 1, Body::Letter(letter));
     let read = core.reader().read_arrival(&arrival);
     bounded(what, bytes, || {
-        core.handle_read_arrival(now(), Kind::Tcp, false, arrival, read)
+        core.handle_read_arrival(now(), Kind::Tcp, arrival, read)
     })
 }
 

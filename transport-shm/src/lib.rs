@@ -39,6 +39,7 @@
 mod combiner;
 mod config;
 mod counters;
+mod deferred;
 mod domain_files;
 mod endpoint;
 mod errors;

@@ -576,7 +576,6 @@ impl Outbox {
         if self.waiting() == 0 {
             return;
         }
-        // The receiver answers in order, or drops parcels unanswered.
         while let Some((sent, conclusion)) = self.concluded(ended) {
             sent.forget();
             concluded.push((sent.attempt, conclusion));
@@ -586,21 +585,31 @@ impl Outbox {
 
     fn concluded(&self, ended: bool) -> Option<(Sent, Conclusion)> {
         let mut state = self.state.lock();
-        let conclusion = state.queue.front()?.conclusion(ended)?;
-        let sent = state.queue.pop_front()?;
+        let mut queue = state.queue.iter().take(self.in_question()).enumerate();
+        let (place, conclusion) =
+            queue.find_map(|(place, sent)| Some((place, sent.conclusion(ended)?)))?;
+        let sent = state.queue.remove(place)?;
         self.waiting.decrement();
         Some((sent, conclusion))
     }
 
+    /// Number of the first parcels of the queue of which any may be answered next. A process that
+    /// answers none late answers in the order of the queue, or drops parcels unanswered.
+    fn in_question(&self) -> usize {
+        match self.page.words().answers_late() {
+            true => self.window,
+            false => 1,
+        }
+    }
+
     /// Whether an answer is probably available.
     pub(crate) fn has_answer(&self) -> bool {
-        self.waiting() > 0
-            && self
-                .state
-                .lock()
-                .queue
-                .front()
-                .is_some_and(Sent::has_answer)
+        if self.waiting() == 0 {
+            return false;
+        }
+        let state = self.state.lock();
+        let mut queue = state.queue.iter().take(self.in_question());
+        queue.any(Sent::has_answer)
     }
 
     /// Abandons an attempt. Returns whether the attempt was here.

@@ -691,7 +691,7 @@ impl LinkTask {
                 let verdict = self.sink.arrived(fipa_transport::Arrival {
                     parcel: *parcel,
                     from,
-                    ticket,
+                    ticket: Some(ticket),
                 });
                 if let fipa_transport::Verdict::Now(answer) = verdict {
                     let mut state = self.link.state.lock();
