@@ -66,7 +66,7 @@ impl ShmConfig {
             max_clients: 64,
             max_peers: 64,
             window: 16,
-            max_loans: 8,
+            max_loans: 15,
             max_borrowed: 256,
             copy_below: 1024,
             share_from: 64 << 10,
