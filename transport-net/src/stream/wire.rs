@@ -290,6 +290,11 @@ impl Writing {
         }
     }
 
+    /// Whether the wire may lead to another host.
+    pub(crate) fn leads_out(&self) -> bool {
+        !matches!(self, Self::Unix(_))
+    }
+
     /// Makes closing the socket reset the connection: the kernel discards unacknowledged bytes and
     /// notifies the peer.
     pub(crate) fn discard(&self) {
