@@ -60,6 +60,7 @@ mod presence;
 #[cfg(feature = "raw")]
 pub mod raw;
 mod segment;
+mod static_file;
 mod storage;
 mod sync;
 mod sync_policy;
