@@ -202,6 +202,8 @@ impl Inbox {
             && self.server.has_requests().unwrap_or(false)
     }
 
+    // Apart from the poll, which mostly finds nothing.
+    #[inline(never)]
     fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
         count(&self.tally.arrived);
         // A copy in private memory: the sender could still change the original.

@@ -585,21 +585,14 @@ impl Outbox {
 
     fn concluded(&self, ended: bool) -> Option<(Sent, Conclusion)> {
         let mut state = self.state.lock();
-        let mut queue = state.queue.iter().take(self.in_question()).enumerate();
-        let (place, conclusion) =
-            queue.find_map(|(place, sent)| Some((place, sent.conclusion(ended)?)))?;
-        let sent = state.queue.remove(place)?;
+        let (sent, conclusion) = match state.queue.front()?.conclusion(ended) {
+            Some(conclusion) => (state.queue.pop_front()?, conclusion),
+            // Otherwise the process answers in the order of the queue, or drops parcels unanswered.
+            None if self.page.words().answers_late() => concluded_behind_front(&mut state, ended)?,
+            None => return None,
+        };
         self.waiting.decrement();
         Some((sent, conclusion))
-    }
-
-    /// Number of the first parcels of the queue of which any may be answered next. A process that
-    /// answers none late answers in the order of the queue, or drops parcels unanswered.
-    fn in_question(&self) -> usize {
-        match self.page.words().answers_late() {
-            true => self.window,
-            false => 1,
-        }
     }
 
     /// Whether an answer is probably available.
@@ -608,8 +601,8 @@ impl Outbox {
             return false;
         }
         let state = self.state.lock();
-        let mut queue = state.queue.iter().take(self.in_question());
-        queue.any(Sent::has_answer)
+        state.queue.front().is_some_and(Sent::has_answer)
+            || self.page.words().answers_late() && state.queue.iter().skip(1).any(Sent::has_answer)
     }
 
     /// Abandons an attempt. Returns whether the attempt was here.
@@ -626,6 +619,15 @@ impl Outbox {
         drop(state);
         sent.inspect(Sent::forget).is_some()
     }
+}
+
+/// Removes the first parcel behind the front that is concluded.
+#[cold]
+fn concluded_behind_front(state: &mut State, ended: bool) -> Option<(Sent, Conclusion)> {
+    let mut queue = state.queue.iter().enumerate().skip(1);
+    let (place, conclusion) =
+        queue.find_map(|(place, sent)| Some((place, sent.conclusion(ended)?)))?;
+    Some((state.queue.remove(place)?, conclusion))
 }
 
 /// Number of unanswered parcels.
