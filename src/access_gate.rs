@@ -253,6 +253,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let open = |gateway| {
             let directory = HostDirectory::open(HostConfig {
+                brief: false,
                 dir: place.path().join("domain"),
                 mts: Mts::new("mts", Incarnation::random()),
                 gateway,

@@ -179,8 +179,22 @@ impl Domain {
     /// # Errors
     /// If the background thread cannot be started, or as for [`crate::Domain::open`].
     pub fn open(config: &Config) -> Result<Self, OpenError> {
+        Self::joined(crate::Domain::open(config))
+    }
+
+    /// Joins the domain for a program that ends within a second; see [`crate::Domain::open_briefly`].
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open).
+    pub fn open_briefly(config: &Config) -> Result<Self, OpenError> {
+        Self::joined(crate::Domain::open_briefly(config))
+    }
+
+    fn joined(
+        open: impl Future<Output = Result<crate::Domain, OpenError>>,
+    ) -> Result<Self, OpenError> {
         let runtime = Background::start().map_err(OpenError::Thread)?;
-        let domain = runtime.block_on(crate::Domain::open(config))?;
+        let domain = runtime.block_on(open)?;
         Ok(Self { domain, runtime })
     }
 

@@ -88,16 +88,31 @@ impl Domain {
     /// If the configuration is invalid, if the directory of the domain cannot be used, or if no
     /// transport can be used.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        Self::open_for(config, false).await
+    }
+
+    /// Joins the domain like [`open`](Self::open), for a program that ends within a second, such as a
+    /// command that sends one message. Joining and leaving is faster by about 20 ms, because the process
+    /// does not have the kernel watch the directory. It polls the directory every 100 ms, so it learns
+    /// later that an agent joined or left; a letter to an agent that has just joined does not wait.
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open).
+    pub async fn open_briefly(config: &Config) -> Result<Self, OpenError> {
+        Self::open_for(config, true).await
+    }
+
+    async fn open_for(config: &Config, brief: bool) -> Result<Self, OpenError> {
         let runtime = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let config = config.clone();
         let opened = background::run(&runtime, move |cancellation| {
-            Self::join(&config, cancellation)
+            Self::join(&config, brief, cancellation)
         });
         opened.await.unwrap_or(Err(OpenError::NoRuntime))
     }
 
     /// Joins the domain on a thread for blocking calls.
-    fn join(config: &Config, cancellation: &Cancellation) -> Result<Self, OpenError> {
+    fn join(config: &Config, brief: bool, cancellation: &Cancellation) -> Result<Self, OpenError> {
         let rules = Rules::load(&config.monitor)?;
         let host = gethostname::gethostname();
         let name = format!("{}-{}", host.to_string_lossy(), std::process::id());
@@ -106,6 +121,7 @@ impl Domain {
             Role {
                 name: name.into(),
                 gateway: false,
+                brief,
                 // Letters from other hosts reach this process only through the gateway.
                 contacts: None,
                 // Connections within this host need no proof of identity.

@@ -103,6 +103,7 @@ impl Gateway {
             Role {
                 name: config.mts.name.as_str().into(),
                 gateway: true,
+                brief: false,
                 contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
                 #[cfg(feature = "secure")]
                 security: guard.as_ref().map(Guard::security),

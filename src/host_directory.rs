@@ -42,11 +42,20 @@ impl Domain {
     }
 }
 
+/// The kind of membership in the directory of the host.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Membership {
+    /// Whether the process may publish agents of other hosts.
+    pub(crate) gateway: bool,
+    /// Whether the process is likely to end within a second.
+    pub(crate) brief: bool,
+}
+
 /// Creates the directory of the domain and joins the agent directory of the host in it.
 pub(crate) fn join(
     domain: &str,
     own: &fipa_sds::Mts,
-    gateway: bool,
+    Membership { gateway, brief }: Membership,
     cancellation: &Cancellation,
 ) -> Result<(DomainDir, Arc<HostDirectory>), OpenError> {
     let mut tries = 0;
@@ -57,6 +66,7 @@ pub(crate) fn join(
             dir: dir.part("directory"),
             mts: own.clone(),
             gateway,
+            brief,
         };
         let joined = HostDirectory::open_unless(config, cancellation);
         match joined {

@@ -19,7 +19,7 @@ use crate::access_gate::{Of, RulesGate};
 use crate::dir_maintenance::DirMaintenance;
 use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
-use crate::host_directory;
+use crate::host_directory::{self, Membership};
 use crate::routes::Report;
 use crate::watch::Watchers;
 
@@ -53,6 +53,8 @@ pub(crate) struct Role<'a> {
     pub(crate) name: Arc<str>,
     /// Whether the service is the gateway, which forwards letters.
     pub(crate) gateway: bool,
+    /// Whether the process is likely to end within a second.
+    pub(crate) brief: bool,
     /// The recipient of notifications about agents of other hosts that have sent letters.
     pub(crate) contacts: Option<Arc<dyn Contacts>>,
     /// The proofs of identity that peers must give.
@@ -81,7 +83,11 @@ impl Service {
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let incarnation = Incarnation::random();
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
-        let (dir, host) = host_directory::join(&config.domain, &own, role.gateway, cancellation)?;
+        let membership = Membership {
+            gateway: role.gateway,
+            brief: role.brief,
+        };
+        let (dir, host) = host_directory::join(&config.domain, &own, membership, cancellation)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| dir.leave())?;
         let gate = gate(config, &role, &host).inspect_err(|_| dir.leave())?;
         let watchers = Arc::new(Watchers::new(&own, role.gateway));
@@ -302,7 +308,7 @@ fn transports(
     for kind in used(config, role) {
         let made = match kind {
             #[cfg(feature = "shm")]
-            Kind::Shm => shm(config, maintenance, incarnation, handle),
+            Kind::Shm => shm(config, role, maintenance, incarnation, handle),
             Kind::Unix => unix(config, role, maintenance, incarnation, handle),
             #[cfg(feature = "net")]
             Kind::Tcp => tcp(config, role, &maintenance.dir, incarnation, handle),
@@ -344,6 +350,7 @@ fn transports(
 #[cfg(feature = "shm")]
 fn shm(
     config: &Config,
+    role: &Role<'_>,
     maintenance: &mut DirMaintenance,
     incarnation: Incarnation,
     handle: &Handle,
@@ -353,6 +360,7 @@ fn shm(
     let config = ShmConfig {
         capacity: settings.capacity,
         max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
+        answers_late: role.gateway,
         ..ShmConfig::new(
             maintenance.dir.part("shm"),
             maintenance.dir.prefix(),

@@ -105,6 +105,7 @@ fn on_one_host(criterion: &mut Criterion) {
     let _within = runtime.enter();
     let [other, own] = ["other", "own"].map(|mts| {
         let config = HostConfig {
+            brief: false,
             dir: place.path().join("run"),
             mts: Mts::new(mts, Incarnation::random()),
             gateway: false,

@@ -105,6 +105,12 @@ pub(crate) async fn join(config: &Config) -> Result<Domain, Failure> {
     joined.map_err(|error| not_joined(error, config))
 }
 
+/// Joins the domain of the configuration, for a command that ends within a second.
+pub(crate) async fn join_briefly(config: &Config) -> Result<Domain, Failure> {
+    let joined = Domain::open_briefly(config).await;
+    joined.map_err(|error| not_joined(error, config))
+}
+
 /// The error report for a domain that cannot be joined or a gateway that cannot be started.
 pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
     let domain = format!("domain {:?}", config.domain);

@@ -461,15 +461,16 @@ impl World {
             body,
         };
         self.next_ticket += 1;
+        let at_once = via == Kind::Shm && self.next_ticket.is_multiple_of(2);
+        let ticket = (!at_once).then_some(Ticket(self.next_ticket));
         let arrival = Arrival {
             parcel,
             from,
-            ticket: Ticket(self.next_ticket),
+            ticket,
         };
         let now = self.clocks();
-        let at_once = via == Kind::Shm;
         let core = &mut self.service(at).core;
-        let verdict = core.handle_arrival(now, via, at_once, arrival);
+        let verdict = core.handle_arrival(now, via, arrival);
         assert!(!at_once || verdict != Verdict::Later);
         self.carry_out(at);
     }
@@ -525,12 +526,12 @@ impl World {
                 let arrival = Arrival {
                     parcel,
                     from: hop(LIAR, Kind::Tcp),
-                    ticket: Ticket(u64::MAX),
+                    ticket: Some(Ticket(u64::MAX)),
                 };
                 let now = self.clocks();
                 let to = input.one_of(&[GATEWAY, FAR_GATEWAY]);
                 let core = &mut self.service(to).core;
-                core.handle_arrival(now, Kind::Tcp, false, arrival);
+                core.handle_arrival(now, Kind::Tcp, arrival);
                 return self.carry_out(to);
             }
         };
@@ -753,17 +754,16 @@ impl World {
         };
         self.next_ticket += 1;
         let ticket = Ticket(self.next_ticket);
+        // Shared memory has few slots for late answers.
+        let at_once = kind == Kind::Shm && self.next_ticket.is_multiple_of(2);
         let arrival = Arrival {
             parcel,
             from: hop(from, kind),
-            ticket,
+            ticket: (!at_once).then_some(ticket),
         };
         let now = self.clocks();
         let service = self.service(to);
-        match service
-            .core
-            .handle_arrival(now, kind, kind == Kind::Shm, arrival)
-        {
+        match service.core.handle_arrival(now, kind, arrival) {
             Verdict::Now(answer) => {
                 let coming = Coming::Conclusion(attempt, Conclusion::Answered(answer));
                 self.coming.push_back((self.now + DELAY, from, coming));

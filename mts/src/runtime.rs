@@ -290,7 +290,6 @@ impl Mts {
             let sink = Arc::new(TransportSink {
                 shared: Arc::downgrade(&shared),
                 kind: transport.kind(),
-                answers_at_once: transport.answers_at_once(),
             });
             match transport.listen(sink) {
                 Ok(found) => shared.locate(transport.kind(), found, false),

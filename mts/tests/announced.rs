@@ -11,7 +11,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
-    Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Principal, Ticket, Verdict,
+    Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Principal, Verdict,
 };
 
 const ROVER: Incarnation = Incarnation::from_u64(0xb);
@@ -117,10 +117,10 @@ impl Gateway {
                 location: "shm://1#0000000000000001".parse().unwrap(),
                 principal: Principal::Host,
             },
-            ticket: Ticket(1),
+            ticket: None,
         };
         let now = self.at(ms);
-        let verdict = self.core.handle_arrival(now, Kind::Shm, true, arrival);
+        let verdict = self.core.handle_arrival(now, Kind::Shm, arrival);
         assert_eq!(verdict, Verdict::Now(Answer::Custody));
     }
 

@@ -82,10 +82,6 @@ impl Transport for Recording {
         usize::MAX
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let _ = self.sink.set(sink);
         Ok(Vec::new())
@@ -184,7 +180,7 @@ impl Gateway {
                 location,
                 principal: Principal::Unproved,
             },
-            ticket: Ticket(agent),
+            ticket: Some(Ticket(agent)),
         });
     }
 }

@@ -12,8 +12,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Principal, Report, Stream, Ticket, TransportError, TransportErrorKind,
-    Verdict,
+    Outcome, Parcel, Principal, Report, Stream, TransportError, TransportErrorKind, Verdict,
 };
 
 use self::common::letter;
@@ -103,10 +102,10 @@ impl Service {
         let arrival = Arrival {
             parcel,
             from,
-            ticket: Ticket(1),
+            ticket: None,
         };
         let now = self.at(ms);
-        self.core.handle_arrival(now, via, true, arrival)
+        self.core.handle_arrival(now, via, arrival)
     }
 
     fn conclude(&mut self, ms: u64, attempt: AttemptId, conclusion: Conclusion) {
@@ -210,6 +209,21 @@ fn a_letter_that_its_custodian_does_not_have_is_sent_again() {
         matches!(outcome, Some(Outcome::Delivered { .. })),
         "{outcome:?}"
     );
+}
+
+#[test]
+fn a_late_answer_names_the_transport_between_the_hosts() {
+    let mut sender = Service::new(false);
+    sender.send();
+    let (attempt, _) = sender.dispatched().unwrap();
+    sender.answer(100, attempt, Answer::Delivered { via: Kind::Quic });
+    let delivered = Outcome::Delivered {
+        via: Kind::Quic,
+        attempts: Vec::new(),
+    };
+    assert_eq!(sender.outcome(), Some(delivered));
+    // No report follows, so the custodian is not asked.
+    assert!(sender.wait_for_dispatch(100, 10_000).is_none());
 }
 
 #[test]

@@ -36,6 +36,8 @@ struct Gateway {
     core: Core,
     /// Actions that were not looked at yet.
     actions: VecDeque<Action>,
+    /// Whether arrivals over shared memory may be answered later.
+    late: bool,
     start: Instant,
 }
 
@@ -53,6 +55,7 @@ impl Gateway {
         Self {
             core: Core::new(config, Arc::new(directory)),
             actions: VecDeque::new(),
+            late: false,
             start: Instant::now(),
         }
     }
@@ -76,12 +79,10 @@ impl Gateway {
         let arrival = Arrival {
             parcel,
             from,
-            ticket: Ticket(7),
+            ticket: (via != Kind::Shm || self.late).then_some(Ticket(7)),
         };
         let now = self.at(ms);
-        let verdict = self
-            .core
-            .handle_arrival(now, via, via == Kind::Shm, arrival);
+        let verdict = self.core.handle_arrival(now, via, arrival);
         // As the runtime does, also for the refresh that follows a contact.
         while let Some(action) = self.core.poll_action() {
             match action {
@@ -192,6 +193,26 @@ fn the_answer_to_a_peer_waits_for_the_outcome() {
 }
 
 #[test]
+fn the_answer_to_a_process_of_the_host_names_the_transport() {
+    let mut gateway = Gateway::new(true);
+    gateway.late = true;
+    let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
+    assert_eq!(verdict, Verdict::Later);
+    let (attempt, ..) = gateway.dispatched();
+    gateway.nothing_to_do();
+    gateway.conclude(1, attempt, Answer::Accepted);
+    match gateway.core.poll_action() {
+        Some(Action::Answer {
+            kind: Kind::Shm,
+            answer: Answer::Delivered { via: Kind::Shm },
+            ..
+        }) => {}
+        other => panic!("{other:?}"),
+    }
+    gateway.nothing_to_do();
+}
+
+#[test]
 fn a_slow_receiver_causes_custody_and_a_report() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
@@ -214,7 +235,7 @@ fn a_slow_receiver_causes_custody_and_a_report() {
 }
 
 #[test]
-fn over_shared_memory_custody_is_answered_at_once() {
+fn an_arrival_without_a_ticket_is_answered_at_once_with_custody() {
     let mut gateway = Gateway::new(true);
     let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
     assert_eq!(verdict, Verdict::Now(Answer::Custody));

@@ -11,7 +11,7 @@ use fipa_mts::{AccessGate, LetterParts, Link, Source, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
-    Stream, Ticket, Verdict,
+    Stream, Verdict,
 };
 use parking_lot::Mutex;
 
@@ -78,7 +78,7 @@ fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
             location,
             principal: Principal::Host,
         },
-        ticket: Ticket(sequence),
+        ticket: None,
     }
 }
 
@@ -101,9 +101,8 @@ fn the_gate_is_called_once_per_letter_and_only_when_there_is_room() {
     let mut core = Core::new(config(false), Arc::new(directory)).gated(gate.clone());
     core.register("arm".into(), ARM);
     core.register("brake".into(), BRAKE);
-    let mut arrive = |to, called, sequence| {
-        core.handle_arrival(now(), Kind::Shm, true, arrival(to, called, sequence))
-    };
+    let mut arrive =
+        |to, called, sequence| core.handle_arrival(now(), Kind::Shm, arrival(to, called, sequence));
     let accepted = Verdict::Now(Answer::Accepted);
     assert_eq!(arrive(ARM, "arm", 1), accepted);
     assert_eq!(arrive(ARM, "arm", 1), accepted, "a copy");
@@ -126,17 +125,17 @@ fn a_gateway_calls_the_gate_with_the_registered_name() {
         directory.register(agent).unwrap();
     }
     let mut core = Core::new(config(true), Arc::new(directory)).gated(gate.clone());
-    let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, "brake", 1));
+    let verdict = core.handle_arrival(now(), Kind::Shm, arrival(BRAKE, "brake", 1));
     assert_eq!(verdict, refused());
     // No agent has this registration and this name.
-    let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, "arm", 1));
+    let verdict = core.handle_arrival(now(), Kind::Shm, arrival(BRAKE, "arm", 1));
     let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
         panic!("{verdict:?}");
     };
     assert_eq!(reason, FailureReason::NoSuchAgent);
     assert!(core.poll_action().is_none(), "the refusal caused no action");
     for _ in 0..2 {
-        let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(ARM, "arm", 1));
+        let verdict = core.handle_arrival(now(), Kind::Shm, arrival(ARM, "arm", 1));
         assert_eq!(verdict, Verdict::Now(Answer::Custody));
     }
     assert_eq!(

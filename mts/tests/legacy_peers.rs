@@ -17,7 +17,7 @@ use fipa_sds::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
-    LegacySource, Location, Outcome, Parcel, Principal, Signature, Ticket, TransportError,
+    LegacySource, Location, Outcome, Parcel, Principal, Signature, TransportError,
     TransportErrorKind, Verdict,
 };
 
@@ -620,9 +620,9 @@ fn a_letter_to_a_legacy_peers_agent_is_sent_not_delivered() {
             location: back,
             principal: Principal::Host,
         },
-        ticket: Ticket(1),
+        ticket: None,
     };
-    let verdict = gateway.handle_arrival(now(), Kind::Shm, true, arrival);
+    let verdict = gateway.handle_arrival(now(), Kind::Shm, arrival);
     assert_eq!(verdict, Verdict::Now(Answer::Custody));
     process.handle_conclusion(now(), sent, Conclusion::Answered(Answer::Custody));
     let (handed, to, parcel) = dispatched(&mut gateway).unwrap();
@@ -637,9 +637,9 @@ fn a_letter_to_a_legacy_peers_agent_is_sent_not_delivered() {
             location: near.parse().unwrap(),
             principal: Principal::Host,
         },
-        ticket: Ticket(2),
+        ticket: None,
     };
-    process.handle_arrival(now(), Kind::Shm, true, arrival);
+    process.handle_arrival(now(), Kind::Shm, arrival);
     match process.poll_action() {
         Some(Action::Outcome { outcome, .. }) => {
             assert!(

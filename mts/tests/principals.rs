@@ -137,10 +137,9 @@ impl Bench {
         let arrival = Arrival {
             parcel,
             from,
-            ticket,
+            ticket: Some(ticket),
         };
-        self.core
-            .handle_arrival(self.now, Kind::Tcp, false, arrival)
+        self.core.handle_arrival(self.now, Kind::Tcp, arrival)
     }
 
     fn letter(&mut self, from: Hop, stream: (Incarnation, Incarnation), sequence: u64) -> Verdict {
@@ -363,10 +362,10 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
         let arrival = Arrival {
             parcel: report,
             from,
-            ticket: Ticket(bench.tickets),
+            ticket: Some(Ticket(bench.tickets)),
         };
         let now = bench.now;
-        bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
+        bench.core.handle_arrival(now, Kind::Tcp, arrival);
         let actions = std::iter::from_fn(|| bench.core.poll_action());
         actions
             .filter(|action| matches!(action, Action::Outcome { .. }))
@@ -426,10 +425,10 @@ fn a_report_from_the_network_in_the_name_of_a_local_process_is_ignored() {
                     ..parcel.clone()
                 },
                 from,
-                ticket: Ticket(1000),
+                ticket: Some(Ticket(1000)),
             };
             let now = bench.now;
-            bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
+            bench.core.handle_arrival(now, Kind::Tcp, arrival);
             std::iter::from_fn(|| bench.core.poll_action())
                 .any(|action| matches!(action, Action::Answer { .. }))
         };
@@ -488,10 +487,10 @@ fn a_report_counts_only_from_a_service_that_introduced_itself_with_its_certifica
                 principal,
                 ..link(away, LIAR)
             },
-            ticket: Ticket(1),
+            ticket: Some(Ticket(1)),
         };
         let now = bench.now;
-        bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
+        bench.core.handle_arrival(now, Kind::Tcp, arrival);
         std::iter::from_fn(|| bench.core.poll_action())
             .any(|action| matches!(action, Action::Outcome { .. }))
     };

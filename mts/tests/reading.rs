@@ -131,7 +131,7 @@ fn the_service_is_not_locked_while_the_gate_reads_a_letter() {
             location,
             principal: Principal::Unproved,
         },
-        ticket: Ticket(1),
+        ticket: Some(Ticket(1)),
     });
     assert_eq!(verdict, Verdict::Now(Answer::Accepted));
     sink.arrived_unframed(letter(), Kind::Tcp, LEGACY_PEER);

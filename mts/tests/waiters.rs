@@ -30,10 +30,6 @@ impl Transport for Slow {
         0
     }
 
-    fn answers_at_once(&self) -> bool {
-        true
-    }
-
     fn listen(&self, _: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         Ok(Vec::new())
     }

@@ -115,7 +115,7 @@ fn processor_time() -> Duration {
 fn arrives(core: &mut Core, stream: (u64, u64), sequence: u64, body: Body) -> Verdict {
     let arrival = arrival(stream, sequence, body);
     let read = core.reader().read_arrival(&arrival);
-    core.handle_read_arrival(now(), Kind::Tcp, false, arrival, read)
+    core.handle_read_arrival(now(), Kind::Tcp, arrival, read)
 }
 
 fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
@@ -138,7 +138,7 @@ fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
             location: location.with_incarnation(PEER),
             principal: Principal::Unproved,
         },
-        ticket: Ticket(sequence),
+        ticket: Some(Ticket(sequence)),
     }
 }
 
@@ -148,7 +148,7 @@ fn framed(core: &mut Core, what: &str, letter: Letter) -> Verdict {
     let arrival = arrival((9, 100), 1, Body::Letter(letter));
     let read = core.reader().read_arrival(&arrival);
     bounded(what, bytes, || {
-        core.handle_read_arrival(now(), Kind::Tcp, false, arrival, read)
+        core.handle_read_arrival(now(), Kind::Tcp, arrival, read)
     })
 }
 
@@ -406,7 +406,7 @@ fn crowded(agents: u64) -> (Core, Arc<dyn Directory>, Instant) {
         let stream = (1_000_000 + sender, 100 + sender % agents);
         let arrival = arrival(stream, 1, Body::Letter(letter.clone()));
         let read = core.reader().read_arrival(&arrival);
-        match core.handle_read_arrival(came, Kind::Tcp, false, arrival, read) {
+        match core.handle_read_arrival(came, Kind::Tcp, arrival, read) {
             Verdict::Later => lanes += 1,
             verdict => assert_eq!(verdict, Verdict::Now(Answer::Busy)),
         }
@@ -460,7 +460,7 @@ fn full_lane() -> (Core, Arc<dyn Directory>, Instant, Vec<AttemptId>) {
     for sequence in 1..1025 {
         let arrival = arrival((9, 100), sequence, Body::Letter(letter.clone()));
         let read = core.reader().read_arrival(&arrival);
-        let verdict = core.handle_read_arrival(came, Kind::Tcp, false, arrival, read);
+        let verdict = core.handle_read_arrival(came, Kind::Tcp, arrival, read);
         assert_eq!(verdict, Verdict::Later);
     }
     let mut sent = Vec::new();

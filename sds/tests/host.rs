@@ -23,6 +23,7 @@ use fipa_transport::Incarnation;
 
 fn config(dir: &Path) -> HostConfig {
     HostConfig {
+        brief: false,
         dir: dir.to_owned(),
         mts: Mts::new("mts", Incarnation::random()),
         gateway: false,
@@ -598,6 +599,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
     assert!(matches!(denied, Err(HostError::NoGateway)));
 
     let gateway = HostDirectory::open(HostConfig {
+        brief: false,
         gateway: true,
         ..config(&dir)
     })
@@ -844,6 +846,7 @@ async fn a_name_that_was_registered_meanwhile_is_lost() {
 async fn a_contact_keeps_no_agent_from_its_name() {
     let (_parent, dir) = fresh_dir();
     let gateway = HostDirectory::open(HostConfig {
+        brief: false,
         gateway: true,
         ..config(&dir)
     })
@@ -882,6 +885,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
 async fn changes_during_the_removal_of_the_directory_are_written_afterwards() {
     let (_parent, dir) = fresh_dir();
     let gateway = HostDirectory::open(HostConfig {
+        brief: false,
         gateway: true,
         ..config(&dir)
     })

@@ -286,6 +286,7 @@ mod tests {
     fn announced(mandate: Mandate, has_keys: bool) -> (usize, usize) {
         let place = tempfile::tempdir().unwrap();
         let host = HostDirectory::open(HostConfig {
+            brief: false,
             dir: place.path().join("domain"),
             mts: Mts::new("mts", Incarnation::from_u64(1)),
             gateway: true,

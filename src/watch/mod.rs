@@ -35,7 +35,7 @@ use crate::dir_maintenance::DirMaintenance;
 use crate::directory_view::DirectoryView;
 use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
-use crate::host_directory;
+use crate::host_directory::{self, Membership};
 use crate::owner::Owner;
 
 /// The options of a [`Watcher`].
@@ -76,7 +76,9 @@ impl Watcher {
         tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let name = format!("fipa-watch-{}", std::process::id());
         let own = fipa_sds::Mts::new(name, Incarnation::random());
-        let (dir, host) = host_directory::join(&config.domain, &own, false, &Cancellation::new())?;
+        let membership = Membership::default();
+        let (dir, host) =
+            host_directory::join(&config.domain, &own, membership, &Cancellation::new())?;
         let socket = host.listen().inspect_err(|_| leave(&host, &dir))?;
         let socket = socket::listening(socket).map_err(|source| {
             leave(&host, &dir);

@@ -1,13 +1,14 @@
 //! The body of an answer frame.
 //!
 //! The first byte is the kind of answer: 0 accepted, 1 in custody, 2 busy, 3 out of order, 4
-//! failed, 5 returned, 6 moved. Kind 3 is followed by the last accepted position (8 bytes,
+//! failed, 5 returned, 6 moved, 7 delivered. Kind 3 is followed by the last accepted position (8 bytes,
 //! little-endian); kind 4 by the code of the reason (one byte) and the detail (UTF-8 to the end);
-//! kind 5 by whether the letter may have been delivered (one byte, 0 or 1).
+//! kind 5 by whether the letter may have been delivered (one byte, 0 or 1); kind 7 by the code of the
+//! kind of transport (one byte).
 
 use bytes::{BufMut, BytesMut};
 use fipa_transport::Answer;
-use fipa_transport::wire::{reason_code, reason_of_code, truncated};
+use fipa_transport::wire::{kind_code, kind_of_code, reason_code, reason_of_code, truncated};
 
 /// Longest body of an answer, in bytes.
 pub(crate) const MAX_ANSWER: usize = 2 + Answer::MAX_DETAIL;
@@ -19,11 +20,12 @@ const OUT_OF_ORDER: u8 = 3;
 const FAILED: u8 = 4;
 const RETURNED: u8 = 5;
 const MOVED: u8 = 6;
+const DELIVERED: u8 = 7;
 
 pub(crate) fn len(answer: &Answer) -> usize {
     match answer {
         Answer::OutOfOrder { .. } => 9,
-        Answer::Returned { .. } => 2,
+        Answer::Returned { .. } | Answer::Delivered { .. } => 2,
         Answer::Failed { detail, .. } => 2 + truncated(detail, Answer::MAX_DETAIL).len(),
         _ => 1,
     }
@@ -43,6 +45,7 @@ pub(crate) fn encode(answer: &Answer, out: &mut BytesMut) {
         }
         Answer::Returned { uncertain } => out.put_slice(&[RETURNED, u8::from(*uncertain)]),
         Answer::Moved => out.put_u8(MOVED),
+        Answer::Delivered { via } => out.put_slice(&[DELIVERED, kind_code(*via)]),
         // Busy, and answers of later versions: "not now" is the safest reading for an older peer.
         _ => out.put_u8(BUSY),
     }
@@ -54,6 +57,9 @@ pub(crate) fn decode(body: &[u8]) -> Option<Answer> {
         [CUSTODY] => Some(Answer::Custody),
         [BUSY] => Some(Answer::Busy),
         [MOVED] => Some(Answer::Moved),
+        [DELIVERED, code] => Some(Answer::Delivered {
+            via: kind_of_code(*code)?,
+        }),
         [RETURNED, uncertain @ (0 | 1)] => Some(Answer::Returned {
             uncertain: *uncertain == 1,
         }),
@@ -72,7 +78,7 @@ pub(crate) fn decode(body: &[u8]) -> Option<Answer> {
 
 #[cfg(test)]
 mod tests {
-    use fipa_transport::FailureReason;
+    use fipa_transport::{FailureReason, Kind};
 
     use super::*;
 
@@ -86,6 +92,7 @@ mod tests {
             Answer::Returned { uncertain: false },
             Answer::Returned { uncertain: true },
             Answer::Moved,
+            Answer::Delivered { via: Kind::Quic },
             Answer::failed(FailureReason::NoSuchAgent, "no agent has the name béla"),
         ] {
             let mut body = BytesMut::new();
@@ -121,6 +128,9 @@ mod tests {
             &[5],
             &[5, 2],
             &[6, 0],
+            &[7],
+            &[7, 200],
+            &[7, 0, 0],
             &[9],
         ] {
             assert_eq!(decode(wrong), None, "{wrong:?}");

@@ -7,17 +7,55 @@
 mod common;
 
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Party, accepted, config, letter_parcel, parcel};
+use common::{Party, Recorder, accepted, config, letter_parcel, parcel};
 use fipa_acl::{ErrorChain, Letter};
-use fipa_testbed::until_some;
+use fipa_testbed::{until, until_async, until_some};
 use fipa_transport::{
-    Answer, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport,
+    Answer, AttemptId, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport,
     TransportErrorKind, Verdict,
 };
 use fipa_transport_net::TcpTransport;
+
+#[test]
+fn letters_that_are_sent_in_a_row_share_a_write() {
+    // One thread: the task of the connection runs only while this test waits.
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let b = Party::new();
+    let sink = Arc::new(Recorder::default());
+    let mut of_gateway = config(&["127.0.0.1:0"]);
+    of_gateway.processes = false;
+    let a = TcpTransport::new(of_gateway, runtime.handle().clone());
+    runtime.block_on(async {
+        a.listen(sink.clone()).unwrap();
+        let send = |attempt| {
+            let parcel = parcel(attempt, "x");
+            a.dispatch(AttemptId(attempt), b.location(), parcel)
+                .unwrap();
+        };
+        let concluded = || sink.record.lock().concluded.len();
+        send(0);
+        until_async("the first answer", || concluded() == 1).await;
+        let before = a.counters().writes;
+        (1..=20).for_each(send);
+        until_async("all answers", || concluded() == 21).await;
+        // The first letter alone, twice eight letters, and the rest.
+        assert_eq!(a.counters().writes - before, 4);
+        // A letter without another one under way is written at once, and not by the task.
+        let before = a.counters().writes;
+        send(21);
+        until("the letter", || b.arrivals() == 22);
+        until_async("the answer", || concluded() == 22).await;
+        assert_eq!(a.counters().writes - before, 1);
+    });
+    a.close();
+}
 
 #[test]
 fn late_answers_may_come_in_any_order() {
@@ -295,7 +333,7 @@ fn a_runtime_that_was_shut_down_is_reported() {
         orphan
     };
     let error = orphan
-        .dispatch(fipa_transport::AttemptId(1), b.location(), parcel(1, "x"))
+        .dispatch(AttemptId(1), b.location(), parcel(1, "x"))
         .unwrap_err();
     assert_eq!(error.fault, TransportErrorKind::Closed, "{error}");
 }

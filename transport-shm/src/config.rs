@@ -41,6 +41,9 @@ pub struct ShmConfig {
     /// Minimum length, in bytes, of content that is stored once for several receivers. Shorter
     /// content is copied for each receiver, which costs less. At least 1.
     pub share_from: usize,
+    /// Whether letters may be answered later, as long as fewer than half of their sender's slots are
+    /// held. For a process that forwards letters.
+    pub answers_late: bool,
 }
 
 impl ShmConfig {
@@ -63,10 +66,11 @@ impl ShmConfig {
             max_clients: 64,
             max_peers: 64,
             window: 16,
-            max_loans: 8,
+            max_loans: 15,
             max_borrowed: 256,
             copy_below: 1024,
             share_from: 64 << 10,
+            answers_late: false,
         }
     }
 

@@ -26,6 +26,8 @@ pub struct ShmCounters {
     pub loans_copied: u64,
     /// Rings of other processes' doorbells: system calls that a polling receiver saves.
     pub rung: u64,
+    /// Parcels whose answer was deferred.
+    pub deferred: u64,
     /// Parcels from other processes that were malformed or could not be answered.
     pub refused: u64,
     /// Other processes whose end was detected.
@@ -46,7 +48,7 @@ macro_rules! tally {
     };
 }
 
-tally!(arrived in_place copied_small copied_full borrowed sent referring loans_sent loans_copied rung refused peers_gone);
+tally!(arrived in_place copied_small copied_full borrowed sent referring loans_sent loans_copied rung deferred refused peers_gone);
 
 /// Increments a counter by one.
 pub(crate) fn count(counter: &AtomicU64) {

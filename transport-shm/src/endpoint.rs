@@ -9,7 +9,8 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Abandoned, AttemptId, Incarnation, Location, Parcel, Sink, TransportError, TransportErrorKind,
+    Abandoned, Answer, AttemptId, Incarnation, Location, Parcel, Sink, Ticket, TransportError,
+    TransportErrorKind,
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
@@ -19,6 +20,7 @@ use tokio::runtime::Handle;
 use crate::answered::Answered;
 use crate::combiner::Combiner;
 use crate::counters::{Tally, count};
+use crate::deferred::LateAnswers;
 use crate::domain_files::{DomainFiles, file_error};
 use crate::errors::{closed, opening};
 use crate::fork::Owner;
@@ -48,6 +50,8 @@ pub(crate) struct Endpoint {
     /// Number of unanswered parcels.
     waiting: Arc<AtomicUsize>,
     answered: Answered,
+    /// Parcels that are answered later.
+    deferred: Arc<LateAnswers>,
     /// Whether a peer has ended and is still in `peers`.
     ended: AtomicBool,
     peers: RwLock<BTreeMap<Incarnation, Arc<Peer>>>,
@@ -120,13 +124,14 @@ impl Endpoint {
             node.map_err(|e| failed("cannot create a node", crate::errors::words(&e), shortage))?;
         domain.restrict_permissions()?;
         let peer_segments = Arc::new(PeerSegments::new(domain.clone()));
+        let deferred = Arc::<LateAnswers>::default();
         let (inbox, shortage) = storage::with_shortage(|| {
             Inbox::create(
                 &config,
                 &node,
                 &presence,
                 tally.clone(),
-                peer_segments.clone(),
+                (peer_segments.clone(), deferred.clone()),
             )
         });
         let inbox =
@@ -147,6 +152,7 @@ impl Endpoint {
             inbox: Combiner::new(Some(inbox)),
             waiting: Arc::default(),
             answered: Answered::default(),
+            deferred,
             ended: AtomicBool::new(false),
             peers: RwLock::default(),
             uses: AtomicU64::new(0),
@@ -435,6 +441,15 @@ impl Endpoint {
         }
     }
 
+    /// Answers a parcel that was not answered when it arrived.
+    pub(crate) fn answer(self: &Arc<Self>, ticket: Ticket, answer: &Answer) {
+        if self.owner.is_this()
+            && let Some(sender) = self.deferred.answer(ticket, answer)
+        {
+            self.wake(sender);
+        }
+    }
+
     /// Abandons an attempt. The parcel may be in the other process's mailbox, and that process may
     /// still take it.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
@@ -704,6 +719,7 @@ impl Endpoint {
             let mut inbox = self.inbox.lock();
             // First the mailbox closes, then peers detect the end, then the own letters are
             // concluded.
+            self.deferred.drop_all();
             *inbox = None;
             *self.presence.write() = None;
             let peers = std::mem::take(&mut *self.peers.write());

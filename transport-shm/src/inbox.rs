@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use bytes::Bytes;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Answer, Arrival, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal, Sink,
-    Ticket, Verdict,
+    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
+    Sink, Ticket, Verdict,
 };
 use iceoryx2::port::{DegradationAction, ReceiveError};
 use iceoryx2::prelude::{BackpressureStrategy, Node, PortFactory, ServiceName};
@@ -17,6 +17,7 @@ use parking_lot::Mutex;
 use crate::ShmConfig;
 use crate::answered::Answered;
 use crate::counters::{Tally, count, count_alone};
+use crate::deferred::{LateAnswers, UnansweredParcel};
 use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
 use crate::memory::MappedPtr;
 use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
@@ -32,6 +33,10 @@ const BATCH: usize = 64;
 const ANSWERS: usize = 1024;
 
 const _: () = assert!(ANSWERS <= storage::MAX_CHUNKS);
+
+/// Maximum number of late answers to all senders together. The others remain for parcels that are
+/// answered at once.
+const MAX_LATE_ANSWERS: usize = ANSWERS / 2;
 
 /// Name of the mailbox of a process.
 pub(crate) fn mailbox_name(of: Incarnation) -> String {
@@ -52,6 +57,8 @@ pub(crate) struct Inbox {
     server: MailServer,
     service_hash: String,
     borrows: Arc<BorrowLimits>,
+    /// Parcels that are answered later; `None` if all are answered at once.
+    deferred: Option<Arc<LateAnswers>>,
     page: Arc<StatusPage>,
     account: Account,
     tally: Arc<Tally>,
@@ -74,7 +81,7 @@ impl Inbox {
         node: &Node<Svc>,
         presence: &Presence,
         tally: Arc<Tally>,
-        peer_segments: Arc<PeerSegments>,
+        (peer_segments, deferred): (Arc<PeerSegments>, Arc<LateAnswers>),
     ) -> Result<Self, String> {
         let name = ServiceName::new(&mailbox_name(config.incarnation)).map_err(debug)?;
         let service = node
@@ -105,11 +112,16 @@ impl Inbox {
             .set_response_degradation_handler(|_, _| DegradationAction::Ignore)
             .create()
             .map_err(debug)?;
+        if config.answers_late {
+            presence.page().words().answer_late();
+        }
         Ok(Self {
             server,
+            deferred: config.answers_late.then_some(deferred),
             service_hash: service.service_hash().as_str().to_owned(),
             borrows: Arc::new(BorrowLimits {
                 per_sender: config.window - 1,
+                late_per_sender: config.window / 2,
                 total: config.max_borrowed,
                 held: Mutex::default(),
                 waiting: AtomicBool::new(false),
@@ -188,6 +200,8 @@ impl Inbox {
             && self.server.has_requests().unwrap_or(false)
     }
 
+    // Apart from the poll, which mostly finds nothing.
+    #[inline(never)]
     fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
         count_alone(&self.tally.arrived);
         // A copy in private memory: the sender could still change the original.
@@ -208,31 +222,61 @@ impl Inbox {
             Ok(parcel) => parcel,
             Err(refusal) => {
                 count(&self.tally.refused);
-                self.reply(answer, &refusal, &header);
-                drop(owner);
+                UnansweredParcel::new(answer, header.token(), sender, owner).send(&refusal);
                 return sender.is_known().then_some(sender);
             }
         };
-        self.tickets += 1;
+        let mut unanswered = Some(UnansweredParcel::new(answer, header.token(), sender, owner));
+        let ticket = self.defer(&parcel, &mut unanswered);
         let arrival = Arrival {
             parcel,
             from: Hop {
                 location: self.location_of_sender(sender),
                 principal: Principal::Host,
             },
-            ticket: Ticket(self.tickets),
+            ticket,
         };
-        let verdict = match sink.arrived(arrival) {
+        let verdict = sink.arrived(arrival);
+        if let Some(deferred) = &self.deferred
+            && let Some(ticket) = ticket
+        {
+            match verdict {
+                Verdict::Now(_) => unanswered = deferred.take(ticket),
+                Verdict::Later => {
+                    count(&self.tally.deferred);
+                    return None;
+                }
+            }
+        }
+        let answer = match verdict {
             Verdict::Now(answer) => answer,
             Verdict::Later => Answer::failed(
                 FailureReason::Refused,
-                "the receiver deferred its answer, which shared memory does not support",
+                "the receiver deferred the answer to a parcel that must be answered at once",
             ),
         };
-        self.reply(answer, &verdict, &header);
-        // After the reply: dropping the request closes the channel of the response.
-        drop(owner);
+        if let Some(unanswered) = unanswered {
+            unanswered.send(&answer);
+        }
         Some(sender)
+    }
+
+    /// Takes a letter that may be answered later to the deferred ones, before the sink has it: the
+    /// answer may be given while the sink is called. Returns its ticket.
+    fn defer(
+        &mut self,
+        parcel: &Parcel,
+        unanswered: &mut Option<UnansweredParcel>,
+    ) -> Option<Ticket> {
+        let deferred = self.deferred.as_ref()?;
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        if !is_letter || !unanswered.as_mut()?.hold(&self.borrows) {
+            return None;
+        }
+        self.tickets += 1;
+        let ticket = Ticket(self.tickets);
+        deferred.insert(ticket, unanswered.take()?);
+        Some(ticket)
     }
 
     /// Location of a sender. Cached, because consecutive parcels mostly have the same sender.
@@ -241,13 +285,6 @@ impl Inbox {
             Some(location) if location.incarnation() == sender => location.clone(),
             _ => self.last_sender.insert(location_of(sender)).clone(),
         }
-    }
-
-    fn reply(&self, uninit: UninitAck, answer: &Answer, header: &Header) {
-        // Fails if the sender has ended, which then needs no answer.
-        let _ = uninit
-            .write_payload(Ack::new(answer, header.token()))
-            .send();
     }
 
     /// Allocates the pages of all answers at the first one, whose own page is allocated already.
@@ -299,9 +336,10 @@ impl Inbox {
             ];
             let mut front = Bytes::from(around.concat());
             let tail = front.split_off(offsets.content - offsets.start);
-            let content = self.borrow_content(NonNull::from(content), active);
-            let parcel = parcel.parcel_of_pieces(front, content.clone(), tail);
-            (parcel, RequestOwner::Content(content))
+            let sender = active.origin().value();
+            let _content = self.borrow_content(NonNull::from(content), active);
+            let parcel = parcel.parcel_of_pieces(front, _content.clone(), tail);
+            (parcel, RequestOwner::Content { _content, sender })
         } else {
             let body = Bytes::copy_from_slice(&payload[offsets.start..offsets.end]);
             (parcel.parcel(body), RequestOwner::Unshared(active))
@@ -372,12 +410,14 @@ fn debug(error: impl std::fmt::Debug) -> String {
     crate::errors::words(&error)
 }
 
-/// The owner of a request: this function alone, or the handed-out content.
-#[expect(dead_code, reason = "owned until it is dropped")]
-enum RequestOwner {
+/// The owner of a request: this value alone, or the handed-out content.
+pub(crate) enum RequestOwner {
     Unshared(Active),
-    /// The content owns the request.
-    Content(Bytes),
+    /// The content owns the request, whose slot is counted as held by this sender.
+    Content {
+        _content: Bytes,
+        sender: u128,
+    },
 }
 
 /// Content in the payload of a sender's request, which is read in place.
@@ -433,18 +473,55 @@ impl Drop for BorrowedSegmentContent {
     }
 }
 
-/// Limits on the content that is held in place.
-struct BorrowLimits {
+/// Limits on the content that is held in place, and on late answers.
+pub(crate) struct BorrowLimits {
     per_sender: usize,
+    /// Number of held slots of a sender at which its parcels are answered at once.
+    late_per_sender: usize,
     total: usize,
-    /// Number of contents for each sender. The list is short enough for a linear search.
-    held: Mutex<Vec<(u128, usize)>>,
+    held: Mutex<HeldSlots>,
     /// Whether the mailbox cannot be drained until content is released.
     waiting: AtomicBool,
     doorbell: Arc<Doorbell>,
     tally: Arc<Tally>,
     // Last: the last owner of content removes the domain's files, which the segments' owner does.
     peer_segments: Arc<PeerSegments>,
+}
+
+/// The slots of senders that are held.
+#[derive(Default)]
+struct HeldSlots {
+    /// Number of held slots of each sender. The list is short enough for a linear search.
+    of: Vec<(u128, usize)>,
+    /// Number of late answers to all senders.
+    late: usize,
+}
+
+impl HeldSlots {
+    fn count(&self, sender: u128) -> usize {
+        let mut of = self.of.iter();
+        of.find(|(one, _)| *one == sender)
+            .map_or(0, |(_, count)| *count)
+    }
+
+    /// Counts one more slot of this sender, up to `most`.
+    fn begin(&mut self, sender: u128, most: usize) -> bool {
+        match self.of.iter().position(|(one, _)| *one == sender) {
+            Some(place) if self.of[place].1 < most => self.of[place].1 += 1,
+            None if self.of.len() < ShmConfig::MAX_LENDERS => self.of.push((sender, 1)),
+            _ => return false,
+        }
+        true
+    }
+
+    fn end(&mut self, sender: u128) {
+        if let Some(place) = self.of.iter().position(|(one, _)| *one == sender) {
+            self.of[place].1 -= 1;
+            if self.of[place].1 == 0 {
+                self.of.swap_remove(place);
+            }
+        }
+    }
 }
 
 impl BorrowLimits {
@@ -465,25 +542,45 @@ impl BorrowLimits {
         if self.tally.borrowed.load(Ordering::Relaxed) >= self.total as u64 {
             return false;
         }
-        match held.iter().position(|(one, _)| *one == sender) {
-            Some(place) if held[place].1 < self.per_sender => held[place].1 += 1,
-            None if held.len() < ShmConfig::MAX_LENDERS => held.push((sender, 1)),
-            _ => return false,
+        let begun = held.begin(sender, self.per_sender);
+        if begun {
+            self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
         }
-        self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
-        true
+        begun
+    }
+
+    /// Counts one more late answer to this sender, if fewer than half of its slots are held without
+    /// it. `counted` is whether the slot is held by content already.
+    pub(crate) fn begin_late_answer(&self, sender: u128, counted: bool) -> bool {
+        let mut held = self.held.lock();
+        let others = held.count(sender) - usize::from(counted);
+        let begun = held.late < MAX_LATE_ANSWERS
+            && others < self.late_per_sender
+            && (counted || held.begin(sender, self.late_per_sender));
+        held.late += usize::from(begun);
+        begun
+    }
+
+    pub(crate) fn end_late_answer(&self, sender: u128, counted: bool) {
+        let mut held = self.held.lock();
+        held.late -= 1;
+        if !counted {
+            held.end(sender);
+        }
+        drop(held);
+        self.drain_again();
     }
 
     fn end(&self, sender: u128) {
         let mut held = self.held.lock();
-        if let Some(place) = held.iter().position(|(one, _)| *one == sender) {
-            held[place].1 -= 1;
-            if held[place].1 == 0 {
-                held.swap_remove(place);
-            }
-            self.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
-        }
+        held.end(sender);
+        self.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
         drop(held);
+        self.drain_again();
+    }
+
+    /// Rings the doorbell if the mailbox waits for a slot.
+    fn drain_again(&self) {
         if self.waiting.swap(false, Ordering::SeqCst) {
             self.doorbell.ring();
         }

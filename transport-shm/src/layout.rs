@@ -2,7 +2,9 @@
 
 use std::mem::MaybeUninit;
 
-use fipa_transport::wire::{HEADER_LEN, ParcelHeader, reason_code, reason_of_code, truncated};
+use fipa_transport::wire::{
+    HEADER_LEN, ParcelHeader, kind_code, kind_of_code, reason_code, reason_of_code, truncated,
+};
 use fipa_transport::{Answer, Incarnation};
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
@@ -124,9 +126,10 @@ impl Header {
 /// The answer to a parcel.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("fipa-mail-ack-2")]
+#[type_name("fipa-mail-ack-3")]
 pub(crate) struct Ack {
     code: u8,
+    /// Code of the reason of a failure, or of the transport of a delivery.
     reason: u8,
     detail_len: u8,
     reserved: [u8; 5],
@@ -142,6 +145,7 @@ const OUT_OF_ORDER: u8 = 4;
 const FAILED: u8 = 5;
 const RETURNED: u8 = 6;
 const MOVED: u8 = 7;
+const DELIVERED: u8 = 8;
 
 impl Ack {
     /// Encodes the answer to the parcel with this token.
@@ -160,6 +164,10 @@ impl Ack {
             Answer::Custody => ack.code = CUSTODY,
             Answer::Busy => ack.code = BUSY,
             Answer::Moved => ack.code = MOVED,
+            Answer::Delivered { via } => {
+                ack.code = DELIVERED;
+                ack.reason = kind_code(*via);
+            }
             Answer::Returned { uncertain } => {
                 ack.code = RETURNED;
                 ack.last = u64::from(*uncertain);
@@ -191,6 +199,9 @@ impl Ack {
             CUSTODY => Answer::Custody,
             BUSY => Answer::Busy,
             MOVED => Answer::Moved,
+            DELIVERED => Answer::Delivered {
+                via: kind_of_code(self.reason)?,
+            },
             RETURNED => Answer::Returned {
                 uncertain: self.last != 0,
             },
@@ -354,7 +365,7 @@ pub(crate) mod fuzzing {
 
 #[cfg(test)]
 mod tests {
-    use fipa_transport::FailureReason;
+    use fipa_transport::{FailureReason, Kind};
 
     use super::*;
 
@@ -369,6 +380,7 @@ mod tests {
             Answer::Returned { uncertain: false },
             Answer::Returned { uncertain: true },
             Answer::Moved,
+            Answer::Delivered { via: Kind::Tcp },
             Answer::failed(FailureReason::Loop, "seen before"),
         ] {
             assert_eq!(Ack::new(&answer, 7).answer(7), Some(answer.clone()));
@@ -379,8 +391,13 @@ mod tests {
             Some(Answer::Failed { detail, .. }) => assert_eq!(detail, "é".repeat(80)),
             other => panic!("{other:?}"),
         }
-        for (code, reason, detail_len) in [(0, 0, 0), (9, 0, 0), (FAILED, 200, 0), (FAILED, 0, 255)]
-        {
+        for (code, reason, detail_len) in [
+            (0, 0, 0),
+            (9, 0, 0),
+            (DELIVERED, 200, 0),
+            (FAILED, 200, 0),
+            (FAILED, 0, 255),
+        ] {
             let mut ack = Ack::new(&Answer::Accepted, 1);
             (ack.code, ack.reason, ack.detail_len) = (code, reason, detail_len);
             assert_eq!(ack.answer(1), None);

@@ -40,6 +40,7 @@ mod answered;
 mod combiner;
 mod config;
 mod counters;
+mod deferred;
 mod domain_files;
 mod endpoint;
 mod errors;
@@ -60,6 +61,7 @@ mod presence;
 #[cfg(feature = "raw")]
 pub mod raw;
 mod segment;
+mod static_file;
 mod storage;
 mod sync;
 mod sync_policy;

@@ -582,13 +582,11 @@ impl Outbox {
         Ok(Some(request))
     }
 
-    /// Collects the available answers. `ended` states that the other process has ended, so that no
-    /// further answer comes.
+    /// Collects the available answers.
     pub(crate) fn collect(&self, look: AnswerLook, concluded: &mut Concluded) {
         if self.waiting() == 0 {
             return;
         }
-        // The receiver answers in order, or drops parcels unanswered.
         while let Some((sent, conclusion)) = self.concluded(look) {
             sent.forget();
             concluded.push((sent.attempt, conclusion));
@@ -598,21 +596,24 @@ impl Outbox {
 
     fn concluded(&self, look: AnswerLook) -> Option<(Sent, Conclusion)> {
         let mut state = self.state.lock();
-        let conclusion = state.queue.front()?.conclusion(look)?;
-        let sent = state.queue.pop_front()?;
+        let (sent, conclusion) = match state.queue.front()?.conclusion(look) {
+            Some(conclusion) => (state.queue.pop_front()?, conclusion),
+            // Otherwise the process answers in the order of the queue, or drops parcels unanswered.
+            None if self.page.words().answers_late() => concluded_behind_front(&mut state, look)?,
+            None => return None,
+        };
         self.waiting.decrement();
         Some((sent, conclusion))
     }
 
     /// Whether an answer is probably available.
     pub(crate) fn has_answer(&self) -> bool {
-        self.waiting() > 0
-            && self
-                .state
-                .lock()
-                .queue
-                .front()
-                .is_some_and(Sent::has_answer)
+        if self.waiting() == 0 {
+            return false;
+        }
+        let state = self.state.lock();
+        state.queue.front().is_some_and(Sent::has_answer)
+            || self.page.words().answers_late() && state.queue.iter().skip(1).any(Sent::has_answer)
     }
 
     /// Abandons an attempt. Returns whether the attempt was here.
@@ -629,6 +630,15 @@ impl Outbox {
         drop(state);
         sent.inspect(Sent::forget).is_some()
     }
+}
+
+/// Removes the first parcel behind the front that is concluded.
+#[cold]
+fn concluded_behind_front(state: &mut State, look: AnswerLook) -> Option<(Sent, Conclusion)> {
+    let mut queue = state.queue.iter().enumerate().skip(1);
+    let (place, conclusion) =
+        queue.find_map(|(place, sent)| Some((place, sent.conclusion(look)?)))?;
+    Some((state.queue.remove(place)?, conclusion))
 }
 
 /// Number of unanswered parcels.

@@ -171,10 +171,6 @@ impl Transport for ShmTransport {
         self.endpoint.load().config().max_letter
     }
 
-    fn answers_at_once(&self) -> bool {
-        true
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let mut listening = self.listening.lock();
         let endpoint = self.endpoint.load();
@@ -208,8 +204,8 @@ impl Transport for ShmTransport {
         self.endpoint.load().abandon(attempt)
     }
 
-    fn answer(&self, _ticket: Ticket, _answer: Answer) {
-        // `arrived` always answers at once, so no ticket is pending.
+    fn answer(&self, ticket: Ticket, answer: Answer) {
+        self.endpoint.load().answer(ticket, &answer);
     }
 
     fn drive(&self) -> bool {

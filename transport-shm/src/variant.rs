@@ -11,21 +11,22 @@ use iceoryx2_cal::shared_memory::common::details::{AllocatorDetails, Memory};
 use iceoryx2_cal::shm_allocator::bump_allocator::BumpAllocator;
 use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
 use iceoryx2_cal::zero_copy_connection::common::details::{Connection, SharedManagementData};
-use iceoryx2_cal::{bag, event, hash, monitoring, reactor, serialize, static_storage};
+use iceoryx2_cal::{bag, event, hash, monitoring, reactor, serialize};
 
+use crate::static_file::StaticFile;
 use crate::storage::Storage;
 use crate::sync_policy::Locked;
 
 /// Memory of payloads.
 type Payloads<A> = Memory<A, Storage<AllocatorDetails<A>, true>>;
 
-/// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use, and that its
-/// lock is cheaper.
+/// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use, that its
+/// descriptions are not synchronized with the disk, and that its lock is cheaper.
 #[derive(Debug, Clone)]
 pub(crate) struct Svc {}
 
 impl Service for Svc {
-    type StaticStorage = static_storage::recommended::Ipc;
+    type StaticStorage = StaticFile;
     type ConfigSerializer = serialize::recommended::Recommended;
     type PersistentDynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
         Storage<T, false>;

@@ -12,6 +12,9 @@ use crate::sync::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 pub(crate) struct StatusWords {
     /// Number of threads of the process that poll.
     pollers: AtomicU32,
+    /// Not 0 if the process answers parcels in another order than it takes them. Set before the
+    /// process listens.
+    answers_late: AtomicU32,
     /// Number of times the process has cleared its doorbell before it polled.
     wakeups: AtomicU64,
     /// Keeps `polls`, which changes often, in a cache line of its own.
@@ -64,6 +67,16 @@ impl StatusWords {
     /// Number of completed polls; 0 if the process does not listen yet.
     pub(crate) fn polls(&self) -> u64 {
         self.polls.load(Ordering::Acquire)
+    }
+
+    /// States that the process may answer parcels in another order than it takes them.
+    pub(crate) fn answer_late(&self) {
+        self.answers_late.store(1, Ordering::Release);
+    }
+
+    /// Whether the process may answer parcels in another order than it takes them.
+    pub(crate) fn answers_late(&self) -> bool {
+        self.answers_late.load(Ordering::Acquire) != 0
     }
 
     /// Announces a parcel, before it is put into the mailbox. The announcement is settled when the guard is

@@ -13,7 +13,9 @@ struct Shm(TestDomain);
 
 impl Fixture for Shm {
     fn endpoint(&self) -> Arc<dyn Transport> {
-        Arc::new(self.0.endpoint())
+        let mut config = self.0.config();
+        config.answers_late = true;
+        Arc::new(self.0.endpoint_with(config))
     }
 
     fn nowhere(&self) -> Location {

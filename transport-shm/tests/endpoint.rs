@@ -149,13 +149,17 @@ fn peers_are_bounded_and_the_least_recently_used_is_closed() {
     let (sender, sink) = domain.listening_with(config);
     let receivers: Vec<_> = (0..4).map(|_| domain.listening()).collect();
     for (sent, (receiver, _)) in receivers.iter().chain(&receivers).enumerate() {
-        sender
-            .dispatch(
-                attempt(),
-                &receiver.location(),
-                parcel(vec![3; 2000].into()),
-            )
-            .unwrap();
+        // A peer is idle when the thread that has opened its mailbox has ended.
+        until("an idle peer", || {
+            let parcel = parcel(vec![3; 2000].into());
+            match sender.dispatch(attempt(), &receiver.location(), parcel) {
+                Ok(()) => true,
+                Err(error) => {
+                    assert_eq!(error.fault, TransportErrorKind::Congested);
+                    false
+                }
+            }
+        });
         until("answer", || sink.conclusions() == sent + 1);
     }
     for (_, got) in &receivers {

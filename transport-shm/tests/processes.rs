@@ -8,6 +8,7 @@ mod common;
 
 use std::io::{BufRead, BufReader};
 use std::os::fd::AsRawFd;
+use std::os::unix::fs::PermissionsExt as _;
 use std::process::Stdio;
 use std::sync::Arc;
 
@@ -532,5 +533,46 @@ fn a_process_that_starts_later_cleans_up() {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
     newcomer.close();
+    domain.until_removed();
+}
+
+/// The files in shared memory are gone after a crash of the system, and the descriptions of nodes and
+/// services on a disk may be empty, because they are not synchronized.
+#[test]
+fn descriptions_that_a_crash_of_the_system_has_emptied_are_removed() {
+    let domain = TestDomain::new();
+    let mut gone = Process::start(&domain, "receive", Incarnation::from_u64(1));
+    let is_made = || {
+        domain
+            .files()
+            .iter()
+            .any(|file| file.ends_with(".port_tag"))
+    };
+    until("mailbox", is_made);
+    gone.kill();
+    let mut emptied = 0;
+    for file in domain.files() {
+        if file.starts_with("/dev/shm") {
+            std::fs::remove_file(file).unwrap();
+        } else if std::fs::metadata(&file).is_ok_and(|found| found.is_file() && found.len() > 0) {
+            std::fs::remove_file(&file).unwrap();
+            std::fs::write(&file, []).unwrap();
+            let finished = std::fs::Permissions::from_mode(0o400);
+            std::fs::set_permissions(&file, finished).unwrap();
+            emptied += 1;
+        }
+    }
+    assert!(
+        emptied >= 2,
+        "{emptied}: a node and a service have a description"
+    );
+    // Processes start, and reach each other.
+    let (one, sink) = domain.listening();
+    let (other, _) = domain.listening();
+    one.dispatch(attempt(), &other.location(), parcel(Bytes::new()))
+        .unwrap();
+    until("an answer", || sink.conclusions() == 1);
+    other.close();
+    one.close();
     domain.until_removed();
 }

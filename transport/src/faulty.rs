@@ -128,10 +128,6 @@ impl Transport for Faulty {
         self.inner.max_letter()
     }
 
-    fn answers_at_once(&self) -> bool {
-        self.inner.answers_at_once()
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         *self.shared.sink.lock() = Some(Arc::clone(&sink));
         self.inner.listen(Arc::new(Filter {

@@ -42,11 +42,6 @@ pub trait Transport: Send + Sync + 'static {
     /// Maximum length of a letter in bytes. A longer one fails with [`TransportErrorKind::TooLarge`].
     fn max_letter(&self) -> usize;
 
-    /// Whether the sink must answer arrivals at once. A delivery core that does not have the
-    /// outcome yet then answers [`Answer::Custody`] and sends a report later, so that a slow next
-    /// hop does not occupy slots of this transport.
-    fn answers_at_once(&self) -> bool;
-
     /// Starts to listen and passes all arrivals to `sink`. Called once, before all other methods.
     /// Returns the locations of this endpoint, best first. [`Sink::relocated`] reports changes.
     ///
@@ -255,8 +250,11 @@ pub struct Arrival {
     pub parcel: Parcel,
     /// The service that handed it over.
     pub from: Hop,
-    /// Identifies the arrival in [`Transport::answer`] after [`Verdict::Later`].
-    pub ticket: Ticket,
+    /// Identifies the arrival in [`Transport::answer`] after [`Verdict::Later`]. `None` if the sink
+    /// must answer at once, because the arrival occupies a slot that the transport needs. A delivery
+    /// core that does not have the outcome yet then answers [`Answer::Custody`] and sends a report
+    /// later.
+    pub ticket: Option<Ticket>,
 }
 
 /// A letter whose content is about to arrive. Only its lengths have been checked.
@@ -310,8 +308,8 @@ pub enum Principal {
 pub enum Verdict {
     /// Answers at once.
     Now(Answer),
-    /// Answers later through [`Transport::answer`]. Not allowed for a transport that
-    /// [answers at once](Transport::answers_at_once).
+    /// Answers later through [`Transport::answer`]. Not allowed for an arrival without a
+    /// [ticket](Arrival::ticket).
     Later,
 }
 
@@ -322,6 +320,13 @@ pub enum Answer {
     /// Accepted into the named agent's queue, now or when an earlier copy arrived. Reports and
     /// credits are accepted, too.
     Accepted,
+    /// Delivered by the service that got the parcel, over this transport. Only for services of the
+    /// same host: those of other hosts get [`Accepted`](Self::Accepted).
+    Delivered {
+        /// The transport that delivered the letter. For a letter to another host, the transport
+        /// between the hosts.
+        via: Kind,
+    },
     /// Accepted for forwarding; a report follows.
     Custody,
     /// No room; a credit follows when there is room.

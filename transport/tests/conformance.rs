@@ -64,10 +64,6 @@ impl Transport for TableTransport {
         MAX_LETTER
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let endpoint = &self.0;
         endpoint.state.lock().sink = Some(sink);
@@ -145,7 +141,7 @@ impl Transport for TableTransport {
                 if let Verdict::Now(answer) = sink.arrived(Arrival {
                     parcel,
                     from,
-                    ticket,
+                    ticket: Some(ticket),
                 }) {
                     self.answer(ticket, answer);
                 }

@@ -172,7 +172,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         return watch::run(&filter, limits, &config, arguments.json);
     }
     let listed = membership::run(async {
-        let domain = membership::join(&config).await?;
+        let domain = membership::join_briefly(&config).await?;
         let directory = domain.directory();
         directory.refresh();
         let entries = directory.entries();

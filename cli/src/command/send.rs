@@ -229,7 +229,11 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
         return options::block_on(repeat::send(&arguments, content, &config))?;
     }
     membership::run(async {
-        let domain = membership::join(&config).await?;
+        // A wait ends at once when the receiver leaves, which the kernel reports.
+        let domain = match arguments.wait {
+            true => membership::join(&config).await?,
+            false => membership::join_briefly(&config).await?,
+        };
         let agent = register(&domain, &arguments, &config).await?;
         let done = match located(&agent, &arguments).await {
             Ok(to) => {

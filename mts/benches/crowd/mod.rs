@@ -123,11 +123,9 @@ impl Crowd {
         let arrival = Arrival {
             parcel,
             from,
-            ticket: Ticket(self.arrived),
+            ticket: Some(Ticket(self.arrived)),
         };
-        let verdict = self
-            .core
-            .handle_arrival(self.now, Kind::Tcp, false, arrival);
+        let verdict = self.core.handle_arrival(self.now, Kind::Tcp, arrival);
         assert_eq!(verdict, Verdict::Now(Answer::Accepted));
         let Some(Action::Deliverable { agent }) = self.core.poll_action() else {
             panic!("a letter that is not delivered");

@@ -533,12 +533,17 @@ impl AttemptTable {
     ) {
         let Upstream {
             back,
+            remote,
             transfer,
             unanswered,
-            ..
         } = upstream;
         if let Some((kind, ticket)) = unanswered {
-            let answer = brief.clone().unwrap_or(Answer::Custody);
+            let answer = match brief {
+                // The transport within another host is of no interest there.
+                Some(Answer::Delivered { .. }) if remote => Answer::Accepted,
+                Some(brief) => brief.clone(),
+                None => Answer::Custody,
+            };
             self.actions.push_back(Action::Answer {
                 kind,
                 ticket,
@@ -753,8 +758,8 @@ fn answer_and_report(settlement: Settlement) -> (Option<Answer>, Report) {
     match settlement {
         Settlement::Outcome(outcome) => {
             let brief = match &outcome {
-                Outcome::Delivered { attempts, .. } if attempts.is_empty() => {
-                    Some(Answer::Accepted)
+                Outcome::Delivered { via, attempts } if attempts.is_empty() => {
+                    Some(Answer::Delivered { via: *via })
                 }
                 Outcome::Failed { reason, attempts } if attempts.is_empty() => {
                     Some(Answer::failed(*reason, ""))

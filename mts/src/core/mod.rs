@@ -731,15 +731,9 @@ impl Core {
 
     /// Handles a parcel that arrived by this kind of transport.
     #[inline]
-    pub fn handle_arrival(
-        &mut self,
-        now: Now,
-        via: Kind,
-        answers_at_once: bool,
-        arrival: Arrival,
-    ) -> Verdict {
+    pub fn handle_arrival(&mut self, now: Now, via: Kind, arrival: Arrival) -> Verdict {
         let read = self.reader.read_arrival(&arrival);
-        self.handle_read_arrival(now, via, answers_at_once, arrival, read)
+        self.handle_read_arrival(now, via, arrival, read)
     }
 
     /// Handles a parcel whose letter the [reader](Self::reader) of this core has
@@ -749,7 +743,6 @@ impl Core {
         &mut self,
         now: Now,
         via: Kind,
-        answers_at_once: bool,
         arrival: Arrival,
         read: Option<Box<ReadLetter>>,
     ) -> Verdict {
@@ -807,7 +800,7 @@ impl Core {
                     }
                     return Verdict::Now(answer);
                 }
-                let unanswered = (!answers_at_once).then_some((via, ticket));
+                let unanswered = ticket.map(|ticket| (via, ticket));
                 let came = (via, from, unanswered);
                 let verdict = self.forward(now, came, &parcel, letter, read);
                 self.send_failures(now);

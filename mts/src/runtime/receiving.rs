@@ -17,7 +17,6 @@ use crate::core::Unframed;
 pub(super) struct TransportSink {
     pub(super) shared: Weak<Shared>,
     pub(super) kind: Kind,
-    pub(super) answers_at_once: bool,
 }
 
 impl Sink for TransportSink {
@@ -38,11 +37,10 @@ impl Sink for TransportSink {
             shared.directory.refresh();
             state = shared.lock();
         }
-        let at_once = self.answers_at_once;
         let now = state.clocks.now();
         let verdict = state
             .core
-            .handle_read_arrival(now, self.kind, at_once, arrival, read);
+            .handle_read_arrival(now, self.kind, arrival, read);
         shared.carry_out(state);
         verdict
     }

@@ -60,10 +60,6 @@ impl Transport for Silent {
         usize::MAX
     }
 
-    fn answers_at_once(&self) -> bool {
-        self.kind.is_host_local()
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let _ = self.sink.set(sink);
         Ok(Vec::new())

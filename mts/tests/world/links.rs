@@ -27,6 +27,9 @@ const SOCKET: usize = 16 << 10;
 /// Largest letter in a datagram.
 pub(super) const MAX_DATAGRAM: usize = 8 << 10;
 
+/// Number of parcels of one sender that shared memory answers later.
+const LATE_ANSWERS: usize = 3;
+
 /// Minimum number of bytes that a parcel's header counts as.
 const HEADER: usize = 64;
 
@@ -272,7 +275,9 @@ impl World {
 
     /// Concludes an attempt.
     pub(super) fn note_end(&mut self, at: usize, attempt: AttemptId, conclusion: &Conclusion) {
-        if let Conclusion::Answered(Answer::Accepted) | Conclusion::Unconfirmed(_) = conclusion {
+        if let Conclusion::Answered(Answer::Accepted | Answer::Delivered { .. })
+        | Conclusion::Unconfirmed(_) = conclusion
+        {
             self.may_repeat.insert((at, attempt));
         }
     }
@@ -392,6 +397,9 @@ impl World {
         let process = &mut self.processes[to];
         process.next_ticket += 1;
         let ticket = Ticket(process.next_ticket);
+        let held = process.tickets.values();
+        let held = held.filter(|(sender, _)| *sender == from).count();
+        let at_once = kind == Kind::Shm && held >= LATE_ANSWERS;
         let arrival = Arrival {
             parcel,
             from: Hop {
@@ -402,14 +410,13 @@ impl World {
                     false => Principal::Host,
                 },
             },
-            ticket,
+            ticket: (!at_once).then_some(ticket),
         };
-        let at_once = kind == Kind::Shm;
         let waiting = process.core.waiting(stream.receiver);
         let bytes = HEADER + size_of(&arrival.parcel);
         #[cfg(debug_assertions)]
         let _before = work::taken();
-        let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
+        let verdict = process.core.handle_arrival(now, kind, arrival);
         #[cfg(debug_assertions)]
         self.work.count(bytes, work::taken());
         #[cfg(not(debug_assertions))]
@@ -432,7 +439,7 @@ impl World {
                 };
                 self.conclude_within(self.weather.answering_ms, from, attempt, conclusion);
             }
-            Verdict::Later if at_once => return Err("a late answer over shared memory".into()),
+            Verdict::Later if at_once => return Err("a late answer without a ticket".into()),
             Verdict::Later if mute => self.conclude_within(60, from, attempt, broken()),
             Verdict::Later => {
                 process.tickets.insert(ticket, (from, attempt));

@@ -51,6 +51,9 @@ pub struct HostConfig {
     pub mts: Mts,
     /// Whether this process may publish agents of other hosts.
     pub gateway: bool,
+    /// Whether this process is likely to end within a second. It then polls the directory: the kernel
+    /// takes about 20 ms to end the watch of a directory.
+    pub brief: bool,
 }
 
 /// The agents of all processes of one domain on one host.
@@ -88,7 +91,10 @@ impl HostDirectory {
         let host_dir = HostDir::join(&config.dir, id, cancellation)?;
         let shared = Arc::new(Shared::new(host_dir, config.mts.clone()));
         // Starts to watch before reading, so that no change is missed in between.
-        let watcher = Watcher::new(&shared.host_dir());
+        let watcher = match config.brief {
+            true => Watcher::polling(),
+            false => Watcher::new(&shared.host_dir()),
+        };
         if let Err(error) = shared.refresh().and_then(|()| shared.find_sockets()) {
             // The first error is the one to return.
             let _ = shared.close();
@@ -288,6 +294,7 @@ impl HostDirectory {
         }
         task.abort();
         let _context = self.runtime.enter();
+        // A process that has to join again is not as brief as it was expected to be.
         let watcher = Watcher::new(&self.shared.host_dir());
         // Reads the changes that other processes made before the watcher started.
         let read = self

@@ -2,7 +2,8 @@
 //!
 //! When a process ends, in any way, the kernel closes its lock file, which was open for writing,
 //! and reports that to every watcher. A process that cannot get an inotify instance, of which the
-//! kernel limits the number per user, polls the directory instead.
+//! kernel limits the number per user, polls the directory instead. So does a process that is expected
+//! to end soon.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
@@ -54,6 +55,13 @@ impl Watcher {
             }
         };
         Self { events }
+    }
+
+    /// Polls from now on.
+    pub(super) fn polling() -> Self {
+        Self {
+            events: Events::Polling(Poller::default()),
+        }
     }
 
     /// Adds watches of files, if the kernel reports changes.

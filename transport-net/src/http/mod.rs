@@ -217,10 +217,6 @@ impl Transport for HttpTransport {
         self.endpoint.stream.limits().max_letter
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let endpoint = &self.endpoint;
         endpoint

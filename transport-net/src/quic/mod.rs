@@ -104,10 +104,6 @@ impl Transport for QuicTransport {
         self.endpoint.limits().max_letter
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let open = |text: &str| self.sockets.listen(text);
         self.endpoint.listen(sink, &self.listen, open, |socket| {

@@ -92,6 +92,7 @@ pub(crate) struct Connection {
     answers_waiting: usize,
     control_waiting: usize,
     parcels_written: u64,
+    writes: u64,
     events: VecDeque<Event>,
     clock: Clock,
 }
@@ -150,6 +151,7 @@ impl Connection {
             answers_waiting: 0,
             control_waiting: 0,
             parcels_written: 0,
+            writes: 0,
             events: VecDeque::new(),
             clock: Clock {
                 connected,
@@ -485,6 +487,7 @@ impl Connection {
     pub(crate) fn written(&mut self, taken: usize, now: Instant) {
         self.clock.written = now;
         self.clock.written_since += taken as u64;
+        self.writes += 1;
         let Self {
             outbox,
             sent,
@@ -510,9 +513,21 @@ impl Connection {
         });
     }
 
-    /// Returns the number of parcels handed to the kernel since the last call.
-    pub(crate) fn take_parcels_written(&mut self) -> u64 {
-        std::mem::take(&mut self.parcels_written)
+    /// Returns the numbers of parcels handed to the kernel, and of writes, since the last call.
+    pub(crate) fn take_written(&mut self) -> (u64, u64) {
+        let parcels = std::mem::take(&mut self.parcels_written);
+        (parcels, std::mem::take(&mut self.writes))
+    }
+
+    /// Whether another frame is likely to follow soon: the peer has parcels to answer, or this side
+    /// has.
+    pub(crate) fn is_busy(&self) -> bool {
+        self.begun > 0 || !self.arrivals.is_empty()
+    }
+
+    /// Returns the number of frames that wait to be written.
+    pub(crate) fn frames_waiting(&self) -> usize {
+        self.outbox.frames()
     }
 
     /// Returns the time at which [`handle_timeout`](Self::handle_timeout) must be called at the

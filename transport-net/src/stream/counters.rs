@@ -38,6 +38,8 @@ counters! {
     dial_failures,
     /// Parcels (letters, reports, credits) handed to the kernel.
     parcels_out,
+    /// System calls, or calls of TLS and QUIC, that wrote frames.
+    writes,
     /// Parcels that arrived in frames.
     parcels_in,
     /// Large contents that were read from the socket directly into memory of the sink.
@@ -64,6 +66,14 @@ counters! {
     held_back,
     /// Failures of the operating system to accept a connection.
     accept_failures,
+}
+
+impl Tally {
+    /// Counts parcels that were handed to the kernel, and writes.
+    pub(crate) fn add_written(&self, (parcels, writes): (u64, u64)) {
+        self.parcels_out.fetch_add(parcels, Ordering::Relaxed);
+        self.writes.fetch_add(writes, Ordering::Relaxed);
+    }
 }
 
 pub(crate) fn count(counter: &AtomicU64) {

@@ -269,6 +269,14 @@ impl Endpoint {
         &self.config.limits
     }
 
+    /// Whether processes of this host connect to this endpoint, whose tasks may block.
+    pub(crate) fn serves_processes(&self) -> bool {
+        #[cfg(feature = "ip")]
+        return self.config.processes;
+        #[cfg(not(feature = "ip"))]
+        true
+    }
+
     /// Returns the rate limit of the peers at `home`, if they have one.
     pub(crate) fn rate_limit(&self, home: Home) -> Option<Arc<PeerRateLimit>> {
         if !self.config.limits_peer_at(home) {

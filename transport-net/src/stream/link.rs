@@ -2,6 +2,10 @@
 //!
 //! A sending thread writes to the socket itself, as far as the kernel takes the bytes; the task of
 //! the link writes the rest. Only that task reads, and only it calls the sink.
+//!
+//! Between hosts, several frames that are queued in a row share a write: while parcels are unanswered,
+//! the task writes, which runs as soon as the calling task yields. A frame that no other one is likely to
+//! follow is written at once.
 
 use std::io::{self, IoSlice};
 #[cfg(feature = "ip")]
@@ -15,6 +19,7 @@ use fipa_transport::{
     Sink, Ticket,
 };
 use parking_lot::Mutex;
+use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 use tokio::time::{sleep_until, timeout};
 
@@ -32,6 +37,9 @@ use crate::rate_limit::PeerRateLimit;
 
 /// Maximum number of buffers handed to the kernel in one call.
 const MAX_SLICES: usize = 64;
+
+/// Number of waiting frames at which they are written at once.
+const MAX_TOGETHER: usize = 8;
 
 /// Maximum number of bytes written before the task yields.
 const MAX_BURST: usize = 1 << 20;
@@ -61,6 +69,8 @@ pub(crate) struct Link {
 struct State {
     connection: Connection,
     writer: Option<Arc<Writing>>,
+    /// Whether frames may share a write.
+    together: bool,
     /// The reason for which the task is to end the connection.
     ending: Option<ConnectionEnd>,
     /// The last location for which the connection was used and confirmed or put in doubt.
@@ -83,6 +93,7 @@ impl Link {
             state: Mutex::new(State {
                 connection,
                 writer: None,
+                together: false,
                 ending: None,
                 leads_to: None,
             }),
@@ -139,8 +150,9 @@ impl Link {
     /// Queues a parcel for sending, and writes as many bytes as the kernel takes.
     pub(crate) fn send(&self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
         let mut state = self.state.lock();
+        let is_busy = state.connection.is_busy();
         state.connection.send(attempt, parcel)?;
-        self.flush(&mut state);
+        self.flush_together(&mut state, is_busy);
         Ok(())
     }
 
@@ -160,7 +172,8 @@ impl Link {
     pub(crate) fn answer(&self, id: u64, answer: &Answer) {
         let mut state = self.state.lock();
         state.connection.answer(id, answer, Instant::now());
-        self.flush(&mut state);
+        let is_busy = state.connection.is_busy();
+        self.flush_together(&mut state, is_busy);
     }
 
     /// Notes that the connection is used for a location for which it was not opened. When the peer
@@ -287,6 +300,19 @@ impl Link {
         Ticket(u64::from(self.number) * MAX_ID + id)
     }
 
+    /// Writes like [`flush`](Self::flush), or leaves that to the task if more frames are likely to
+    /// follow before it runs. Only on a runtime, whose tasks yield.
+    fn flush_together(&self, state: &mut State, is_busy: bool) {
+        let is_together = state.together
+            && is_busy
+            && state.connection.frames_waiting() < MAX_TOGETHER
+            && Handle::try_current().is_ok();
+        match is_together {
+            true => self.wake.notify_one(),
+            false => self.flush(state),
+        }
+    }
+
     /// Writes as many bytes as the kernel takes, and wakes the task for the rest.
     fn flush(&self, state: &mut State) {
         if state.flush() != Flushed::All {
@@ -410,7 +436,11 @@ impl LinkTask {
         if let Some(letters) = extra.reader() {
             letters.count_with(self.endpoint.meter(&quota_key));
         }
-        self.link.state.lock().writer = Some(writer.clone());
+        {
+            let mut state = self.link.state.lock();
+            state.together = writer.leads_out() && !self.endpoint.serves_processes();
+            state.writer = Some(writer.clone());
+        }
         let mut greeted = Some(greeted);
         let exchange = self.exchange(
             (&mut read, &mut extra),
@@ -472,8 +502,7 @@ impl LinkTask {
                 let flushed = state.flush();
                 self.endpoint
                     .tally()
-                    .parcels_out
-                    .fetch_add(state.connection.take_parcels_written(), Ordering::Relaxed);
+                    .add_written(state.connection.take_written());
                 if let Some(end) = state.ending.clone() {
                     return end;
                 }
@@ -691,7 +720,7 @@ impl LinkTask {
                 let verdict = self.sink.arrived(fipa_transport::Arrival {
                     parcel: *parcel,
                     from,
-                    ticket,
+                    ticket: Some(ticket),
                 });
                 if let fipa_transport::Verdict::Now(answer) = verdict {
                     let mut state = self.link.state.lock();
@@ -708,11 +737,9 @@ impl Drop for LinkTask {
     fn drop(&mut self) {
         let concluded = {
             let mut state = self.link.state.lock();
-            let written = state.connection.take_parcels_written();
             self.endpoint
                 .tally()
-                .parcels_out
-                .fetch_add(written, Ordering::Relaxed);
+                .add_written(state.connection.take_written());
             if !self.end.is_orderly() {
                 state.writer = None;
             }

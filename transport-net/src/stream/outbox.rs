@@ -128,6 +128,11 @@ impl Outbox {
         }
     }
 
+    /// Returns the number of frames that the kernel has not taken completely.
+    pub(crate) fn frames(&self) -> usize {
+        usize::from(self.begun.is_some()) + self.urgent.len() + self.parcels.len()
+    }
+
     /// Whether no frame waits except parcels that may not begin now (see [`gather`](Self::gather)).
     pub(crate) fn is_idle(&self, parcels: usize) -> bool {
         self.begun.is_none() && self.urgent.is_empty() && (parcels == 0 || self.parcels.is_empty())

@@ -24,11 +24,16 @@ use crate::secure::{Certificate, Security, advice};
 /// First byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
 pub(crate) const FIRST_BYTE: u8 = 22;
 
-/// Maximum number of bytes read from the socket at once: the longest record (RFC 8446 section 5.2).
+/// Length of the longest record (RFC 8446 section 5.2), in bytes.
 const RECORD: usize = 5 + (1 << 14) + 256;
 
-/// Maximum number of encrypted bytes that wait for the kernel.
-const MAX_WAITING: usize = 1 << 18;
+/// Number of records that are read from the socket at once after a read that filled its buffer.
+const RECORDS_AT_ONCE: usize = 4;
+
+/// Maximum number of bytes that are encrypted and wait for the kernel. The peer decrypts the first
+/// records of a large letter while this side encrypts the next ones, and the memory of so few records
+/// is reused without going back to the system.
+const MAX_WAITING: usize = 1 << 16;
 
 /// A connection whose peer has proved its identity.
 pub(crate) struct Secured {
@@ -113,6 +118,7 @@ fn secured(
     let incoming = Incoming {
         session: session.clone(),
         records: BytesMut::new(),
+        at_once: 1,
     };
     Ok(Secured {
         ends: (Reading::Tls(read, incoming), Writing::Tls(write, session)),
@@ -179,6 +185,8 @@ pub(crate) struct Incoming {
     session: Arc<Session>,
     /// Bytes from the socket that have not been decrypted.
     records: BytesMut,
+    /// Number of records that the next read has room for.
+    at_once: usize,
 }
 
 impl Incoming {
@@ -192,10 +200,14 @@ impl Incoming {
                 return Ok(taken);
             }
             socket.readable().await?;
-            self.records.reserve(RECORD);
+            // All of its bytes are in the session.
+            self.records.reserve(self.at_once * RECORD);
             match socket.try_read_buf(&mut self.records) {
                 Ok(0) => return Ok(0),
-                Ok(_) => {}
+                Ok(_) => {
+                    let is_full = self.records.len() == self.records.capacity();
+                    self.at_once = if is_full { RECORDS_AT_ONCE } else { 1 };
+                }
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
                 Err(error) => return Err(error),
             }

@@ -3,20 +3,23 @@
 //! Frames do not depend on the wire. Bytes handed to TLS count as begun, like bytes handed to the
 //! kernel: they may arrive.
 
-use std::io::{self, IoSlice};
+use std::io::{self, IoSlice, Write as _};
 #[cfg(feature = "ip")]
 use std::net::IpAddr;
+use std::net::Shutdown;
+use std::os::unix::net::UnixStream as StdUnixStream;
 #[cfg(feature = "quic")]
 use std::pin::Pin;
-#[cfg(feature = "secure")]
 use std::sync::Arc;
 
+use parking_lot::Mutex;
 use tokio::io::{AsyncRead, AsyncReadExt};
 #[cfg(feature = "ip")]
 use tokio::net::TcpStream;
+use tokio::net::UnixStream;
 #[cfg(feature = "ip")]
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
-use tokio::net::{UnixStream, unix};
+use tokio::net::unix::pipe;
 
 use super::budget::ReservedBytes;
 use super::frame::{FrameReader, Space};
@@ -25,7 +28,7 @@ use super::tls::{Incoming, Session};
 
 /// The reading half of a wire.
 pub(crate) enum Reading {
-    Unix(unix::OwnedReadHalf),
+    Unix(pipe::Receiver),
     #[cfg(feature = "ip")]
     Plain(OwnedReadHalf),
     #[cfg(feature = "secure")]
@@ -38,7 +41,7 @@ pub(crate) enum Reading {
 /// The writing half of a wire.
 #[derive(Debug)]
 pub(crate) enum Writing {
-    Unix(unix::OwnedWriteHalf),
+    Unix(UnixWriter),
     #[cfg(feature = "ip")]
     Plain(OwnedWriteHalf),
     #[cfg(feature = "secure")]
@@ -92,9 +95,66 @@ pub(crate) trait StreamWriter: std::fmt::Debug + Send + Sync {
 }
 
 /// Splits a Unix domain socket into its halves.
-pub(crate) fn unix(stream: UnixStream) -> (Reading, Writing) {
-    let (read, write) = stream.into_split();
-    (Reading::Unix(read), Writing::Unix(write))
+///
+/// The kernel reports a Unix socket as writable whenever the peer has read something. A socket that is
+/// registered for that, as tokio's are, wakes this process for each of its letters. Therefore the
+/// reading half is registered for reading only, as tokio's end of a pipe: tokio reads from any kind of
+/// descriptor that way.
+///
+/// # Errors
+/// Fails without a free descriptor.
+pub(crate) fn unix(stream: UnixStream) -> io::Result<(Reading, Writing)> {
+    let socket = stream.into_std()?;
+    let read = pipe::Receiver::from_owned_fd_unchecked(socket.try_clone()?.into())?;
+    let writer = UnixWriter {
+        socket,
+        room: Mutex::default(),
+    };
+    Ok((Reading::Unix(read), Writing::Unix(writer)))
+}
+
+/// The writing half of a Unix domain socket. Dropping it closes this direction.
+#[derive(Debug)]
+pub(crate) struct UnixWriter {
+    socket: StdUnixStream,
+    /// Waits until the socket takes more bytes; exists only while it takes none.
+    room: Mutex<Option<Arc<pipe::Sender>>>,
+}
+
+impl UnixWriter {
+    fn try_write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
+        match &*self.room.lock() {
+            Some(room) => room.try_write_vectored(slices),
+            None => (&self.socket).write_vectored(slices),
+        }
+    }
+
+    /// Ends the wait for room after all bytes were written.
+    fn finish(&self) {
+        *self.room.lock() = None;
+    }
+
+    async fn writable(&self) -> io::Result<()> {
+        let room = {
+            let mut room = self.room.lock();
+            match &*room {
+                Some(room) => Arc::clone(room),
+                None => {
+                    let socket = self.socket.try_clone()?.into();
+                    let sender = pipe::Sender::from_owned_fd_unchecked(socket)?;
+                    Arc::clone(room.insert(Arc::new(sender)))
+                }
+            }
+        };
+        room.writable().await
+    }
+}
+
+impl Drop for UnixWriter {
+    fn drop(&mut self) {
+        // Fails if the peer has closed the connection.
+        let _ = self.socket.shutdown(Shutdown::Write);
+    }
 }
 
 /// Splits a TCP socket without TLS into its halves.
@@ -230,6 +290,11 @@ impl Writing {
         }
     }
 
+    /// Whether the wire may lead to another host.
+    pub(crate) fn leads_out(&self) -> bool {
+        !matches!(self, Self::Unix(_))
+    }
+
     /// Makes closing the socket reset the connection: the kernel discards unacknowledged bytes and
     /// notifies the peer.
     pub(crate) fn discard(&self) {
@@ -248,7 +313,7 @@ impl Writing {
     /// Writes as many bytes as the wire takes without waiting.
     pub(crate) fn try_write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
         match self {
-            Self::Unix(socket) => socket.try_write_vectored(slices),
+            Self::Unix(socket) => socket.try_write(slices),
             #[cfg(feature = "ip")]
             Self::Plain(socket) => socket.try_write_vectored(slices),
             #[cfg(feature = "secure")]
@@ -262,7 +327,10 @@ impl Writing {
     /// them now.
     pub(crate) fn try_finish(&self) -> io::Result<()> {
         match self {
-            Self::Unix(_) => Ok(()),
+            Self::Unix(socket) => {
+                socket.finish();
+                Ok(())
+            }
             #[cfg(feature = "ip")]
             Self::Plain(_) => Ok(()),
             #[cfg(feature = "secure")]

@@ -88,7 +88,7 @@ impl Protocol for Core {
                 let verdict = sink.arrived(Arrival {
                     parcel: *parcel,
                     from,
-                    ticket,
+                    ticket: Some(ticket),
                 });
                 if let Verdict::Now(answer) = verdict {
                     with(&mut |core| core.answer(Instant::now(), ticket, &answer));

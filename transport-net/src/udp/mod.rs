@@ -126,10 +126,6 @@ impl Transport for UdpTransport {
         datagram.clamp(BASE, LARGEST) - PARCEL_OVERHEAD - NAME
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         if let Some(fault) = self.identity.fault() {
             return Err(ListenError::Unavailable(fault));

@@ -99,10 +99,6 @@ impl Transport for UdtTransport {
         self.config.limits.max_letter
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         if let Some(fault) = self.config.identity.fault() {
             return Err(ListenError::Unavailable(fault));

@@ -7,6 +7,7 @@ use bytes::BytesMut;
 use tokio::net::{UnixListener, UnixStream};
 
 use super::directory::peer;
+use crate::end::ConnectionEnd;
 use crate::log_limit::warn_limited;
 use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
@@ -49,8 +50,13 @@ async fn receive(endpoint: Arc<Endpoint>, slot: UnprovedSlot, stream: UnixStream
         return;
     };
     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
-    LinkTask::new(endpoint, link, sink, None)
-        .serve(wire::unix(stream), Proof::default(), reader, from, || {
+    let running = LinkTask::new(endpoint, link, sink, None);
+    let ends = match wire::unix(stream) {
+        Ok(ends) => ends,
+        Err(error) => return running.fail(ConnectionEnd::Broken(error.to_string())),
+    };
+    running
+        .serve(ends, Proof::default(), reader, from, || {
             drop(slot);
         })
         .await;

@@ -39,11 +39,15 @@ pub(super) async fn dial(
         Ok(connected) => connected,
         Err(error) => return running.fail(ConnectionEnd::unreachable(&to, &error)),
     };
+    let ends = match wire::unix(stream) {
+        Ok(ends) => ends,
+        Err(error) => return running.fail(ConnectionEnd::unreachable(&to, &error)),
+    };
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
     let from = Source::Process(number);
     running
-        .serve(wire::unix(stream), Proof::default(), reader, from, || {})
+        .serve(ends, Proof::default(), reader, from, || {})
         .await;
 }
 

@@ -213,10 +213,6 @@ impl Transport for UnixTransport {
         self.endpoint.limits().max_letter
     }
 
-    fn answers_at_once(&self) -> bool {
-        false
-    }
-
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let runtime = &self.endpoint.runtime;
         let open = || {

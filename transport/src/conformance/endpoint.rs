@@ -21,7 +21,7 @@ type VerdictOf = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
 
 #[derive(Default)]
 pub(super) struct Record {
-    pub(super) arrivals: Vec<(Parcel, Hop, Ticket)>,
+    pub(super) arrivals: Vec<(Parcel, Hop, Option<Ticket>)>,
     pub(super) concluded: HashMap<AttemptId, Vec<Conclusion>>,
 }
 

@@ -52,7 +52,9 @@ impl Lane {
             Conclusion::Answered(answer) => {
                 if let Some(tally) = self.tally() {
                     Tally::add(match answer {
-                        Answer::Accepted | Answer::Custody => &tally.taken,
+                        Answer::Accepted | Answer::Delivered { .. } | Answer::Custody => {
+                            &tally.taken
+                        }
                         _ => &tally.turned_back,
                     });
                 }
@@ -107,6 +109,12 @@ impl Lane {
                 let via = location.kind();
                 let outcome = Outcome::Delivered { via, attempts };
                 self.settle(now, index, Settlement::Outcome(outcome), table);
+            }
+            Answer::Delivered { via } => {
+                let taken_by = Some(location.kind());
+                let attempts = Vec::new();
+                let outcome = Outcome::Delivered { via, attempts };
+                self.settled_by_report(now, index, taken_by, outcome, table);
             }
             Answer::Custody => {
                 let delivery = &mut self.letters[index];
