@@ -262,10 +262,10 @@ pub(crate) fn take_back_local(
         let local = locals.and_then(|locals| run.state(locals));
         state = local.map_or(state, |local| local.global_in(machine));
         // It may be sent to another agent instead.
-        let released = conversation.bound.drain(sent.bound..sent.bound_after);
+        let released = conversation.bound.remove(sent.bound..sent.bound_after);
         for RoleBinding { agent, .. } in released {
             let cost = Names::cost(names.text(agent).len());
-            conversation.charged_names = conversation.charged_names.saturating_sub(cost);
+            conversation.discharge(cost);
             names.release(agent);
         }
     }
