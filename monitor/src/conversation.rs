@@ -471,8 +471,15 @@ pub(crate) struct Rare {
     pub(crate) local: Option<LocalRun>,
     /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
     pub(crate) claimed: bool,
+    /// Whether the last message of the monitored agent was reported as undelivered.
+    pub(crate) undelivered: bool,
+    /// Whether only a message of an agent that claimed a role has shown that such a message arrived.
+    pub(crate) doubtful: bool,
     /// The last message of the monitored agent in it, until it is known to have arrived.
     pub(crate) last_sent: Option<LastSent>,
+    /// The roles that the receivers of that message got with it, after it was reported as undelivered. It
+    /// may have arrived, so only these agents can answer it.
+    pub(crate) asked: SmallVec<[RoleBinding; 2]>,
     /// The last messages of which an observer gets each copy by itself.
     pub(crate) copied: Vec<Copied>,
     /// The parties by their peers, if there are more than [`FEW`].
@@ -561,6 +568,10 @@ impl Conversation {
                 + copies
                     .map(|copied| 8 * copied.seen.capacity())
                     .sum::<usize>()
+                + match rare.asked.spilled() {
+                    true => rare.asked.capacity() * size_of::<RoleBinding>(),
+                    false => 0,
+                }
                 + rare.index.allocation_size()
                 + rare.local.as_ref().map_or(0, LocalRun::allocated)
         });
@@ -572,6 +583,20 @@ impl Conversation {
     pub(crate) fn acquire(&mut self, names: &mut Names, text: &str) -> Name {
         self.charge(Names::cost(text.len()));
         names.acquire(text)
+    }
+
+    /// Releases the names of [`Rare::asked`], of the roles for which `is_known` holds.
+    pub(crate) fn release_asked(&mut self, names: &mut Names, is_known: impl Fn(u8) -> bool) {
+        let Some(rare) = self.rare.as_deref_mut() else {
+            return;
+        };
+        let (known, others) = rare.asked.drain(..).partition(|asked| is_known(asked.role));
+        rare.asked = others;
+        let known: SmallVec<[RoleBinding; 2]> = known;
+        for RoleBinding { agent, .. } in known {
+            self.discharge(Names::cost(names.text(agent).len()));
+            names.release(agent);
+        }
     }
 
     /// Whether it is checked as the role of the monitored agent sees it.

@@ -1251,10 +1251,13 @@ impl Monitor {
             let peers = conversation.parties.iter().map(|party| party.peer);
             let bound = conversation.bound.iter().map(|bound| bound.agent);
             let delegates = conversation.delegates().iter().map(|(_, agent)| *agent);
+            let rare = conversation.rare.as_deref().into_iter();
+            let asked = rare.flat_map(|rare| rare.asked.iter().map(|asked| asked.agent));
             let named = peers
                 .chain(bound)
                 .chain(conversation.reply_to().iter().copied())
                 .chain(delegates)
+                .chain(asked)
                 .chain([self.table.peer(at)]);
             for name in named.filter(|name| *name != NONE) {
                 self.names.release(name);
