@@ -380,6 +380,12 @@ fn an_outsider_ends_no_conversation_of_roles() {
     drone.right(&["request dro>med"]);
     drone.lost("request dro>med");
     drone.right(&["request dro>other", "refuse other>dro"]);
+    // An agent that sends the first message has its role, also if the message was not delivered.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    drone.right(&["request mallory>dro", "request dro>med", "refuse med>dro"]);
+    assert_eq!(drone.monitor.len(), 2);
     // The station does not know the agent that is the drone.
     let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
     let mut station = stage("sta");
