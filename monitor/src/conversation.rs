@@ -1223,6 +1223,49 @@ mod tests {
     }
 
     #[test]
+    fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
+        let mut names = Names::new(std::hash::RandomState::new());
+        let mut conversation = Conversation::unused();
+        let party = Party::new(NONE, 0);
+        conversation.add(party.clone());
+        assert_eq!(conversation.allocated(), 0);
+        let [first] = &mut conversation.parties[..] else {
+            panic!()
+        };
+        first.ask(Side::Initiator, 0, "");
+        assert_eq!(first.allocated(), 0);
+        first.begin_step(Side::Initiator, 1, 7, false);
+        first.ask(Side::Initiator, 7, "r7");
+        assert_eq!(first.asked_text(0), "r7");
+        assert_eq!(first.allocated(), size_of::<Details>());
+        assert!(!first.take_back(Side::Initiator, 1, 8));
+        assert!(first.take_back(Side::Initiator, 1, 7));
+        assert_eq!(first.state, FAILED);
+        // Two worlds with details each.
+        let uncertain = 3 * size_of::<Details>() + size_of::<Worlds>();
+        assert_eq!(first.allocated(), uncertain);
+        conversation.add(party);
+        let both = conversation.parties.allocated();
+        assert_eq!(both, uncertain + 2 * size_of::<Party>());
+        let agent = conversation.acquire(&mut names, "ann");
+        conversation.bound.push(RoleBinding { role: 0, agent });
+        let bound = size_of::<SmallVec<[RoleBinding; 2]>>();
+        assert_eq!(conversation.allocated(), both + bound + Names::cost(3));
+        conversation.clear();
+        assert_eq!(conversation.allocated(), 0);
+        // The buffer of a single party serves the next one.
+        let mut single = Party::new(NONE, 0);
+        single.ask(Side::Other, 9, "r9");
+        conversation.add(single);
+        conversation.clear();
+        assert_eq!(conversation.allocated(), size_of::<Details>());
+        conversation.add(Party::new(NONE, 0));
+        assert_eq!(conversation.allocated(), size_of::<Details>());
+        let party = conversation.parties.first().unwrap();
+        assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
+    }
+
+    #[test]
     fn a_party_is_found_among_few_and_many() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut table = crate::table::Table::new(&std::hash::RandomState::new());

@@ -1550,6 +1550,35 @@ mod tests {
     }
 
     #[test]
+    fn names_of_undelivered_messages_are_released() {
+        let text = r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="propagate" from="b" to="c" target="3"/></state>
+            <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
+            <state id="4" final="yes"/></scxml>"#;
+        let mut library = Library::standard();
+        library.add(Machine::read("own", text).unwrap()).unwrap();
+        let mut monitor = Monitor::agent(Arc::new(library), "ann");
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let request = |to: &'static str| {
+            let header = Header::new(Performative::Request).sender("ann");
+            header.receivers([to]).protocol("own").conversation_id("1")
+        };
+        let mut bytes = Vec::new();
+        for to in ["ben", "cid", "dan"] {
+            assert!(monitor.check(&request(to), now).is_accepted());
+            assert!(monitor.names.known(to).is_some());
+            assert_eq!(monitor.names.len(), 2, "{to}");
+            bytes.push(monitor.bytes());
+            monitor.undelivered(&request(to), to, now);
+            assert_eq!(monitor.names.len(), 2, "{to}");
+        }
+        assert_eq!(bytes[1], bytes[2]);
+        monitor.handle_timeout(now + Duration::from_secs(100_000));
+        assert_eq!(monitor.names.len(), 0);
+    }
+
+    #[test]
     fn names_are_released_with_the_last_conversation() {
         let mut monitor = Monitor::observer(Arc::new(Library::standard()));
         let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);

@@ -603,6 +603,25 @@ mod tests {
     }
 
     #[test]
+    fn a_conversation_moves_in_its_list_at_most_once_a_second() {
+        let mut table = Table::new(&RandomState::new());
+        let [a, _] = ["a", "b"].map(|id| table.insert(id, NONE, 7, 0, 1));
+        for now in [400, 800, 1_000] {
+            table.touch(a, List::Open, now);
+            assert_eq!(order(&table, List::Open), ["a", "b"], "{now}");
+            assert_eq!(table.slot(a).unwrap().touched, now);
+        }
+        table.touch(a, List::Open, 1_001);
+        assert_eq!(order(&table, List::Open), ["b", "a"]);
+        // The clock was set back, and then by hours forward.
+        for now in [500, 1_499, 90_000_000] {
+            table.touch(a, List::Open, now);
+            assert_eq!(order(&table, List::Open), ["b", "a"], "{now}");
+            assert_eq!(table.slot(a).unwrap().touched, now);
+        }
+    }
+
+    #[test]
     fn each_peer_has_a_list_and_is_charged() {
         let mut table = Table::new(&RandomState::new());
         let a = table.insert("a", NONE, 1, 0, 1);
