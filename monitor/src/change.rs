@@ -12,7 +12,7 @@ use crate::names::Names;
 
 /// Applies the timeouts that are due.
 pub(crate) fn expire(machine: &Machine, conversation: &mut Conversation, now: u64) {
-    for party in &mut conversation.parties {
+    for party in conversation.parties.iter_mut() {
         if party.deadline != 0 && party.deadline < now {
             expire_party(machine, party);
         }
@@ -56,18 +56,19 @@ impl Change<'_> {
             }
             MoveTarget::Sender => {
                 let peer = conversation.acquire(self.names, self.observed.sender);
-                let unnamed = conversation.unnamed.as_deref().cloned();
+                let unnamed = conversation.unnamed().cloned();
                 let party = unnamed.unwrap_or_else(|| fresh(peer));
                 conversation.add(Party { peer, ..party })
             }
             MoveTarget::Unnamed => {
-                self.opened |= conversation.unnamed.is_none();
-                let mut party = match conversation.unnamed.take() {
+                let unnamed = conversation.rare().unnamed.take();
+                self.opened |= unnamed.is_none();
+                let mut party = match unnamed {
                     Some(party) => party,
                     None => Box::new(fresh(NONE)),
                 };
                 self.move_party(&mut party, made);
-                conversation.unnamed = Some(party);
+                conversation.rare().unnamed = Some(party);
                 return;
             }
         };
@@ -113,11 +114,12 @@ impl Change<'_> {
             side,
             act_number(self.observed.act),
             self.observed.reply_with,
+            cancels,
         );
         party.before = next_state.before.unwrap_or(party.state);
         if cancels {
             party.canceling_side = side;
-            party.cancel = self.observed.reply_with;
+            party.set_cancel(self.observed.reply_with);
         } else if !next_state.answers_cancel {
             let index = side_index(side);
             party.acts[index] = act_number(self.observed.act);
@@ -172,11 +174,11 @@ impl Change<'_> {
     /// Adds the agents of the `reply-to`: they receive replies instead of the initiator.
     pub(crate) fn designate(&mut self, conversation: &mut Conversation, header: &Header<'_>) {
         for name in header.reply_to_names() {
-            let known = conversation.reply_to.iter();
+            let known = conversation.reply_to().iter();
             let known = known.chain([&conversation.initiator]);
             if !known.into_iter().any(|agent| self.names.is(*agent, name)) {
                 let name = conversation.acquire(self.names, name);
-                conversation.reply_to.push(name);
+                conversation.rare().reply_to.push(name);
             }
         }
     }

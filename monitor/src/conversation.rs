@@ -3,6 +3,8 @@
 //! With [`Scope::Participant`], each participant has a [`Party`] with a state of its own. With
 //! [`Scope::Conversation`], there is one party without a participant, and a list of role bindings.
 
+use std::ops::{Deref, Range};
+
 use fipa_acl::Performative;
 use hashbrown::HashTable;
 use smallvec::SmallVec;
@@ -10,6 +12,7 @@ use smallvec::SmallVec;
 use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
 use crate::names::{Name, Names};
+use crate::parties::Parties;
 use crate::projection::LocalRun;
 use crate::table::spread;
 use crate::verdict::ViolationKind as Kind;
@@ -73,8 +76,10 @@ impl Side {
     }
 }
 
-/// The state of a conversation with one participant or with all of them.
+/// The state of a conversation with one participant or with all of them. It fits into one cache line: see
+/// [`Slot`](crate::table::Slot).
 #[derive(Debug, Clone)]
+#[repr(C)]
 pub(crate) struct Party {
     /// The participant, or [`NONE`].
     pub(crate) peer: Name,
@@ -95,19 +100,11 @@ pub(crate) struct Party {
     pub(crate) acts: [u8; 2],
     /// Fingerprint of the last `reply-with` of each side; 0 for none.
     pub(crate) asked: [u64; 2],
-    /// [`short`] fingerprints of the `reply-with` values of each side before `asked`, the latest
-    /// first; 0 for none.
-    pub(crate) earlier: [[u32; EARLIER]; 2],
-    /// Text of the last `reply-with` of each side.
-    pub(crate) asked_text: [Tail; 2],
-    /// Fingerprint of the `reply-with` of the cancel.
-    pub(crate) cancel: u64,
     /// Deadline of the next message in milliseconds of the monotonic clock; 0 for none.
     pub(crate) deadline: u64,
     /// The last message that has changed the party, and the values before it.
     pub(crate) last_step: Option<LastStep>,
-    /// After a message that was not delivered, or of which that is uncertain.
-    pub(crate) worlds: Option<Box<Worlds>>,
+    pub(crate) details: Option<Box<Details>>,
 }
 
 /// The last message that has changed a party, and the values before it.
@@ -116,20 +113,45 @@ pub(crate) struct LastStep {
     side: Side,
     /// [`act_number`] of the message.
     act: u8,
-    reply_with: u64,
     state: u16,
     resume: u16,
     before: u16,
     last: Side,
     canceling_side: Side,
     echo: bool,
-    /// Values of the side that sent the message.
+    /// Performative of the side that sent the message.
     own_act: u8,
-    own_asked: u64,
-    /// The `reply-with` that the message has displaced from [`Party::earlier`].
-    displaced: u32,
+    /// Whether the message is a cancel, which has changed [`Details::cancel`].
+    cancels: bool,
+    /// Whether it has [`StepValues`].
+    has_values: bool,
+}
+
+/// The parts of a party that need no memory before the first `reply-with`, deadline or cancel.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Details {
+    /// [`short`] fingerprints of the `reply-with` values of each side before the last one, the latest
+    /// first; 0 for none.
+    pub(crate) earlier: [[u32; EARLIER]; 2],
+    /// Text of the last `reply-with` of each side.
+    pub(crate) asked_text: [Tail; 2],
+    /// Fingerprint of the `reply-with` of the cancel.
     cancel: u64,
+    step: StepValues,
+    /// After a message that was not delivered, or of which that is uncertain.
+    worlds: Option<Box<Worlds>>,
+}
+
+/// Values of the last message of a party, and those before it.
+#[derive(Debug, Clone, Copy, Default)]
+struct StepValues {
+    reply_with: u64,
+    /// The `reply-with` of the same side before it.
+    own_asked: u64,
+    /// The `reply-with` that the message has displaced from [`Details::earlier`], if it has.
+    displaced: u32,
     deadline: u64,
+    cancel: u64,
 }
 
 /// The party if a message that was reported as failed has not arrived, and if it has arrived. The next
@@ -159,22 +181,73 @@ impl Party {
             echo: false,
             acts: [0; 2],
             asked: [0; 2],
-            earlier: [[0; EARLIER]; 2],
-            asked_text: [Tail::default(); 2],
-            cancel: 0,
             deadline: 0,
             last_step: None,
-            worlds: None,
+            details: None,
         }
     }
 
-    /// Records the message that is about to change the party.
-    pub(crate) fn begin_step(&mut self, side: Side, act: u8, reply_with: u64) {
+    pub(crate) fn details(&mut self) -> &mut Details {
+        self.details.get_or_insert_default()
+    }
+
+    /// Fingerprint of the `reply-with` of the cancel; 0 for none.
+    pub(crate) fn cancel(&self) -> u64 {
+        self.details.as_deref().map_or(0, |details| details.cancel)
+    }
+
+    pub(crate) fn set_cancel(&mut self, reply_with: u64) {
+        if self.cancel() != reply_with {
+            self.details().cancel = reply_with;
+        }
+    }
+
+    /// Values of [`Details::earlier`] of a side.
+    pub(crate) fn earlier(&self, side: usize) -> &[u32; EARLIER] {
+        let details = self.details.as_deref();
+        details.map_or(&[0; EARLIER], |details| &details.earlier[side])
+    }
+
+    /// Text of the last `reply-with` of a side.
+    pub(crate) fn asked_text(&self, side: usize) -> &str {
+        let details = self.details.as_deref();
+        details.map_or("", |details| details.asked_text[side].text())
+    }
+
+    pub(crate) fn worlds(&self) -> Option<&Worlds> {
+        self.details.as_deref()?.worlds.as_deref()
+    }
+
+    /// Bytes that the party has allocated.
+    pub(crate) fn allocated(&self) -> usize {
+        let Some(details) = self.details.as_deref() else {
+            return 0;
+        };
+        let worlds = details.worlds.as_deref();
+        size_of::<Details>()
+            + worlds.map_or(0, |Worlds { missing, arrived }| {
+                size_of::<Worlds>() + missing.allocated() + arrived.allocated()
+            })
+    }
+
+    /// Records the message that is about to change the party, and whether it is a cancel.
+    pub(crate) fn begin_step(&mut self, side: Side, act: u8, reply_with: u64, cancels: bool) {
         let index = side_index(side);
+        let (own_asked, deadline) = (self.asked[index], self.deadline);
+        let has_values = cancels || [reply_with, own_asked, deadline] != [0; 3];
+        if has_values {
+            let details = self.details();
+            details.step = StepValues {
+                reply_with,
+                own_asked,
+                displaced: details.earlier[index][EARLIER - 1],
+                deadline,
+                cancel: details.cancel,
+            };
+        }
         self.last_step = Some(LastStep {
             side,
             act,
-            reply_with,
             state: self.state,
             resume: self.resume,
             before: self.before,
@@ -182,16 +255,15 @@ impl Party {
             canceling_side: self.canceling_side,
             echo: self.echo,
             own_act: self.acts[index],
-            own_asked: self.asked[index],
-            displaced: self.earlier[index][EARLIER - 1],
-            cancel: self.cancel,
-            deadline: self.deadline,
+            cancels,
+            has_values,
         });
     }
 
     /// Decides that a message which was reported as failed has arrived, or has not.
     pub(crate) fn settle(&mut self, world: World) {
-        if let Some(worlds) = self.worlds.take() {
+        let details = self.details.as_deref_mut();
+        if let Some(worlds) = details.and_then(|details| details.worlds.take()) {
             let Worlds { missing, arrived } = *worlds;
             let peer = self.peer;
             *self = match world {
@@ -205,15 +277,19 @@ impl Party {
     /// Takes a message back, because it was not delivered, or because that is uncertain. Returns whether
     /// the message is the last one.
     pub(crate) fn take_back(&mut self, side: Side, act: u8, reply_with: u64) -> bool {
-        let is_it =
-            |step: &LastStep| step.side == side && step.act == act && step.reply_with == reply_with;
+        let has_values = self.last_step.is_some_and(|step| step.has_values);
+        let details = self.details.as_deref().filter(|_| has_values);
+        let values = details.map_or_else(StepValues::default, |details| details.step);
+        let is_it = |step: &LastStep| {
+            step.side == side && step.act == act && values.reply_with == reply_with
+        };
         let cancels = act == act_number(CANCEL);
         let Some(step) = self.last_step.take_if(|step| is_it(step)) else {
             // A message of the other side may have crossed the cancel.
             if cancels
                 && self.state == CANCELLING
                 && self.canceling_side == side
-                && self.cancel == reply_with
+                && self.cancel() == reply_with
             {
                 (self.state, self.echo) = (self.resume, false);
                 return true;
@@ -224,22 +300,26 @@ impl Party {
         let index = side_index(side);
         (self.state, self.resume, self.before) = (step.state, step.resume, step.before);
         (self.last, self.canceling_side, self.echo) = (step.last, step.canceling_side, step.echo);
-        (self.cancel, self.deadline) = (step.cancel, step.deadline);
+        self.deadline = values.deadline;
+        if step.cancels {
+            self.set_cancel(values.cancel);
+        }
         self.acts[index] = step.own_act;
-        if self.asked[index] != step.own_asked {
-            self.asked[index] = step.own_asked;
+        if self.asked[index] != values.own_asked {
+            self.asked[index] = values.own_asked;
+            let details = self.details();
             // The text is for descriptions only.
-            self.asked_text[index] = Tail::default();
-            if step.own_asked != 0 {
-                self.earlier[index].rotate_left(1);
-                self.earlier[index][EARLIER - 1] = step.displaced;
+            details.asked_text[index] = Tail::default();
+            if values.own_asked != 0 {
+                details.earlier[index].rotate_left(1);
+                details.earlier[index][EARLIER - 1] = values.displaced;
             }
         }
         // Nothing follows the other messages, if they have arrived.
         if ![AFTER_NOT_UNDERSTOOD, CANCELLED].contains(&arrived.state) {
             let missing = self.clone();
             (self.state, self.resume, self.before) = (FAILED, arrived.state, missing.state);
-            self.worlds = Some(Box::new(Worlds { missing, arrived }));
+            self.details().worlds = Some(Box::new(Worlds { missing, arrived }));
         }
         true
     }
@@ -252,12 +332,16 @@ impl Party {
     /// Records the `reply-with` of a message, of which `text` is the text.
     pub(crate) fn ask(&mut self, side: Side, reply_with: u64, text: &str) {
         let index = side_index(side);
-        if self.asked[index] != 0 {
-            self.earlier[index].rotate_right(1);
-            self.earlier[index][0] = short(self.asked[index]);
+        let before = std::mem::replace(&mut self.asked[index], reply_with);
+        if before == 0 && reply_with == 0 {
+            return;
         }
-        self.asked[index] = reply_with;
-        self.asked_text[index] = Tail::of(text);
+        let details = self.details();
+        if before != 0 {
+            details.earlier[index].rotate_right(1);
+            details.earlier[index][0] = short(before);
+        }
+        details.asked_text[index] = Tail::of(text);
     }
 }
 
@@ -310,29 +394,70 @@ pub(crate) struct RoleBinding {
     pub(crate) agent: Name,
 }
 
+/// The roles of agents. Most conversations have one state for each participant, and no roles.
+#[derive(Debug, Default)]
+pub(crate) struct Bound {
+    bindings: Option<Box<SmallVec<[RoleBinding; 2]>>>,
+}
+
+impl Bound {
+    pub(crate) fn push(&mut self, binding: RoleBinding) {
+        self.bindings.get_or_insert_default().push(binding);
+    }
+
+    /// Removes these bindings and returns them.
+    pub(crate) fn remove(&mut self, range: Range<usize>) -> SmallVec<[RoleBinding; 2]> {
+        let bindings = self.bindings.as_deref_mut();
+        let removed = bindings.map(|bindings| bindings.drain(range).collect());
+        removed.unwrap_or_default()
+    }
+
+    /// Bytes that the bindings have allocated.
+    fn allocated(&self) -> usize {
+        self.bindings.as_deref().map_or(0, |bindings| {
+            let spilled = match bindings.spilled() {
+                true => bindings.capacity() * size_of::<RoleBinding>(),
+                false => 0,
+            };
+            size_of::<SmallVec<[RoleBinding; 2]>>() + spilled
+        })
+    }
+}
+
+impl Deref for Bound {
+    type Target = [RoleBinding];
+
+    fn deref(&self) -> &[RoleBinding] {
+        self.bindings.as_deref().map_or(&[], |bindings| bindings)
+    }
+}
+
+/// The order of the fields is that of the memory: see [`Slot`](crate::table::Slot).
 #[derive(Debug)]
+#[repr(C)]
 pub(crate) struct Conversation {
-    pub(crate) id: String,
     /// Index into the library.
     pub(crate) machine: u16,
-    pub(crate) initiator: Name,
-    pub(crate) parties: SmallVec<[Party; 1]>,
-    pub(crate) bound: SmallVec<[RoleBinding; 2]>,
     /// Whether the conversation began between other agents, and the monitored agent joined it because
     /// a `reply-to` names it. It then has the place of the initiator.
     pub(crate) joined: bool,
-    /// Agents that receive replies instead of the initiator, and may continue in its place.
-    pub(crate) reply_to: Vec<Name>,
-    /// State of the members of a multicast. Their names are unknown until they answer.
-    pub(crate) unnamed: Option<Box<Party>>,
+    pub(crate) initiator: Name,
+    /// Bytes that the texts of the conversation are charged with: its identifier and its names.
+    charged_texts: u32,
+    /// Bytes with which the peer is charged.
+    pub(crate) cost: u32,
     pub(crate) rare: Option<Box<Rare>>,
-    /// Bytes that the names of the conversation are charged with.
-    pub(crate) charged_names: usize,
+    pub(crate) bound: Bound,
+    pub(crate) parties: Parties,
 }
 
 /// The parts of a conversation that most conversations do not have.
 #[derive(Debug, Default)]
 pub(crate) struct Rare {
+    /// Agents that receive replies instead of the initiator, and may continue in its place.
+    pub(crate) reply_to: Vec<Name>,
+    /// State of the members of a multicast. Their names are unknown until they answer.
+    pub(crate) unnamed: Option<Box<Party>>,
     /// Agents that receive messages instead of a participant, and may continue in its place: the index
     /// of the party and the agent.
     pub(crate) delegates: Vec<(u32, Name)>,
@@ -346,8 +471,15 @@ pub(crate) struct Rare {
     pub(crate) local: Option<LocalRun>,
     /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
     pub(crate) claimed: bool,
+    /// Whether the last message of the monitored agent was reported as undelivered.
+    pub(crate) undelivered: bool,
+    /// Whether only a message of an agent that claimed a role has shown that such a message arrived.
+    pub(crate) doubtful: bool,
     /// The last message of the monitored agent in it, until it is known to have arrived.
     pub(crate) last_sent: Option<LastSent>,
+    /// The roles that the receivers of that message got with it, after it was reported as undelivered. It
+    /// may have arrived, so only these agents can answer it.
+    pub(crate) asked: SmallVec<[RoleBinding; 2]>,
     /// The last messages of which an observer gets each copy by itself.
     pub(crate) copied: Vec<Copied>,
     /// The parties by their peers, if there are more than [`FEW`].
@@ -384,45 +516,87 @@ pub(crate) struct Copied {
 const FEW: usize = 8;
 
 impl Conversation {
+    /// A conversation without agents, as an unused slot has it.
+    pub(crate) fn unused() -> Self {
+        Self {
+            machine: 0,
+            joined: false,
+            initiator: NONE,
+            charged_texts: 0,
+            cost: 0,
+            rare: None,
+            bound: Bound::default(),
+            parties: Parties::default(),
+        }
+    }
+
+    /// Removes all but a buffer for the next conversation.
+    pub(crate) fn clear(&mut self) {
+        let mut parties = std::mem::take(&mut self.parties);
+        parties.clear();
+        *self = Self {
+            parties,
+            ..Self::unused()
+        };
+    }
+
+    /// Adds to the bytes of the texts.
+    pub(crate) fn charge(&mut self, bytes: usize) {
+        let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
+        self.charged_texts = self.charged_texts.saturating_add(bytes);
+    }
+
+    /// Subtracts from the bytes of the texts.
+    pub(crate) fn discharge(&mut self, bytes: usize) {
+        let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
+        self.charged_texts = self.charged_texts.saturating_sub(bytes);
+    }
+
     /// Bytes that the conversation has allocated.
     pub(crate) fn allocated(&self) -> usize {
-        let parties = match self.parties.spilled() {
-            true => self.parties.capacity() * size_of::<Party>(),
-            false => 0,
-        };
-        let bound = match self.bound.spilled() {
-            true => self.bound.capacity() * size_of::<RoleBinding>(),
-            false => 0,
-        };
-        let unnamed = self.unnamed.as_ref().map_or(0, |_| size_of::<Party>());
-        let uncertain = self.parties.iter().filter(|party| party.worlds.is_some());
-        let worlds = uncertain.count() * size_of::<Worlds>();
         let rare = self.rare.as_deref().map_or(0, |rare| {
             let copies = rare.copied.iter();
             size_of::<Rare>()
+                + rare.reply_to.capacity() * size_of::<Name>()
+                + rare
+                    .unnamed
+                    .as_deref()
+                    .map_or(0, |party| size_of::<Party>() + party.allocated())
                 + rare.delegates.capacity() * size_of::<(u32, Name)>()
                 + rare.alternatives.capacity() * size_of::<(u32, u16)>()
                 + rare.copied.capacity() * size_of::<Copied>()
                 + copies
                     .map(|copied| 8 * copied.seen.capacity())
                     .sum::<usize>()
+                + match rare.asked.spilled() {
+                    true => rare.asked.capacity() * size_of::<RoleBinding>(),
+                    false => 0,
+                }
                 + rare.index.allocation_size()
                 + rare.local.as_ref().map_or(0, LocalRun::allocated)
         });
-        self.id.capacity()
-            + parties
-            + bound
-            + self.reply_to.capacity() * size_of::<Name>()
-            + unnamed
-            + worlds
-            + rare
-            + self.charged_names
+        let texts = usize::try_from(self.charged_texts).unwrap_or(usize::MAX);
+        self.parties.allocated() + self.bound.allocated() + rare + texts
     }
 
     /// Takes a reference to a name for this conversation.
     pub(crate) fn acquire(&mut self, names: &mut Names, text: &str) -> Name {
-        self.charged_names += Names::cost(text.len());
+        self.charge(Names::cost(text.len()));
         names.acquire(text)
+    }
+
+    /// Releases the names of [`Rare::asked`], of the roles for which `is_known` holds.
+    pub(crate) fn release_asked(&mut self, names: &mut Names, is_known: impl Fn(u8) -> bool) {
+        let Some(rare) = self.rare.as_deref_mut() else {
+            return;
+        };
+        let (known, others) = rare.asked.drain(..).partition(|asked| is_known(asked.role));
+        rare.asked = others;
+        let known: SmallVec<[RoleBinding; 2]> = known;
+        for RoleBinding { agent, .. } in known {
+            self.discharge(Names::cost(names.text(agent).len()));
+            names.release(agent);
+        }
     }
 
     /// Whether it is checked as the role of the monitored agent sees it.
@@ -485,6 +659,15 @@ impl Conversation {
         rare.map_or(&[], |rare| &rare.delegates)
     }
 
+    pub(crate) fn reply_to(&self) -> &[Name] {
+        let rare = self.rare.as_deref();
+        rare.map_or(&[], |rare| &rare.reply_to)
+    }
+
+    pub(crate) fn unnamed(&self) -> Option<&Party> {
+        self.rare.as_deref()?.unnamed.as_deref()
+    }
+
     /// Whether the agent has sent or received a message of this conversation, or may.
     pub(crate) fn takes_part(&self, names: &Names, agent: &str) -> bool {
         let bound = self.bound.iter().map(|bound| bound.agent);
@@ -494,7 +677,7 @@ impl Conversation {
 
     /// Whether a `reply-to` names the agent instead of the initiator.
     pub(crate) fn is_designated(&self, names: &Names, agent: &str) -> bool {
-        self.reply_to.iter().any(|name| names.is(*name, agent))
+        self.reply_to().iter().any(|name| names.is(*name, agent))
     }
 
     /// With one state for all participants: whether the agent is the initiator, or continues in its
@@ -627,7 +810,7 @@ pub(crate) fn next_state(
         }
         AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
         // A message that was reported as failed may have arrived, or is sent again.
-        FAILED if let Some(worlds) = &party.worlds => in_worlds(machine, party, worlds, message),
+        FAILED if let Some(worlds) = party.worlds() => in_worlds(machine, party, worlds, message),
         FAILED => {
             let in_state = |state| {
                 let taken = in_state(machine, party, state, message)?;
@@ -655,7 +838,7 @@ pub(crate) fn next_state(
         own if party.echo
             && message.side != party.canceling_side
             && is_told_apart(party, message)
-            && message.in_reply_to == party.cancel
+            && message.in_reply_to == party.cancel()
             && is_cancel_answer(message) =>
         {
             Ok(NextState {
@@ -711,7 +894,7 @@ fn is_cancel_answer(message: &PartyMessage<'_>) -> bool {
 
 /// Whether `in-reply-to` distinguishes the answer to a cancel from other messages.
 fn is_told_apart(party: &Party, message: &PartyMessage<'_>) -> bool {
-    message.in_reply_to != 0 && party.cancel != 0
+    message.in_reply_to != 0 && party.cancel() != 0
 }
 
 /// Returns the state after a message of the canceled side. The message that was taken for the answer to
@@ -722,7 +905,8 @@ fn after_crossing(
     message: &PartyMessage<'_>,
 ) -> Result<NextState, Kind> {
     let told_apart = is_told_apart(party, message);
-    let answers = is_cancel_answer(message) && (!told_apart || message.in_reply_to == party.cancel);
+    let answers =
+        is_cancel_answer(message) && (!told_apart || message.in_reply_to == party.cancel());
     let crossing = in_state(machine, party, party.resume, message);
     match (message.act, crossing) {
         // The cancel failed, so the conversation continues. If this is a failure of the protocol
@@ -774,7 +958,7 @@ fn while_cancelling(
         };
     }
     let told_apart = is_told_apart(party, message);
-    let answers = !told_apart || message.in_reply_to == party.cancel;
+    let answers = !told_apart || message.in_reply_to == party.cancel();
     let crossing = in_state(machine, party, party.resume, message);
     if answers && is_cancel_answer(message) {
         let next_state = match message.act {
@@ -871,7 +1055,7 @@ fn has_crossed(machine: &Machine, party: &Party, state: u16, message: &PartyMess
         }
         answered => {
             answered != party.asked[other]
-                && may_have_asked(&party.earlier[other], answered)
+                && may_have_asked(party.earlier(other), answered)
                 && machine.states.iter().any(fits)
         }
     }
@@ -947,16 +1131,17 @@ enum Reply {
 
 fn in_reply(party: &Party, message: &PartyMessage<'_>) -> Result<Reply, Kind> {
     let other = side_index(message.side.opposite());
-    let (asked, earlier) = (party.asked[other], &party.earlier[other]);
+    let asked = party.asked[other];
+    let earlier = || party.earlier(other);
     // A message that crossed the `not-understood` answers the message before it.
     let is_crossing = || {
-        let [before, ..] = earlier;
+        let [before, ..] = earlier();
         party.state == AFTER_NOT_UNDERSTOOD && short(message.in_reply_to) == *before
     };
     if !message.answers || [0, asked].contains(&message.in_reply_to) || asked == 0 || is_crossing()
     {
         Ok(Reply::ToLast)
-    } else if may_have_asked(earlier, message.in_reply_to) && !message.own {
+    } else if may_have_asked(earlier(), message.in_reply_to) && !message.own {
         Ok(Reply::ToEarlier)
     } else {
         Err(Kind::WrongReply)
@@ -1035,6 +1220,49 @@ mod tests {
             Tail::of(&format!("{wide}b")).text(),
             format!("{}b", "ä".repeat(15))
         );
+    }
+
+    #[test]
+    fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
+        let mut names = Names::new(std::hash::RandomState::new());
+        let mut conversation = Conversation::unused();
+        let party = Party::new(NONE, 0);
+        conversation.add(party.clone());
+        assert_eq!(conversation.allocated(), 0);
+        let [first] = &mut conversation.parties[..] else {
+            panic!()
+        };
+        first.ask(Side::Initiator, 0, "");
+        assert_eq!(first.allocated(), 0);
+        first.begin_step(Side::Initiator, 1, 7, false);
+        first.ask(Side::Initiator, 7, "r7");
+        assert_eq!(first.asked_text(0), "r7");
+        assert_eq!(first.allocated(), size_of::<Details>());
+        assert!(!first.take_back(Side::Initiator, 1, 8));
+        assert!(first.take_back(Side::Initiator, 1, 7));
+        assert_eq!(first.state, FAILED);
+        // Two worlds with details each.
+        let uncertain = 3 * size_of::<Details>() + size_of::<Worlds>();
+        assert_eq!(first.allocated(), uncertain);
+        conversation.add(party);
+        let both = conversation.parties.allocated();
+        assert_eq!(both, uncertain + 2 * size_of::<Party>());
+        let agent = conversation.acquire(&mut names, "ann");
+        conversation.bound.push(RoleBinding { role: 0, agent });
+        let bound = size_of::<SmallVec<[RoleBinding; 2]>>();
+        assert_eq!(conversation.allocated(), both + bound + Names::cost(3));
+        conversation.clear();
+        assert_eq!(conversation.allocated(), 0);
+        // The buffer of a single party serves the next one.
+        let mut single = Party::new(NONE, 0);
+        single.ask(Side::Other, 9, "r9");
+        conversation.add(single);
+        conversation.clear();
+        assert_eq!(conversation.allocated(), size_of::<Details>());
+        conversation.add(Party::new(NONE, 0));
+        assert_eq!(conversation.allocated(), size_of::<Details>());
+        let party = conversation.parties.first().unwrap();
+        assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
     }
 
     #[test]

@@ -16,7 +16,7 @@
 use std::sync::Arc;
 
 use crate::act::{Act, FAILURE, INFORM};
-use crate::conversation::{Conversation, ELSEWHERE, NONE, Party, Side, act_number, side_index};
+use crate::conversation::{ELSEWHERE, NONE, Party, Side, act_number, side_index};
 use crate::judge::ObservedMessage;
 use crate::machine::{Cancel, Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
@@ -36,13 +36,9 @@ impl Monitor {
         let slot = self.table.slot(at);
         slot.zip(self.agent.as_deref())
             .is_some_and(|(slot, agent)| {
-                let Conversation {
-                    joined,
-                    initiator,
-                    reply_to,
-                    ..
-                } = &slot.conversation;
-                *joined || !reply_to.is_empty() && self.names.is(*initiator, agent)
+                let conversation = &slot.conversation;
+                let named = || !conversation.reply_to().is_empty();
+                conversation.joined || named() && self.names.is(conversation.initiator, agent)
             })
     }
 

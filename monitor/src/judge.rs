@@ -116,7 +116,7 @@ impl Judge<'_> {
         let known = self.party(sender);
         let known = known.map(|(at, party)| (MoveTarget::Party(at), party));
         // A service is no member of the multicast.
-        let unnamed = self.conversation.unnamed.as_deref();
+        let unnamed = self.conversation.unnamed();
         let unnamed = unnamed.filter(|_| self.observed.undelivered_to.is_none());
         let Some((target, party)) = known.or(unnamed.map(|party| (MoveTarget::Sender, party)))
         else {
@@ -161,8 +161,8 @@ impl Judge<'_> {
             }
             let (target, party) = match self.party(receiver) {
                 Some((at, party)) => (MoveTarget::Party(at), party),
-                None if is_pattern(receiver) && (began || conversation.unnamed.is_some()) => {
-                    let unnamed = conversation.unnamed.as_deref();
+                None if is_pattern(receiver) && (began || conversation.unnamed().is_some()) => {
+                    let unnamed = conversation.unnamed();
                     (MoveTarget::Unnamed, unnamed.unwrap_or(&fresh))
                 }
                 None if began => (MoveTarget::Receiver(number), &fresh),
@@ -390,10 +390,10 @@ impl Judge<'_> {
             return None;
         }
         let mut known = HashMap::new();
-        for bound in &self.conversation.bound {
+        for bound in self.conversation.bound.iter() {
             *known.entry(bound.agent).or_insert(0) |= 1 << bound.role;
         }
-        for agent in &self.conversation.reply_to {
+        for agent in self.conversation.reply_to() {
             *known.entry(*agent).or_insert(0) |= 1 << self.machine.initiator;
         }
         Some(known)
@@ -409,7 +409,7 @@ impl Judge<'_> {
         };
         let conversation = self.conversation;
         // The states of the others are unknown, if their messages go to another agent.
-        let others_known = !conversation.joined && conversation.reply_to.is_empty();
+        let others_known = !conversation.joined && conversation.reply_to().is_empty();
         if !others_known {
             return Ok(());
         }
@@ -437,7 +437,9 @@ impl Judge<'_> {
             let reach = moves.iter().filter(|made| made.next_state.state == target);
             let there = others().filter(|(party, _)| party.state == target);
             if reach.count() + there.clone().count() > usize::from(guard.at_most) {
-                let mut blocking = there.map(|(party, _)| party).chain(&conversation.parties);
+                let mut blocking = there
+                    .map(|(party, _)| party)
+                    .chain(conversation.parties.iter());
                 if let Some(party) = blocking.next() {
                     return refuse(party);
                 }

@@ -32,6 +32,7 @@ mod machine;
 mod memory;
 mod monitor;
 mod names;
+mod parties;
 mod policy;
 pub mod projection;
 pub mod recording;

@@ -196,7 +196,9 @@ impl Machine {
     /// Whether `name` is the name or an alias of the protocol. Case is ignored.
     #[must_use]
     pub fn is_called(&self, name: &str) -> bool {
-        self.name.eq_ignore_ascii_case(name)
+        // Comparing bytes is several times as fast, and nearly all messages have this name.
+        self.name == name
+            || self.name.eq_ignore_ascii_case(name)
             || self
                 .aliases
                 .iter()

@@ -11,8 +11,8 @@ use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
-    Conversation, Copied, FAILED, Holders, NONE, NextState, Party, RoleBinding, Side, act_number,
-    is_final, is_over, state_name,
+    Conversation, Copied, Details, FAILED, Holders, NONE, NextState, Party, Rare, RoleBinding,
+    Side, act_number, is_final, is_over, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
 use crate::fingerprints::Fingerprints;
@@ -301,10 +301,10 @@ impl Monitor {
                     self.charge(at);
                     return;
                 }
-                let Some(slot) = self.table.slot(next) else {
+                if self.table.slot(next).is_none() {
                     break;
-                };
-                (at, next) = (next, slot.sibling);
+                }
+                (at, next) = (next, self.table.sibling(next));
             }
         }
     }
@@ -469,16 +469,19 @@ impl Monitor {
         if let Some(at) = local.find(|at| self.fits_role(**at, header, observed)) {
             return Some(*at);
         }
+        // A service stands for the agent that did not get a message.
+        let sender = observed.undelivered_to.unwrap_or(observed.sender);
+        if let [only] = alike.as_slice()
+            && self.rank(*only, sender, observed) == 2
+        {
+            return Some(*only);
+        }
         let ranked = alike.iter().map(|at| {
-            // A service stands for the agent that did not get a message.
-            let rank = match observed.undelivered_to {
-                Some(lost) => self.rank(*at, lost, observed),
-                None => self.rank(*at, observed.sender, observed),
-            };
+            let rank = self.rank(*at, sender, observed);
             let slot = self.table.slot(*at);
             // Other agents may take part in a conversation that began elsewhere.
             let joined = rank == 0 && slot.is_some_and(|slot| slot.conversation.joined);
-            let serial = slot.map_or(0, |slot| slot.serial);
+            let serial = self.table.serial(*at);
             (
                 rank,
                 joined,
@@ -521,7 +524,11 @@ impl Monitor {
                 if takes_part(&here.conversation) {
                     return true;
                 }
-                at = if at == main { first } else { here.sibling };
+                at = if at == main {
+                    first
+                } else {
+                    self.table.sibling(at)
+                };
                 slot = self.table.slot(at);
             }
             false
@@ -532,7 +539,7 @@ impl Monitor {
                 || conversation.is_designated(&self.names, agent)
         };
         let sends = |conversation: &Conversation| {
-            conversation.unnamed.is_some() || has(conversation, sender)
+            conversation.unnamed().is_some() || has(conversation, sender)
         };
         let receives = |conversation: &Conversation| {
             let mut receivers = observed.receivers.iter().take(MAX_LOOKED_AT);
@@ -549,7 +556,7 @@ impl Monitor {
                 names.is(conversation.initiator, agent) || conversation.is_designated(names, agent)
             };
             let answers = |agent: &str| {
-                conversation.unnamed.is_some() || conversation.party(names, agent).is_some()
+                conversation.unnamed().is_some() || conversation.party(names, agent).is_some()
             };
             let receivers = || observed.receivers.iter().take(MAX_LOOKED_AT);
             leads(sender) && receivers().any(|receiver| answers(receiver))
@@ -576,7 +583,11 @@ impl Monitor {
             {
                 return true;
             }
-            part = if part == at { slot.child } else { slot.sibling };
+            part = if part == at {
+                slot.child
+            } else {
+                self.table.sibling(part)
+            };
         }
         false
     }
@@ -600,7 +611,11 @@ impl Monitor {
             {
                 return false;
             }
-            part = if inner { slot.sibling } else { slot.child };
+            part = if inner {
+                self.table.sibling(part)
+            } else {
+                slot.child
+            };
         }
         true
     }
@@ -617,7 +632,11 @@ impl Monitor {
             if leads || self.may_begin(&self.library, part, name, observed.sender) {
                 return false;
             }
-            part = if part == at { slot.child } else { slot.sibling };
+            part = if part == at {
+                slot.child
+            } else {
+                self.table.sibling(part)
+            };
         }
         true
     }
@@ -666,7 +685,7 @@ impl Monitor {
                     Err(fault) => denied = denied.or(Some(fault)),
                 }
             }
-            child = self.table.slot(child).map_or(NONE, |slot| slot.sibling);
+            child = self.table.sibling(child);
         }
         if !may_begin {
             return Err(match (denied, open) {
@@ -817,7 +836,7 @@ impl Monitor {
             self.evict_alike(id)?;
         }
         let peer = match self.table.slot(parent) {
-            Some(main) => self.names.acquire_again(main.peer),
+            Some(_) => self.names.acquire_again(self.table.peer(parent)),
             None if observed.own => NONE,
             None => {
                 let peer = header.peer_name().unwrap_or(observed.sender);
@@ -832,7 +851,7 @@ impl Monitor {
         self.evict(parent, peer, 1, bytes);
         let at = self.table.insert(id, parent, peer, machine, now.millis());
         if let Some(slot) = self.table.slot_mut(at) {
-            slot.conversation.charged_names += peer_cost;
+            slot.conversation.charge(peer_cost);
         }
         Ok(at)
     }
@@ -882,8 +901,8 @@ impl Monitor {
         let slots = alike
             .iter()
             .filter_map(|at| Some((*at, self.table.slot(*at)?)));
-        let of_peers = slots.filter(|(_, slot)| slot.peer != NONE || self.agent.is_none());
-        let oldest = of_peers.min_by_key(|(_, slot)| (slot.touched, slot.serial));
+        let of_peers = slots.filter(|(at, _)| self.table.peer(*at) != NONE || self.agent.is_none());
+        let oldest = of_peers.min_by_key(|(at, slot)| (slot.touched, self.table.serial(*at)));
         match oldest.map(|(at, _)| at) {
             Some(at) => {
                 self.forgotten += 1;
@@ -900,7 +919,7 @@ impl Monitor {
             && let Some(slot) = self.table.slot(at)
         {
             let main = if slot.parent == NONE { at } else { slot.parent };
-            self.evict(main, slot.peer, 0, 0);
+            self.evict(main, self.table.peer(at), 0, 0);
         }
     }
 
@@ -981,13 +1000,18 @@ impl Monitor {
         .map_err(|fault| Denied::Fault(fault, at))?;
         let new =
             |made: &&Move| matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
-        let grown = conversation.parties.len() + self.moves.iter().filter(new).count();
+        let added = self.moves.iter().filter(new).count();
+        let grown = conversation.parties.len() + added;
+        let grows = added > 0
+            || !header.reply_to_names().is_empty()
+            || machine.scope == Scope::Conversation;
         let agents = observed.receivers.len() + header.reply_to_names().len();
         if grown > self.limits.participants
             || conversation.bound.len() + agents > self.limits.participants + 1
             || is_crowded(conversation, &self.names, header)
-            || size_after(conversation, observed, &self.moves, header)
-                > self.limits.share_of_bytes()
+            || grows
+                && size_after(conversation, observed, &self.moves, header)
+                    > self.limits.share_of_bytes()
         {
             return Err(fault(Kind::TooMany));
         }
@@ -1076,7 +1100,7 @@ impl Monitor {
         let over = |slot: &crate::table::Slot| {
             let conversation = &slot.conversation;
             let machine = library.machine(conversation.machine);
-            conversation.unnamed.is_none()
+            conversation.unnamed().is_none()
                 && machine.is_some_and(|machine| {
                     let mut parties = conversation.parties.iter();
                     parties.all(|party| is_over(machine, party.state))
@@ -1089,7 +1113,7 @@ impl Monitor {
         let mut child = slot.child;
         while let Some(slot) = self.table.slot(child) {
             all_over &= over(slot);
-            child = slot.sibling;
+            child = self.table.sibling(child);
         }
         let list = if all_over { List::Ended } else { List::Open };
         self.table.touch(at, list, now);
@@ -1149,7 +1173,7 @@ impl Monitor {
                 if known && !conversation.parties.iter().all(resting) {
                     events.push(Event::Abandoned {
                         protocol: machine.map_or("", Machine::name).to_owned(),
-                        conversation_id: slot.conversation.id.clone(),
+                        conversation_id: self.table.id(at).to_owned(),
                     });
                 }
                 // After an undelivered message, a conversation may continue.
@@ -1181,18 +1205,17 @@ impl Monitor {
         let (peer, scope) = (party.peer, machine.scope);
         expire_party(machine, party);
         let next = (party.state != before).then(|| state_name(machine, party.state).to_owned());
+        let (touched, parent) = (slot.touched, slot.parent);
         let event = Event::Overdue {
             protocol: machine.name().to_owned(),
-            conversation_id: slot.conversation.id.clone(),
+            conversation_id: self.table.id(deadline.at).to_owned(),
             participant: (scope == Scope::Participant).then(|| self.names.text(peer).to_owned()),
             state: state_name(machine, before).to_owned(),
             next,
         };
-        let touched = slot.touched;
-        let main = if slot.parent == NONE {
-            deadline.at
-        } else {
-            slot.parent
+        let main = match parent {
+            NONE => deadline.at,
+            parent => parent,
         };
         self.touch(main, touched);
         complete.then_some(event)
@@ -1201,8 +1224,8 @@ impl Monitor {
     /// Removes a main conversation with its embedded conversations before its time. Messages to it may
     /// still come.
     fn forget(&mut self, at: u32) {
-        if let Some(slot) = self.table.slot(at) {
-            let id = self.hasher.hash_one(slot.conversation.id.as_str());
+        if self.table.slot(at).is_some() {
+            let id = self.hasher.hash_one(self.table.id(at));
             self.removed.add(id);
         }
         self.remove_all(at);
@@ -1228,11 +1251,14 @@ impl Monitor {
             let peers = conversation.parties.iter().map(|party| party.peer);
             let bound = conversation.bound.iter().map(|bound| bound.agent);
             let delegates = conversation.delegates().iter().map(|(_, agent)| *agent);
+            let rare = conversation.rare.as_deref().into_iter();
+            let asked = rare.flat_map(|rare| rare.asked.iter().map(|asked| asked.agent));
             let named = peers
                 .chain(bound)
-                .chain(conversation.reply_to.iter().copied())
+                .chain(conversation.reply_to().iter().copied())
                 .chain(delegates)
-                .chain([slot.peer]);
+                .chain(asked)
+                .chain([self.table.peer(at)]);
             for name in named.filter(|name| *name != NONE) {
                 self.names.release(name);
             }
@@ -1266,7 +1292,7 @@ impl Passed {
             machine: index,
             state: parties.first().map_or(machine.initial, |party| party.state),
             opened: false,
-            complete: conversation.unnamed.is_none()
+            complete: conversation.unnamed().is_none()
                 && parties.iter().all(|party| is_final(machine, party.state)),
             late: false,
             void: false,
@@ -1294,7 +1320,7 @@ fn is_crowded(conversation: &Conversation, names: &Names, header: &Header<'_>) -
                 .iter()
                 .any(|(_, known)| names.is(*known, name))
     };
-    let kept = conversation.reply_to.len() + conversation.delegates().len();
+    let kept = conversation.reply_to().len() + conversation.delegates().len();
     kept + reply_to.iter().filter(new).count() > MAX_DESIGNATED
 }
 
@@ -1309,13 +1335,19 @@ fn size_after(
     let receivers = moves.iter().map(|made| match made.target {
         MoveTarget::Receiver(number) => {
             let receiver = observed.receivers.get(number);
-            size_of::<Party>() + receiver.map_or(0, |receiver| name(receiver))
+            size_of::<Party>()
+                + size_of::<Details>()
+                + receiver.map_or(0, |receiver| name(receiver))
         }
         _ => 0,
     });
     let reply_to = header.reply_to_names().iter().map(|agent| name(agent));
+    let rare = match conversation.rare {
+        None if !header.reply_to_names().is_empty() => size_of::<Rare>(),
+        _ => 0,
+    };
     let added = receivers.sum::<usize>() + reply_to.sum::<usize>() + name(observed.sender);
-    crate::table::Slot::COST + conversation.allocated() + added
+    crate::table::Slot::COST + conversation.allocated() + added + rare
 }
 
 /// Whether the message is another copy of the last one to several receivers. Its receiver then has the
@@ -1390,7 +1422,7 @@ impl PartiesBefore {
             } else {
                 conversation.parties.len()
             },
-            has_unnamed: conversation.unnamed.is_some(),
+            has_unnamed: conversation.unnamed().is_some(),
         }
     }
 }
@@ -1403,6 +1435,7 @@ fn keep_alternatives(
     observed: &ObservedMessage<'_>,
     (moves, before): (&[Move], PartiesBefore),
 ) {
+    let count = conversation.parties.len();
     let Some(rare) = conversation.rare.as_deref_mut() else {
         return;
     };
@@ -1435,8 +1468,8 @@ fn keep_alternatives(
     let Some(first) = step(first, observed.act, u32::MAX, u32::MAX) else {
         return;
     };
-    let unnamed = (conversation.unnamed.is_some() && !before.has_unnamed).then_some(NONE);
-    let new = (before.count..conversation.parties.len()).map(index);
+    let unnamed = (rare.unnamed.is_some() && !before.has_unnamed).then_some(NONE);
+    let new = (before.count..count).map(index);
     let others = machine.later_targets(observed.act, first);
     for party in new.chain(unnamed) {
         let others = others.iter().map(|state| (party, *state));
@@ -1514,6 +1547,35 @@ mod tests {
             "{:?}",
             monitor.deadlines.len()
         );
+    }
+
+    #[test]
+    fn names_of_undelivered_messages_are_released() {
+        let text = r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="propagate" from="b" to="c" target="3"/></state>
+            <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
+            <state id="4" final="yes"/></scxml>"#;
+        let mut library = Library::standard();
+        library.add(Machine::read("own", text).unwrap()).unwrap();
+        let mut monitor = Monitor::agent(Arc::new(library), "ann");
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let request = |to: &'static str| {
+            let header = Header::new(Performative::Request).sender("ann");
+            header.receivers([to]).protocol("own").conversation_id("1")
+        };
+        let mut bytes = Vec::new();
+        for to in ["ben", "cid", "dan"] {
+            assert!(monitor.check(&request(to), now).is_accepted());
+            assert!(monitor.names.known(to).is_some());
+            assert_eq!(monitor.names.len(), 2, "{to}");
+            bytes.push(monitor.bytes());
+            monitor.undelivered(&request(to), to, now);
+            assert_eq!(monitor.names.len(), 2, "{to}");
+        }
+        assert_eq!(bytes[1], bytes[2]);
+        monitor.handle_timeout(now + Duration::from_secs(100_000));
+        assert_eq!(monitor.names.len(), 0);
     }
 
     #[test]

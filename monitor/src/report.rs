@@ -118,7 +118,7 @@ pub(crate) fn violation(
         };
         let other = usize::from(by_initiator);
         violation.reply = party.map(|party| ReplyMismatch {
-            expected: party.asked_text[other].text().to_owned(),
+            expected: party.asked_text(other).to_owned(),
             received: Tail::of(header.in_reply_to_text().unwrap_or_default())
                 .text()
                 .to_owned(),

@@ -191,11 +191,23 @@ impl Monitor {
                         conversation.bound.push(RoleBinding { role, agent });
                     }
                     let began = self.names.is(conversation.initiator, observed.sender);
-                    conversation.rare().claimed |= !observed.own && !began;
+                    let rare = conversation.rare();
+                    // The monitored agent has asked it to take the role.
+                    let is_asked = rare.asked.iter().any(|asked| {
+                        asked.role == role && self.names.is(asked.agent, observed.sender)
+                    });
+                    let claims = !observed.own && !began && !is_asked;
+                    rare.claimed |= claims;
+                    rare.doubtful |= claims && rare.undelivered;
+                    conversation.release_asked(&mut self.names, |asked| asked == role);
+                }
+                if observed.own {
+                    conversation.release_asked(&mut self.names, |_| true);
                 }
                 let complete = local.is_some_and(|local| local.is_final());
                 let bound_after = conversation.bound.len();
                 let rare = conversation.rare();
+                rare.undelivered = false;
                 if observed.own {
                     rare.last_sent = Some(last_sent(false, bound_after));
                 } else if rare.local.as_ref().is_none_or(|run| !run.has_last()) {
@@ -225,6 +237,10 @@ impl Monitor {
                     && [CANCEL, FAILURE, NOT_UNDERSTOOD].contains(&observed.act) =>
             {
                 Err(Denied::Unchecked(Unchecked::BegunElsewhere))
+            }
+            // The undelivered message has arrived only if the agent has the role that it claims.
+            Err(_) if observed.own && conversation.rare().doubtful => {
+                Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
             // Another agent may have claimed the role of the sender.
             Err(_) if peers == 0 && !observed.own && conversation.rare().claimed => {
@@ -262,12 +278,10 @@ pub(crate) fn take_back_local(
         let local = locals.and_then(|locals| run.state(locals));
         state = local.map_or(state, |local| local.global_in(machine));
         // It may be sent to another agent instead.
-        let released = conversation.bound.drain(sent.bound..sent.bound_after);
-        for RoleBinding { agent, .. } in released {
-            let cost = Names::cost(names.text(agent).len());
-            conversation.charged_names = conversation.charged_names.saturating_sub(cost);
-            names.release(agent);
-        }
+        let asked = conversation.bound.remove(sent.bound..sent.bound_after);
+        conversation.release_asked(names, |_| true);
+        let rare = conversation.rare();
+        (rare.asked, rare.undelivered) = (asked, true);
     }
     if let Some(party) = conversation.parties.first_mut() {
         party.state = state;
@@ -287,11 +301,20 @@ fn observed_by_role<'a>(
     let run = run.and_then(|rare| rare.local.as_ref());
     let own_role = run.and_then(LocalRun::role).map_or(0, |role| 1 << role);
     let free = unbound(machine, conversation) & !own_role;
+    // Roles of which an undelivered message has asked others.
+    let asked_others = |name: &str| {
+        let asked = conversation.rare.as_deref().map(|rare| &rare.asked);
+        let asked = || asked.into_iter().flatten();
+        let others = asked().fold(0, |mask, asked| mask | (1 << asked.role));
+        let own = asked().filter(|asked| names.is(asked.agent, name));
+        others & !own.fold(0, |mask, asked| mask | (1 << asked.role))
+    };
     let may = |name: &str| {
         let bound = conversation.bound.iter();
         let held = bound.filter(|bound| names.is(bound.agent, name));
         match held.fold(0, |mask, bound| mask | (1 << bound.role)) {
-            0 => free,
+            0 if observed.own => free,
+            0 => free & !asked_others(name),
             held => held,
         }
     };

@@ -36,7 +36,6 @@ use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope};
 use crate::monitor::Monitor;
 use crate::names::{Name, Names};
-use crate::table::Slot;
 use crate::{Library, Limits, Now};
 
 const MAGIC: [u8; 8] = *b"fipa-cnv";
@@ -132,28 +131,27 @@ impl Monitor {
 
     /// Writes a main conversation with its embedded ones. `None` if one of them is uncertain.
     fn write_main(&self, main: u32, agent: &str, now: Now, out: &mut Vec<u8>) -> Option<()> {
-        let slot = self.table.slot(main)?;
-        self.write_part(slot, agent, now, out)?;
+        self.write_part(main, agent, now, out)?;
         let count_at = out.len();
         put_count(out, 0);
-        let (mut count, mut child) = (0_u32, slot.child);
-        while let Some(slot) = self.table.slot(child) {
-            self.write_part(slot, agent, now, out)?;
+        let (mut count, mut child) = (0_u32, self.table.slot(main)?.child);
+        while child != NONE {
+            self.write_part(child, agent, now, out)?;
             count += 1;
-            child = slot.sibling;
+            child = self.table.sibling(child);
         }
         let place = out.get_mut(count_at..count_at + 4)?;
         place.copy_from_slice(&count.to_le_bytes());
         Some(())
     }
 
-    fn write_part(&self, slot: &Slot, agent: &str, now: Now, out: &mut Vec<u8>) -> Option<()> {
-        let conversation = &slot.conversation;
+    fn write_part(&self, at: u32, agent: &str, now: Now, out: &mut Vec<u8>) -> Option<()> {
+        let conversation = &self.table.slot(at)?.conversation;
         let names = &self.names;
         let machine = self.library.machine(conversation.machine)?;
         let rare = conversation.rare.as_deref();
         let local = rare.is_some_and(|rare| rare.local.is_some() || rare.may_continue);
-        let named = !conversation.reply_to.is_empty() && names.is(conversation.initiator, agent);
+        let named = !conversation.reply_to().is_empty() && names.is(conversation.initiator, agent);
         let takes_part =
             conversation.takes_part(names, agent) || conversation.is_designated(names, agent);
         if local || conversation.joined || named || !takes_part {
@@ -164,24 +162,24 @@ impl Monitor {
             name => names.text(name),
         };
         put_text(out, machine.name())?;
-        put_text(out, &conversation.id)?;
-        put_text(out, text(slot.peer))?;
+        put_text(out, self.table.id(at))?;
+        put_text(out, text(self.table.peer(at)))?;
         put_text(out, text(conversation.initiator))?;
         put_count(out, conversation.parties.len());
-        for party in &conversation.parties {
+        for party in conversation.parties.iter() {
             write_party(machine, names, party, now, out)?;
         }
-        out.push(u8::from(conversation.unnamed.is_some()));
-        if let Some(party) = conversation.unnamed.as_deref() {
+        out.push(u8::from(conversation.unnamed().is_some()));
+        if let Some(party) = conversation.unnamed() {
             write_party(machine, names, party, now, out)?;
         }
         put_count(out, conversation.bound.len());
-        for bound in &conversation.bound {
+        for bound in conversation.bound.iter() {
             out.push(bound.role);
             put_text(out, text(bound.agent))?;
         }
-        put_count(out, conversation.reply_to.len());
-        for agent in &conversation.reply_to {
+        put_count(out, conversation.reply_to().len());
+        for agent in conversation.reply_to() {
             put_text(out, text(*agent))?;
         }
         put_count(out, conversation.delegates().len());
@@ -217,7 +215,7 @@ impl Monitor {
                 self.put(child, main, now);
             }
             self.touch(main, now.millis());
-            let peer = self.table.slot(main).map_or(NONE, |slot| slot.peer);
+            let peer = self.table.peer(main);
             self.evict(main, peer, 0, 0);
         }
         self.last = now;
@@ -238,7 +236,7 @@ impl Monitor {
         let generation = slot.generation;
         let conversation = &mut slot.conversation;
         if peer != NONE {
-            conversation.charged_names += Names::cost(part.peer.len());
+            conversation.charge(Names::cost(part.peer.len()));
         }
         conversation.initiator = conversation.acquire(&mut self.names, part.initiator);
         for (index, (peer, party)) in (0_u32..).zip(&part.parties) {
@@ -259,7 +257,9 @@ impl Monitor {
                 ..party.clone()
             });
         }
-        conversation.unnamed = part.unnamed.clone().map(Box::new);
+        if let Some(party) = &part.unnamed {
+            conversation.rare().unnamed = Some(Box::new(party.clone()));
+        }
         for (role, agent) in &part.bound {
             let agent = conversation.acquire(&mut self.names, agent);
             let role = *role;
@@ -268,7 +268,7 @@ impl Monitor {
         }
         for agent in &part.reply_to {
             let agent = conversation.acquire(&mut self.names, agent);
-            conversation.reply_to.push(agent);
+            conversation.rare().reply_to.push(agent);
         }
         for (party, agent) in &part.delegates {
             let agent = conversation.acquire(&mut self.names, agent);
@@ -312,7 +312,7 @@ fn write_party(
     now: Now,
     out: &mut Vec<u8>,
 ) -> Option<()> {
-    if party.state == FAILED || party.worlds.is_some() {
+    if party.state == FAILED || party.worlds().is_some() {
         return None;
     }
     let peer = Some(party.peer).filter(|peer| *peer != NONE);
@@ -327,15 +327,14 @@ fn write_party(
             | flag(party.echo, ECHO),
     );
     out.extend_from_slice(&party.acts);
-    let asked = party.asked.iter().zip(&party.asked_text);
-    for ((asked, tail), earlier) in asked.zip(&party.earlier) {
+    for (side, asked) in party.asked.iter().enumerate() {
         out.extend_from_slice(&asked.to_le_bytes());
-        put_text(out, tail.text())?;
-        for earlier in earlier {
+        put_text(out, party.asked_text(side))?;
+        for earlier in party.earlier(side) {
             out.extend_from_slice(&earlier.to_le_bytes());
         }
     }
-    out.extend_from_slice(&party.cancel.to_le_bytes());
+    out.extend_from_slice(&party.cancel().to_le_bytes());
     let deadline = match party.deadline {
         0 => 0,
         due => {
@@ -633,21 +632,21 @@ impl<'s> Input<'s> {
             acts,
             ..Party::new(NONE, state)
         };
-        let mut earlier = [[0; EARLIER]; 2];
-        for (side, earlier) in earlier.iter_mut().enumerate() {
+        for side in 0..2 {
             let asked = self.u64()?;
-            let tail = Tail::of(self.text()?);
-            for earlier in earlier {
+            let text = self.text()?;
+            let mut earlier = [0; EARLIER];
+            for earlier in &mut earlier {
                 *earlier = self.u32()?;
             }
-            if let (Some(to), Some(text)) =
-                (party.asked.get_mut(side), party.asked_text.get_mut(side))
-            {
-                (*to, *text) = (asked, tail);
+            party.asked[side] = asked;
+            if !text.is_empty() || earlier != [0; EARLIER] {
+                let details = party.details();
+                details.asked_text[side] = Tail::of(text);
+                details.earlier[side] = earlier;
             }
         }
-        party.earlier = earlier;
-        party.cancel = self.u64()?;
+        party.set_cancel(self.u64()?);
         party.deadline = match self.u64()? {
             0 => 0,
             due => {

@@ -7,7 +7,6 @@ use std::hash::{BuildHasher, RandomState};
 
 use hashbrown::HashTable;
 use siphasher::sip128::SipHasher13;
-use smallvec::SmallVec;
 
 use crate::conversation::{Conversation, NONE};
 use crate::names::Name;
@@ -23,12 +22,14 @@ pub(crate) enum List {
 
 /// Precision of the order of the lists, in milliseconds. Moving a conversation changes two others. For
 /// every message, this would be the largest cost of a check.
-const PRECISION: u64 = 1_000;
+const PRECISION: u16 = 1_000;
 
 /// Conversations in slots. A free slot is reused without allocating.
 #[derive(Debug)]
 pub(crate) struct Table {
-    slots: Vec<Slot>,
+    slots: Slots,
+    /// As many as slots.
+    cold: Vec<Cold>,
     free: Vec<u32>,
     by_id: HashTable<Indexed>,
     keys: [u64; 2],
@@ -40,14 +41,21 @@ pub(crate) struct Table {
     begun: u64,
 }
 
-/// A main conversation in the index: the fingerprint of its identifier, and its slot.
+/// A main conversation in the index: a part of the fingerprint of its identifier, and its slot.
 ///
-/// The fingerprint has 128 bits and a secret random key, so that equal fingerprints are equal
-/// identifiers. A search reads neither the slot nor the text, which are in other cache lines.
+/// The index is small, so that most of it is in the cache. The slot has the rest of the fingerprint.
 #[derive(Debug)]
 struct Indexed {
-    id: [u64; 2],
+    tag: u32,
     at: u32,
+}
+
+/// A fingerprint of an identifier. It has 96 bits and a secret random key, so that equal fingerprints are
+/// equal identifiers: a search does not read the text.
+#[derive(Debug, Clone, Copy)]
+struct Fingerprint {
+    tag: u32,
+    rest: u64,
 }
 
 /// The conversations of one peer.
@@ -59,30 +67,82 @@ struct Account {
     ends: [Ends; 2],
 }
 
+/// A conversation with its place in the table.
+///
+/// With many conversations, misses of the cache are most of the time of a check. So a slot has what every
+/// message needs, in two cache lines. The rest is in [`Cold`], and behind pointers that an ordinary
+/// message does not follow.
 #[derive(Debug)]
+#[repr(C, align(64))]
 pub(crate) struct Slot {
-    pub(crate) conversation: Conversation,
-    /// Number of conversations that have used the slot.
-    pub(crate) generation: u32,
-    /// Time of the last message, in milliseconds of the monotonic clock.
-    pub(crate) touched: u64,
-    /// First conversation embedded in this one.
-    pub(crate) child: u32,
-    /// Next conversation with the same parent.
-    pub(crate) sibling: u32,
-    pub(crate) parent: u32,
-    /// The peer to which the conversation belongs, or [`NONE`] for the monitored agent.
-    pub(crate) peer: Name,
-    /// Bytes with which the peer is charged.
-    cost: usize,
-    /// Number of conversations that began before this one.
-    pub(crate) serial: u64,
     used: bool,
     list: List,
-    /// Value of `touched` when the conversation got its position in the lists.
-    listed: u64,
+    /// Time from the last change of its position in the lists to the last message, in milliseconds. It is
+    /// less than [`PRECISION`].
+    since_listed: u16,
+    /// Number of conversations that have used the slot.
+    pub(crate) generation: u32,
+    /// First conversation embedded in this one.
+    pub(crate) child: u32,
+    pub(crate) parent: u32,
+    /// Time of the last message, in milliseconds of the monotonic clock.
+    pub(crate) touched: u64,
+    /// See [`Fingerprint`]; 0 for an embedded conversation.
+    id_rest: u64,
+    pub(crate) conversation: Conversation,
+}
+
+/// What only the beginning and the end of a conversation need.
+#[derive(Debug)]
+struct Cold {
+    id: String,
+    /// Number of conversations that began before this one.
+    serial: u64,
+    /// Next conversation with the same parent.
+    sibling: u32,
+    /// The peer to which the conversation belongs, or [`NONE`] for the monitored agent.
+    peer: Name,
     /// Neighbors in the list of all conversations and in that of the peer.
     links: [Link; 2],
+}
+
+/// Slots in chunks. A growing number of them is not copied.
+#[derive(Debug, Default)]
+struct Slots {
+    /// All but the last one are full.
+    chunks: Vec<Vec<Slot>>,
+}
+
+/// Number of slots in a chunk.
+const CHUNK: usize = 256;
+
+impl Slots {
+    fn get(&self, at: u32) -> Option<&Slot> {
+        let at = at as usize;
+        self.chunks.get(at / CHUNK)?.get(at % CHUNK)
+    }
+
+    fn get_mut(&mut self, at: u32) -> Option<&mut Slot> {
+        let at = at as usize;
+        self.chunks.get_mut(at / CHUNK)?.get_mut(at % CHUNK)
+    }
+
+    fn iter(&self) -> impl Iterator<Item = &Slot> {
+        self.chunks.iter().flatten()
+    }
+
+    /// Adds a slot. Returns its index.
+    fn push(&mut self, slot: Slot) -> u32 {
+        if self.chunks.last().is_none_or(|last| last.len() == CHUNK) {
+            self.chunks.push(Vec::new());
+        }
+        let full = (self.chunks.len() - 1) * CHUNK;
+        let Some(last) = self.chunks.last_mut() else {
+            return NONE;
+        };
+        last.push(slot);
+        u32::try_from(full + last.len() - 1).unwrap_or(NONE)
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -115,7 +175,7 @@ const EMPTY: Ends = Ends {
 impl Slot {
     /// Bytes of a conversation with its entry in the index, which may be half empty, but without its
     /// allocations.
-    pub(crate) const COST: usize = size_of::<Self>() + 2 * size_of::<Indexed>();
+    pub(crate) const COST: usize = size_of::<Self>() + size_of::<Cold>() + 2 * size_of::<Indexed>();
 
     pub(crate) fn list(&self) -> List {
         self.list
@@ -125,7 +185,8 @@ impl Slot {
 impl Table {
     pub(crate) fn new(random: &RandomState) -> Self {
         Self {
-            slots: Vec::new(),
+            slots: Slots::default(),
+            cold: Vec::new(),
             free: Vec::new(),
             by_id: HashTable::new(),
             keys: ["first", "second"].map(|key| random.hash_one(key)),
@@ -156,17 +217,21 @@ impl Table {
     /// The conversations with this identifier, at most [`MAX_ALIKE`](crate::limits::MAX_ALIKE).
     #[inline]
     pub(crate) fn find_all<'t>(&'t self, id: &'t str) -> impl Iterator<Item = u32> + 't {
-        let id = self.fingerprint(id);
-        let [hash, _] = id;
-        let alike = self.by_id.iter_hash(hash).filter(move |one| one.id == id);
+        let Fingerprint { tag, rest } = self.fingerprint(id);
+        let alike = self.by_id.iter_hash(spread(tag)).filter(move |one| {
+            one.tag == tag && self.slot(one.at).is_some_and(|slot| slot.id_rest == rest)
+        });
         alike.map(|one| one.at)
     }
 
-    fn fingerprint(&self, id: &str) -> [u64; 2] {
+    fn fingerprint(&self, id: &str) -> Fingerprint {
         let [first, second] = self.keys;
         let hasher = SipHasher13::new_with_keys(first, second);
         let found = hasher.hash(id.as_bytes());
-        [found.h1, found.h2]
+        Fingerprint {
+            tag: u32::try_from(found.h1 >> 32).unwrap_or(0),
+            rest: found.h2,
+        }
     }
 
     #[cfg(test)]
@@ -176,17 +241,45 @@ impl Table {
 
     /// The main conversations: the time of the last message, the serial number and the slot.
     pub(crate) fn mains(&self) -> impl Iterator<Item = (u64, u64, u32)> + '_ {
-        let used = (0..).zip(&self.slots).filter(|(_, slot)| slot.used);
+        let used = (0..).zip(self.slots.iter()).filter(|(_, slot)| slot.used);
         used.filter(|(_, slot)| slot.parent == NONE)
-            .map(|(at, slot)| (slot.touched, slot.serial, at))
+            .map(|(at, slot)| (slot.touched, self.serial(at), at))
     }
 
     pub(crate) fn slot(&self, at: u32) -> Option<&Slot> {
-        self.slots.get(at as usize).filter(|slot| slot.used)
+        self.slots.get(at).filter(|slot| slot.used)
     }
 
     pub(crate) fn slot_mut(&mut self, at: u32) -> Option<&mut Slot> {
-        self.slots.get_mut(at as usize).filter(|slot| slot.used)
+        self.slots.get_mut(at).filter(|slot| slot.used)
+    }
+
+    fn cold(&self, at: u32) -> Option<&Cold> {
+        self.cold.get(at as usize)
+    }
+
+    fn cold_mut(&mut self, at: u32) -> Option<&mut Cold> {
+        self.cold.get_mut(at as usize)
+    }
+
+    /// Identifier of a conversation.
+    pub(crate) fn id(&self, at: u32) -> &str {
+        self.cold(at).map_or("", |cold| &cold.id)
+    }
+
+    /// Number of conversations that began before this one.
+    pub(crate) fn serial(&self, at: u32) -> u64 {
+        self.cold(at).map_or(0, |cold| cold.serial)
+    }
+
+    /// The next conversation with the same parent, or [`NONE`].
+    pub(crate) fn sibling(&self, at: u32) -> u32 {
+        self.cold(at).map_or(NONE, |cold| cold.sibling)
+    }
+
+    /// The peer to which a conversation belongs, or [`NONE`] for the monitored agent.
+    pub(crate) fn peer(&self, at: u32) -> Name {
+        self.cold(at).map_or(NONE, |cold| cold.peer)
     }
 
     pub(crate) fn oldest(&self, list: List) -> Option<u32> {
@@ -211,7 +304,7 @@ impl Table {
         if oldest != keep {
             return Some(oldest);
         }
-        let newer = self.slot(keep)?.links[kind].newer;
+        let newer = self.cold(keep)?.links[kind].newer;
         Some(newer).filter(|at| *at != NONE)
     }
 
@@ -225,29 +318,38 @@ impl Table {
         machine: u16,
         now: u64,
     ) -> u32 {
-        let at = self.free_slot(id);
-        if let Some(slot) = self.slots.get_mut(at as usize) {
+        let at = self.free_slot();
+        if let Some(slot) = self.slots.get_mut(at) {
             slot.used = true;
             slot.generation = slot.generation.wrapping_add(1);
-            slot.serial = self.begun;
-            slot.touched = now;
-            (slot.child, slot.sibling, slot.parent) = (NONE, NONE, parent);
-            (slot.peer, slot.cost) = (peer, 0);
+            (slot.touched, slot.id_rest) = (now, 0);
+            (slot.child, slot.parent) = (NONE, parent);
             slot.conversation.machine = machine;
+        }
+        if let Some(cold) = self.cold.get_mut(at as usize) {
+            cold.id.push_str(id);
+            let capacity = cold.id.capacity();
+            (cold.serial, cold.sibling, cold.peer) = (self.begun, NONE, peer);
+            if let Some(slot) = self.slots.get_mut(at) {
+                slot.conversation.charge(capacity);
+            }
         }
         self.len += 1;
         self.begun += 1;
         self.account(peer).len += 1;
         if parent == NONE {
-            let id = self.fingerprint(id);
-            let [hash, _] = id;
-            let entry = Indexed { id, at };
-            self.by_id.insert_unique(hash, entry, |one| one.id[0]);
+            let Fingerprint { tag, rest } = self.fingerprint(id);
+            if let Some(slot) = self.slots.get_mut(at) {
+                slot.id_rest = rest;
+            }
+            let entry = Indexed { tag, at };
+            self.by_id
+                .insert_unique(spread(tag), entry, |one| spread(one.tag));
             self.append(at, List::Open);
         } else {
             let first = self.slot(parent).map_or(NONE, |slot| slot.child);
-            if let Some(slot) = self.slot_mut(at) {
-                slot.sibling = first;
+            if let Some(cold) = self.cold_mut(at) {
+                cold.sibling = first;
             }
             if let Some(slot) = self.slot_mut(parent) {
                 slot.child = at;
@@ -263,11 +365,13 @@ impl Table {
             return false;
         };
         let cost = Slot::COST + slot.conversation.allocated();
-        if cost == slot.cost {
+        let stored = u32::try_from(cost).unwrap_or(u32::MAX);
+        let before = std::mem::replace(&mut slot.conversation.cost, stored);
+        if stored == before {
             return false;
         }
-        let before = std::mem::replace(&mut slot.cost, cost);
-        let peer = slot.peer;
+        let [cost, before] = [stored, before].map(|bytes| bytes as usize);
+        let peer = self.peer(at);
         self.bytes = (self.bytes + cost).saturating_sub(before);
         let account = self.account(peer);
         account.bytes = (account.bytes + cost).saturating_sub(before);
@@ -288,41 +392,28 @@ impl Table {
             .into_mut()
     }
 
-    fn free_slot(&mut self, id: &str) -> u32 {
+    fn free_slot(&mut self) -> u32 {
         if let Some(at) = self.free.pop() {
-            if let Some(slot) = self.slots.get_mut(at as usize) {
-                slot.conversation.id.clear();
-                slot.conversation.id.push_str(id);
-            }
             return at;
         }
-        self.slots.push(Slot {
-            conversation: Conversation {
-                id: id.to_owned(),
-                machine: 0,
-                initiator: NONE,
-                parties: SmallVec::new(),
-                bound: SmallVec::new(),
-                joined: false,
-                reply_to: Vec::new(),
-                unnamed: None,
-                rare: None,
-                charged_names: 0,
-            },
-            generation: 0,
-            touched: 0,
-            child: NONE,
-            sibling: NONE,
-            parent: NONE,
-            peer: NONE,
-            cost: 0,
+        self.cold.push(Cold {
+            id: String::new(),
             serial: 0,
-            used: false,
-            list: List::Open,
-            listed: 0,
+            sibling: NONE,
+            peer: NONE,
             links: [UNLINKED; 2],
         });
-        u32::try_from(self.slots.len() - 1).unwrap_or(NONE)
+        self.slots.push(Slot {
+            used: false,
+            list: List::Open,
+            since_listed: 0,
+            generation: 0,
+            child: NONE,
+            parent: NONE,
+            touched: 0,
+            id_rest: 0,
+            conversation: Conversation::unused(),
+        })
     }
 
     /// Updates the time and the list of a main conversation.
@@ -330,8 +421,12 @@ impl Table {
         let Some(slot) = self.slot_mut(at) else {
             return;
         };
+        let listed = slot.touched.saturating_sub(u64::from(slot.since_listed));
         slot.touched = now;
-        if slot.list == list && now < slot.listed.saturating_add(PRECISION) {
+        // The clock may have been set back.
+        let since = u16::try_from(now.saturating_sub(listed)).unwrap_or(u16::MAX);
+        if slot.list == list && since < PRECISION {
+            slot.since_listed = since;
             return;
         }
         self.unlink(at);
@@ -343,30 +438,27 @@ impl Table {
         let Some(slot) = self.slot(at) else {
             return;
         };
-        let (parent, peer, cost) = (slot.parent, slot.peer, slot.cost);
+        let (parent, cost) = (slot.parent, slot.conversation.cost as usize);
+        let peer = self.peer(at);
         if parent == NONE {
-            let [hash, _] = self.fingerprint(&slot.conversation.id);
-            if let Ok(found) = self.by_id.find_entry(hash, |one| one.at == at) {
+            let Fingerprint { tag, .. } = self.fingerprint(self.id(at));
+            if let Ok(found) = self.by_id.find_entry(spread(tag), |one| one.at == at) {
                 found.remove();
             }
             self.unlink(at);
         } else {
             self.leave_parent(at, parent);
         }
-        if let Some(slot) = self.slots.get_mut(at as usize) {
+        if let Some(slot) = self.slots.get_mut(at) {
             slot.used = false;
-            let conversation = &mut slot.conversation;
+            slot.conversation.clear();
+        }
+        if let Some(cold) = self.cold.get_mut(at as usize) {
+            cold.id.clear();
             // Large buffers are not kept for reuse.
-            if conversation.id.capacity() > KEPT {
-                conversation.id = String::new();
+            if cold.id.capacity() > KEPT {
+                cold.id = String::new();
             }
-            conversation.parties = SmallVec::new();
-            conversation.bound = SmallVec::new();
-            conversation.joined = false;
-            conversation.reply_to = Vec::new();
-            conversation.unnamed = None;
-            conversation.rare = None;
-            conversation.charged_names = 0;
         }
         self.free.push(at);
         self.len -= 1;
@@ -384,12 +476,12 @@ impl Table {
     }
 
     fn leave_parent(&mut self, at: u32, parent: u32) {
-        let next = self.slot(at).map_or(NONE, |slot| slot.sibling);
+        let next = self.sibling(at);
         let mut before = None;
         let mut current = self.slot(parent).map_or(NONE, |slot| slot.child);
         while current != NONE && current != at {
             before = Some(current);
-            current = self.slot(current).map_or(NONE, |slot| slot.sibling);
+            current = self.sibling(current);
         }
         match before {
             None => {
@@ -398,8 +490,8 @@ impl Table {
                 }
             }
             Some(before) => {
-                if let Some(slot) = self.slot_mut(before) {
-                    slot.sibling = next;
+                if let Some(cold) = self.cold_mut(before) {
+                    cold.sibling = next;
                 }
             }
         }
@@ -410,18 +502,18 @@ impl Table {
             return;
         };
         slot.list = list;
-        slot.listed = slot.touched;
-        let peer = slot.peer;
+        slot.since_listed = 0;
+        let peer = self.peer(at);
         for kind in [ALL, PEERS] {
             let newest = self.ends_of(kind, peer, list).newest;
-            if let Some(slot) = self.slot_mut(at) {
-                slot.links[kind] = Link {
+            if let Some(cold) = self.cold_mut(at) {
+                cold.links[kind] = Link {
                     older: newest,
                     newer: NONE,
                 };
             }
-            match self.slot_mut(newest) {
-                Some(slot) => slot.links[kind].newer = at,
+            match self.cold_mut(newest) {
+                Some(cold) => cold.links[kind].newer = at,
                 None => self.ends_of(kind, peer, list).oldest = at,
             }
             self.ends_of(kind, peer, list).newest = at;
@@ -432,15 +524,19 @@ impl Table {
         let Some(slot) = self.slot(at) else {
             return;
         };
-        let (peer, list, links) = (slot.peer, slot.list, slot.links);
+        let list = slot.list;
+        let Some(Cold { peer, links, .. }) = self.cold(at) else {
+            return;
+        };
+        let (peer, links) = (*peer, *links);
         for kind in [ALL, PEERS] {
             let Link { older, newer } = links[kind];
-            match self.slot_mut(older) {
-                Some(slot) => slot.links[kind].newer = newer,
+            match self.cold_mut(older) {
+                Some(cold) => cold.links[kind].newer = newer,
                 None => self.ends_of(kind, peer, list).oldest = newer,
             }
-            match self.slot_mut(newer) {
-                Some(slot) => slot.links[kind].older = older,
+            match self.cold_mut(newer) {
+                Some(cold) => cold.links[kind].older = older,
                 None => self.ends_of(kind, peer, list).newest = older,
             }
         }
@@ -471,8 +567,11 @@ mod tests {
         let mut names = Vec::new();
         let mut at = table.oldest(list);
         while let Some(slot) = at.and_then(|at| table.slot(at)) {
-            names.push(slot.conversation.id.clone());
-            at = Some(slot.links[ALL].newer);
+            let Some(cold) = at.filter(|_| slot.used).and_then(|at| table.cold(at)) else {
+                break;
+            };
+            names.push(cold.id.clone());
+            at = Some(cold.links[ALL].newer);
         }
         names
     }
@@ -504,6 +603,25 @@ mod tests {
     }
 
     #[test]
+    fn a_conversation_moves_in_its_list_at_most_once_a_second() {
+        let mut table = Table::new(&RandomState::new());
+        let [a, _] = ["a", "b"].map(|id| table.insert(id, NONE, 7, 0, 1));
+        for now in [400, 800, 1_000] {
+            table.touch(a, List::Open, now);
+            assert_eq!(order(&table, List::Open), ["a", "b"], "{now}");
+            assert_eq!(table.slot(a).unwrap().touched, now);
+        }
+        table.touch(a, List::Open, 1_001);
+        assert_eq!(order(&table, List::Open), ["b", "a"]);
+        // The clock was set back, and then by hours forward.
+        for now in [500, 1_499, 90_000_000] {
+            table.touch(a, List::Open, now);
+            assert_eq!(order(&table, List::Open), ["b", "a"], "{now}");
+            assert_eq!(table.slot(a).unwrap().touched, now);
+        }
+    }
+
+    #[test]
     fn each_peer_has_a_list_and_is_charged() {
         let mut table = Table::new(&RandomState::new());
         let a = table.insert("a", NONE, 1, 0, 1);
@@ -520,7 +638,7 @@ mod tests {
         let (count, bytes) = table.of_peer(1);
         assert_eq!(count, 3);
         assert_eq!(bytes + table.of_peer(2).1, table.bytes());
-        table.slot_mut(a).unwrap().conversation.charged_names = 500;
+        table.slot_mut(a).unwrap().conversation.charge(500);
         table.charge(a);
         assert_eq!(table.of_peer(1), (3, bytes + 500));
         for at in [child, c, a, b] {
@@ -536,9 +654,32 @@ mod tests {
             let mut table = Table::new(&RandomState::new());
             let at = table.insert(&"x".repeat(len), NONE, 7, 0, 1);
             table.remove(at);
-            let left = table.slots[at as usize].conversation.id.capacity();
+            let left = table.cold[at as usize].id.capacity();
             assert_eq!(left >= len, kept, "{len}: {left}");
         }
+    }
+
+    #[test]
+    fn what_every_message_needs_is_in_two_cache_lines() {
+        use crate::conversation::Party;
+
+        assert_eq!(size_of::<Party>(), 64);
+        assert_eq!(size_of::<Slot>(), 2 * 64);
+    }
+
+    #[test]
+    fn slots_are_found_in_all_chunks() {
+        let mut table = Table::new(&RandomState::new());
+        let ids: Vec<String> = (0..3 * CHUNK).map(|number| number.to_string()).collect();
+        for (at, id) in (0..).zip(&ids) {
+            assert_eq!(table.insert(id, NONE, 7, 0, 1), at);
+        }
+        for (at, id) in (0..).zip(&ids) {
+            assert_eq!(table.id(at), id);
+            assert_eq!(table.find(id), Some(at));
+        }
+        assert!(table.slot(u32::try_from(ids.len()).unwrap()).is_none());
+        assert!(table.slot(NONE).is_none());
     }
 
     #[test]
@@ -551,7 +692,7 @@ mod tests {
             let mut at = table.slot(main).unwrap().child;
             while at != NONE {
                 found.push(at);
-                at = table.slot(at).unwrap().sibling;
+                at = table.sibling(at);
             }
             found
         };

@@ -368,8 +368,34 @@ fn an_outsider_ends_no_conversation_of_roles() {
         assert_eq!(mediator.wrong(words), Kind::Stranger, "{act}");
         mediator.right(&["confirm sta>med", "agree med>dro"]);
     }
+    // Only the receiver of an undelivered message can answer it: it may have arrived.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    assert_eq!(drone.wrong("refuse mallory>dro"), Kind::Unexpected);
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    drone.right(&["refuse med>dro"]);
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    drone.right(&["request dro>other", "refuse other>dro"]);
+    // An agent that sends the first message has its role, also if the message was not delivered.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    drone.right(&["request mallory>dro", "request dro>med", "refuse med>dro"]);
+    assert_eq!(drone.monitor.len(), 2);
     // The station does not know the agent that is the drone.
     let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    let mut station = stage("sta");
+    station.right(&["query-if med>sta", "confirm sta>med", "inform dro>sta"]);
+    assert_eq!(station.wrong("confirm sta>med"), Kind::Unexpected);
+    let mut station = stage("sta");
+    station.right(&["query-if med>sta", "confirm sta>med"]);
+    station.lost("confirm sta>med");
+    station.right(&["inform mallory>sta"]);
+    assert_eq!(station.check("confirm sta>med"), unknown);
     let mut station = stage("sta");
     station.right(&["query-if med>sta", "confirm sta>med", "inform mallory>sta"]);
     assert_eq!(station.check("inform dro>sta"), unknown);

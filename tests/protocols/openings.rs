@@ -124,6 +124,34 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_bidders_of_an_auction_are_the_agents_that_its_receivers_stand_for() {
+    let (here, there) = two(&["monitor.check=enforce"]).await;
+    let rover = here.register("rover").await.unwrap();
+    let _arms = [
+        there.register("arm_1").await.unwrap(),
+        there.register("arm_2").await.unwrap(),
+    ];
+    let both = ["arm_1", "arm_2"];
+    let options = RegisterOptions::default;
+    let _platoon = here.form("platoon", both, None, options()).unwrap();
+    let _led = here.form("led", both, Some("arm_2"), options()).unwrap();
+    let one = ["arm_2"];
+    for (receivers, bidders) in [
+        (&["platoon"][..], &both[..]),
+        (&["led"], &one),
+        (&["arm_.*"], &both),
+        (&["led", "arm_2", "led"], &one),
+    ] {
+        let opening = || rover.message(Performative::Inform);
+        let receivers = ids(receivers);
+        let english = rover.english_auction(opening(), &receivers).await.unwrap();
+        assert_eq!(english.bidders(), ids(bidders));
+        let dutch = rover.dutch_auction(opening(), &receivers).await.unwrap();
+        assert_eq!(dutch.bidders(), ids(bidders));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_request_needs_receivers_that_stand_for_one_agent() {
     let (here, there) = two(&["monitor.check=enforce"]).await;
     let rover = here.register("rover").await.unwrap();
@@ -136,12 +164,39 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
     let _platoon = here.form("platoon", both, None, options()).unwrap();
     let _led = here.form("led", both, Some("arm_2"), options()).unwrap();
     for several in ["platoon", "arm_.*"] {
-        let lift = rover
-            .message(Performative::Request)
-            .receivers(ids(&[several]));
-        match rover.request(lift, PATIENCE).await {
-            Err(DialogueError::Several { agents }) => assert_eq!(agents, both),
-            other => panic!("{other:?}"),
+        let to = |act| rover.message(act).receivers(ids(&[several]));
+        let refused = [
+            rover
+                .request(to(Performative::Request), PATIENCE)
+                .await
+                .err(),
+            rover.query(to(Performative::QueryIf), PATIENCE).await.err(),
+            rover
+                .request_when(to(Performative::RequestWhen), PATIENCE)
+                .await
+                .err(),
+            rover
+                .propose(to(Performative::Propose), PATIENCE)
+                .await
+                .err(),
+            rover
+                .subscribe(to(Performative::Subscribe), PATIENCE)
+                .await
+                .err(),
+            rover
+                .brokering(to(Performative::Proxy), PATIENCE)
+                .await
+                .err(),
+            rover
+                .recruiting(to(Performative::Proxy), PATIENCE)
+                .await
+                .err(),
+        ];
+        for refused in refused {
+            match refused {
+                Some(DialogueError::Several { agents }) => assert_eq!(agents, both),
+                other => panic!("{several}: {other:?}"),
+            }
         }
     }
     for one in ["led", ".*_2"] {

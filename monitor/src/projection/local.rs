@@ -250,10 +250,14 @@ impl LocalRun {
             first.filter(|first| taken.iter().all(|part| one(part) == *first))
         };
         let roles = (same(&|(part, _)| part.role), same(&|(_, peer)| *peer));
-        let taken = taken.into_iter().map(|(part, _)| part).collect();
+        let taken: Vec<Part> = taken.into_iter().map(|(part, _)| part).collect();
         let before = std::mem::replace(&mut self.parts, taken);
         self.without_last = match message.own {
-            true => before,
+            // An agent that sends a message knows its role.
+            true => {
+                let has = |part: &Part| self.parts.iter().any(|own| own.role == part.role);
+                before.into_iter().filter(has).collect()
+            }
             // A message that does not fit without the last one shows that it has arrived.
             false => {
                 let without = after(&self.without_last, locals, message);

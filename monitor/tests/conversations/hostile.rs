@@ -314,7 +314,7 @@ fn the_oldest_conversation_of_a_peer_cannot_grow_beyond_its_share() {
     for id in 0..20 {
         stage.right(call(id, id));
     }
-    for number in 20..250 {
+    for number in 20..260 {
         stage.right(call(0, number));
         assert!(stage.monitor.bytes() <= 1 << 20);
     }

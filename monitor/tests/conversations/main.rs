@@ -470,6 +470,12 @@ fn brokers_run_embedded_protocols() {
     stage.right(say_in("fipa-propose", "propose bro>zoe"));
     stage.right(broker("agree bro>ann"));
     stage.right(say_in("fipa-query", "query-ref bro>ben,cid"));
+    // The report of a message transport service begins no conversation.
+    let lost = say_in("fipa-request", "failure bro>ann").undelivered_to("bro");
+    assert_eq!(
+        stage.check(&lost),
+        Verdict::Unchecked(Unchecked::UnknownHistory)
+    );
     stage.right(say_in("fipa-request", "request bro>dan"));
     // A violation in the existing query does not begin another one.
     let own = stage.wrong(say_in("fipa-query", "inform bro>cid"));

@@ -578,9 +578,10 @@ impl<'l> Conversation<'l> {
             return Err("too-many");
         }
         let mut inner = Conversation::new(machine, words.from, self.agent);
-        let verdict = inner
-            .check(words, now)
-            .map_err(|_| first_wrong.unwrap_or("not-opened"))?;
+        // The report of a service begins no conversation.
+        let verdict = Some(()).filter(|()| begins(machine, words.act));
+        let verdict = verdict.and_then(|()| inner.check(words, now).ok());
+        let verdict = verdict.ok_or(first_wrong.unwrap_or("not-opened"))?;
         self.inner.insert(0, inner);
         Ok(verdict)
     }

@@ -1,0 +1,82 @@
+//! The parties of a conversation.
+
+use std::ops::{Deref, DerefMut};
+
+use crate::conversation::{Details, Party};
+
+/// The parties of a conversation. A single one needs no allocation, and is in the cache line after the other
+/// fields: see [`Slot`](crate::table::Slot).
+#[derive(Debug)]
+pub(crate) enum Parties {
+    /// No party, and a buffer for the next one.
+    None(Option<Box<Details>>),
+    One(Party),
+    Many(Vec<Party>),
+}
+
+impl Parties {
+    pub(crate) fn push(&mut self, mut party: Party) {
+        match std::mem::take(self) {
+            Self::None(buffer) => {
+                party.details = party.details.or(buffer);
+                *self = Self::One(party);
+            }
+            Self::One(first) => *self = Self::Many(vec![first, party]),
+            Self::Many(mut all) => {
+                all.push(party);
+                *self = Self::Many(all);
+            }
+        }
+    }
+
+    /// Removes the parties. A buffer of the first one is kept.
+    pub(crate) fn clear(&mut self) {
+        let mut buffer = match std::mem::take(self) {
+            Self::None(buffer) => buffer,
+            Self::One(party) => party.details,
+            Self::Many(_) => None,
+        };
+        if let Some(buffer) = &mut buffer {
+            **buffer = Details::default();
+        }
+        *self = Self::None(buffer);
+    }
+
+    /// Bytes that the parties have allocated.
+    pub(crate) fn allocated(&self) -> usize {
+        let own = match self {
+            Self::None(buffer) => buffer.as_ref().map_or(0, |_| size_of::<Details>()),
+            Self::One(_) => 0,
+            Self::Many(all) => all.capacity() * size_of::<Party>(),
+        };
+        own + self.iter().map(Party::allocated).sum::<usize>()
+    }
+}
+
+impl Default for Parties {
+    fn default() -> Self {
+        Self::None(None)
+    }
+}
+
+impl Deref for Parties {
+    type Target = [Party];
+
+    fn deref(&self) -> &[Party] {
+        match self {
+            Self::None(_) => &[],
+            Self::One(party) => std::slice::from_ref(party),
+            Self::Many(all) => all,
+        }
+    }
+}
+
+impl DerefMut for Parties {
+    fn deref_mut(&mut self) -> &mut [Party] {
+        match self {
+            Self::None(_) => &mut [],
+            Self::One(party) => std::slice::from_mut(party),
+            Self::Many(all) => all,
+        }
+    }
+}
