@@ -3,9 +3,9 @@
 use std::sync::OnceLock;
 
 use bytes::Bytes;
-use fipa_acl::{
-    DecodeError, Letter, Message, MessageIndex, MessageView, Performative, Representation, Text,
-};
+use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
+#[cfg(feature = "protocols")]
+use fipa_acl::{Performative, Text};
 use fipa_mts::core::Received;
 use fipa_transport::Kind;
 #[cfg(feature = "protocols")]
@@ -119,11 +119,13 @@ impl Incoming {
     }
 
     /// Whether the message has this communicative act of the standard.
+    #[cfg(feature = "protocols")]
     pub(crate) fn is(&self, performative: &Performative) -> bool {
         self.parts.index.is(performative)
     }
 
     /// Returns the conversation identifier without a view of the other parameters.
+    #[cfg(feature = "protocols")]
     pub(crate) fn conversation_id(&self) -> Option<Text<'_>> {
         self.parts
             .index
@@ -137,6 +139,7 @@ impl Incoming {
     }
 
     /// Returns the ontology without a view of the other parameters.
+    #[cfg(feature = "protocols")]
     pub(crate) fn ontology(&self) -> Option<Text<'_>> {
         self.parts.index.ontology(self.parts.letter.payload())
     }

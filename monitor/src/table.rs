@@ -92,7 +92,7 @@ pub(crate) struct Slot {
     pub(crate) conversation: Conversation,
 }
 
-/// What only the beginning and the end of a conversation need.
+/// The parts that only the beginning and the end of a conversation need.
 #[derive(Debug)]
 struct Cold {
     id: String,

@@ -27,7 +27,7 @@ const OWN: Incarnation = Incarnation::from_u64(1);
 /// Agents of another process of this host.
 const AGENTS: u64 = 40;
 
-/// What happened, in order.
+/// The events, in order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Event {
     Heard(String),
