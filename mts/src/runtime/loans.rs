@@ -17,8 +17,8 @@ const LOAN_FROM: usize = 4096;
 impl Mts {
     /// Allocates memory for the content of a letter from this agent to these receivers (names or
     /// patterns), to be filled in place: shared memory if the letter's first route is shared
-    /// memory and the content is not [short](LOAN_FROM), otherwise heap memory. `head_room` and `tail_room` are the lengths of the encoded
-    /// data before and after the content.
+    /// memory and the content has at least 4 KiB, otherwise heap memory. `head_room` and `tail_room`
+    /// are the lengths of the encoded data before and after the content.
     pub fn loan(
         &self,
         sender: Incarnation,
