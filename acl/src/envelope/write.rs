@@ -528,7 +528,7 @@ impl Writer {
     /// otherwise take it for a text in another form, for the end of a list (01), or for the code
     /// (0a) that JADE writes in front of stamps.
     fn string(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
-        if memchr::memchr(0, text.as_bytes()).is_some() {
+        if text.as_bytes().contains(&0) {
             return Err(EncodeError::Nul(what));
         }
         let bare = string_form(text.as_bytes()).0 == Form::Bare
