@@ -157,6 +157,25 @@ fn an_answer_that_crossed_an_undelivered_cancel_is_accepted() {
 }
 
 #[test]
+fn an_undelivered_cancel_that_a_message_crossed_is_taken_back() {
+    let subscribe = |words| say_in("fipa-subscribe", words);
+    for (lost, is_taken_back) in [("x", true), ("another", false)] {
+        let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+        stage.right(subscribe("subscribe ann>ben").reply_with("s"));
+        stage.right(subscribe("agree ben>ann").in_reply_to("s"));
+        let cancel = |id| subscribe("cancel ann>ben").reply_with(id);
+        stage.right(cancel("x"));
+        stage.right(subscribe("inform ben>ann").in_reply_to("s"));
+        let now = stage.now;
+        stage.monitor.undelivered(&cancel(lost), "ben", now);
+        match is_taken_back {
+            true => assert_eq!(stage.right(cancel("y")), "cancelling"),
+            false => drop(stage.wrong(cancel("y"))),
+        }
+    }
+}
+
+#[test]
 fn valid_deadlines_are_kept_among_many_stale_ones() {
     let mut stage = Stage::observer();
     let due = Time::from_system_time(stage.now + Duration::from_secs(50)).unwrap();

@@ -36,6 +36,19 @@ fn a_peer_evicts_only_its_own_conversations() {
 }
 
 #[test]
+fn a_later_message_may_not_name_more_bytes_than_the_share_of_a_peer() {
+    let mut limits = Limits::default();
+    limits.bytes = 1 << 20;
+    let mut stage = Stage::new(Monitor::agent(library(), "ben").with_limits(limits));
+    stage.right(request("request ann>ben"));
+    let long = |number: usize| format!("{number}{}", "x".repeat(4_000));
+    let agree = request("agree ben>ann").reply_to((0..60).map(long));
+    assert_eq!(stage.wrong(agree).kind, Kind::TooMany);
+    assert!(stage.monitor.bytes() < (1 << 20) / 8);
+    stage.right(request("agree ben>ann").reply_to([long(0)]));
+}
+
+#[test]
 fn the_bytes_of_a_peer_are_bounded() {
     let mut limits = Limits::default();
     limits.bytes = 8 << 20;
