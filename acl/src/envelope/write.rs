@@ -80,12 +80,7 @@ impl Message {
     /// # Errors
     /// The envelope cannot represent a value.
     pub fn to_letter(&self, date: Time) -> Result<Letter, EncodeError> {
-        let content = self.content.clone();
-        let letter = enclose(self, content.as_ref().map(Bytes::len), date)?;
-        Ok(match content {
-            Some(content) => letter.with_content(content),
-            None => letter,
-        })
+        EnvelopeTemplate::default().letter_of(self, date, false)
     }
 
     /// Encodes the message as a new letter, as [`to_letter`](Self::to_letter) does, around content of
@@ -97,20 +92,8 @@ impl Message {
     /// # Errors
     /// `content_len` exceeds [`Message::MAX_CONTENT`], or the envelope cannot represent a value.
     pub fn to_letter_around(&self, content_len: usize, date: Time) -> Result<Letter, EncodeError> {
-        if content_len as u64 > Self::MAX_CONTENT {
-            return Err(EncodeError::ContentTooLong(content_len));
-        }
-        enclose(self, Some(content_len), date)
+        EnvelopeTemplate::default().letter_around(self, content_len, date, false)
     }
-}
-
-/// Encodes a letter without its content.
-fn enclose(
-    message: &Message,
-    content_len: Option<usize>,
-    date: Time,
-) -> Result<Letter, EncodeError> {
-    EnvelopeTemplate::default().enclose(message, content_len, date, false)
 }
 
 /// The envelope of the latest letter that was encoded with it.
@@ -136,12 +119,7 @@ impl EnvelopeTemplate {
     /// # Errors
     /// See [`Message::to_letter`].
     pub fn to_letter(&mut self, message: &Message, date: Time) -> Result<Letter, EncodeError> {
-        let content = message.content.clone();
-        let letter = self.enclose(message, content.as_ref().map(Bytes::len), date, true)?;
-        Ok(match content {
-            Some(content) => letter.with_content(content),
-            None => letter,
-        })
+        self.letter_of(message, date, true)
     }
 
     /// Encodes a message as [`Message::to_letter_around`] does.
@@ -154,10 +132,34 @@ impl EnvelopeTemplate {
         content_len: usize,
         date: Time,
     ) -> Result<Letter, EncodeError> {
+        self.letter_around(message, content_len, date, true)
+    }
+
+    fn letter_of(
+        &mut self,
+        message: &Message,
+        date: Time,
+        is_kept: bool,
+    ) -> Result<Letter, EncodeError> {
+        let content = message.content.clone();
+        let letter = self.enclose(message, content.as_ref().map(Bytes::len), date, is_kept)?;
+        Ok(match content {
+            Some(content) => letter.with_content(content),
+            None => letter,
+        })
+    }
+
+    fn letter_around(
+        &mut self,
+        message: &Message,
+        content_len: usize,
+        date: Time,
+        is_kept: bool,
+    ) -> Result<Letter, EncodeError> {
         if content_len as u64 > Message::MAX_CONTENT {
             return Err(EncodeError::ContentTooLong(content_len));
         }
-        self.enclose(message, Some(content_len), date, true)
+        self.enclose(message, Some(content_len), date, is_kept)
     }
 
     /// Encodes a letter without its content. Keeps its envelope if `is_kept`.
