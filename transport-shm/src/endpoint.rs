@@ -75,13 +75,18 @@ pub(crate) struct Endpoint {
 }
 
 impl Endpoint {
-    pub(crate) fn open(config: ShmConfig, runtime: Handle) -> Result<Arc<Self>, ShmError> {
+    /// Opens the endpoint. `generation` differs from that of all mailboxes that this process had before.
+    pub(crate) fn open(
+        config: ShmConfig,
+        generation: u64,
+        runtime: Handle,
+    ) -> Result<Arc<Self>, ShmError> {
         let domain = DomainFiles::new(&config)?;
         let budget = Arc::new(Budget::new(&config));
         // Under the lock, so that no other process takes unfinished files for those of a dead one.
         let lock = domain.enter()?;
         let domain = Arc::new(domain.for_endpoint());
-        let opened = Self::open_locked(config, runtime, budget, Arc::clone(&domain));
+        let opened = Self::open_locked(config, generation, runtime, budget, Arc::clone(&domain));
         // Before `domain` is dropped: after a failure, its last owner takes the lock to clean up.
         drop(lock);
         let endpoint = opened?;
@@ -91,6 +96,7 @@ impl Endpoint {
 
     fn open_locked(
         config: ShmConfig,
+        generation: u64,
         runtime: Handle,
         budget: Arc<Budget>,
         domain: Arc<DomainFiles>,
@@ -128,6 +134,7 @@ impl Endpoint {
         let (inbox, shortage) = storage::with_shortage(|| {
             Inbox::create(
                 &config,
+                generation,
                 &node,
                 &presence,
                 tally.clone(),
@@ -207,15 +214,6 @@ impl Endpoint {
             found.is_err_and(|error| error.kind() == ErrorKind::NotFound)
         };
         !self.files.iter().any(missing)
-    }
-
-    /// Removes what is left of these files after closing: iceoryx2 keeps the files of a mailbox
-    /// while content from it is held.
-    pub(crate) fn remove_files(&self) {
-        for file in &self.files {
-            // Mostly missing already.
-            let _ = std::fs::remove_file(file);
-        }
     }
 
     pub(crate) fn is_closed(&self) -> bool {
@@ -533,7 +531,7 @@ impl Endpoint {
         memory: MemoryLock,
     ) -> Result<Arc<Outbox>, TransportError> {
         let node = node.filter(|_| !self.is_closed()).ok_or_else(closed)?;
-        let name = mailbox_name(peer.incarnation());
+        let name = mailbox_name(peer.incarnation(), peer.page().words().generation());
         let service = ServiceName::new(&name).map_err(|e| {
             TransportError::new(
                 TransportErrorKind::Unreachable,

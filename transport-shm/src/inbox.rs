@@ -38,9 +38,14 @@ const _: () = assert!(ANSWERS <= storage::MAX_CHUNKS);
 /// answered at once.
 const MAX_LATE_ANSWERS: usize = ANSWERS / 2;
 
-/// Name of the mailbox of a process.
-pub(crate) fn mailbox_name(of: Incarnation) -> String {
-    format!("fipa/mail/{of}")
+/// Name of a mailbox of a process. Each mailbox has a name of its own: with the last reference to a
+/// mailbox, iceoryx2 removes the files of its name, and peers and content may hold a reference
+/// after the process has made the next mailbox.
+pub(crate) fn mailbox_name(of: Incarnation, generation: u64) -> String {
+    match generation {
+        0 => format!("fipa/mail/{of}"),
+        _ => format!("fipa/mail/{of}/{generation}"),
+    }
 }
 
 /// Location of the mailbox of a process.
@@ -75,15 +80,18 @@ impl Inbox {
         &self.service_hash
     }
 
-    /// Creates the mailbox.
+    /// Creates the mailbox. The caller holds the lock of the domain, so no peer reads the status
+    /// page before the mailbox exists.
     pub(crate) fn create(
         config: &ShmConfig,
+        generation: u64,
         node: &Node<Svc>,
         presence: &Presence,
         tally: Arc<Tally>,
         (peer_segments, deferred): (Arc<PeerSegments>, Arc<LateAnswers>),
     ) -> Result<Self, String> {
-        let name = ServiceName::new(&mailbox_name(config.incarnation)).map_err(debug)?;
+        let name =
+            ServiceName::new(&mailbox_name(config.incarnation, generation)).map_err(debug)?;
         let service = node
             .service_builder(&name)
             .request_response::<[u8], Ack>()
@@ -112,6 +120,7 @@ impl Inbox {
             .set_response_degradation_handler(|_, _| DegradationAction::Ignore)
             .create()
             .map_err(debug)?;
+        presence.page().words().set_generation(generation);
         if config.answers_late {
             presence.page().words().answer_late();
         }

@@ -45,6 +45,8 @@ pub struct ShmTransport {
 struct Listening {
     sink: Option<Arc<dyn Sink>>,
     task: Option<AbortHandle>,
+    /// Number of attempts to join the domain again.
+    rejoins: u64,
 }
 
 impl ShmTransport {
@@ -57,7 +59,7 @@ impl ShmTransport {
     /// memory cannot be allocated. Nothing is left open then.
     pub fn new(config: ShmConfig, runtime: Handle) -> Result<Self, ShmError> {
         Ok(Self {
-            endpoint: ArcSwap::new(Endpoint::open(config, runtime)?),
+            endpoint: ArcSwap::new(Endpoint::open(config, 0, runtime)?),
             listening: Mutex::default(),
             closed: AtomicBool::new(false),
         })
@@ -113,10 +115,15 @@ impl ShmTransport {
         if let Some(task) = listening.task.take() {
             task.abort();
         }
-        // Closed first, because both endpoints use the same file names.
+        // Closed first, because both endpoints use the same names for all files but those of the
+        // mailbox.
         before.close();
-        before.remove_files();
-        let endpoint = Endpoint::open(before.config().clone(), before.runtime().clone())?;
+        listening.rejoins += 1;
+        let endpoint = Endpoint::open(
+            before.config().clone(),
+            listening.rejoins,
+            before.runtime().clone(),
+        )?;
         if let Some(sink) = listening.sink.clone() {
             let started = start_listening(&endpoint, sink);
             listening.task = Some(started.map_err(|source| {

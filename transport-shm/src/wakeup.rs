@@ -17,8 +17,10 @@ pub(crate) struct StatusWords {
     answers_late: AtomicU32,
     /// Number of times the process has cleared its doorbell before it polled.
     wakeups: AtomicU64,
+    /// Tells this mailbox from earlier ones of the process. Set before the process listens.
+    generation: AtomicU64,
     /// Keeps `polls`, which changes often, in a cache line of its own.
-    _apart: [u64; 6],
+    _apart: [u64; 5],
     /// Number of times the process has found its mailbox empty, or emptied it.
     polls: AtomicU64,
     /// Keeps apart what the process and its peers write, also from processors that load two cache
@@ -77,6 +79,16 @@ impl StatusWords {
     /// Whether the process may answer parcels in another order than it takes them.
     pub(crate) fn answers_late(&self) -> bool {
         self.answers_late.load(Ordering::Acquire) != 0
+    }
+
+    /// States the generation of the mailbox: a part of its name.
+    pub(crate) fn set_generation(&self, generation: u64) {
+        self.generation.store(generation, Ordering::Release);
+    }
+
+    /// The generation of the mailbox: a part of its name.
+    pub(crate) fn generation(&self) -> u64 {
+        self.generation.load(Ordering::Acquire)
     }
 
     /// Announces a parcel, before it is put into the mailbox. The announcement is settled when the guard is
