@@ -13,6 +13,7 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::request_mut::RequestMut;
 use iceoryx2::request_mut_uninit::RequestMutUninit;
+use iceoryx2::response::Response as IceoryxResponse;
 use iceoryx2::response_mut_uninit::ResponseMutUninit;
 use zerocopy::{FromBytes, IntoBytes};
 
@@ -25,6 +26,7 @@ pub(crate) type UninitRequest = RequestMutUninit<Svc, [MaybeUninit<u8>], Header,
 pub(crate) type InitRequest = RequestMut<Svc, [u8], Header, Ack, ()>;
 pub(crate) type Pending = PendingResponse<Svc, [u8], Header, Ack, ()>;
 pub(crate) type Active = ActiveRequest<Svc, [u8], Header, Ack, ()>;
+pub(crate) type Response = IceoryxResponse<Svc, Ack, ()>;
 pub(crate) type UninitAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 
 /// Alignment of contents in bytes.

@@ -15,7 +15,7 @@ use fipa_transport::{
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::DegradationAction;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
-use parking_lot::Mutex;
+use parking_lot::{Mutex, MutexGuard};
 
 use crate::counters::{Tally, count};
 use crate::domain_files::DomainFiles;
@@ -25,7 +25,8 @@ use crate::errors::{
 };
 use crate::fork::Owner;
 use crate::layout::{
-    ALIGNMENT, Ack, Header, InitRequest, MailClient, Pending, PieceOffsets, Svc, UninitRequest,
+    ALIGNMENT, Ack, Header, InitRequest, MailClient, Pending, PieceOffsets, Response, Svc,
+    UninitRequest,
 };
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
@@ -36,6 +37,9 @@ use crate::storage;
 
 /// Length in bytes of the chunks of the first memory segment, headers included.
 const FIRST_CHUNK: usize = 4096;
+
+/// Maximum length of a parcel, in bytes, that stays unreleased when it is answered.
+const KEPT_ANSWERED: usize = 4096;
 
 /// Upper bound of the memory for a client and its connection, with a window of 128.
 const OPENING: u64 = 1 << 20;
@@ -81,6 +85,9 @@ pub(crate) struct Outbox {
 #[derive(Debug, Default)]
 struct State {
     queue: VecDeque<Sent>,
+    /// A copied parcel that was answered. It is released behind the next parcel, so that both processes
+    /// work at the same time.
+    answered: Option<AnsweredParcel>,
     /// The registered loans by the addresses of their contents; at most `max_loans` exist.
     loans: Vec<(usize, Weak<Loan>)>,
     segment: Segment,
@@ -120,6 +127,14 @@ enum SentMemory {
         /// Keeps the content in a segment that the letter refers to.
         _content: Bytes,
     },
+}
+
+/// The memory of an answered parcel.
+#[derive(Debug)]
+struct AnsweredParcel {
+    _answer: Option<Response>,
+    // After the answer, which came over the channel of this parcel.
+    memory: SentMemory,
 }
 
 /// The result of a dispatch.
@@ -282,6 +297,10 @@ impl Outbox {
         if self.is_retired() {
             return Ok(Posted::Retired);
         }
+        // iceoryx2 counts it as unanswered, and this parcel too.
+        if state.queue.len() + state.loans.len() + 2 > self.window {
+            state.answered = None;
+        }
         // Counted before it is sent: the answer may arrive before this returns, and the thread that
         // gets the wake-up looks for answers only if the count is not 0. It then waits for the lock
         // held here.
@@ -300,13 +319,7 @@ impl Outbox {
                         return Ok(Posted::Retired);
                     }
                     count(&self.tally.loans_sent);
-                    self.queue(
-                        &mut state,
-                        attempt,
-                        token,
-                        SentMemory::Loaned(loan),
-                        unanswered,
-                    );
+                    self.queue(state, attempt, token, SentMemory::Loaned(loan), unanswered);
                     return Ok(Posted::Sent);
                 }
                 None => count(&self.tally.loans_copied),
@@ -348,13 +361,13 @@ impl Outbox {
             }
             None => SentMemory::Own(pending),
         };
-        self.queue(&mut state, attempt, token, memory, unanswered);
+        self.queue(state, attempt, token, memory, unanswered);
         Ok(Posted::Sent)
     }
 
     fn queue(
         &self,
-        state: &mut State,
+        mut state: MutexGuard<'_, State>,
         attempt: AttemptId,
         token: u64,
         memory: SentMemory,
@@ -366,6 +379,9 @@ impl Outbox {
             memory,
         });
         unanswered.keep();
+        let answered = state.answered.take();
+        drop(state);
+        drop(answered);
     }
 
     fn not_delivered(&self, pending: &Pending) -> TransportError {
@@ -587,23 +603,39 @@ impl Outbox {
         if self.waiting() == 0 {
             return;
         }
-        while let Some((sent, conclusion)) = self.concluded(look) {
-            sent.forget();
-            concluded.push((sent.attempt, conclusion));
+        while let Some((attempt, conclusion, released)) = self.concluded(look) {
+            concluded.push((attempt, conclusion));
             // Dropped outside of the lock: this may be the last owner of a letter.
+            drop(released);
         }
     }
 
-    fn concluded(&self, look: AnswerLook) -> Option<(Sent, Conclusion)> {
+    /// Takes a parcel that is concluded out of the queue. Also returns memory to be released without the
+    /// lock.
+    fn concluded(
+        &self,
+        look: AnswerLook,
+    ) -> Option<(AttemptId, Conclusion, Option<AnsweredParcel>)> {
         let mut state = self.state.lock();
-        let (sent, conclusion) = match state.queue.front()?.conclusion(look) {
-            Some(conclusion) => (state.queue.pop_front()?, conclusion),
+        let (sent, end) = match state.queue.front()?.end(look) {
+            Some(end) => (state.queue.pop_front()?, end),
             // Otherwise the process answers in the order of the queue, or drops parcels unanswered.
-            None if self.page.words().answers_late() => concluded_behind_front(&mut state, look)?,
+            None if self.page.words().answers_late() => ended_behind_front(&mut state, look)?,
             None => return None,
         };
         self.waiting.decrement();
-        Some((sent, conclusion))
+        sent.forget();
+        let answered = AnsweredParcel {
+            _answer: end.answer,
+            memory: sent.memory,
+        };
+        let released = match &answered.memory {
+            SentMemory::Own(pending) if pending.payload().len() <= KEPT_ANSWERED => {
+                state.answered.replace(answered)
+            }
+            _ => Some(answered),
+        };
+        Some((sent.attempt, end.conclusion, released))
     }
 
     /// Whether an answer is probably available.
@@ -634,11 +666,26 @@ impl Outbox {
 
 /// Removes the first parcel behind the front that is concluded.
 #[cold]
-fn concluded_behind_front(state: &mut State, look: AnswerLook) -> Option<(Sent, Conclusion)> {
+fn ended_behind_front(state: &mut State, look: AnswerLook) -> Option<(Sent, End)> {
     let mut queue = state.queue.iter().enumerate().skip(1);
-    let (place, conclusion) =
-        queue.find_map(|(place, sent)| Some((place, sent.conclusion(look)?)))?;
-    Some((state.queue.remove(place)?, conclusion))
+    let (place, end) = queue.find_map(|(place, sent)| Some((place, sent.end(look)?)))?;
+    Some((state.queue.remove(place)?, end))
+}
+
+/// The end of a parcel.
+struct End {
+    conclusion: Conclusion,
+    /// The memory of the answer.
+    answer: Option<Response>,
+}
+
+impl From<Conclusion> for End {
+    fn from(conclusion: Conclusion) -> Self {
+        Self {
+            conclusion,
+            answer: None,
+        }
+    }
 }
 
 /// Number of unanswered parcels.
@@ -686,24 +733,22 @@ impl Sent {
         }
     }
 
-    fn conclusion(&self, look: AnswerLook) -> Option<Conclusion> {
-        let look = |pending: &Pending| self.conclusion_of(pending, look);
+    fn end(&self, look: AnswerLook) -> Option<End> {
+        let look = |pending: &Pending| self.end_of(pending, look);
         match &self.memory {
             SentMemory::Own(pending) | SentMemory::Referring { pending, .. } => look(pending),
             SentMemory::Loaned(loan) => loan.with_pending(look).flatten(),
         }
     }
 
-    fn conclusion_of(&self, pending: &Pending, look: AnswerLook) -> Option<Conclusion> {
+    fn end_of(&self, pending: &Pending, look: AnswerLook) -> Option<End> {
         if look == AnswerLook::Quick && !pending.has_response() {
             return None;
         }
         let ended = look == AnswerLook::Ended;
         let broken = |detail: String| {
-            Some(Conclusion::Unconfirmed(TransportError::new(
-                TransportErrorKind::Broken,
-                detail,
-            )))
+            let error = TransportError::new(TransportErrorKind::Broken, detail);
+            Some(Conclusion::Unconfirmed(error).into())
         };
         let mut answer = pending.receive();
         let dropped = matches!(answer, Ok(None)) && !pending.is_connected();
@@ -712,12 +757,15 @@ impl Sent {
             answer = pending.receive();
         }
         match answer {
-            Ok(Some(ack)) => Some(match ack.answer(self.token) {
-                Some(answer) => Conclusion::Answered(answer),
-                None => Conclusion::Unconfirmed(TransportError::new(
-                    TransportErrorKind::Incompatible,
-                    "the answer is malformed",
-                )),
+            Ok(Some(ack)) => Some(End {
+                conclusion: match ack.answer(self.token) {
+                    Some(answer) => Conclusion::Answered(answer),
+                    None => Conclusion::Unconfirmed(TransportError::new(
+                        TransportErrorKind::Incompatible,
+                        "the answer is malformed",
+                    )),
+                },
+                answer: Some(ack),
             }),
             Ok(None) if ended => broken("the other process ended before it answered".into()),
             Ok(None) if dropped => broken("the other process dropped it without an answer".into()),
