@@ -38,8 +38,8 @@ use crate::storage;
 /// Length in bytes of the chunks of the first memory segment, headers included.
 const FIRST_CHUNK: usize = 4096;
 
-/// Maximum length of a parcel, in bytes, that stays unreleased when it is answered.
-const KEPT_ANSWERED: usize = 4096;
+/// Length of the payload of a short parcel, in bytes. It fits a chunk of the first segment.
+const SHORT: usize = FIRST_CHUNK - header_len();
 
 /// Upper bound of the memory for a client and its connection, with a window of 128.
 const OPENING: u64 = 1 << 20;
@@ -88,6 +88,9 @@ struct State {
     /// A copied parcel that was answered. It is released behind the next parcel, so that both processes
     /// work at the same time.
     answered: Option<AnsweredParcel>,
+    /// Memory for the next short parcel, in the current segment. It is taken while the receiver has the
+    /// parcel before.
+    next: Option<UninitRequest>,
     /// The registered loans by the addresses of their contents; at most `max_loans` exist.
     loans: Vec<(usize, Weak<Loan>)>,
     segment: Segment,
@@ -203,7 +206,7 @@ impl Outbox {
         let most_loans = settings.max_loaned_requests();
         let builder = service
             .client_builder()
-            .initial_max_slice_len(FIRST_CHUNK - header_len())
+            .initial_max_slice_len(SHORT)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .set_request_degradation_handler(|_, _| DegradationAction::Ignore)
@@ -325,8 +328,13 @@ impl Outbox {
                 None => count(&self.tally.loans_copied),
             }
         }
-        let Some(mut request) = self.take(&mut state, offsets.end, lock)? else {
-            return Ok(Posted::Contended);
+        let next = state.next.take();
+        let mut request = match next.filter(|next| offsets.end <= next.payload().len()) {
+            Some(next) => next,
+            None => match self.take(&mut state, offsets.end, lock)? {
+                Some(request) => request,
+                None => return Ok(Posted::Contended),
+            },
         };
         let header = Header::new(&header, offset(offsets.start)?, self.own, token);
         *request.user_header_mut() = header.referring(reference);
@@ -380,6 +388,15 @@ impl Outbox {
         });
         unanswered.keep();
         let answered = state.answered.take();
+        if let Some(Sent {
+            memory: SentMemory::Own(pending),
+            ..
+        }) = state.queue.back()
+            && pending.payload().len() <= SHORT
+        {
+            // Without memory, the next parcel reports the error.
+            state.next = self.take(&mut state, SHORT, MemoryLock::Try).ok().flatten();
+        }
         drop(state);
         drop(answered);
     }
@@ -565,6 +582,8 @@ impl Outbox {
             && (chunk - segment.base).is_multiple_of(segment.stride)
             && (chunk - segment.base) / segment.stride < self.chunks;
         if !known {
+            // Of the segment before.
+            state.next = None;
             segment.number += 1;
             segment.base = chunk;
             segment.stride = (head + len).max(FIRST_CHUNK).next_power_of_two();
@@ -630,7 +649,7 @@ impl Outbox {
             memory: sent.memory,
         };
         let released = match &answered.memory {
-            SentMemory::Own(pending) if pending.payload().len() <= KEPT_ANSWERED => {
+            SentMemory::Own(pending) if pending.payload().len() <= SHORT => {
                 state.answered.replace(answered)
             }
             _ => Some(answered),
@@ -831,7 +850,7 @@ unsafe fn write(
 }
 
 /// Length of iceoryx2's header and `Header`, rounded up to the alignment of the payload.
-fn header_len() -> usize {
+const fn header_len() -> usize {
     use iceoryx2::service::header::request_response::RequestHeader;
     (size_of::<RequestHeader>() + size_of::<Header>()).next_multiple_of(ALIGNMENT)
 }
