@@ -106,8 +106,12 @@ pub struct EnvelopeTemplate {
     receivers: Vec<AgentId>,
     /// Empty before the first letter.
     envelope: Vec<u8>,
-    date: Range<usize>,
-    payload_length: Range<usize>,
+    /// The date of the envelope, and its place there.
+    date: Option<(Time, Range<usize>)>,
+    /// The payload length of the envelope, and its place there.
+    payload_length: (u64, Range<usize>),
+    /// Length of the letter without its content.
+    frame_len: usize,
 }
 
 /// Maximum length of an envelope that is kept, in bytes.
@@ -170,68 +174,108 @@ impl EnvelopeTemplate {
         date: Time,
         is_kept: bool,
     ) -> Result<Letter, EncodeError> {
-        let head_len = head_len(message, content_len);
-        let payload_len = (head_len + content_len.unwrap_or(0) + TAIL.len()) as u64;
-        let mut out = Vec::new();
+        if let Some(letter) = self.copy(message, content_len, date) {
+            return Ok(letter);
+        }
+        let payload_len = payload_len(head_len(message, content_len), content_len);
+        let mut writer = Writer::new(Dialect::Standard);
         // Enough for names of usual length, so that the buffer rarely grows.
         let names = 96 * message.receivers.len().min(16);
-        out.reserve(128 + names + head_len + TAIL.len());
-        if !self.copy(message, payload_len, date, &mut out) {
-            let mut writer = Writer {
-                out,
-                dialect: Dialect::Standard,
-            };
-            let (date, payload_length) = writer.envelope_of(message, payload_len, date)?;
-            out = writer.out;
-            if is_kept && out.len() <= MAX_TEMPLATE {
-                self.sender.clone_from(&message.sender);
-                self.receivers.clone_from(&message.receivers);
-                self.envelope.clone_from(&out);
-                (self.date, self.payload_length) = (date, payload_length);
-            }
+        writer.out.reserve(128 + names);
+        let places = writer.envelope_of(message, payload_len, date)?;
+        let out = writer.out;
+        let is_kept = is_kept && out.len() <= MAX_TEMPLATE;
+        if is_kept {
+            self.sender.clone_from(&message.sender);
+            self.receivers.clone_from(&message.receivers);
+            self.envelope.clone_from(&out);
+            self.date = Some((date, places.0));
+            self.payload_length = (payload_len, places.1);
         }
         let envelope_len = out.len();
-        append_head(message, content_len, &mut out);
-        let tail = match content_len {
-            Some(_) => Bytes::from_static(TAIL),
-            None => {
-                out.slice(TAIL);
-                Bytes::new()
-            }
-        };
-        let mut envelope = Bytes::from(out);
-        let head = envelope.split_off(envelope_len);
-        let payload = Payload {
-            head,
-            content: Bytes::new(),
-            tail,
-        };
-        Ok(Letter::new(envelope, payload))
+        let out = with_head(out, message, content_len);
+        if is_kept {
+            self.frame_len = out.len();
+        }
+        Ok(framed(out, envelope_len, content_len))
     }
 
-    /// Writes the envelope of this message as a changed copy. Returns false and writes nothing if sender,
-    /// receivers or the length of a parameter differ.
-    fn copy(&self, message: &Message, payload_len: u64, date: Time, out: &mut Vec<u8>) -> bool {
-        if self.envelope.is_empty()
-            || self.sender != message.sender
-            || self.receivers != message.receivers
-        {
-            return false;
+    /// Encodes a letter without its content, with a changed copy of the envelope. Returns `None` if
+    /// sender, receivers or the length of a parameter differ.
+    fn copy(
+        &mut self,
+        message: &Message,
+        content_len: Option<usize>,
+        date: Time,
+    ) -> Option<Letter> {
+        if self.sender != message.sender || self.receivers != message.receivers {
+            return None;
         }
+        let (of_envelope, place) = self.date.as_mut()?;
+        if *of_envelope != date {
+            let end = self.envelope.len();
+            write_date_time(date, &mut self.envelope);
+            if !replace(&mut self.envelope, end, place) {
+                self.envelope.truncate(end);
+                return None;
+            }
+            *of_envelope = date;
+        }
+        let envelope_len = self.envelope.len();
+        let mut out = Vec::with_capacity(self.frame_len);
         out.slice(&self.envelope);
-        // Each parameter is written behind the envelope first, and replaces the old one if it has
-        // the same length.
-        let end = out.len();
-        write_date_time(date, out);
-        let is_replaced = replace(out, end, &self.date) && {
-            write_digits(payload_len, out);
-            replace(out, end, &self.payload_length)
-        };
-        if !is_replaced {
-            out.clear();
+        let mut out = with_head(out, message, content_len);
+        let head_len = out.len() - envelope_len - own_tail(content_len).len();
+        let payload_len = payload_len(head_len, content_len);
+        let (of_envelope, place) = &mut self.payload_length;
+        if *of_envelope != payload_len {
+            write_digits(payload_len, &mut self.envelope);
+            if !replace(&mut self.envelope, envelope_len, place) {
+                self.envelope.truncate(envelope_len);
+                return None;
+            }
+            *of_envelope = payload_len;
+            let changed = self.envelope.get(place.clone())?;
+            out.get_mut(place.clone())?.copy_from_slice(changed);
         }
-        is_replaced
+        self.frame_len = out.len();
+        Some(framed(out, envelope_len, content_len))
     }
+}
+
+fn payload_len(head_len: usize, content_len: Option<usize>) -> u64 {
+    (head_len + content_len.unwrap_or(0) + TAIL.len()) as u64
+}
+
+/// The bytes behind the content, which follow the head at once if there is no content.
+fn own_tail(content_len: Option<usize>) -> &'static [u8] {
+    match content_len {
+        Some(_) => &[],
+        None => TAIL,
+    }
+}
+
+/// Appends the message without its content to its envelope.
+fn with_head(mut envelope: Vec<u8>, message: &Message, content_len: Option<usize>) -> Vec<u8> {
+    append_head(message, content_len, &mut envelope);
+    envelope.slice(own_tail(content_len));
+    envelope
+}
+
+/// A letter whose content is still missing, from its envelope and the message behind it.
+fn framed(envelope_and_head: Vec<u8>, envelope_len: usize, content_len: Option<usize>) -> Letter {
+    let mut envelope = Bytes::from(envelope_and_head);
+    let head = envelope.split_off(envelope_len);
+    let tail = match content_len {
+        Some(_) => Bytes::from_static(TAIL),
+        None => Bytes::new(),
+    };
+    let payload = Payload {
+        head,
+        content: Bytes::new(),
+        tail,
+    };
+    Letter::new(envelope, payload)
 }
 
 /// Moves the bytes from `end` to this range, if they have its length.
