@@ -213,6 +213,9 @@ struct Slot {
     complete: Notify,
 }
 
+/// Maximum number of expected outcomes for which memory is reserved.
+const FEW_OUTCOMES: usize = 64;
+
 /// Number of expected outcomes of a letter whose receivers are not resolved yet.
 const UNRESOLVED: usize = usize::MAX;
 
@@ -424,6 +427,10 @@ impl Mts {
             state.sends.insert(id, Arc::clone(&slot));
         }
         self.shared.carry_out(state);
+        if expected <= FEW_OUTCOMES {
+            // While the receiver has the letter.
+            slot.outcomes.lock().known.reserve(expected);
+        }
         Sending {
             shared: Arc::clone(&self.shared),
             slot,
