@@ -112,6 +112,49 @@ fn a_full_window_is_an_error() {
 }
 
 #[test]
+fn an_answered_parcel_takes_no_place_in_the_window_and_its_successor_no_loan() {
+    let domain = TestDomain::new();
+    let config = domain.config();
+    let (sender, sink) = domain.listening();
+    let (receiver, received) = domain.listening();
+    let to = receiver.location();
+    send_until_accepted((&sender, &sink), &receiver);
+    let dispatch = |content: &'static [u8]| {
+        let sent = sender.dispatch(attempt(), &to, parcel(Bytes::from_static(content)));
+        sent.map_err(|error| error.fault)
+    };
+    let answered = |number: usize| {
+        until("answers", || {
+            sender.drive();
+            sink.conclusions() == number
+        });
+    };
+    // The short parcel is answered, and memory is taken for another one.
+    let before = sink.conclusions();
+    dispatch(b"short").unwrap();
+    answered(before + 1);
+    let loans: Vec<_> = (0..config.max_loans)
+        .map(|_| sender.loan(&to, 100, 100, 1).unwrap().unwrap())
+        .collect();
+    // One that is too long for that memory can be sent beside all loans, too.
+    dispatch(&[7; 10_000]).unwrap();
+    answered(before + 2);
+    dispatch(b"short").unwrap();
+    answered(before + 3);
+    drop(loans);
+    // The receiver waits within the first of these parcels.
+    let stopped = received.arrived.lock().unwrap();
+    for _ in 0..config.window {
+        dispatch(b"short").unwrap();
+    }
+    assert_eq!(dispatch(b"short"), Err(TransportErrorKind::Congested));
+    drop(stopped);
+    answered(before + 3 + config.window);
+    dispatch(b"short").unwrap();
+    answered(before + 4 + config.window);
+}
+
+#[test]
 fn an_abandoned_parcel_does_not_hide_later_ones() {
     let domain = TestDomain::new();
     let (sender, sink) = domain.listening();

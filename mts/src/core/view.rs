@@ -76,3 +76,56 @@ impl Deref for PresentView {
         &*self.view
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use std::time::SystemTime;
+
+    use fipa_sds::{Mts, Reach, Role, Snapshot, Source};
+
+    use super::*;
+
+    fn entry(name: &str, registration: u64) -> Arc<Entry> {
+        Arc::new(Entry {
+            name: name.into(),
+            agent_type: String::new(),
+            incarnation: Incarnation::from_u64(registration),
+            locations: Vec::new(),
+            mts: Mts::new("mts", Incarnation::from_u64(9)),
+            description: String::new(),
+            registered: SystemTime::UNIX_EPOCH,
+            source: Source::Host,
+            reach: Reach::Local,
+            role: Role::Agent,
+        })
+    }
+
+    fn view(entries: &[Arc<Entry>]) -> Arc<dyn View> {
+        Arc::new(Snapshot::of(entries))
+    }
+
+    #[test]
+    fn a_kept_entry_answers_only_for_its_name_its_registration_and_its_view() {
+        let of = Incarnation::from_u64;
+        let found = |view: &PresentView, name| view.named(name).map(|entry| entry.incarnation);
+        let mut present = PresentView::new(view(&[entry("arm", 1), entry("leg", 2)]));
+        for _ in 0..2 {
+            assert_eq!(found(&present, "arm"), Some(of(1)));
+            assert_eq!(found(&present, "leg"), Some(of(2)));
+            assert_eq!(found(&present, "tail"), None);
+            assert_eq!(present.receiver(of(1), "arm").unwrap().incarnation, of(1));
+            assert!(present.receiver(of(2), "arm").is_none());
+            assert!(present.receiver(of(1), "leg").is_none());
+            assert_eq!(present.receiver(of(2), "leg").unwrap().incarnation, of(2));
+        }
+        present.replace(view(&[entry("leg", 3)]));
+        assert_eq!(found(&present, "leg"), Some(of(3)));
+        assert!(present.receiver(of(2), "leg").is_none());
+        assert_eq!(present.receiver(of(3), "leg").unwrap().incarnation, of(3));
+        present.replace(view(&[]));
+        assert_eq!(found(&present, "leg"), None);
+        assert!(present.receiver(of(3), "leg").is_none());
+    }
+}
