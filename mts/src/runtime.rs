@@ -690,7 +690,6 @@ impl Shared {
     ) -> Unlocked {
         let state = &mut *guard;
         let mut rest = Unlocked::default();
-        let mut settled = None;
         while let Some(action) = state.core.poll_action() {
             match action {
                 Action::Dispatch {
@@ -702,7 +701,6 @@ impl Shared {
                         Some(transport) => transport.dispatch(attempt, &location, parcel),
                         None => Err(no_such_transport(location.kind())),
                     };
-                    settled = settled.or_else(|| state.core.take_settled());
                     if let Err(error) = result {
                         let conclusion = Conclusion::NotSent(error);
                         let now = state.clocks.now();
@@ -776,7 +774,6 @@ impl Shared {
         release(guard);
         // The last owner of a view frees the memory of all its entries.
         drop(replaced);
-        drop(settled);
         if earlier {
             self.timer.notify_one();
         }

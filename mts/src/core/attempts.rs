@@ -15,7 +15,6 @@ use smallvec::SmallVec;
 use super::departed::Departed;
 use super::lane::{Delivery, LaneId};
 use super::routes::Tallies;
-use super::view::PresentView;
 use super::{CoreConfig, News, Notice, SendId};
 use crate::failure::Failed;
 use crate::{Map, Set};
@@ -211,10 +210,7 @@ impl Note {
 /// State that all lanes share.
 pub(crate) struct AttemptTable {
     pub(crate) config: CoreConfig,
-    pub(crate) view: PresentView,
-    /// The latest settled letter, if it is short. It is freed behind the next dispatch, while the receiver
-    /// has that letter.
-    settled: Option<Box<Delivery>>,
+    pub(crate) view: Arc<dyn View>,
     pub(crate) actions: VecDeque<Action>,
     pub(crate) attempts: Map<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
@@ -260,15 +256,11 @@ pub(super) fn leads_to_letters(location: &Location) -> bool {
     location.signature() == Signature::Frames || !location.incarnation().is_known()
 }
 
-/// Maximum length of a letter, in bytes, that is kept after it is settled.
-const MAX_SETTLED: usize = 4096;
-
 impl AttemptTable {
     pub(crate) fn new(config: CoreConfig, view: Arc<dyn View>) -> Self {
         Self {
             config,
-            view: PresentView::new(view),
-            settled: None,
+            view,
             actions: VecDeque::new(),
             attempts: Map::default(),
             undelivered: VecDeque::new(),
@@ -492,23 +484,19 @@ impl AttemptTable {
     }
 
     /// Reports the end of a letter to its sender, or to the services that handed it over.
-    /// Takes the latest settled letter, which the caller drops.
-    pub(crate) fn take_settled(&mut self) -> Option<impl Send + use<>> {
-        self.settled.take()
-    }
-
     pub(crate) fn settle(
         &mut self,
-        mut delivery: Box<Delivery>,
+        delivery: Box<Delivery>,
         stream: Stream,
         receiver: Arc<str>,
         settlement: Settlement,
     ) {
-        let (sequence, deadline) = (delivery.sequence, delivery.deadline);
-        let origin = std::mem::replace(&mut delivery.origin, Origin::FailureMessage);
-        if delivery.letter.len() <= MAX_SETTLED {
-            self.settled = Some(delivery);
-        }
+        let Delivery {
+            origin,
+            sequence,
+            deadline,
+            ..
+        } = *delivery;
         if let Settlement::Outcome(outcome) = &settlement {
             self.notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
@@ -577,6 +565,21 @@ impl AttemptTable {
             sent: None,
             until: Some(deadline),
         });
+    }
+
+    /// Resolves the receiver of a stream, if it is in the view of the directory. Another host may
+    /// announce an agent with this registration under another name, which is not the receiver.
+    pub(crate) fn receiver(&self, registration: Incarnation, name: &str) -> Option<Arc<Entry>> {
+        let registered = self.view.registered(registration);
+        let registered = registered.filter(|entry| *entry.name == *name);
+        registered.or_else(|| {
+            let entry = self.view.named(name)?;
+            let is_meant = match entry.incarnation.is_known() {
+                true => entry.incarnation == registration,
+                false => registration == registration_by_name(name),
+            };
+            is_meant.then_some(entry)
+        })
     }
 
     /// Returns the best location of this receiver that is not in `tried`: by the configured order,
@@ -731,7 +734,7 @@ pub(crate) fn registration_of(entry: &Entry) -> Incarnation {
 }
 
 /// The 64-bit FNV-1a hash: equal in every process, so that reports match their letters.
-pub(super) fn registration_by_name(name: &str) -> Incarnation {
+fn registration_by_name(name: &str) -> Incarnation {
     let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
     let hash = name.as_bytes().iter().fold(0xcbf2_9ce4_8422_2325, step);
     Incarnation::from_u64(hash.max(1))

@@ -377,7 +377,7 @@ impl Core {
             return Err(unknown("the agent is no longer in this process"));
         };
         let registration = parcel.stream.receiver;
-        let Some(entry) = self.table.view.receiver(registration, &parcel.receiver) else {
+        let Some(entry) = self.table.receiver(registration, &parcel.receiver) else {
             return Err(
                 match self.table.departed.contains(now.instant, registration) {
                     true => Answer::Moved,

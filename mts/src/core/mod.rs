@@ -44,7 +44,6 @@ mod reading;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
-mod view;
 mod waiting;
 #[doc(hidden)]
 pub mod work;
@@ -402,7 +401,7 @@ impl Core {
         unresolved: Unresolved,
         is_fresh: bool,
     ) -> Result<usize, Unresolved> {
-        let view = Arc::clone(self.table.view.shared());
+        let view = Arc::clone(&self.table.view);
         let sender = unresolved.sender;
         let sender_name = self
             .agents
@@ -489,7 +488,7 @@ impl Core {
     /// Replaces the view of the directory. Call it before other methods when the directory has
     /// changed. Returns the previous view.
     pub fn set_view(&mut self, view: Arc<dyn View>) -> Arc<dyn View> {
-        self.table.view.replace(view)
+        std::mem::replace(&mut self.table.view, view)
     }
 
     /// Handles the end of a refresh of the directory, which began after the core had emitted
@@ -523,7 +522,7 @@ impl Core {
     pub fn misses(&self, registration: Incarnation, name: &str) -> bool {
         self.table.config.forwards
             && !self.agents.contains_key(&registration)
-            && self.table.view.receiver(registration, name).is_none()
+            && self.table.receiver(registration, name).is_none()
     }
 
     /// Sends a letter to exactly this registration of an agent; the receivers in the submission are
@@ -701,16 +700,10 @@ impl Core {
         }
     }
 
-    /// Takes the memory of a settled letter, to be dropped after the core is unlocked and the next letter is on
-    /// its way.
-    pub fn take_settled(&mut self) -> Option<impl Send + use<>> {
-        self.table.take_settled()
-    }
-
     /// Returns the view of the directory in which receivers are looked up.
     #[must_use]
     pub fn view(&self) -> &Arc<dyn View> {
-        self.table.view.shared()
+        &self.table.view
     }
 
     /// Turns watching on or off: while it is on, an [`Action::Notice`] reports every event of a

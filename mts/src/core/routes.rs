@@ -255,7 +255,7 @@ impl Core {
         if !config.forwards || self.agents.contains_key(&registration) {
             return None;
         }
-        let entry = self.table.view.receiver(registration, receiver)?;
+        let entry = self.table.receiver(registration, receiver)?;
         let here = entry.role == Role::Agent && entry.reach == Reach::Local;
         let way = here.then(|| self.table.choose(now.instant, &entry, &[]))?;
         Some((way?, stamp::max_len(&config.name)))

@@ -481,7 +481,7 @@ impl Lane {
             let known = match &entry {
                 Some((of, known)) if *of == registration => known.clone(),
                 _ => {
-                    let known = table.view.receiver(registration, &self.receiver);
+                    let known = table.receiver(registration, &self.receiver);
                     let known = known.or_else(|| self.stated.clone());
                     entry = Some((registration, known.clone()));
                     known
@@ -506,7 +506,7 @@ impl Lane {
         let mut registrations = self.letters.iter().map(|letter| letter.registration);
         let ended = registrations.find(|registration| {
             let is_there = present == Some(*registration)
-                || table.view.receiver(*registration, &self.receiver).is_some();
+                || table.receiver(*registration, &self.receiver).is_some();
             if is_there {
                 present = Some(*registration);
             }

@@ -302,7 +302,7 @@ impl Lane {
         if self.moving.is_some_and(|(moved, _)| moved == registration) {
             return None;
         }
-        let known = table.view.receiver(registration, &self.receiver);
+        let known = table.receiver(registration, &self.receiver);
         known.or_else(|| self.stated.clone())
     }
 
