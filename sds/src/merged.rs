@@ -5,6 +5,7 @@ use std::sync::{Arc, OnceLock};
 
 use arc_swap::ArcSwapOption;
 use fipa_transport::{Incarnation, Mandate};
+use parking_lot::Mutex;
 
 use crate::{
     Change, DeregisterError, Directory, Entry, Reach, RegisterError, Registration, Role, Source,
@@ -70,6 +71,8 @@ impl Directory for MergedDirectory {
         Arc::new(Merged {
             views: self.back_ends.iter().map(|one| one.view()).collect(),
             sorted: OnceLock::new(),
+            by_name: KeptEntries::default(),
+            by_incarnation: KeptEntries::default(),
         })
     }
 
@@ -154,19 +157,27 @@ impl Directory for MergedDirectory {
     }
 }
 
-/// Several views merged into one.
+/// Several views that do not change, merged into one.
 struct Merged {
     views: Vec<Arc<dyn View>>,
     sorted: OnceLock<Arc<[Arc<Entry>]>>,
+    by_name: KeptEntries,
+    by_incarnation: KeptEntries,
 }
 
 impl View for Merged {
     fn named(&self, name: &str) -> Option<Arc<Entry>> {
-        holder(&self.views, name)
+        let hash = name.bytes().rev().take(2).map(usize::from).sum::<usize>() + name.len();
+        let is_it = |entry: &Entry| *entry.name == *name;
+        self.by_name
+            .get_or(hash, is_it, || holder(&self.views, name))
     }
 
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        registered(&self.views, incarnation)
+        let hash = incarnation.as_u64() as usize;
+        let is_it = |entry: &Entry| entry.incarnation == incarnation;
+        self.by_incarnation
+            .get_or(hash, is_it, || registered(&self.views, incarnation))
     }
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
@@ -183,6 +194,32 @@ impl View for Merged {
 
     fn mandate_of(&self, mts: Incarnation) -> Mandate {
         mandate(&self.views, mts)
+    }
+}
+
+/// The entries that lookups returned last. Most letters have the sender and the receiver of one of the
+/// letters before, and a lookup asks all views, which may be merged themselves.
+#[derive(Default)]
+struct KeptEntries([Mutex<Option<Arc<Entry>>>; 8]);
+
+impl KeptEntries {
+    /// Returns the kept entry that is the wanted one, or else the one that `find` returns, which is kept.
+    fn get_or(
+        &self,
+        hash: usize,
+        is_it: impl FnOnce(&Entry) -> bool,
+        find: impl FnOnce() -> Option<Arc<Entry>>,
+    ) -> Option<Arc<Entry>> {
+        let place = self.0.get(hash % self.0.len())?;
+        let kept = place.lock().clone();
+        if let Some(kept) = kept.filter(|kept| is_it(kept)) {
+            return Some(kept);
+        }
+        let found = find()?;
+        let replaced = place.lock().replace(Arc::clone(&found));
+        // Without the lock: a view may be the last owner of the entry.
+        drop(replaced);
+        Some(found)
     }
 }
 
@@ -423,6 +460,45 @@ mod tests {
             registered: std::time::UNIX_EPOCH,
             ..Registration::new("team", Incarnation::from_u64(7), Vec::new())
         }
+    }
+
+    #[test]
+    fn a_view_answers_repeated_lookups_as_its_directory_does() {
+        let of = Incarnation::from_u64;
+        let mts = Mts::new("mts", of(1));
+        let [first, second] = [(); 2].map(|()| Arc::new(MemoryDirectory::new(mts.clone())));
+        let inner = MergedDirectory::new(vec![first.clone()]);
+        let merged = MergedDirectory::new(vec![Arc::new(inner), second.clone()]);
+        // More than are kept; some names and some registrations are in both directories.
+        for number in 0..40 {
+            let register = |directory: &MemoryDirectory, incarnation| {
+                let name = format!("arm_{}", number % 30);
+                let registration = Registration::new(&*name, of(incarnation), Vec::new());
+                let _ = directory.register(registration);
+            };
+            register(&first, 100 + number);
+            register(&second, 110 + number);
+        }
+        let view = merged.view();
+        let mut seed = fastrand::Rng::with_seed(1);
+        for _ in 0..2000 {
+            let name = format!("arm_{}", seed.u8(0..35));
+            assert_eq!(view.named(&name), merged.known(&name), "{name}");
+            let incarnation = of(seed.u64(95..155));
+            let registered = merged.known_incarnation(incarnation);
+            assert_eq!(view.registered(incarnation), registered, "{incarnation}");
+        }
+        // The view does not change, and a later one does not show what the earlier one kept.
+        let before = view.named("arm_3").unwrap();
+        first.deregister("arm_3", before.incarnation).unwrap();
+        assert_eq!(view.named("arm_3"), Some(Arc::clone(&before)));
+        assert_eq!(
+            view.registered(before.incarnation),
+            Some(Arc::clone(&before))
+        );
+        let later = merged.view();
+        assert_eq!(later.named("arm_3"), merged.known("arm_3"));
+        assert_ne!(later.named("arm_3"), Some(before));
     }
 
     #[test]
