@@ -355,7 +355,7 @@ fn a_long_letter_that_cannot_be_decoded() {
     }
     let envelope = envelope.encode_standard().unwrap();
     let received = Received {
-        letter: Letter::new(envelope, Bytes::from(vec![b'('; 1 << 20])),
+        letter: Letter::new(envelope, Bytes::from(vec![b'('; 1 << 18])),
         sender: sender.incarnation,
         via: Some(Kind::Shm),
         service: PROCESS,
