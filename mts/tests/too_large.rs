@@ -210,8 +210,8 @@ fn a_letter_has_at_most_1_mib_besides_its_content() {
     }
 }
 
-/// What a service of this kind answers to a letter with this many bytes besides the content, to `arm` in
-/// its own process or in another one.
+/// Returns the answer of a service of this kind to a letter with this many bytes besides the content, to
+/// `arm` in its own process or in another one. `None` if it answers later.
 fn answer(forwards: bool, is_own: bool, len: usize) -> Option<Answer> {
     let own = Incarnation::from_u64(1);
     let directory = MemoryDirectory::new(Mts::new("mts", own));
