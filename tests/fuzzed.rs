@@ -42,6 +42,8 @@ mod locking;
 mod mdns;
 #[path = "../fuzz/src/platform.rs"]
 mod platform;
+#[path = "../fuzz/src/quic.rs"]
+mod quic;
 #[path = "../fuzz/src/recording.rs"]
 mod recording;
 #[path = "../fuzz/src/seeds.rs"]
@@ -151,7 +153,7 @@ mod bodies {
 
     bodies!(
         access, actions, config, datagrams, delivery, exchange, framed, host, http, locking, mdns,
-        platform, recording, shm, texts, udt
+        platform, quic, recording, shm, texts, udt
     );
 
     #[test]

@@ -88,6 +88,9 @@ impl Letter {
         }
     }
 
+    /// Maximum [length around the content](Self::around_len) of a letter that is sent, in bytes.
+    pub const MAX_AROUND: usize = 1 << 20;
+
     /// Adds an encoded extension envelope in front of the letter. Nothing is copied.
     #[must_use]
     pub fn stamped(mut self, extension: Bytes) -> Self {
@@ -135,6 +138,13 @@ impl Letter {
     #[must_use]
     pub fn len(&self) -> usize {
         self.envelope_len() + self.payload.len()
+    }
+
+    /// Length in bytes without the content: the envelope with all stamps, and the message before and
+    /// behind its content. A message in one piece counts as a whole.
+    #[must_use]
+    pub fn around_len(&self) -> usize {
+        self.envelope_len() + self.payload.head.len() + self.payload.tail.len()
     }
 
     /// Whether the letter has no bytes.
@@ -199,6 +209,6 @@ mod tests {
         assert_eq!(payload.to_bytes(), "headcontent\x01");
         let letter = Letter::new(Bytes::from_static(b"e"), payload);
         assert_eq!(letter.pieces().count(), 4);
-        assert_eq!(letter.len(), 13);
+        assert_eq!((letter.len(), letter.around_len()), (13, 6));
     }
 }

@@ -13,6 +13,7 @@ pub mod input;
 pub mod locking;
 pub mod mdns;
 pub mod platform;
+pub mod quic;
 pub mod recording;
 pub mod seeds;
 pub mod shm;

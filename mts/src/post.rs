@@ -15,6 +15,18 @@ pub enum PostError {
     /// The message or its envelope cannot be encoded.
     #[error("cannot encode the letter")]
     Encode(#[from] EncodeError),
+    /// The envelope, and the parameters of the message other than its content, are longer than
+    /// [`Letter::MAX_AROUND`] together. Lengths are in bytes.
+    #[error(
+        "the letter would have {len} bytes besides its content, and at most {limit} are allowed; put \
+         long values into the content, or send the message to fewer receivers at once"
+    )]
+    TooLong {
+        /// Length of the letter without its content.
+        len: usize,
+        /// Maximum length of a letter without its content.
+        limit: usize,
+    },
 }
 
 /// Encodes a message as a letter: a bit-efficient message in a bit-efficient envelope of the
@@ -23,7 +35,7 @@ pub enum PostError {
 /// # Errors
 /// Fails when the message or its envelope cannot be encoded.
 pub fn letter_for(message: &Message, utc: SystemTime) -> Result<Letter, PostError> {
-    Ok(message.to_letter(Time::from_system_time(utc)?)?)
+    checked(message.to_letter(Time::from_system_time(utc)?)?)
 }
 
 /// Encodes a message as [`letter_for`] does, with the envelope of the sender's latest letter as a template.
@@ -35,7 +47,16 @@ pub fn letter_by(
     message: &Message,
     utc: SystemTime,
 ) -> Result<Letter, PostError> {
-    Ok(template.to_letter(message, Time::from_system_time(utc)?)?)
+    checked(template.to_letter(message, Time::from_system_time(utc)?)?)
+}
+
+/// Returns the letter if its parts other than the content are not too long.
+fn checked(letter: Letter) -> Result<Letter, PostError> {
+    let (len, limit) = (letter.around_len(), Letter::MAX_AROUND);
+    match len <= limit {
+        true => Ok(letter),
+        false => Err(PostError::TooLong { len, limit }),
+    }
 }
 
 /// A letter whose content is written later, into memory that is loaned for it. The message is
@@ -61,7 +82,7 @@ impl LetterDraft {
         template: &mut EnvelopeTemplate,
     ) -> Result<Self, PostError> {
         let date = Time::from_system_time(utc)?;
-        let frame = template.to_letter_around(&message, content_len, date)?;
+        let frame = checked(template.to_letter_around(&message, content_len, date)?)?;
         Ok(Self {
             message,
             frame,

@@ -1,18 +1,18 @@
 //! A letter that is too large for one route waits for another that the directory does not show at
-//! present.
+//! present. A letter that is too long without its content is neither sent nor taken.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative};
+use fipa_acl::{AgentId, Envelope, EnvelopeTemplate, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_mts::letter_for;
+use fipa_mts::{LetterDraft, letter_by, letter_for};
 use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome,
-    TransportError, TransportErrorKind,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
+    Outcome, Parcel, Principal, Stream, Ticket, TransportError, TransportErrorKind, Verdict,
 };
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
@@ -171,4 +171,115 @@ fn the_wait_for_another_route_is_short() {
         }
     }
     panic!("the letter still waits");
+}
+
+/// A message whose letter has this many bytes besides the content.
+fn around(len: usize, content: usize) -> Message {
+    let padded = |padding: usize| {
+        Message::builder(Performative::Inform)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .reply_with("x".repeat(padding))
+            .content(vec![7; content])
+            .build()
+            .unwrap()
+    };
+    let padding = len - 500;
+    let short = letter_for(&padded(padding), SystemTime::UNIX_EPOCH).unwrap();
+    padded(padding + len - short.around_len())
+}
+
+#[test]
+fn a_letter_has_at_most_1_mib_besides_its_content() {
+    let utc = SystemTime::UNIX_EPOCH;
+    let most = Letter::MAX_AROUND;
+    for content in [0, 3 << 20] {
+        let letter = letter_for(&around(most, content), utc).unwrap();
+        assert_eq!(letter.around_len(), most);
+        let mut template = EnvelopeTemplate::default();
+        let long = around(most + 1, content);
+        for refused in [
+            letter_for(&long, utc).err(),
+            letter_by(&mut template, &long, utc).err(),
+            LetterDraft::new(long, content, utc, &mut template).err(),
+        ] {
+            let told = refused.unwrap().to_string();
+            assert!(told.contains("1048577 bytes besides its content"), "{told}");
+            assert!(told.contains("1048576"), "{told}");
+        }
+    }
+}
+
+/// Returns the answer of a service of this kind to a letter with this many bytes besides the content, to
+/// `arm` in its own process or in another one. `None` if it answers later.
+fn answer(forwards: bool, is_own: bool, len: usize) -> Option<Answer> {
+    let own = Incarnation::from_u64(1);
+    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let at = "shm://0000000000000009#0000000000000009".parse().unwrap();
+    let arm = Registration::new("arm", ARM, vec![at]);
+    directory.register(arm).unwrap();
+    let config = CoreConfig {
+        forwards,
+        ..CoreConfig::new("mts", own, vec![Kind::Shm, Kind::Tcp])
+    };
+    let mut core = Core::new(config, Arc::new(directory));
+    if is_own {
+        core.register("arm".into(), ARM);
+    }
+    let short = letter_for(&around(1000, 3 << 20), SystemTime::UNIX_EPOCH).unwrap();
+    let mut payload = short.payload().clone();
+    let mut envelope = short.parse_envelope().unwrap();
+    envelope.base.comments = Some("x".repeat(len - 1100));
+    let missing = |envelope: &Envelope| {
+        let letter = Letter::new(envelope.encode_standard().unwrap(), payload.clone());
+        len - letter.around_len()
+    };
+    envelope.base.comments = Some("x".repeat(len - 1100 + missing(&envelope)));
+    payload.content = vec![7; 3 << 20].into();
+    let letter = Letter::new(envelope.encode_standard().unwrap(), payload);
+    assert_eq!(letter.around_len(), len);
+    let location = "tcp://192.0.2.1:1#0000000000000002".parse().unwrap();
+    let arrival = Arrival {
+        parcel: Parcel {
+            receiver: "arm".into(),
+            stream: Stream {
+                sender: ROVER,
+                receiver: ARM,
+            },
+            sequence: 1,
+            after: 0,
+            transfer: 1,
+            remaining: Duration::from_secs(5),
+            body: Body::Letter(letter),
+        },
+        from: Hop {
+            location,
+            principal: Principal::Unproved,
+        },
+        ticket: Some(Ticket(7)),
+    };
+    let now = Now {
+        instant: Instant::now(),
+        utc: SystemTime::UNIX_EPOCH,
+    };
+    match core.handle_arrival(now, Kind::Tcp, arrival) {
+        Verdict::Now(answer) => Some(answer),
+        Verdict::Later => None,
+    }
+}
+
+#[test]
+fn a_longer_letter_is_refused_on_arrival_and_one_with_stamps_is_not() {
+    let most = Letter::MAX_AROUND + (64 << 10);
+    assert_eq!(answer(false, true, most), Some(Answer::Accepted));
+    assert_eq!(answer(true, false, most), None, "taken into custody");
+    for (forwards, is_own) in [(false, true), (true, true), (true, false)] {
+        match answer(forwards, is_own, most + 1) {
+            Some(Answer::Failed {
+                reason: FailureReason::TooLarge,
+                detail,
+            }) => assert!(detail.contains("besides its content"), "{detail}"),
+            other => panic!("{other:?}"),
+        }
+    }
 }

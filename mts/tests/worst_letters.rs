@@ -299,17 +299,18 @@ fn a_letter_whose_failure_message_repeats_long_parts() {
     let at_home = |agent: AgentId| agent.with_address("tcp://127.0.0.1:6789").unwrap();
     let liar = || at_home(AgentId::new("liar").unwrap());
     let mut addresses = liar();
-    for number in 0..50_000 {
+    for number in 0..20_000 {
         addresses = addresses
             .with_address(format!("tcp://192.0.2.1:{number}"))
             .unwrap();
     }
-    let long = "x".repeat(1 << 20);
+    let long = "x".repeat(1_000_000);
     for (what, message) in [
         ("many addresses", message().sender(addresses)),
         (
             "a long address",
-            message().sender(liar().with_address(&long).unwrap()),
+            // It is in the envelope and in the message.
+            message().sender(liar().with_address(&long[..500_000]).unwrap()),
         ),
         (
             "a long conversation identifier",
@@ -354,7 +355,7 @@ fn a_long_letter_that_cannot_be_decoded() {
     }
     let envelope = envelope.encode_standard().unwrap();
     let received = Received {
-        letter: Letter::new(envelope, Bytes::from(vec![b'('; 1 << 20])),
+        letter: Letter::new(envelope, Bytes::from(vec![b'('; 1 << 18])),
         sender: sender.incarnation,
         via: Some(Kind::Shm),
         service: PROCESS,

@@ -119,6 +119,17 @@ fn agents_that_the_certificate_does_not_name_are_left_out() {
 }
 
 #[test]
+fn agents_whose_names_are_patterns_are_left_out() {
+    for mandate in [Mandate::Unproved, certified(&[]), certified(&["arm_*"])] {
+        let mut bench = Bench::new(vec![present(1, mandate)]);
+        bench.tell(1, &["arm_.*", "arm_1", "arm_(1|2)", "arm_?"], 5);
+        let entries = bench.exchange.directory().entries();
+        let names: Vec<&str> = entries.iter().map(|entry| &*entry.name).collect();
+        assert_eq!(names, ["arm_1"]);
+    }
+}
+
+#[test]
 fn a_proved_claim_precedes_an_earlier_one_without_proof() {
     let mut bench = Bench::new(vec![
         present(1, Mandate::Unproved),

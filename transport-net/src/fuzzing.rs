@@ -8,6 +8,8 @@
 
 #[cfg(feature = "http")]
 pub use crate::http::fuzzing as http;
+#[cfg(feature = "quic")]
+pub use crate::quic::fuzzing::QuicStreams;
 #[cfg(feature = "secure")]
 pub use crate::secure::certified;
 pub use crate::stream::fuzzing::{Framed, answer_body, frame, hello_body, parcel_body};

@@ -5,7 +5,8 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{DecodeError, Letter, Message};
+use bytes::Bytes;
+use fipa_acl::{AclRepresentation, DecodeError, EncodeError, Letter, Message};
 use fipa_sds::{Entry, Reach, Resolution, Role, Source, View};
 use fipa_transport::{
     Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel,
@@ -17,6 +18,7 @@ use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::{ask, link_of};
 use super::lane::{Delivery, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
+use super::reading::too_long;
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
 use crate::gate::{self, LetterParts, Link};
 use smallvec::smallvec;
@@ -112,12 +114,21 @@ impl Unframed {
             Ok(message) => Failed::of_message(message, &letter),
             Err(_) => Failed::of_envelope(&letter),
         };
+        let mut letter = letter;
         let (sender, mut fault) = match (too_many(&names), message) {
             (Some(fault), _) => {
                 names.truncate(1);
                 (None, Some(fault))
             }
-            (None, Ok(message)) => (locate(&message, &letter, from), None),
+            (None, Ok(message)) => {
+                let sender = locate(&message, &letter, from);
+                if letter.around_len() > Letter::MAX_AROUND
+                    && let Ok(divided) = divide(&letter, &message)
+                {
+                    letter = divided;
+                }
+                (sender, too_long(&letter))
+            }
             (None, Err(error)) => (None, Some(cannot_be_decoded(&error))),
         };
         let named = stamp::sender(&letter).unwrap_or_default();
@@ -152,6 +163,21 @@ impl Unframed {
             fault,
             parts: None,
         })
+    }
+
+    /// The content, if it is apart from the other bytes of the letter.
+    #[must_use]
+    pub fn content(&self) -> &Bytes {
+        &self.letter.payload().content
+    }
+
+    /// Returns the letter with its [content](Self::content) in other memory.
+    #[must_use]
+    pub fn with_content(self, content: Bytes) -> Self {
+        Self {
+            letter: self.letter.with_content(content),
+            ..self
+        }
     }
 
     /// Whether the core has [handled](Core::handle_unframed) the letter for all receivers.
@@ -211,6 +237,29 @@ fn too_many(names: &[String]) -> Option<String> {
     }
     let too_long = patterns.iter().any(|it| it.len() > MAX_UNFRAMED_PATTERN);
     too_long.then(|| format!("the pattern has more than {MAX_UNFRAMED_PATTERN} bytes"))
+}
+
+/// Returns the letter with its message in the encoding that keeps the content apart: a legacy peer's
+/// message is in one piece, which would be copied while the core is locked.
+fn divide(letter: &Letter, message: &Message) -> Result<Letter, DivideError> {
+    let mut envelope = letter.parse_envelope()?;
+    for part in std::iter::once(&mut envelope.base).chain(&mut envelope.extensions) {
+        part.acl_representation = None;
+        part.payload_length = None;
+        part.payload_encoding = None;
+    }
+    envelope.base.acl_representation = Some(AclRepresentation::BitEfficient);
+    let envelope = envelope.encode_standard()?;
+    Ok(Letter::new(envelope, message.to_payload()))
+}
+
+/// The reason why a letter cannot be [divided](divide).
+#[derive(Debug, thiserror::Error)]
+enum DivideError {
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
 }
 
 /// The name of the sender, and the first location that it states as its own.

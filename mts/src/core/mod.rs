@@ -776,6 +776,9 @@ impl Core {
                     let reason = FailureReason::NoSuchAgent;
                     return Verdict::Now(Answer::failed(reason, "the process is closing"));
                 }
+                if let Some(detail) = reading::too_long(&letter) {
+                    return Verdict::Now(Answer::failed(FailureReason::TooLarge, detail));
+                }
                 let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());

@@ -11,6 +11,21 @@ use super::{CoreConfig, work};
 use crate::stamp::{self, EnvelopeParts};
 use crate::{AccessGate, LetterParts};
 
+/// Maximum length of an arriving letter without its content, in bytes: that of a letter that is sent,
+/// and room for the stamps of the gateways on its path. A gateway copies these bytes while its core is
+/// locked.
+const MAX_AROUND: usize = Letter::MAX_AROUND + (64 << 10);
+
+/// Returns the reason why an arriving letter is refused unread, if it is.
+pub(super) fn too_long(letter: &Letter) -> Option<String> {
+    let len = letter.around_len();
+    (len > MAX_AROUND).then(|| {
+        format!(
+            "the letter has {len} bytes besides its content, and at most {MAX_AROUND} are allowed"
+        )
+    })
+}
+
 /// Reads arriving letters for one core.
 #[derive(Clone)]
 pub struct LetterReader {
@@ -46,7 +61,7 @@ impl LetterReader {
     }
 
     /// Reads the letter of this arrival, if it has one. Returns `None` where no part is needed, in a
-    /// process without a gate.
+    /// process without a gate, and for a letter that the core refuses for its length.
     #[must_use]
     pub fn read_arrival(&self, arrival: &Arrival) -> Option<Box<ReadLetter>> {
         match &arrival.parcel.body {
@@ -56,7 +71,7 @@ impl LetterReader {
     }
 
     pub(super) fn read(&self, letter: &Letter) -> Option<Box<ReadLetter>> {
-        if self.gate.is_none() && !self.forwards {
+        if (self.gate.is_none() && !self.forwards) || too_long(letter).is_some() {
             return None;
         }
         work::steps(letter.len() / 512);

@@ -119,6 +119,16 @@ impl Shared {
         })
     }
 
+    /// Copies the content of a letter that arrived in other memory to memory of the transport that would
+    /// copy it while the core is locked.
+    pub(super) fn shared_content(&self, content: &Bytes) -> Option<Bytes> {
+        let mut transports = self.transports.iter();
+        let transport = transports.find(|transport| transport.copies_for_each(content))?;
+        let mut loan = self.loan_from(transport.kind(), |it| it.loan_for_many(content.len()))?;
+        loan.content_mut().copy_from_slice(content);
+        Some(loan.freeze())
+    }
+
     /// Returns a loan if this transport offers one.
     fn loan_from(
         &self,

@@ -51,7 +51,13 @@ impl Sink for TransportSink {
         };
         shared.directory.refresh();
         let mut unframed = match Unframed::read(letter, via, from, &*shared.directory) {
-            Ok(unframed) => unframed.read_by(&shared.reader),
+            Ok(unframed) => {
+                let unframed = unframed.read_by(&shared.reader);
+                match shared.shared_content(unframed.content()) {
+                    Some(content) => unframed.with_content(content),
+                    None => unframed,
+                }
+            }
             Err(error) => {
                 tracing::warn!(%error, "dropping an unframed letter: its envelope is malformed");
                 return;

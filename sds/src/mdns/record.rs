@@ -376,7 +376,7 @@ mod tests {
     use super::*;
     use fipa_acl::is_unprintable;
 
-    use crate::{MAX_NAME, check_name, is_pattern};
+    use crate::{MAX_NAME, NameError, check_name, is_pattern};
 
     const SIGNATURE: &str = Signature::FipaServices.signature_type();
 
@@ -584,6 +584,20 @@ mod tests {
         let mut endless = good.clone();
         endless.extend((1..100).map(|number| (format!("fipa-mts.{number}"), vec![b'x'; 200])));
         assert_eq!(read("x", &endless), Err(RecordError::TooLong("fipa-mts")));
+    }
+
+    #[test]
+    fn a_record_of_an_agent_whose_name_is_a_pattern_is_rejected() {
+        for pattern in ["arm_.*", "arm_+", "(arm)", "arm|rover"] {
+            let mut own = encode(&example());
+            own.retain(|(key, _)| key != "fipa-name");
+            own.push(("fipa-name".to_owned(), pattern.as_bytes().to_vec()));
+            let legacy = strings(&[("LOCATOR", b"tcp://10.0.0.3:6789 JadeProxyAgent")]);
+            for (label, record) in [("x", &own), (pattern, &legacy)] {
+                let expected = EntryError::Name(NameError::Pattern(pattern.to_owned()));
+                assert_eq!(read(label, record), Err(RecordError::Entry(expected)));
+            }
+        }
     }
 
     fn any_text(max: usize) -> impl Strategy<Value = String> {

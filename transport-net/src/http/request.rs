@@ -176,10 +176,14 @@ impl RequestReader {
         length.saturating_sub(self.buffer.len())
     }
 
-    /// Removes a complete body of this length from the buffer.
+    /// Removes a complete body of this length from the buffer. The bytes behind it get memory of their
+    /// own: the memory of the body is free when the body is dropped, however long the connection stays
+    /// open.
     pub(super) fn body(&mut self, length: usize) -> Bytes {
-        let length = length.min(self.buffer.len());
-        self.buffer.split_to(length).freeze()
+        let behind = BytesMut::from(self.buffer.get(length..).unwrap_or_default());
+        let mut body = std::mem::replace(&mut self.buffer, behind);
+        body.truncate(length);
+        body.freeze()
     }
 }
 

@@ -7,7 +7,8 @@ use bytes::BytesMut;
 
 use super::head::{HeadEnd, MAX_HEAD, length, lists, unfolded};
 
-/// Maximum number of bytes between the head of an answer and the next answer.
+/// Maximum number of bytes between the head of an answer and the next answer. Answers that announce
+/// another one count.
 const MAX_BODY: usize = 64 << 10;
 
 /// The beginning of each answer.
@@ -73,12 +74,13 @@ impl ResponseReader {
             };
             let head = self.buffer.split_to(len);
             self.end = HeadEnd::default();
-            self.skipped = 0;
             let (response, body) = parse(&head)?;
             self.body = body;
             if response.status >= 200 {
+                self.skipped = 0;
                 return Ok(Some(response));
             }
+            self.skip_bytes(len)?;
         }
     }
 
@@ -111,6 +113,11 @@ impl ResponseReader {
 
     fn drop_front(&mut self, len: usize) -> Result<(), ResponseError> {
         let _ = self.buffer.split_to(len);
+        self.skip_bytes(len)
+    }
+
+    /// Counts skipped bytes.
+    fn skip_bytes(&mut self, len: usize) -> Result<(), ResponseError> {
         self.skipped += len;
         match self.skipped <= MAX_BODY {
             true => Ok(()),

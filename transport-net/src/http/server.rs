@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant as Now};
 
-use bytes::Bytes;
+use bytes::{BufMut, Bytes};
 use fipa_transport::{LegacySource, Signature};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -31,7 +31,7 @@ use crate::stream::config::Limits;
 use crate::stream::counters::count;
 use crate::stream::source::{Home, QuotaKey, Source};
 
-/// Number of bytes that are read at a time, at least.
+/// Number of bytes that are read at a time, except for bodies.
 const READ: usize = 4096;
 
 /// Minimum length of a body whose memory is reserved in the budget of the endpoint.
@@ -301,7 +301,7 @@ impl Serving {
         };
         let until = Instant::now() + patience;
         while self.reader.is_idle()? {
-            match timeout_at(until, self.read()).await {
+            match timeout_at(until, self.read(READ)).await {
                 Ok(read) => read?,
                 Err(_) => return Err(End::Over),
             }
@@ -310,11 +310,11 @@ impl Serving {
         Ok(())
     }
 
-    /// Reads more bytes.
-    async fn read(&mut self) -> Result<(), End> {
+    /// Reads at most this many bytes more. The buffer grows by no more than that.
+    async fn read(&mut self, most: usize) -> Result<(), End> {
         let buffer = self.reader.buffer();
-        buffer.reserve(READ);
-        match self.stream.read_buf(buffer).await? {
+        buffer.reserve(most.min(READ));
+        match self.stream.read_buf(&mut buffer.limit(most)).await? {
             0 => Err(End::Over),
             _ => Ok(()),
         }
@@ -326,7 +326,7 @@ impl Serving {
         loop {
             match self.reader.head(max_body)? {
                 Some(head) => return Ok(head),
-                None => self.read().await?,
+                None => self.read(READ).await?,
             }
         }
     }
@@ -347,7 +347,7 @@ impl Serving {
         self.reader.buffer().reserve(missing);
         let mut window = (Instant::now() + patience, missing);
         while missing > 0 {
-            match timeout_at(window.0, self.read()).await {
+            match timeout_at(window.0, self.read(missing)).await {
                 Ok(read) => read?,
                 Err(_) => {
                     let progress = (window.1 - missing) as u64;

@@ -205,6 +205,48 @@ fn answers_that_are_none_end_in_an_error() {
     assert_eq!(all(&endless), Err(ResponseError::HeadTooLarge));
 }
 
+#[test]
+fn answers_that_announce_another_one_without_end_end_in_an_error() {
+    let mut reader = ResponseReader::default();
+    let interim = b"HTTP/1.1 102 Processing\r\n\r\n";
+    let end = (0..10_000).find_map(|_| {
+        reader.buffer().extend_from_slice(interim);
+        match reader.next() {
+            Ok(answer) => {
+                assert_eq!(answer, None);
+                None
+            }
+            Err(error) => Some(error),
+        }
+    });
+    assert_eq!(end, Some(ResponseError::NoAnswer));
+    // Their number starts again with each answer.
+    let mut reader = ResponseReader::default();
+    for _ in 0..10 {
+        let answer = [&interim.repeat(1000)[..], b"HTTP/1.1 200 OK\r\n\r\n"].concat();
+        reader.buffer().extend_from_slice(&answer);
+        assert_eq!(reader.next().unwrap().unwrap().status, 200);
+    }
+}
+
+#[test]
+fn a_connection_keeps_no_memory_of_a_body() {
+    const LEN: usize = 1 << 20;
+    for spare in [0, 100, LEN] {
+        let mut reader = RequestReader::default();
+        reader.buffer().reserve(LEN + 2 + spare);
+        reader.buffer().extend_from_slice(&vec![7; LEN]);
+        reader.buffer().extend_from_slice(b"\r\n");
+        let body = reader.body(LEN);
+        assert_eq!(body, vec![7; LEN]);
+        drop(body);
+        assert_eq!(&reader.buffer()[..], b"\r\n");
+        // As the server reads the next request.
+        reader.buffer().reserve(4096);
+        assert!(reader.buffer().capacity() < 64 << 10, "{spare}");
+    }
+}
+
 /// A request with these header fields after the request line and a body of no bytes.
 fn request(line: &str, fields: &str) -> String {
     format!("{line}\r\nContent-Length: 0\r\n{fields}\r\n")

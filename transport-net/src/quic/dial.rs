@@ -69,7 +69,7 @@ pub(super) fn ends(
     receive: RecvStream,
     max_letter: usize,
 ) -> (Reading, Writing) {
-    let letters = Box::new(Letters::new(connection, max_letter));
+    let letters = Box::new(Letters::new(connection.clone(), max_letter));
     let control = Box::new(Control::new(connection, receive));
     let outgoing = Box::new(Outgoing::new(connection, send));
     (

@@ -16,6 +16,8 @@
 
 mod accept;
 mod dial;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod settings;
 mod sockets;
 mod streams;

@@ -12,7 +12,7 @@ use std::net::IpAddr;
 use std::pin::Pin;
 use std::task::{Context, Poll, Waker};
 
-use bytes::BytesMut;
+use bytes::{Bytes, BytesMut};
 use parking_lot::Mutex;
 use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
@@ -75,40 +75,84 @@ impl Drop for Control {
     }
 }
 
-/// The streams of the peer's parcels.
-pub(super) struct Letters {
-    connection: Connection,
-    stream: Option<RecvStream>,
+/// The streams that the peer opens for its parcels.
+pub(super) trait PeerStreams: Send + Sync {
+    type Stream: PeerStream;
+
+    /// Waits for the next stream, in the order of opening.
+    fn accept(&self) -> impl Future<Output = Result<Self::Stream, ConnectionError>> + Send;
+}
+
+/// The bytes of one stream.
+pub(super) trait PeerStream: Send {
+    /// Waits for the next bytes, at most `most`. `None` at the end of the stream.
+    fn next(
+        &mut self,
+        most: usize,
+    ) -> impl Future<Output = Result<Option<Bytes>, ReadError>> + Send;
+}
+
+impl PeerStreams for Connection {
+    type Stream = RecvStream;
+
+    async fn accept(&self) -> Result<RecvStream, ConnectionError> {
+        self.accept_uni().await
+    }
+}
+
+impl PeerStream for RecvStream {
+    async fn next(&mut self, most: usize) -> Result<Option<Bytes>, ReadError> {
+        let chunk = self.read_chunk(most, true).await?;
+        Ok(chunk.map(|chunk| chunk.bytes))
+    }
+}
+
+/// The reader of the peer's parcels, which reads the streams one after the other.
+pub(super) struct Letters<C: PeerStreams> {
+    connection: C,
+    stream: Option<C::Stream>,
+    /// Whether bytes of the stream have been read.
+    begun: bool,
     reader: FrameReader,
 }
 
-impl Letters {
-    pub(super) fn new(connection: &Connection, max_letter: usize) -> Self {
+impl<C: PeerStreams> Letters<C> {
+    pub(super) fn new(connection: C, max_letter: usize) -> Self {
         Self {
-            connection: connection.clone(),
+            connection,
             stream: None,
+            begun: false,
             reader: FrameReader::new(max_letter, BytesMut::new()),
         }
     }
 
-    /// Reads the available bytes of the current parcel. Never completes after the connection is
-    /// lost: the control stream reports the loss after the frames that precede it.
+    /// Reads the available bytes of the current parcel; 0 for a stream without bytes, so that a peer
+    /// that opens many of them does not keep the link from other work. Never completes after the
+    /// connection is lost: the control stream reports the loss after the frames that precede it.
     async fn read(&mut self) -> io::Result<usize> {
         loop {
             let stream = match &mut self.stream {
                 Some(stream) => stream,
-                none => match self.connection.accept_uni().await {
+                none => match self.connection.accept().await {
                     Ok(stream) => none.insert(stream),
                     Err(_lost) => return pending().await,
                 },
             };
             match fill(stream, &mut self.reader.space()).await {
-                Ok(Some(len)) => return Ok(len),
+                Ok(Some(len)) => {
+                    self.begun = true;
+                    return Ok(len);
+                }
                 Ok(None) if self.reader.is_partial() => {
                     let what = "a stream ended in the middle of a letter";
                     return Err(io::Error::new(io::ErrorKind::InvalidData, what));
                 }
-                Ok(None) => self.stream = None,
+                Ok(None) => {
+                    self.stream = None;
+                    if !std::mem::take(&mut self.begun) {
+                        return Ok(0);
+                    }
+                }
                 Err(ReadError::ConnectionLost(_)) => return pending().await,
                 Err(error) => return Err(error.into()),
             }
@@ -116,7 +160,7 @@ impl Letters {
     }
 }
 
-impl ParcelStreams for Letters {
+impl<C: PeerStreams> ParcelStreams for Letters<C> {
     fn read(&mut self) -> BoxFuture<'_, io::Result<usize>> {
         Box::pin(self.read())
     }
@@ -127,9 +171,12 @@ impl ParcelStreams for Letters {
 }
 
 /// Copies the available bytes into the space. Returns `None` at the end of the stream.
-async fn fill(stream: &mut RecvStream, space: &mut Space<'_>) -> Result<Option<usize>, ReadError> {
-    let chunk = stream.read_chunk(space.room(), true).await?;
-    Ok(chunk.map(|chunk| space.fill(&chunk.bytes)))
+async fn fill(
+    stream: &mut impl PeerStream,
+    space: &mut Space<'_>,
+) -> Result<Option<usize>, ReadError> {
+    let bytes = stream.next(space.room()).await?;
+    Ok(bytes.map(|bytes| space.fill(&bytes)))
 }
 
 /// Returns the error of a lost connection.

@@ -42,6 +42,15 @@ pub(crate) enum Role {
     Acceptor,
 }
 
+/// The readers of a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Reader {
+    /// Reads all frames, or all except parcels.
+    Main,
+    /// Reads the streams of parcels, where they are apart.
+    Parcels,
+}
+
 /// An event of a connection. Events are delivered in order.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Event {
@@ -121,9 +130,9 @@ struct Clock {
     pinged: bool,
     /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
-    /// Start of the present measuring period of a partly arrived frame, and the bytes that arrived
-    /// since.
-    partial: Option<(Instant, u64)>,
+    /// For each [reader](Reader): start of the present measuring period of a partly arrived frame, and
+    /// the bytes that arrived since.
+    partial: [Option<(Instant, u64)>; 2],
 }
 
 impl Connection {
@@ -161,7 +170,7 @@ impl Connection {
                 busy: now,
                 pinged: false,
                 doubted: None,
-                partial: None,
+                partial: [None; 2],
             },
         }
     }
@@ -337,14 +346,20 @@ impl Connection {
         }
     }
 
-    /// Notes that `bytes` arrived; `partial` is whether a frame has partly arrived.
-    pub(crate) fn received(&mut self, bytes: usize, partial: bool, now: Instant) {
+    /// Notes that `bytes` arrived at a reader; `partial` is whether a frame has partly arrived there. They
+    /// are no progress of a frame that has partly arrived at the other one.
+    pub(crate) fn received(&mut self, reader: Reader, bytes: usize, partial: bool, now: Instant) {
         self.clock.received = now;
         self.clock.pinged = false;
         self.clock.doubted = None;
         self.clock.written_since = 0;
         self.suspect = false;
-        self.clock.partial = match (self.clock.partial, partial) {
+        let [main, parcels] = &mut self.clock.partial;
+        let clock = match reader {
+            Reader::Main => main,
+            Reader::Parcels => parcels,
+        };
+        *clock = match (*clock, partial) {
             (_, false) => None,
             (None, true) => Some((now, 0)),
             (Some((since, before)), true) => Some((since, before.saturating_add(bytes as u64))),
@@ -534,10 +549,9 @@ impl Connection {
     /// latest.
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
         let connected = self.clock.connected?;
-        let stalled = self
-            .clock
-            .partial
-            .map(|(since, _)| since + self.limits.stall_timeout);
+        let partial = self.clock.partial.iter().flatten();
+        let stalled = partial.map(|(since, _)| *since + self.limits.stall_timeout);
+        let stalled = stalled.min();
         if self.peer.is_none() {
             return Some(connected + self.limits.handshake_timeout);
         }
@@ -552,14 +566,14 @@ impl Connection {
     }
 
     /// Handles the timers that are due. `least_progress` is the number of bytes of a partly arrived
-    /// frame that must arrive in each measuring period.
+    /// frame that must arrive in each measuring period, at the main reader and at that of parcels.
     ///
     /// # Errors
     /// When the connection is over.
     pub(crate) fn handle_timeout(
         &mut self,
         now: Instant,
-        least_progress: u64,
+        least_progress: [u64; 2],
     ) -> Result<(), ConnectionEnd> {
         let Some(connected) = self.clock.connected else {
             return Ok(());
@@ -573,15 +587,17 @@ impl Connection {
                 Ok(())
             };
         }
-        if let Some((since, bytes)) = self.clock.partial
-            && now >= since + self.limits.stall_timeout
-        {
-            if bytes < least_progress.max(Limits::MIN_PROGRESS) {
-                return Err(ConnectionEnd::TooSlow(
-                    "the peer stopped sending in the middle of a frame (stall_timeout)",
-                ));
+        for (clock, least) in self.clock.partial.iter_mut().zip(least_progress) {
+            if let Some((since, bytes)) = *clock
+                && now >= since + self.limits.stall_timeout
+            {
+                if bytes < least.max(Limits::MIN_PROGRESS) {
+                    return Err(ConnectionEnd::TooSlow(
+                        "the peer stopped sending in the middle of a frame (stall_timeout)",
+                    ));
+                }
+                *clock = Some((now, 0));
             }
-            self.clock.partial = Some((now, 0));
         }
         if self.is_idle() && now >= self.clock.busy + self.limits.idle_close {
             self.retiring = true;

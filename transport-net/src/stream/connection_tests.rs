@@ -106,7 +106,7 @@ impl Side {
             self.take_events();
         }
         let partial = self.reader.is_partial();
-        self.connection.received(step, partial, now);
+        self.connection.received(Reader::Main, step, partial, now);
     }
 
     fn take_events(&mut self) {
@@ -423,15 +423,15 @@ fn a_silent_peer_gets_a_ping_and_is_then_given_up() {
     for _ in 0..5 {
         now += keep_alive;
         assert!(a.connection.poll_timeout().unwrap() <= now);
-        a.connection.handle_timeout(now, 0).unwrap();
+        a.connection.handle_timeout(now, [0; 2]).unwrap();
         settle(&mut a, &mut b, now);
     }
     now += keep_alive;
-    a.connection.handle_timeout(now, 0).unwrap();
+    a.connection.handle_timeout(now, [0; 2]).unwrap();
     a.transmit(usize::MAX, &mut b.coming, now);
     now += keep_alive;
     assert_eq!(
-        a.connection.handle_timeout(now, 0),
+        a.connection.handle_timeout(now, [0; 2]),
         Err(ConnectionEnd::Silent)
     );
 }
@@ -450,7 +450,7 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     assert!(a.connection.doubt(now, patience));
     settle(&mut a, &mut b, now);
     now += patience;
-    a.connection.handle_timeout(now, 0).unwrap();
+    a.connection.handle_timeout(now, [0; 2]).unwrap();
     // A peer that does not respond is given up; doubting again grants no more time.
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.transmit(usize::MAX, &mut b.coming, now);
@@ -458,9 +458,9 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     assert_eq!(due, now + patience);
     now += patience / 2;
     assert!(a.connection.doubt(now, Duration::ZERO));
-    a.connection.handle_timeout(now, 0).unwrap();
+    a.connection.handle_timeout(now, [0; 2]).unwrap();
     assert_eq!(
-        a.connection.handle_timeout(due, 0),
+        a.connection.handle_timeout(due, [0; 2]),
         Err(ConnectionEnd::Silent)
     );
 }
@@ -476,12 +476,12 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
     for _ in 0..10 {
         now += patience / 2;
         a.transmit(100, &mut BytesMut::new(), now);
-        a.connection.handle_timeout(now, 0).unwrap();
+        a.connection.handle_timeout(now, [0; 2]).unwrap();
     }
     // The written bytes have time to arrive.
     now += patience + Duration::from_millis(10);
     assert_eq!(
-        a.connection.handle_timeout(now, 0),
+        a.connection.handle_timeout(now, [0; 2]),
         Err(ConnectionEnd::Silent)
     );
 }
@@ -502,7 +502,8 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     a.connection.abandon(first, now + patience / 2);
     assert!(!a.connection.is_suspect());
     let second = dispatch(&mut a, now);
-    a.connection.received(1, false, now + patience / 2);
+    a.connection
+        .received(Reader::Main, 1, false, now + patience / 2);
     a.connection.abandon(second, now + patience * 2);
     assert!(!a.connection.is_suspect(), "a byte arrived meanwhile");
     let now = now + patience * 3;
@@ -513,7 +514,8 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     let mut asked = BytesMut::new();
     a.transmit(usize::MAX, &mut asked, now + patience);
     assert!(!asked.is_empty());
-    a.connection.received(1, false, now + patience);
+    a.connection
+        .received(Reader::Main, 1, false, now + patience);
     assert!(!a.connection.is_suspect());
     settle(&mut a, &mut b, now + patience);
 }
@@ -528,8 +530,8 @@ fn an_idle_connection_closes_unless_a_parcel_is_open() {
     b.receive(usize::MAX, now);
     for _ in 0..20 {
         now += limits().keep_alive;
-        a.connection.handle_timeout(now, 0).unwrap();
-        b.connection.handle_timeout(now, 0).unwrap();
+        a.connection.handle_timeout(now, [0; 2]).unwrap();
+        b.connection.handle_timeout(now, [0; 2]).unwrap();
         a.transmit(usize::MAX, &mut b.coming, now);
         b.receive(usize::MAX, now);
         b.transmit(usize::MAX, &mut a.coming, now);
@@ -539,7 +541,7 @@ fn an_idle_connection_closes_unless_a_parcel_is_open() {
     assert_eq!(a.concluded.len(), 1);
     now += limits().idle_close;
     assert_eq!(
-        a.connection.handle_timeout(now, 0),
+        a.connection.handle_timeout(now, [0; 2]),
         Err(ConnectionEnd::Idle)
     );
     assert_eq!(a.dispatch(1), Err(SendError::Ended));
@@ -549,23 +551,44 @@ fn an_idle_connection_closes_unless_a_parcel_is_open() {
 fn a_stalled_frame_ends_the_connection_and_a_slow_one_does_not() {
     let mut now = Instant::now();
     let (mut a, _) = greeted(now);
-    a.connection.received(100, true, now);
+    a.connection.received(Reader::Main, 100, true, now);
     for _ in 0..3 {
         now += limits().stall_timeout / 2;
         a.connection
-            .received(Limits::MIN_PROGRESS as usize, true, now);
+            .received(Reader::Main, Limits::MIN_PROGRESS as usize, true, now);
         now += limits().stall_timeout / 2;
-        a.connection.handle_timeout(now, 0).unwrap();
+        a.connection.handle_timeout(now, [0; 2]).unwrap();
     }
     // One byte a second.
     for _ in 0..10 {
         now += limits().stall_timeout / 10;
-        a.connection.received(1, true, now);
+        a.connection.received(Reader::Main, 1, true, now);
     }
     assert!(matches!(
-        a.connection.handle_timeout(now, 0),
+        a.connection.handle_timeout(now, [0; 2]),
         Err(ConnectionEnd::TooSlow(_))
     ));
+}
+
+#[test]
+fn bytes_of_one_reader_are_no_progress_of_a_frame_at_the_other() {
+    let start = Instant::now();
+    for (stalled, other) in [
+        (Reader::Main, Reader::Parcels),
+        (Reader::Parcels, Reader::Main),
+    ] {
+        let (mut a, _) = greeted(start);
+        a.connection.received(stalled, 100, true, start);
+        let due = start + limits().stall_timeout;
+        let half = start + limits().stall_timeout / 2;
+        for partial in [true, false] {
+            let enough = 2 * Limits::MIN_PROGRESS as usize;
+            a.connection.received(other, enough, partial, half);
+        }
+        assert!(a.connection.poll_timeout().unwrap() <= due);
+        let end = a.connection.handle_timeout(due, [0; 2]);
+        assert!(matches!(end, Err(ConnectionEnd::TooSlow(_))), "{end:?}");
+    }
 }
 
 #[test]
@@ -575,7 +598,7 @@ fn a_hello_must_come_in_time() {
     let late = now + limits().handshake_timeout;
     assert_eq!(b.connection.poll_timeout(), Some(late));
     assert!(matches!(
-        a.connection.handle_timeout(late, 0),
+        a.connection.handle_timeout(late, [0; 2]),
         Err(ConnectionEnd::TooSlow(_))
     ));
 }

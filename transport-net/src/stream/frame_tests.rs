@@ -210,6 +210,25 @@ fn large_content_is_read_only_into_the_offered_memory() {
 }
 
 #[test]
+fn content_behind_the_longest_front_is_read_into_the_offered_memory() {
+    for front in [CHUNK, 100_000, Letter::MAX_AROUND] {
+        let whole = parcel(9, &letter_parcel(vec![1; front], vec![2; 100_000])).unwrap();
+        let mut places = Vec::new();
+        let memory = |arriving: &Arriving<'_>| {
+            let memory = Memory(vec![0; arriving.len]);
+            places.push(memory.0.as_ptr());
+            let loan = ByteBudget::default().lend(arriving.len, arriving.len)?;
+            Some(ContentBuffer::new(Box::new(memory), loan))
+        };
+        let run = [&whole.concat()[..], &ping()].concat();
+        let read = read_into(&mut reader(8 << 20), &run, &[usize::MAX, 7, 999], memory).unwrap();
+        assert_eq!(read.len(), 2);
+        assert_eq!([content(&read[0]).as_ptr()], places[..]);
+        assert_eq!(*content(&read[0]), [2; 100_000][..]);
+    }
+}
+
+#[test]
 fn inconsistent_lengths_get_no_memory() {
     let whole = parcel(9, &letter_parcel(vec![1; 10], vec![2; 100_000])).unwrap();
     let mut bytes = whole.concat();

@@ -12,7 +12,7 @@ use fipa_transport::{
 
 use super::budget::{ByteBudget, ContentBuffer};
 use super::config::Limits;
-use super::connection::{Connection, Event, Role};
+use super::connection::{Connection, Event, Reader, Role};
 use super::frame::{self, FrameReader, Space};
 use crate::Identity;
 use crate::end::ConnectionEnd;
@@ -163,7 +163,7 @@ impl Framed {
             self.take_frames(now);
             if !self.ended {
                 let partial = self.reader.is_partial();
-                self.connection.received(taken, partial, now);
+                self.connection.received(Reader::Main, taken, partial, now);
             }
         }
     }
@@ -260,7 +260,7 @@ impl Framed {
             return;
         }
         let least = self.reader.least_progress();
-        if let Err(end) = self.connection.handle_timeout(now, least) {
+        if let Err(end) = self.connection.handle_timeout(now, [least, 0]) {
             self.end(&end);
         }
     }

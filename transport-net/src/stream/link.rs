@@ -24,7 +24,7 @@ use tokio::sync::{Notify, watch};
 use tokio::time::{sleep_until, timeout};
 
 use super::budget::ContentBuffer;
-use super::connection::{Connection, Event, MAX_ID, SendError};
+use super::connection::{Connection, Event, MAX_ID, Reader, SendError};
 use super::counters::count;
 use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
@@ -479,7 +479,8 @@ impl LinkTask {
         let timer = sleep_until(Instant::now().into());
         tokio::pin!(timer);
         let (link, byte_budget) = (self.link.clone(), self.endpoint.byte_budget.clone());
-        if let Err(end) = self.take_frames(reader, 0, false, from, greeted).await {
+        let begun = self.take_frames((Reader::Main, reader), 0, from, greeted);
+        if let Err(end) = begun.await {
             return end;
         }
         loop {
@@ -526,8 +527,8 @@ impl LinkTask {
                         Ok(bytes) => bytes,
                         Err(error) => return ConnectionEnd::Broken(error.to_string()),
                     };
-                    let other = extra.is_partial();
-                    if let Err(end) = self.take_frames(reader, arrived, other, from, greeted).await {
+                    let taken = self.take_frames((Reader::Main, reader), arrived, from, greeted);
+                    if let Err(end) = taken.await {
                         return end;
                     }
                 }
@@ -537,11 +538,12 @@ impl LinkTask {
                         Ok(bytes) => bytes,
                         Err(error) => return ConnectionEnd::ProtocolViolation(error.to_string()),
                     };
-                    let other = reader.is_partial();
-                    if let Some(letters) = extra.reader()
-                        && let Err(end) = self.take_frames(letters, arrived, other, from, greeted).await
-                    {
-                        return end;
+                    if let Some(letters) = extra.reader() {
+                        let reader = (Reader::Parcels, letters);
+                        let taken = self.take_frames(reader, arrived, from, greeted);
+                        if let Err(end) = taken.await {
+                            return end;
+                        }
                     }
                 }
                 ready = writer.writable(), if flushed == Flushed::Rest => {
@@ -552,8 +554,8 @@ impl LinkTask {
                 () = link.wake.notified() => {}
                 () = &mut freed, if blocked != (false, false) => {}
                 () = &mut timer => {
-                    let least = reader.least_progress();
-                    let least = least.max(extra.reader().map_or(0, |it| it.least_progress()));
+                    let parcels = extra.reader().map_or(0, |it| it.least_progress());
+                    let least = [reader.least_progress(), parcels];
                     let mut state = link.state.lock();
                     if let Err(end) = state.connection.handle_timeout(Instant::now(), least) {
                         return end;
@@ -572,23 +574,23 @@ impl LinkTask {
         greeted: &mut Option<impl FnOnce() + Send>,
     ) -> Result<(), ConnectionEnd> {
         if blocked.0 {
-            let other = extra.is_partial();
-            self.take_frames(reader, 0, other, from, greeted).await?;
+            let reader = (Reader::Main, reader);
+            self.take_frames(reader, 0, from, greeted).await?;
         }
-        let other = reader.is_partial();
         match extra.reader() {
-            Some(letters) if blocked.1 => self.take_frames(letters, 0, other, from, greeted).await,
+            Some(letters) if blocked.1 => {
+                let reader = (Reader::Parcels, letters);
+                self.take_frames(reader, 0, from, greeted).await
+            }
             _ => Ok(()),
         }
     }
 
-    /// Processes the complete frames that have arrived. `other_partial` is whether a frame has
-    /// partly arrived on another stream of this link.
+    /// Processes the complete frames that have arrived at a reader.
     async fn take_frames(
         &mut self,
-        reader: &mut FrameReader,
+        (which, reader): (Reader, &mut FrameReader),
         arrived: usize,
-        other_partial: bool,
         from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
     ) -> Result<(), ConnectionEnd> {
@@ -636,10 +638,10 @@ impl LinkTask {
             self.paused = self.paused.max(until);
         }
         let mut state = link.state.lock();
-        let partial = reader.is_partial() || other_partial;
+        let partial = reader.is_partial();
         // A letter that waits for memory does not count as received.
         if arrived > 0 || !reader.is_blocked() {
-            state.connection.received(arrived, partial, now);
+            state.connection.received(which, arrived, partial, now);
             link.note_suspicion(&state);
         }
         drop(state);

@@ -195,11 +195,6 @@ impl ExtraStreams {
     pub(crate) fn is_blocked(&mut self) -> bool {
         self.reader().is_some_and(|reader| reader.is_blocked())
     }
-
-    /// Whether a letter has begun to arrive and is not complete.
-    pub(crate) fn is_partial(&mut self) -> bool {
-        self.reader().is_some_and(|reader| reader.is_partial())
-    }
 }
 
 impl Reading {

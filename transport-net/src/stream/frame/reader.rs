@@ -12,6 +12,7 @@
 
 use bytes::buf::Limit;
 use bytes::{Buf, BufMut, BytesMut};
+use fipa_acl::Letter;
 use fipa_transport::Arriving;
 use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader};
 use zerocopy::FromBytes;
@@ -28,6 +29,10 @@ pub(super) const FIRST_STEP: usize = 4 << 20;
 
 /// Minimum length of content that is read into memory of the sink.
 pub(super) const APART_FROM: u64 = 32 * 1024;
+
+/// Maximum length of the bytes in front of content that is read into memory of the sink. Longer ones
+/// belong to no letter that a service sends; see [`Letter::MAX_AROUND`].
+const MAX_FRONT: usize = Letter::MAX_AROUND + (128 << 10);
 
 /// Length of both headers of a parcel: these bytes can be read without any content.
 const HEADERS: usize = HEADER_LEN + PARCEL_HEADER_LEN;
@@ -353,7 +358,9 @@ impl PartialBody {
             return self.keep_along();
         };
         let announced = (PARCEL_HEADER_LEN as u64).saturating_add(header.body_len());
-        if announced != self.len as u64 || header.content_len() < APART_FROM || self.front() > CHUNK
+        if announced != self.len as u64
+            || header.content_len() < APART_FROM
+            || self.front() > MAX_FRONT
         {
             return self.keep_along();
         }
