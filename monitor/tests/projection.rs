@@ -417,6 +417,13 @@ fn an_outsider_ends_no_conversation_of_roles() {
     drone.lost("request dro>med");
     drone.right(&["request mallory>dro", "request dro>med", "refuse med>dro"]);
     assert_eq!(drone.monitor.len(), 2);
+    // An answered message has arrived, so its receiver keeps the role.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "agree med>dro"]);
+    drone.lost("request dro>med");
+    drone.right(&["inform dro>sta"]);
+    assert_eq!(drone.wrong("inform mallory>dro"), Kind::Stranger);
+    drone.right(&["inform med>dro"]);
     // The station does not know the agent that is the drone.
     let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
     let mut station = stage("sta");
