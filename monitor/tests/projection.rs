@@ -417,6 +417,12 @@ fn an_outsider_ends_no_conversation_of_roles() {
     drone.lost("request dro>med");
     drone.right(&["request mallory>dro", "request dro>med", "refuse med>dro"]);
     assert_eq!(drone.monitor.len(), 2);
+    // With two conversations of one identifier, the message may belong to another one.
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "request mallory>dro"]);
+    assert_eq!(drone.monitor.len(), 2);
+    assert_eq!(drone.check("confirm med>dro"), unknown);
     // An answered message has arrived, so its receiver keeps the role.
     let mut drone = stage("dro");
     drone.right(&["request dro>med", "agree med>dro"]);
@@ -425,7 +431,6 @@ fn an_outsider_ends_no_conversation_of_roles() {
     assert_eq!(drone.wrong("inform mallory>dro"), Kind::Stranger);
     drone.right(&["inform med>dro"]);
     // The station does not know the agent that is the drone.
-    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
     let mut station = stage("sta");
     station.right(&["query-if med>sta", "confirm sta>med", "inform dro>sta"]);
     assert_eq!(station.wrong("confirm sta>med"), Kind::Unexpected);
