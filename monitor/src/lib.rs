@@ -25,6 +25,7 @@ mod deadlines;
 mod delegated;
 mod fingerprints;
 mod header;
+mod index;
 mod judge;
 mod library;
 mod limits;

@@ -1524,6 +1524,7 @@ mod tests {
     use fipa_acl::{Performative, Time};
 
     use super::*;
+    use crate::names::COMPARISONS;
 
     #[test]
     fn stale_deadlines_are_removed() {
@@ -1576,6 +1577,38 @@ mod tests {
         assert_eq!(bytes[1], bytes[2]);
         monitor.handle_timeout(now + Duration::from_secs(100_000));
         assert_eq!(monitor.names.len(), 0);
+    }
+
+    #[test]
+    fn names_are_compared_in_linear_steps() {
+        const MANY: usize = 500;
+        let text = r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="inform" from="a" to="b" target="3"/></state>
+            <state id="3"><transition performative="agree" from="b" to="a" target="3"/></state></scxml>"#;
+        let mut library = Library::standard();
+        library.add(Machine::read("plain", text).unwrap()).unwrap();
+        let library = Arc::new(library);
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let header = |act, protocol| Header::new(act).protocol(protocol).conversation_id("1");
+        let all = || (0..MANY).map(|number| format!("agent {number}"));
+        for (protocol, acts) in [
+            ("plain", [Performative::Request, Performative::Inform]),
+            (
+                "fipa-contract-net",
+                [Performative::Cfp, Performative::Cancel],
+            ),
+        ] {
+            let mut monitor = Monitor::observer(Arc::clone(&library));
+            for act in acts {
+                let before = COMPARISONS.get();
+                let message = header(act, protocol).sender("ann").receivers(all());
+                let verdict = monitor.check(&message, now);
+                assert!(verdict.is_accepted(), "{verdict:?}");
+                let made = COMPARISONS.get() - before;
+                assert!(made < 10 * MANY, "{protocol}: {made} comparisons");
+            }
+        }
     }
 
     #[test]

@@ -16,6 +16,12 @@ pub(crate) struct Names {
     hasher: RandomState,
 }
 
+#[cfg(test)]
+thread_local! {
+    /// Number of comparisons of names by this thread. Tests bound it by the number of names.
+    pub(crate) static COMPARISONS: std::cell::Cell<usize> = const { std::cell::Cell::new(0) };
+}
+
 /// Maximum capacity of the buffer of an unused name, in bytes.
 const KEPT: usize = 64;
 
@@ -99,6 +105,8 @@ impl Names {
 
     #[inline]
     pub(crate) fn is(&self, name: Name, text: &str) -> bool {
+        #[cfg(test)]
+        COMPARISONS.with(|count| count.set(count.get() + 1));
         let entry = self.entries.get(name as usize);
         entry.is_some_and(|entry| entry.name == text)
     }

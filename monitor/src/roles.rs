@@ -192,10 +192,9 @@ impl Monitor {
                     }
                     let began = self.names.is(conversation.initiator, observed.sender);
                     let rare = conversation.rare();
-                    // The monitored agent has asked it to take the role.
-                    let is_asked = rare.asked.iter().any(|asked| {
-                        asked.role == role && self.names.is(asked.agent, observed.sender)
-                    });
+                    // The monitored agent has asked the sender to take the role: `peers` has no role of
+                    // which it has asked only others.
+                    let is_asked = rare.asked.iter().any(|asked| asked.role == role);
                     let claims = !observed.own && !began && !is_asked;
                     rare.claimed |= claims;
                     rare.doubtful |= claims && rare.undelivered;

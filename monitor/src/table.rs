@@ -9,6 +9,7 @@ use hashbrown::HashTable;
 use siphasher::sip128::SipHasher13;
 
 use crate::conversation::{Conversation, NONE};
+use crate::index::Index;
 use crate::names::Name;
 
 /// A list of conversations.
@@ -31,7 +32,7 @@ pub(crate) struct Table {
     /// As many as slots.
     cold: Vec<Cold>,
     free: Vec<u32>,
-    by_id: HashTable<Indexed>,
+    by_id: Index,
     keys: [u64; 2],
     /// The lists of all conversations.
     ends: [Ends; 2],
@@ -41,17 +42,8 @@ pub(crate) struct Table {
     begun: u64,
 }
 
-/// A main conversation in the index: a part of the fingerprint of its identifier, and its slot.
-///
-/// The index is small, so that most of it is in the cache. The slot has the rest of the fingerprint.
-#[derive(Debug)]
-struct Indexed {
-    tag: u32,
-    at: u32,
-}
-
 /// A fingerprint of an identifier. It has 96 bits and a secret random key, so that equal fingerprints are
-/// equal identifiers: a search does not read the text.
+/// equal identifiers: a search does not read the text. The index has the tag, and the slot the rest.
 #[derive(Debug, Clone, Copy)]
 struct Fingerprint {
     tag: u32,
@@ -175,7 +167,7 @@ const EMPTY: Ends = Ends {
 impl Slot {
     /// Bytes of a conversation with its entry in the index, which may be half empty, but without its
     /// allocations.
-    pub(crate) const COST: usize = size_of::<Self>() + size_of::<Cold>() + 2 * size_of::<Indexed>();
+    pub(crate) const COST: usize = size_of::<Self>() + size_of::<Cold>() + Index::COST;
 
     pub(crate) fn list(&self) -> List {
         self.list
@@ -188,7 +180,7 @@ impl Table {
             slots: Slots::default(),
             cold: Vec::new(),
             free: Vec::new(),
-            by_id: HashTable::new(),
+            by_id: Index::default(),
             keys: ["first", "second"].map(|key| random.hash_one(key)),
             ends: [EMPTY; 2],
             accounts: HashTable::new(),
@@ -218,10 +210,8 @@ impl Table {
     #[inline]
     pub(crate) fn find_all<'t>(&'t self, id: &'t str) -> impl Iterator<Item = u32> + 't {
         let Fingerprint { tag, rest } = self.fingerprint(id);
-        let alike = self.by_id.iter_hash(spread(tag)).filter(move |one| {
-            one.tag == tag && self.slot(one.at).is_some_and(|slot| slot.id_rest == rest)
-        });
-        alike.map(|one| one.at)
+        let alike = self.by_id.find_all(tag);
+        alike.filter(move |at| self.slot(*at).is_some_and(|slot| slot.id_rest == rest))
     }
 
     fn fingerprint(&self, id: &str) -> Fingerprint {
@@ -342,9 +332,7 @@ impl Table {
             if let Some(slot) = self.slots.get_mut(at) {
                 slot.id_rest = rest;
             }
-            let entry = Indexed { tag, at };
-            self.by_id
-                .insert_unique(spread(tag), entry, |one| spread(one.tag));
+            self.by_id.insert(tag, at);
             self.append(at, List::Open);
         } else {
             let first = self.slot(parent).map_or(NONE, |slot| slot.child);
@@ -442,9 +430,7 @@ impl Table {
         let peer = self.peer(at);
         if parent == NONE {
             let Fingerprint { tag, .. } = self.fingerprint(self.id(at));
-            if let Ok(found) = self.by_id.find_entry(spread(tag), |one| one.at == at) {
-                found.remove();
-            }
+            self.by_id.remove(tag, at);
             self.unlink(at);
         } else {
             self.leave_parent(at, parent);

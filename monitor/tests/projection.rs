@@ -360,6 +360,37 @@ fn a_message_of_another_role_leaves_the_last_one_open() {
 }
 
 #[test]
+fn an_agent_that_was_asked_to_take_one_role_may_claim_another() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="b" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    library.add(machine(text)).unwrap();
+    let library = Arc::new(library);
+    let asked = || {
+        let mut stage = stage("ann");
+        stage.monitor = Monitor::agent(Arc::clone(&library), "ann");
+        stage.right(&["request ann>ben"]);
+        stage.lost("request ann>ben");
+        stage
+    };
+    // Whether the request arrived is unknown if ben does not have the role c.
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    let mut ann = asked();
+    ann.right(&["inform ben>ann"]);
+    assert_eq!(ann.check("request ann>cid"), unknown);
+    assert_eq!(ann.check("inform cid>ann"), unknown);
+    // The agent that was asked of a role claims nothing with it.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med"]);
+    drone.lost("request dro>med");
+    drone.right(&["agree med>dro"]);
+    assert_eq!(drone.wrong("request dro>med"), Kind::Unexpected);
+}
+
+#[test]
 fn an_outsider_ends_no_conversation_of_roles() {
     for act in ["not-understood", "failure", "cancel"] {
         let mut mediator = stage("med");
@@ -386,8 +417,20 @@ fn an_outsider_ends_no_conversation_of_roles() {
     drone.lost("request dro>med");
     drone.right(&["request mallory>dro", "request dro>med", "refuse med>dro"]);
     assert_eq!(drone.monitor.len(), 2);
-    // The station does not know the agent that is the drone.
+    // With two conversations of one identifier, the message may belong to another one.
     let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "request mallory>dro"]);
+    assert_eq!(drone.monitor.len(), 2);
+    assert_eq!(drone.check("confirm med>dro"), unknown);
+    // An answered message has arrived, so its receiver keeps the role.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "agree med>dro"]);
+    drone.lost("request dro>med");
+    drone.right(&["inform dro>sta"]);
+    assert_eq!(drone.wrong("inform mallory>dro"), Kind::Stranger);
+    drone.right(&["inform med>dro"]);
+    // The station does not know the agent that is the drone.
     let mut station = stage("sta");
     station.right(&["query-if med>sta", "confirm sta>med", "inform dro>sta"]);
     assert_eq!(station.wrong("confirm sta>med"), Kind::Unexpected);

@@ -484,3 +484,32 @@ fn a_monitor_of_one_conversation_refuses_protocols_that_cannot_run_within_it() {
     stage.right(query());
     assert_eq!(stage.monitor.len(), 2);
 }
+
+#[test]
+fn a_message_with_another_in_reply_to_than_the_cancel_may_have_crossed_it() {
+    let news = |words| say_in("fipa-subscribe", words);
+    let mut stage = Stage::observer();
+    stage.right(news("subscribe ann>ben").reply_with("s"));
+    stage.right(news("agree ben>ann"));
+    stage.right(news("cancel ann>ben").reply_with("x"));
+    assert_eq!(stage.right(news("inform ben>ann")), "cancelled");
+    let crossed = news("inform ben>ann").in_reply_to("s");
+    assert_eq!(stage.right(crossed), "cancelled");
+    let answer = news("inform ben>ann").in_reply_to("x");
+    assert_eq!(stage.right(answer), "cancelled");
+}
+
+#[test]
+fn a_cancel_has_one_answer_that_is_told_apart() {
+    let news = |words| say_in("fipa-subscribe", words);
+    let mut stage = Stage::observer();
+    stage.right(news("subscribe ann>ben"));
+    stage.right(news("agree ben>ann"));
+    stage.right(news("cancel ann>ben").reply_with("x"));
+    assert_eq!(stage.right(news("inform ben>ann")), "cancelled");
+    let failed = news("failure ben>ann").in_reply_to("x");
+    let going_on = stage.right(failed);
+    // The next message is one of the subscription.
+    let next = news("inform ben>ann").in_reply_to("x");
+    assert_eq!(stage.right(next), going_on);
+}

@@ -220,6 +220,23 @@ fn a_guessed_identifier_does_not_block_its_owner() {
     }
     stage.right(request("inform ann>ben"));
     assert_eq!(stage.monitor.len(), 8);
+    assert_eq!(stage.monitor.forgotten(), 193, "all but 7 of 200");
+}
+
+#[test]
+fn a_message_that_fits_no_conversation_is_reported_with_the_last_that_began() {
+    let mut stage = Stage::observer();
+    let other = |words| request(words).conversation_id("other");
+    stage.right(other("request ann>ben"));
+    stage.right(other("refuse ben>ann"));
+    stage.right(request("request ann>ben"));
+    stage.right(request("agree ben>ann"));
+    // The next conversation takes the place of the ended one in the table.
+    stage.pass(100);
+    assert_eq!(stage.monitor.len(), 1);
+    let last = stage.right(request("request cid>ben"));
+    let violation = stage.wrong(request("inform ben>dan"));
+    assert_eq!(violation.state, Some(last));
 }
 
 #[test]

@@ -84,6 +84,22 @@ fn the_next_monitor_has_the_same_states() {
 }
 
 #[test]
+fn embedded_conversations_move_along() {
+    let broker = |words| say_in("fipa-brokering", words);
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(broker("proxy ann>ben"));
+    stage.right(broker("agree ben>ann"));
+    stage.right(request("request ben>cid"));
+    stage.right(say_in("fipa-query", "query-if ben>dan"));
+    assert_eq!(stage.monitor.len(), 3);
+    let mut stage = moved(&stage, "ben");
+    assert_eq!(stage.wrong(request("agree dan>ben")).kind, Kind::Stranger);
+    stage.right(say_in("fipa-query", "inform dan>ben"));
+    stage.right(request("agree cid>ben"));
+    stage.right(broker("inform ben>ann"));
+}
+
+#[test]
 fn deadlines_move_along() {
     let mut stage = Stage::new(Monitor::agent(library(), "ben"));
     let due = Time::from_system_time(stage.now + Duration::from_secs(10)).unwrap();
