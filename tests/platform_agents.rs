@@ -346,6 +346,7 @@ async fn of_two_agents_with_one_name_that_which_holds_it_is_found() {
     let (two, at_two) = host(&config(&[])).await;
     // These two hosts do not know each other; a third one knows both.
     let first = at_one.register("crane").await.unwrap();
+    support::next_millisecond().await;
     let second = at_two.register("crane").await.unwrap();
     for (agent, name) in [(&first, "lift-1"), (&second, "lift-2")] {
         let df = agent.df().unwrap();

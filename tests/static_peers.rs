@@ -242,7 +242,7 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     let near_config = config(&[]);
     let near_host = Domain::open(&near_config).await.unwrap();
     // Registered while neither gateway knows the other registration.
-    tokio::time::sleep(Duration::from_millis(5)).await;
+    support::next_millisecond().await;
     let later = near_host.register("arm").await.unwrap();
     let mut knows_both = near_config.clone();
     knows_both.discovery = config(&[&knowing("far", &[&address(&far)])]).discovery;

@@ -6,7 +6,7 @@ mod common;
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant, SystemTime};
 
 use common::{Host, Running};
@@ -316,12 +316,7 @@ fn a_stopped_watcher_does_not_delay_letters() {
     let ((mut rover, mut events), (mut arm, _)) =
         (ordered_agent(&host, "rover"), ordered_agent(&host, "arm"));
     let mut watching = watch(&host, &[]);
-    let pid = watching.pid();
-    let signal = |signal: &str| {
-        let sent = Command::new("kill").args([signal, pid.as_str()]).status();
-        assert!(sent.unwrap().success());
-    };
-    signal("-STOP");
+    watching.send_signal("-STOP");
     let order = format!("{{\"do\":\"measure\",\"to\":\"arm\",\"len\":9,\"rounds\":{LETTERS}}}\n");
     rover
         .stdin
@@ -335,7 +330,7 @@ fn a_stopped_watcher_does_not_delay_letters() {
         output.contains("\"measured\""),
         "not every letter was delivered: {output}"
     );
-    signal("-CONT");
+    watching.send_signal("-CONT");
     let lost = next_of(&mut watching, "lost");
     assert!(lost["records"].as_u64().unwrap() > 0, "{lost}");
     for agent in [&mut rover, &mut arm] {

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, View};
+use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Principal, Report, Stream, TransportError, TransportErrorKind, Verdict,
@@ -35,6 +35,15 @@ struct Service {
 
 impl Service {
     fn new(forwards: bool) -> Self {
+        Self::with_view(forwards, |directory| directory)
+    }
+
+    /// Creates a service that sends letters, and whose directory shows the agent on another host.
+    fn of_another_host() -> Self {
+        Self::with_view(false, |directory| Arc::new(Abroad(directory)))
+    }
+
+    fn with_view(forwards: bool, view: impl FnOnce(Arc<MemoryDirectory>) -> Arc<dyn View>) -> Self {
         let directory = Arc::new(MemoryDirectory::new(Mts::new("mts", NEXT)));
         let at = shm(NEXT);
         directory
@@ -44,7 +53,7 @@ impl Service {
             forwards,
             ..CoreConfig::new("mts", OWN, vec![Kind::Shm])
         };
-        let mut core = Core::new(config, Arc::clone(&directory) as Arc<dyn View>);
+        let mut core = Core::new(config, view(Arc::clone(&directory)));
         core.register("rover".into(), ROVER);
         let start = Instant::now();
         Self {
@@ -157,6 +166,29 @@ impl Service {
             Action::Outcome { outcome, .. } => Some(outcome),
             _ => None,
         })
+    }
+}
+
+/// A view of a directory that shows its agents on another host.
+struct Abroad(Arc<MemoryDirectory>);
+
+fn abroad(entry: &Arc<Entry>) -> Arc<Entry> {
+    let mut entry = Entry::clone(entry);
+    entry.reach = Reach::Remote { gateway: NEXT };
+    Arc::new(entry)
+}
+
+impl View for Abroad {
+    fn named(&self, name: &str) -> Option<Arc<Entry>> {
+        self.0.named(name).as_ref().map(abroad)
+    }
+
+    fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.0.registered(incarnation).as_ref().map(abroad)
+    }
+
+    fn all(&self) -> Arc<[Arc<Entry>]> {
+        self.0.all().iter().map(abroad).collect()
     }
 }
 
@@ -391,6 +423,75 @@ fn a_letter_that_may_have_arrived_waits_one_second_for_its_receiver() {
         panic!("{report:?}");
     };
     assert_eq!(reason, FailureReason::Unconfirmed);
+}
+
+/// Brings a sender into the state in which attempts may have delivered these letters, and in which its directory
+/// no longer has their receiver.
+fn without_receiver(mut sender: Service, letters: usize) -> Service {
+    let mut attempts = Vec::new();
+    for _ in 0..letters {
+        sender.send();
+        attempts.extend(sender.dispatched());
+    }
+    assert_eq!(attempts.len(), letters);
+    sender.directory.deregister("arm", ARM).unwrap();
+    let now = sender.at(10);
+    sender.core.handle_directory_change(now);
+    for (attempt, _) in attempts {
+        let broken = TransportError::new(TransportErrorKind::Broken, "");
+        sender.conclude(20, attempt, Conclusion::Unconfirmed(broken));
+    }
+    sender
+}
+
+#[test]
+fn a_sender_sends_a_letter_again_when_its_receiver_on_another_host_returns() {
+    let mut sender = without_receiver(Service::of_another_host(), 1);
+    assert_eq!(sender.wait_for_dispatch(20, 900), None);
+    let arm = Registration::new("arm", ARM, vec![shm(NEXT)]);
+    sender.directory.register(arm).unwrap();
+    let now = sender.at(910);
+    sender.core.handle_directory_change(now);
+    let (ms, attempt, again) = sender.wait_for_dispatch(910, 10_000).unwrap();
+    assert_eq!(again.sequence, 1);
+    sender.answer(ms, attempt, Answer::Accepted);
+    assert!(sender.outcome().unwrap().is_success());
+}
+
+#[test]
+fn letters_that_may_have_arrived_wait_one_second_together_for_their_receiver_on_another_host() {
+    let mut sender = without_receiver(Service::of_another_host(), 3);
+    let mut failed = Vec::new();
+    for ms in (20..10_000).step_by(10) {
+        let now = sender.at(ms);
+        sender.core.handle_timeout(now);
+        failed.extend(std::iter::from_fn(|| sender.outcome()).map(|outcome| (ms, outcome)));
+    }
+    assert_eq!(failed.len(), 3);
+    for (ms, outcome) in failed {
+        assert!((1_000..1_100).contains(&ms), "{ms} ms");
+        let is_unconfirmed = matches!(
+            outcome,
+            Outcome::Failed {
+                reason: FailureReason::Unconfirmed,
+                ..
+            }
+        );
+        assert!(is_unconfirmed, "{outcome:?}");
+    }
+}
+
+#[test]
+fn a_letter_that_may_have_arrived_does_not_wait_for_a_receiver_of_this_host() {
+    let mut sender = without_receiver(Service::new(false), 1);
+    let is_unconfirmed = matches!(
+        sender.outcome(),
+        Some(Outcome::Failed {
+            reason: FailureReason::Unconfirmed,
+            ..
+        })
+    );
+    assert!(is_unconfirmed);
 }
 
 #[test]

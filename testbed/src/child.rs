@@ -1,8 +1,11 @@
 //! Processes that tests start.
 
+use std::fs;
 use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
 use std::thread::JoinHandle;
+
+use crate::until;
 
 /// Returns a command that runs this ignored test of this test program in a process of its own.
 ///
@@ -15,7 +18,8 @@ pub fn ignored_test(name: &str) -> Command {
     command
 }
 
-/// Sends a signal, such as `-TERM`, to a process.
+/// Sends a signal, such as `-TERM`, to a process. After `-STOP`, waits until all threads of the process have
+/// stopped: a thread that runs on another processor goes on for a moment.
 ///
 /// # Panics
 /// If there is no such process or signal.
@@ -24,6 +28,22 @@ pub fn send_signal(process: u32, signal: &str) {
     let pid = process.to_string();
     let sent = Command::new("kill").args([signal, &pid]).status();
     assert!(sent.unwrap().success(), "kill {signal} {pid}");
+    if signal == "-STOP" {
+        until("the process has stopped", || is_stopped(process));
+    }
+}
+
+/// Whether no thread of the process runs.
+fn is_stopped(process: u32) -> bool {
+    let Ok(threads) = fs::read_dir(format!("/proc/{process}/task")) else {
+        return true;
+    };
+    threads.flatten().all(|thread| {
+        // A thread that has ended has no status. The state follows the name, which may contain parentheses.
+        let status = fs::read_to_string(thread.path().join("stat")).unwrap_or_default();
+        let state = status.rsplit_once(") ").map(|(_, fields)| fields);
+        state.is_none_or(|fields| fields.starts_with(['T', 't', 'Z', 'X']))
+    })
 }
 
 /// A process that is killed on drop.
@@ -151,6 +171,18 @@ mod tests {
         let (mut guard, ready) = ChildGuard::until_ready(&mut command);
         assert_eq!(ready, "here I am\n");
         assert!(guard.ended().is_none());
+    }
+
+    #[test]
+    fn a_process_has_stopped_when_its_signal_was_sent() {
+        let mut command = Command::new("sh");
+        let guard = ChildGuard::start(command.args(["-c", "while :; do :; done"]));
+        for _ in 0..20 {
+            assert!(!is_stopped(guard.id()));
+            guard.signal("-STOP");
+            assert!(is_stopped(guard.id()));
+            guard.signal("-CONT");
+        }
     }
 
     #[test]

@@ -315,7 +315,6 @@ fn cleanup_waits_until_the_last_letters_of_dead_processes_are_taken() {
     until("connection", || connections() >= 2);
     // Stopped, so that it does not poll for a while.
     receiver.signal("-STOP");
-    std::thread::sleep(std::time::Duration::from_millis(50));
     sender.kill();
     std::thread::scope(|scope| {
         scope.spawn(|| {

@@ -116,14 +116,13 @@ impl Lane {
             [deadline, delivery.custody_due, times_out, held, not_before]
         });
         let paused = self.paused_until.filter(|until| *until > now);
-        let moving = self
-            .moving
-            .map(|(_, until)| until)
-            .filter(|until| *until > now);
+        let still =
+            |wait: Option<(_, Instant)>| wait.map(|(_, until)| until).filter(|until| *until > now);
+        let (moving, absent) = (still(self.moving), still(self.absent));
         let ended = self.ended.map(|(_, heard)| heard + ENDED_PATIENCE);
         let ended = ended.filter(|due| *due > now);
         let ask = self.ask_custodian.filter(|due| *due > now);
-        let others = [paused, moving, ended, ask];
+        let others = [paused, moving, absent, ended, ask];
         letters.chain(others).flatten().min()
     }
 }

@@ -61,8 +61,6 @@ pub(super) struct Progress {
     pub(super) unfit_since: Option<Instant>,
     /// Time since which its receiver's service does not know the receiver that the directory shows.
     pub(super) unknown_since: Option<Instant>,
-    /// Time since which a custodian's directory has no entry of its receiver.
-    pub(super) absent_since: Option<Instant>,
     /// Set when the letter came back because its predecessor was not taken.
     pub(super) hold: Option<Holding>,
     /// Set while the letter waits for a refresh of the directory.
@@ -143,7 +141,6 @@ impl Delivery {
             busy: false,
             unfit_since: None,
             unknown_since: None,
-            absent_since: None,
             hold: None,
             departure: None,
         };

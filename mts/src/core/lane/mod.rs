@@ -55,8 +55,7 @@ const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
 const HOP_MARGIN: Duration = Duration::from_millis(100);
 /// Time for which a letter waits for the new registration of a receiver that has moved.
 const MOVING_PATIENCE: Duration = Duration::from_secs(2);
-/// Time for which a custodian waits for the receiver of a letter to return to its directory, if an attempt may
-/// have delivered the letter.
+/// Time for which a letter that an attempt may have delivered waits for its receiver to return to the directory.
 const ABSENT_PATIENCE: Duration = Duration::from_secs(1);
 /// Time for which letters that were handed over for an ended registration are waited for.
 const ENDED_PATIENCE: Duration = Duration::from_secs(2);
@@ -133,6 +132,10 @@ pub(crate) struct Lane {
     busy_at: Option<(Incarnation, bool)>,
     /// A registration that has moved, and the end of the wait for its successor.
     moving: Option<(Incarnation, Instant)>,
+    /// A registration that the directory lacks and that may return, and the end of the wait for it.
+    absent: Option<(Incarnation, Instant)>,
+    /// Whether the last letter was dispatched for a receiver on another host.
+    is_abroad: bool,
     /// A registration that left the directory, and the time of the last event of letters for it.
     ended: Option<(Incarnation, Instant)>,
     /// Time at which custodians are asked whether they have letters of this lane.
@@ -183,6 +186,8 @@ impl Lane {
             was_busy: None,
             busy_at: None,
             moving: None,
+            absent: None,
+            is_abroad: false,
             ended: None,
             ask_custodian: None,
             holds: false,
@@ -477,7 +482,7 @@ impl Lane {
         delivery.handed_to(&route, local);
         delivery.progress.tried.push(route.clone());
         delivery.progress.hold = None;
-        delivery.progress.absent_since = None;
+        (self.is_abroad, self.absent) = (!local, None);
         delivery.progress.state = State::UnderWay {
             attempt,
             location: route.clone(),
@@ -643,18 +648,21 @@ impl Lane {
         }
     }
 
-    /// Whether a letter in custody waits for its receiver to return to the directory. After a broken connection
-    /// this service may know less than the sender's: the receiver was known from its letters only, for example.
-    /// A registration that has a successor does not return.
+    /// Whether a letter that may have arrived waits for its receiver to return to the directory. After a broken
+    /// connection, the directory may have less than before: the receiver was known from its letters only, for
+    /// example. A registration that has a successor does not return, and neither does one of this host.
     fn may_return(&mut self, now: Instant, index: usize, table: &AttemptTable) -> bool {
-        let is_custody = self.is_custody();
+        let registration = self.letters[index].registration;
+        let is_known_here = !self.is_abroad && !self.is_custody();
         let has_successor = table.view.named(&self.receiver).is_some();
-        let delivery = &mut self.letters[index];
-        if !is_custody || has_successor || table.departed.contains(now, delivery.registration) {
+        if is_known_here || has_successor || table.departed.contains(now, registration) {
             return false;
         }
-        let since = *delivery.progress.absent_since.get_or_insert(now);
-        let until = since + ABSENT_PATIENCE;
+        let until = match self.absent {
+            Some((absent, until)) if absent == registration => until,
+            _ => now + ABSENT_PATIENCE,
+        };
+        self.absent = Some((registration, until));
         self.due_at(until);
         now < until
     }
@@ -788,6 +796,7 @@ impl Lane {
             self.route = None;
             self.ended = None;
             self.moving = None;
+            self.absent = None;
             self.failed.clear();
         }
         let delivered = matches!(
