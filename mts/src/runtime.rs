@@ -708,12 +708,12 @@ impl Shared {
                     }
                 }
                 Action::Abandon {
-                    kind,
                     attempt,
+                    location,
                     error,
                 } => {
-                    let end = match self.transport(kind) {
-                        Some(transport) => transport.abandon(attempt),
+                    let end = match self.transport(location.kind()) {
+                        Some(transport) => transport.abandon(attempt, &location),
                         None => Abandoned::Unconfirmed,
                     };
                     let conclusion = end.conclusion(error);

@@ -93,7 +93,7 @@ impl Transport for Recording {
         Ok(())
     }
 
-    fn abandon(&self, _: AttemptId) -> Abandoned {
+    fn abandon(&self, _: AttemptId, _: &Location) -> Abandoned {
         Abandoned::Unconfirmed
     }
 

@@ -74,7 +74,7 @@ impl Transport for Shared {
         Ok(())
     }
 
-    fn abandon(&self, _: AttemptId) -> Abandoned {
+    fn abandon(&self, _: AttemptId, _: &Location) -> Abandoned {
         Abandoned::Unconfirmed
     }
 

@@ -41,7 +41,7 @@ impl Transport for Slow {
         ))
     }
 
-    fn abandon(&self, _: AttemptId) -> Abandoned {
+    fn abandon(&self, _: AttemptId, _: &Location) -> Abandoned {
         Abandoned::Unconfirmed
     }
 

@@ -174,7 +174,7 @@ fn waiting_letters_are_bounded_and_concluded_once() {
     }
     let full = party.send(4, &slow, message_parcel(4, "x")).unwrap_err();
     assert_eq!(full.fault, TransportErrorKind::Congested, "{full}");
-    party.transport.abandon(AttemptId(2));
+    party.transport.abandon(AttemptId(2), &slow);
     party.transport.close();
     assert!(matches!(party.conclusion(0), Conclusion::Unconfirmed(_)));
     for attempt in [1, 3] {

@@ -448,11 +448,11 @@ impl Endpoint {
         }
     }
 
-    /// Abandons an attempt. The parcel may be in the other process's mailbox, and that process may
-    /// still take it.
-    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        let peers = self.peers.read();
-        let abandoned = peers.values().find_map(|peer| peer.abandon(attempt));
+    /// Abandons an attempt to this process. The parcel may be in its mailbox, and the process may still
+    /// take it.
+    pub(crate) fn abandon(&self, attempt: AttemptId, process: Incarnation) -> Abandoned {
+        let peer = self.peers.read().get(&process).cloned();
+        let abandoned = peer.and_then(|peer| peer.abandon(attempt));
         abandoned.unwrap_or(Abandoned::Unconfirmed)
     }
 

@@ -207,8 +207,8 @@ impl Transport for ShmTransport {
         posted.map_err(|error| self.retriable_while_rejoining(error))
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.endpoint.load().abandon(attempt)
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        self.endpoint.load().abandon(attempt, to.incarnation())
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

@@ -168,7 +168,10 @@ fn an_abandoned_parcel_does_not_hide_later_ones() {
         attempt
     };
     let abandoned = [dispatch(), dispatch(), dispatch()][1];
-    assert_eq!(sender.abandon(abandoned), Abandoned::Unconfirmed);
+    assert_eq!(
+        sender.abandon(abandoned, &receiver.location()),
+        Abandoned::Unconfirmed
+    );
     let got = Arc::new(RecordingSink::default());
     receiver.listen(got.clone()).unwrap();
     until("answers", || sink.conclusions() == 2);

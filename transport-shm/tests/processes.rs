@@ -345,7 +345,7 @@ fn close_waits_until_the_last_letters_are_taken() {
             .dispatch(one, &to, parcel(vec![1; 3000].into()))
             .unwrap();
         if number % 2 == 0 {
-            sender.abandon(one);
+            sender.abandon(one, &to);
         }
     }
     std::thread::scope(|scope| {

@@ -171,13 +171,13 @@ impl Transport for Faulty {
         }
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
         self.shared.pending.lock().remove(&attempt);
         self.shared
             .substituted
             .lock()
             .retain(|(other, _)| *other != attempt);
-        self.inner.abandon(attempt)
+        self.inner.abandon(attempt, to)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

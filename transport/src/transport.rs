@@ -61,9 +61,9 @@ pub trait Transport: Send + Sync + 'static {
     ) -> Result<(), TransportError>;
 
     /// Ends an attempt and concludes it at once: its resources are released, and
-    /// [`Sink::concluded`] is not called for it. Returns [`Abandoned::Unconfirmed`] for an unknown
-    /// attempt.
-    fn abandon(&self, attempt: AttemptId) -> Abandoned;
+    /// [`Sink::concluded`] is not called for it. `to` is the location to which it was dispatched.
+    /// Returns [`Abandoned::Unconfirmed`] for an unknown attempt.
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned;
 
     /// Answers an arrival for which the sink returned [`Verdict::Later`]. Unknown tickets are
     /// ignored, because the peer may have disconnected.

@@ -102,7 +102,7 @@ impl Transport for TableTransport {
         Ok(())
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
+    fn abandon(&self, attempt: AttemptId, _to: &Location) -> Abandoned {
         let mut state = self.0.state.lock();
         state.open.remove(&attempt);
         state.conclusions.retain(|(other, _)| *other != attempt);

@@ -35,10 +35,10 @@ pub enum Action {
     /// Make the transport [abandon](fipa_transport::Transport::abandon) this attempt. Its end is
     /// reported at once with [`Core::handle_conclusion`](super::Core::handle_conclusion).
     Abandon {
-        /// The transport.
-        kind: Kind,
         /// The attempt.
         attempt: AttemptId,
+        /// The location to which it was dispatched.
+        location: Location,
         /// The error of the conclusion.
         error: TransportError,
     },
@@ -346,19 +346,24 @@ impl AttemptTable {
     }
 
     /// Makes the transport end an attempt, whose conclusion follows at once.
-    pub(crate) fn abandon(&mut self, kind: Kind, attempt: AttemptId, error: TransportError) {
+    pub(crate) fn abandon(
+        &mut self,
+        location: Location,
+        attempt: AttemptId,
+        error: TransportError,
+    ) {
         self.actions.push_back(Action::Abandon {
-            kind,
             attempt,
+            location,
             error,
         });
     }
 
     /// Makes the transport end an attempt whose conclusion is ignored.
-    pub(crate) fn drop_attempt(&mut self, kind: Kind, attempt: AttemptId) {
+    pub(crate) fn drop_attempt(&mut self, location: Location, attempt: AttemptId) {
         if self.attempts.remove(&attempt).is_some() {
             let error = TransportError::new(TransportErrorKind::TimedOut, "");
-            self.abandon(kind, attempt, error);
+            self.abandon(location, attempt, error);
         }
     }
 

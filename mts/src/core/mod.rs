@@ -936,9 +936,9 @@ impl Core {
             Late::Again(note) => self.table.note(*note),
             Late::Check(attempt) => {
                 if let Some(Purpose::Note(note)) = self.table.attempts.remove(&attempt) {
-                    let kind = note.location.kind();
+                    let location = note.location.clone();
                     let error = TransportError::new(TransportErrorKind::TimedOut, "");
-                    self.table.abandon(kind, attempt, error.clone());
+                    self.table.abandon(location, attempt, error.clone());
                     self.note_concluded(now, *note, Conclusion::Unconfirmed(error));
                 }
             }

@@ -166,7 +166,7 @@ impl Peers {
                 if let State::Asked { attempt, until } = candidate.state
                     && until <= now
                 {
-                    table.drop_attempt(candidate.location.kind(), attempt);
+                    table.drop_attempt(candidate.location.clone(), attempt);
                     static_peer.failed(
                         now,
                         index,
@@ -386,7 +386,7 @@ impl PeerLocation {
 
     fn give_up(self, table: &mut AttemptTable) {
         if let State::Asked { attempt, .. } = self.state {
-            table.drop_attempt(self.location.kind(), attempt);
+            table.drop_attempt(self.location.clone(), attempt);
         }
     }
 }

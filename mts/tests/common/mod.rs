@@ -69,7 +69,7 @@ impl Transport for Silent {
         Err(TransportError::new(TransportErrorKind::Unreachable, ""))
     }
 
-    fn abandon(&self, _: AttemptId) -> Abandoned {
+    fn abandon(&self, _: AttemptId, _: &Location) -> Abandoned {
         Abandoned::Unconfirmed
     }
 

@@ -78,10 +78,6 @@ impl<C: Scheduled> Connections<C> {
         slots.map(|(number, slot)| (*number, &slot.connection))
     }
 
-    pub(crate) fn values_mut(&mut self) -> impl Iterator<Item = &mut C> {
-        self.slots.values_mut().map(|slot| &mut slot.connection)
-    }
-
     pub(crate) fn numbers(&self) -> Vec<u32> {
         self.slots.keys().copied().collect()
     }

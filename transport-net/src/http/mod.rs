@@ -243,8 +243,8 @@ impl Transport for HttpTransport {
         endpoint.senders.send(context, attempt, to, parcel, sender)
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.endpoint.senders.abandon(attempt)
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        self.endpoint.senders.abandon(attempt, to)
     }
 
     fn answer(&self, _ticket: Ticket, _answer: Answer) {

@@ -210,22 +210,24 @@ impl LegacySenders {
     }
 
     /// Ends an attempt. The letter is not sent if no byte of it has been written.
-    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        for queue in self.0.queues.lock().values_mut() {
-            if queue.current == Some(attempt) {
-                queue.current = None;
-                return match queue.begun {
-                    true => Abandoned::Unconfirmed,
-                    false => Abandoned::NotSent,
-                };
-            }
-            let place = queue.waiting.iter().position(|e| e.attempt == attempt);
-            if let Some(delivery) = place.and_then(|place| queue.waiting.remove(place)) {
-                queue.bytes -= delivery.letter.len();
-                return Abandoned::NotSent;
-            }
+    pub(crate) fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        let mut queues = self.0.queues.lock();
+        let Some(queue) = queues.get_mut(to) else {
+            return Abandoned::Unconfirmed;
+        };
+        if queue.current == Some(attempt) {
+            queue.current = None;
+            return match queue.begun {
+                true => Abandoned::Unconfirmed,
+                false => Abandoned::NotSent,
+            };
         }
-        Abandoned::Unconfirmed
+        let place = queue.waiting.iter().position(|e| e.attempt == attempt);
+        let Some(delivery) = place.and_then(|place| queue.waiting.remove(place)) else {
+            return Abandoned::Unconfirmed;
+        };
+        queue.bytes -= delivery.letter.len();
+        Abandoned::NotSent
     }
 
     /// Removes the queue of a location whose task has not begun. Returns whether the letter was

@@ -484,7 +484,7 @@ impl QuicStreams {
             && !self.sink.state.lock().concluded.contains_key(&attempt)
             && self.abandoned.insert(attempt);
         let told = self.link.abandon(attempt);
-        assert!(is_open || told == Abandoned::Unconfirmed);
+        assert!(is_open || told.is_none_or(|told| told == Abandoned::Unconfirmed));
         self.poll();
     }
 

@@ -308,17 +308,15 @@ impl Connection {
 
     /// Ends an attempt. The parcel is not sent if the kernel has taken no byte of it. An attempt
     /// that had enough time and during which no byte came from the peer puts the connection in
-    /// doubt.
-    pub(crate) fn abandon(&mut self, attempt: AttemptId, now: Instant) -> Abandoned {
-        let Some(id) = self.attempts.remove(&attempt) else {
-            return Abandoned::Unconfirmed;
-        };
+    /// doubt. `None` if the attempt is not here.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId, now: Instant) -> Option<Abandoned> {
+        let id = self.attempts.remove(&attempt)?;
         if self.outbox.remove_parcel(id) {
             self.sent.remove(&id);
             if !self.open {
                 self.suspect_slow_start(now);
             }
-            return Abandoned::NotSent;
+            return Some(Abandoned::NotSent);
         }
         let begun = self.sent.get(&id).and_then(|sent| sent.begun);
         if let Some(begun) = begun
@@ -333,7 +331,7 @@ impl Connection {
             // window.
             sent.attempt = None;
         }
-        Abandoned::Unconfirmed
+        Some(Abandoned::Unconfirmed)
     }
 
     /// Answers a parcel that arrived. An unknown number is ignored.

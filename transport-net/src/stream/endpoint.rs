@@ -616,14 +616,20 @@ impl Endpoint {
         }
     }
 
-    /// Ends an attempt on any connection.
-    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        let links: Vec<_> = self.registry.lock().links.values().cloned().collect();
-        let unsent = |link: &Arc<Link>| link.abandon(attempt) == Abandoned::NotSent;
-        if links.iter().any(unsent) {
-            return Abandoned::NotSent;
+    /// Ends an attempt to this location.
+    pub(crate) fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        let registry = self.registry.lock();
+        let dialled = registry.dialled.get(to).into_iter();
+        let known = registry.known.get(&to.incarnation()).into_iter().flatten();
+        let present: Vec<_> = dialled.chain(known).cloned().collect();
+        drop(registry);
+        let end = |links: &[Arc<Link>]| links.iter().find_map(|link| link.abandon(attempt));
+        if let Some(end) = end(&present) {
+            return end;
         }
-        Abandoned::Unconfirmed
+        // A connection that another one has replaced keeps its attempts.
+        let all: Vec<_> = self.registry.lock().links.values().cloned().collect();
+        end(&all).unwrap_or(Abandoned::Unconfirmed)
     }
 
     /// Creates a link for an accepted connection. Returns `None` when the endpoint is closed.

@@ -156,16 +156,16 @@ impl Link {
         Ok(())
     }
 
-    /// Ends an attempt. A peer that has not answered in time gets a ping.
-    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
+    /// Ends an attempt. A peer that has not answered in time gets a ping. `None` if the attempt is not here.
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Option<Abandoned> {
         let mut state = self.state.lock();
-        let end = state.connection.abandon(attempt, Instant::now());
+        let end = state.connection.abandon(attempt, Instant::now())?;
         self.note_suspicion(&state);
         if state.connection.is_suspect() && self.has_begun() {
             self.flush(&mut state);
             self.wake.notify_one();
         }
-        end
+        Some(end)
     }
 
     /// Answers a parcel that arrived on this link, by its number.

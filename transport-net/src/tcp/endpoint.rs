@@ -4,7 +4,7 @@
 use std::ops::Deref;
 use std::sync::Arc;
 
-use fipa_transport::{Abandoned, AttemptId};
+use fipa_transport::{Abandoned, AttemptId, Location, Signature};
 
 use super::legacy::Legacy;
 use super::refusals::Refusals;
@@ -31,10 +31,10 @@ impl TcpEndpoint {
     }
 
     /// Ends an attempt, framed or not.
-    pub(super) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        match self.stream.abandon(attempt) {
-            Abandoned::NotSent => Abandoned::NotSent,
-            _ => self.legacy.abandon(attempt),
+    pub(super) fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        match to.signature() {
+            Signature::Frames => self.stream.abandon(attempt, to),
+            _ => self.legacy.abandon(attempt, to),
         }
     }
 

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_transport::{Abandoned, AttemptId};
+use fipa_transport::{Abandoned, AttemptId, Location};
 use socket2::SockRef;
 use tokio::net::TcpStream;
 use tokio::time::sleep;
@@ -33,8 +33,8 @@ impl Legacy {
     }
 
     /// Ends the attempt to send a letter.
-    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.senders.abandon(attempt)
+    pub(crate) fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        self.senders.abandon(attempt, to)
     }
 
     /// Resets a connection for which the accept queue has no room, so that its sender sees an error.

@@ -146,8 +146,8 @@ impl Transport for TcpTransport {
         })
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.endpoint.abandon(attempt)
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        self.endpoint.abandon(attempt, to)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

@@ -236,15 +236,23 @@ impl Core {
         self.end(number, &ConnectionEnd::NotOpened(error));
     }
 
-    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
+    /// Ends an attempt to this location.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId, to: &Location) -> Abandoned {
         self.notes
             .retain(|told| !matches!(told, CoreEvent::Concluded(other, _) if *other == attempt));
-        let mut connections = self.connections.values_mut();
-        let unsent = connections.any(|it| it.connection.abandon(attempt) == Abandoned::NotSent);
-        match unsent {
-            true => Abandoned::NotSent,
-            false => Abandoned::Unconfirmed,
+        let dialled = self.dialled.get(to).into_iter();
+        let known = self.known.get(&to.incarnation()).into_iter().flatten();
+        for number in dialled.chain(known) {
+            let Some(entry) = self.connections.get_mut(*number) else {
+                continue;
+            };
+            let end = entry.connection.abandon(attempt);
+            self.connections.touch(*number);
+            if end == Abandoned::NotSent {
+                return end;
+            }
         }
+        Abandoned::Unconfirmed
     }
 
     pub(crate) fn answer(&mut self, now: Instant, ticket: Ticket, answer: &Answer) {

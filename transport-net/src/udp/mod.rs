@@ -149,8 +149,8 @@ impl Transport for UdpTransport {
             .dispatch(to, |core, now| core.dispatch(now, attempt, to, &parcel))
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        let abandoned = self.endpoint.call(|core, _| core.abandon(attempt));
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        let abandoned = self.endpoint.call(|core, _| core.abandon(attempt, to));
         abandoned.unwrap_or(Abandoned::Unconfirmed)
     }
 

@@ -62,6 +62,10 @@ fn address(who: usize) -> SocketAddr {
     SocketAddr::from(([192, 0, 2, who as u8 + 1], 7788))
 }
 
+fn to(who: usize) -> Location {
+    Location::new(Kind::Udp, &address(who).to_string()).unwrap()
+}
+
 fn core(who: usize, seed: u64, limits: &UdpLimits, now: Instant) -> Core {
     let mut random = fastrand::Rng::with_seed(seed * 10 + who as u64);
     let identity = Identity {
@@ -94,7 +98,7 @@ impl Simulation {
     }
 
     fn send(&mut self, from: usize, attempt: u64, len: usize) -> Result<(), TransportErrorKind> {
-        let to = Location::new(Kind::Udp, &address(1 - from).to_string()).unwrap();
+        let to = to(1 - from);
         let parcel = parcel(attempt, len);
         let fresh = self.cores[from]
             .dispatch(self.now, AttemptId(attempt), &to, &parcel)
@@ -315,7 +319,7 @@ fn run(seed: u64, conditions: LinkConditions, late: f64) -> (usize, usize) {
             && let Some(open) = attempts[from].last().copied()
             && !simulation.concluded[from].contains_key(&AttemptId(open))
         {
-            simulation.cores[from].abandon(AttemptId(open));
+            simulation.cores[from].abandon(AttemptId(open), &to(1 - from));
             attempts[from].remove(&open);
         }
     }

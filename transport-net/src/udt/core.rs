@@ -211,16 +211,17 @@ impl Core {
         self.end(now, number, &ConnectionEnd::NotOpened(error));
     }
 
-    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
+    /// Ends an attempt to this location.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId, to: &Location) -> Abandoned {
         self.concluded.retain(|(other, _)| *other != attempt);
-        let connections = self.connections.values_mut();
-        let unsent = connections
-            .filter_map(|entry| entry.connection.sender_mut())
-            .any(|sender| sender.abandon(attempt) == Abandoned::NotSent);
-        match unsent {
-            true => Abandoned::NotSent,
-            false => Abandoned::Unconfirmed,
-        }
+        let Some(number) = self.dialled.get(to) else {
+            return Abandoned::Unconfirmed;
+        };
+        let entry = self.connections.get_mut(*number);
+        let sender = entry.and_then(|entry| entry.connection.sender_mut());
+        let end = sender.map_or(Abandoned::Unconfirmed, |sender| sender.abandon(attempt));
+        self.connections.touch(*number);
+        end
     }
 
     /// Handles a datagram. `listening` is whether the socket accepts datagrams of unproved peers.

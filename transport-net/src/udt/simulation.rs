@@ -317,7 +317,7 @@ fn run(seed: u64, conditions: LinkConditions) -> Simulation {
             && let Some(open) = attempts[from].last().copied()
             && !simulation.concluded[from].contains_key(&AttemptId(open))
         {
-            let abandoned = simulation.cores[from].abandon(AttemptId(open));
+            let abandoned = simulation.cores[from].abandon(AttemptId(open), &to(1 - from));
             attempts[from].remove(&open);
             assert!(
                 abandoned != Abandoned::NotSent || !simulation.arrived[1 - from].contains(&open)

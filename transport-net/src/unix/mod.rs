@@ -248,8 +248,8 @@ impl Transport for UnixTransport {
         })
     }
 
-    fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.endpoint.abandon(attempt)
+    fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
+        self.endpoint.abandon(attempt, to)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

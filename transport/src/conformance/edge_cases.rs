@@ -28,11 +28,11 @@ pub fn an_abandoned_attempt_is_concluded_at_once(fixture: &dyn Fixture) {
         }
         Verdict::Now(Answer::Accepted)
     });
-    let unknown = a.transport.abandon(AttemptId(77));
+    let unknown = a.transport.abandon(AttemptId(77), &b.location);
     assert_eq!(unknown, Abandoned::Unconfirmed, "for an unknown attempt");
     a.send(1, &b, parcel(1, letter("x")));
-    let end = a.transport.abandon(AttemptId(1));
-    let twice = a.transport.abandon(AttemptId(1));
+    let end = a.transport.abandon(AttemptId(1), &b.location);
+    let twice = a.transport.abandon(AttemptId(1), &b.location);
     assert_eq!(
         twice,
         Abandoned::Unconfirmed,
@@ -62,7 +62,7 @@ pub fn an_attempt_that_is_abandoned_unsent_never_arrives(fixture: &dyn Fixture) 
             .dispatch(AttemptId(attempt), to, parcel(attempt, letter(text)));
         match sent {
             Ok(()) if attempt % 3 == 0 => {
-                if a.transport.abandon(AttemptId(attempt)) == Abandoned::NotSent {
+                if a.transport.abandon(AttemptId(attempt), to) == Abandoned::NotSent {
                     unsent.push(attempt);
                 }
             }
@@ -174,7 +174,8 @@ pub fn no_call_waits_for_another_process(fixture: &dyn Fixture) {
         for attempt in 1..=3 {
             a.send(attempt, &b, parcel(attempt, letter("x")));
         }
-        assert_eq!(a.transport.abandon(AttemptId(2)), Abandoned::NotSent);
+        let end = a.transport.abandon(AttemptId(2), &b.location);
+        assert_eq!(end, Abandoned::NotSent);
         a.transport.drive();
         // A loan may fail, but does not wait either.
         let _ = a.transport.loan(&b.location, 64, 1000, 1);
@@ -388,7 +389,7 @@ pub fn a_sink_may_call_its_transport(fixture: &dyn Fixture) {
     let b = TestEndpoint::with_verdict(fixture, move |arrival| {
         if let Some((transport, to)) = &*next_hop.lock() {
             let attempt = AttemptId(arrival.parcel.sequence);
-            transport.abandon(AttemptId(u64::MAX));
+            transport.abandon(AttemptId(u64::MAX), to);
             transport
                 .dispatch(attempt, to, arrival.parcel.clone())
                 .expect("the dispatch succeeds");

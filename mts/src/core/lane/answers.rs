@@ -411,7 +411,7 @@ impl Lane {
             attempt, location, ..
         } = before
         {
-            table.drop_attempt(location.kind(), attempt);
+            table.drop_attempt(location.clone(), attempt);
             // A report of an earlier hand-over does not show that this route works.
             if attempt.0 == transfer {
                 table.route_worked(&location);
@@ -561,7 +561,7 @@ impl Lane {
                 if !std::mem::replace(abandoned, true) {
                     let text = "the service at this location was replaced";
                     let error = TransportError::new(TransportErrorKind::Broken, text);
-                    table.abandon(location.kind(), *attempt, error);
+                    table.abandon(location.clone(), *attempt, error);
                 }
             }
             State::Custody { .. } => {

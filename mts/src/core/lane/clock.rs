@@ -55,7 +55,7 @@ impl Lane {
                             ),
                             false => TransportError::new(TransportErrorKind::TimedOut, ""),
                         };
-                        table.abandon(location.kind(), *attempt, error);
+                        table.abandon(location.clone(), *attempt, error);
                     }
                 }
                 State::Custody { location, .. } if expired || abandoned => {

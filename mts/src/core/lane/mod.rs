@@ -705,7 +705,7 @@ impl Lane {
                     if !std::mem::replace(abandoned, true) {
                         let error =
                             TransportError::new(TransportErrorKind::Closed, "the sender went away");
-                        table.abandon(location.kind(), *attempt, error);
+                        table.abandon(location.clone(), *attempt, error);
                     }
                     index += 1;
                 }
