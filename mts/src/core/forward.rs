@@ -115,7 +115,7 @@ impl Unframed {
             Err(_) => Failed::of_envelope(&letter),
         };
         let mut letter = letter;
-        let (sender, mut fault) = match (too_many(&names), message) {
+        let (sender, mut fault) = match (refused_names(&names), message) {
             (Some(fault), _) => {
                 names.truncate(1);
                 (None, Some(fault))
@@ -222,7 +222,7 @@ fn receivers_of(name: Arc<str>, resolution: Resolution) -> Vec<Receiver> {
 }
 
 /// The reason why a legacy peer's letter to these receivers is refused, if it is.
-fn too_many(names: &[String]) -> Option<String> {
+fn refused_names(names: &[String]) -> Option<String> {
     if names.len() > MAX_UNFRAMED_RECEIVERS {
         return Some(format!(
             "the letter has more than {MAX_UNFRAMED_RECEIVERS} receivers"
@@ -235,8 +235,21 @@ fn too_many(names: &[String]) -> Option<String> {
             "the letter has more than {MAX_UNFRAMED_PATTERNS} pattern among its receivers"
         ));
     }
-    let too_long = patterns.iter().any(|it| it.len() > MAX_UNFRAMED_PATTERN);
-    too_long.then(|| format!("the pattern has more than {MAX_UNFRAMED_PATTERN} bytes"))
+    if patterns.iter().any(|it| it.len() > MAX_UNFRAMED_PATTERN) {
+        return Some(format!(
+            "the pattern has more than {MAX_UNFRAMED_PATTERN} bytes"
+        ));
+    }
+    let flags = patterns.iter().any(|pattern| sets_flags(pattern));
+    flags.then(|| "the pattern sets flags, as `(?i)` does".to_owned())
+}
+
+/// Whether a group of the pattern sets flags. A short pattern that ignores the case may take 40 ms to compile,
+/// and the regular expressions of fipa_services have no flags.
+fn sets_flags(pattern: &str) -> bool {
+    let has_no_flags = |group: &str| group.starts_with([':', '<']) || group.starts_with("P<");
+    let mut groups = pattern.split("(?").skip(1);
+    groups.any(|group| !has_no_flags(group))
 }
 
 /// Returns the letter with its message in the encoding that keeps the content apart: a legacy peer's
