@@ -36,6 +36,13 @@ fn machine(text: &str) -> Machine {
     Machine::read("own", text).unwrap()
 }
 
+/// The standard protocols and this one.
+fn library_with(machine: Machine) -> Arc<Library> {
+    let mut library = Library::standard();
+    library.add(machine).unwrap();
+    Arc::new(library)
+}
+
 /// The states and messages of a projection: `state: act from>to`.
 fn shown(local: &Local) -> Vec<String> {
     let states = local.states().iter();
@@ -186,11 +193,15 @@ struct Stage {
     now: SystemTime,
 }
 
+/// The monitor of an agent in the docking protocol.
 fn stage(agent: &str) -> Stage {
-    let mut library = Library::standard();
-    library.add(machine(DOCKING)).unwrap();
+    stage_with(machine(DOCKING), agent)
+}
+
+/// The monitor of an agent in this protocol.
+fn stage_with(machine: Machine, agent: &str) -> Stage {
     Stage {
-        monitor: Monitor::agent(Arc::new(library), agent),
+        monitor: Monitor::agent(library_with(machine), agent),
         now: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
     }
 }
@@ -270,10 +281,7 @@ fn a_message_may_overtake_one_of_another_sender() {
         <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
         <state id="4"><transition performative="agree" from="b" to="a" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(machine(text)).unwrap();
-    let mut stage = stage("ben");
-    stage.monitor = Monitor::agent(Arc::new(library), "ben");
+    let mut stage = stage_with(machine(text), "ben");
     // The inform of cid overtakes the request of ann.
     stage.right(&["inform cid>ben"]);
     let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
@@ -347,12 +355,9 @@ fn a_message_of_another_role_leaves_the_last_one_open() {
         <state id="3"><transition performative="inform" from="b" to="a" target="5"/></state>
         <state id="4"><transition performative="request" from="a" to="c" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
     let joint = machine(text);
     assert!(joint.projection().is_some());
-    library.add(joint).unwrap();
-    let mut stage = stage("ann");
-    stage.monitor = Monitor::agent(Arc::new(library), "ann");
+    let mut stage = stage_with(joint, "ann");
     stage.right(&["request ann>ben", "request ann>cid", "inform ben>ann"]);
     stage.lost("request ann>cid");
     stage.right(&["request ann>cid"]);
@@ -366,12 +371,8 @@ fn an_agent_that_was_asked_to_take_one_role_may_claim_another() {
         <state id="2"><transition performative="request" from="b" to="c" target="3"/></state>
         <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
         <state id="4" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(machine(text)).unwrap();
-    let library = Arc::new(library);
     let asked = || {
-        let mut stage = stage("ann");
-        stage.monitor = Monitor::agent(Arc::clone(&library), "ann");
+        let mut stage = stage_with(machine(text), "ann");
         stage.right(&["request ann>ben"]);
         stage.lost("request ann>ben");
         stage
@@ -462,9 +463,7 @@ fn no_message_of_a_projected_protocol_is_refused() {
     let runs = number("FIPA_WALK_SEEDS").unwrap_or(2_000);
     let docking = machine(DOCKING);
     let locals = docking.projection().unwrap().locals();
-    let mut library = Library::standard();
-    library.add(docking.clone()).unwrap();
-    let library = Arc::new(library);
+    let library = library_with(docking.clone());
     let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
     let names = ["dro", "med", "sta"];
     let (mut said, mut ended, mut lost, mut unchecked) = (0, 0, 0, 0);

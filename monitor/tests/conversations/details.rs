@@ -3,9 +3,7 @@
 use super::*;
 
 fn stage_of(text: &str) -> Stage {
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    Stage::new(Monitor::observer(Arc::new(library)))
+    Stage::new(Monitor::observer(library_with("own", text)))
 }
 
 fn own(words: &'static str) -> Header<'static> {
@@ -101,9 +99,7 @@ fn the_initiator_need_not_be_the_first_role_of_the_file() {
     assert_eq!(stage.wrong(own("inform ann>ben")).kind, Kind::WrongSender);
     stage.right(own("inform ben>ann"));
     assert_eq!(stage.right(own("inform cid>ann")), "done");
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    let mut stage = Stage::new(Monitor::agent(Arc::new(library), "dan"));
+    let mut stage = Stage::new(Monitor::agent(library_with("own", text), "dan"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&own("inform ben>dan")), elsewhere);
     assert_eq!(stage.check(&own("propose cid>dan")), elsewhere);
@@ -132,11 +128,9 @@ fn the_limit_of_participants_is_exact() {
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
         <state id="3" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
     let mut limits = Limits::default();
     limits.participants = 2;
-    let monitor = Monitor::observer(Arc::new(library)).with_limits(limits);
+    let monitor = Monitor::observer(library_with("own", text)).with_limits(limits);
     assert!(monitor.library().find("own").is_some());
     let mut stage = Stage::new(monitor);
     stage.right(own("request ann>ben"));
@@ -358,13 +352,9 @@ fn the_initiator_may_name_itself_and_others_in_reply_to() {
     let mut stage = stage_of(ONE_STATE);
     stage.right(own("request ann>ben").reply_to(["ann", "dan"]));
     assert_eq!(stage.right(own("agree ben>ann,dan")), "3");
-    let mut library = Library::standard();
-    library
-        .add(Machine::read("own", ONE_STATE).unwrap())
-        .unwrap();
     let mut limits = Limits::default();
     limits.participants = 4;
-    let monitor = Monitor::observer(Arc::new(library)).with_limits(limits);
+    let monitor = Monitor::observer(library_with("own", ONE_STATE)).with_limits(limits);
     let mut stage = Stage::new(monitor);
     stage.right(own("request ann>ben").reply_to(["dan", "eve"]));
     assert_eq!(stage.right(own("agree ben>ann,dan,eve")), "3");

@@ -298,10 +298,8 @@ fn an_outsider_reports_no_undelivered_message() {
         <state id="1"><transition performative="request" from="i" to="B" target="2"/></state>
         <state id="2"><transition performative="agree" from="B" to="i" target="3"/></state>
         <state id="3" final="yes"/></scxml>"#;
-    let mut all = Library::standard();
-    all.add(Machine::read("plain", text).unwrap()).unwrap();
     let own = |words| say_in("plain", words);
-    let mut stage = Stage::new(Monitor::observer(Arc::new(all)));
+    let mut stage = Stage::new(Monitor::observer(library_with("plain", text)));
     stage.right(own("request ann>ben"));
     let forged = stage.wrong(own("failure mallory>ann"));
     assert_eq!(forged.kind, Kind::Stranger);

@@ -479,9 +479,7 @@ fn messages_go_to_the_delegate_of_a_participant() {
         <state id="3"><transition performative="accept-proposal" from="a" to="b" target="4"/></state>
         <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
     let own = |words| say_in("own", words);
     stage.right(own("cfp ann>ben"));
     stage.right(own("propose ben>ann").reply_to(["dan"]));
@@ -570,9 +568,7 @@ fn the_copies_of_a_multicast_are_one_message() {
         <state id="1"><transition performative="query-if" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="inform" from="b" to="a" target="2"/></state>
         </scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
     let own = |words| say_in("own", words);
     let copy = |to: &'static str| own("query-if ann>ben,cid,dan").copy_for(to);
     stage.right(copy("ben"));

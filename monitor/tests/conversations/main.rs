@@ -33,6 +33,13 @@ fn library() -> Arc<Library> {
     Arc::new(Library::standard())
 }
 
+/// The standard protocols and one of this text.
+fn library_with(name: &str, text: &str) -> Arc<Library> {
+    let mut library = Library::standard();
+    library.add(Machine::read(name, text).unwrap()).unwrap();
+    Arc::new(library)
+}
+
 impl Stage {
     fn new(monitor: Monitor) -> Self {
         let now = SystemTime::UNIX_EPOCH + START;
