@@ -158,6 +158,18 @@ fn two_roles_must_not_decide_the_same_choice() {
 }
 
 #[test]
+fn messages_of_two_roles_may_cross() {
+    let crossing = machine(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="3"/>
+            <transition performative="confirm" from="a" to="b" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#,
+    );
+    assert_eq!(Projection::defects(&crossing), []);
+}
+
+#[test]
 fn a_choice_that_a_waiting_role_is_not_told_is_a_deadlock() {
     let found = defects(
         r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/>
@@ -344,6 +356,18 @@ fn an_undelivered_message_can_be_sent_again() {
     assert_eq!(mediator.wrong("agree med>dro"), Kind::Ended);
     mediator.lost("not-understood med>old");
     mediator.right(&["inform old>med", "inform med>dro"]);
+    // Reports about other messages than the last one take nothing back.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "agree med>dro", "inform dro>sta"]);
+    drone.lost("request dro>med");
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
+    let (header, receiver) = header_of("inform dro>sta");
+    let now = drone.now;
+    let other = header.reply_with("other");
+    drone.monitor.undelivered(&other, receiver, now);
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
+    drone.lost("inform dro>sta");
+    drone.right(&["inform dro>sta", "inform med>dro"]);
 }
 
 #[test]

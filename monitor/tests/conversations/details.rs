@@ -36,6 +36,35 @@ fn expected_messages_are_those_of_the_concerned_participant() {
 }
 
 #[test]
+fn after_an_undelivered_message_those_after_it_are_expected() {
+    let english = |text| say_in("fipa-auction-english", text);
+    for mut stage in [
+        Stage::observer(),
+        Stage::new(Monitor::agent(library(), "ann")),
+    ] {
+        stage.right(english("inform ann>ben").reply_with("opening"));
+        let call = |text| english("cfp ann>ben").reply_with(text);
+        for text in ["1", "2", "3"] {
+            stage.right(call(text));
+        }
+        let now = stage.now;
+        stage.monitor.undelivered(&call("3"), "ben", now);
+        let answers = [
+            "propose ben>ann".to_owned(),
+            "cfp, inform ann>ben".to_owned(),
+        ];
+        let violation = stage.wrong(english("confirm ben>ann"));
+        assert_eq!(violation.state.as_deref(), Some("undelivered"));
+        assert_eq!(expected(&violation), answers);
+        // A bid for an earlier call does not show whether the last one arrived.
+        let state = stage.right(english("propose ben>ann").in_reply_to("1"));
+        assert_eq!(state, "undelivered");
+        let violation = stage.wrong(english("confirm ben>ann"));
+        assert_eq!(expected(&violation), answers);
+    }
+}
+
+#[test]
 fn the_answer_to_a_cancel_is_expected_during_the_cancel() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
@@ -358,6 +387,16 @@ fn the_initiator_may_name_itself_and_others_in_reply_to() {
     let mut stage = Stage::new(monitor);
     stage.right(own("request ann>ben").reply_to(["dan", "eve"]));
     assert_eq!(stage.right(own("agree ben>ann,dan,eve")), "3");
+}
+
+#[test]
+fn many_agents_in_reply_to_have_the_role_of_the_initiator() {
+    let names = || (0..20).map(|number| format!("d{number}"));
+    let mut stage = stage_of(ONE_STATE);
+    stage.right(own("request ann>ben").reply_to(names()));
+    let other = own("agree ben>ann").receivers(names().chain(["zoe".to_owned()]));
+    assert_eq!(stage.wrong(other).kind, Kind::WrongReceiver);
+    assert_eq!(stage.right(own("agree ben>ann").receivers(names())), "3");
 }
 
 #[test]

@@ -49,6 +49,27 @@ fn a_later_message_may_not_name_more_bytes_than_the_share_of_a_peer() {
 }
 
 #[test]
+fn a_conversation_at_its_share_of_bytes_continues_if_it_does_not_grow() {
+    let call = || {
+        let names = (0..600).map(|number| format!("arm_{number}"));
+        say("cfp ann>ben").receivers(names).reply_with("call")
+    };
+    let mut stage = Stage::observer();
+    stage.right(call());
+    let mut limits = Limits::default();
+    limits.bytes = stage.monitor.bytes() * 8;
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    stage.right(call());
+    assert_eq!(stage.monitor.bytes() * 8, limits.bytes);
+    assert_eq!(stage.right(say("propose arm_7>ann")), "proposed");
+    assert_eq!(stage.right(say("accept-proposal ann>arm_7")), "accepted");
+    assert_eq!(stage.wrong(say("cfp ann>ben")).kind, Kind::TooMany);
+    let named = say("inform arm_7>ann").reply_to(["dan"]);
+    assert_eq!(stage.wrong(named).kind, Kind::TooMany);
+    assert_eq!(stage.right(say("inform arm_7>ann")), "done");
+}
+
+#[test]
 fn the_bytes_of_a_peer_are_bounded() {
     let mut limits = Limits::default();
     limits.bytes = 8 << 20;

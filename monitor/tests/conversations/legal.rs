@@ -255,6 +255,32 @@ fn messages_that_cross_a_not_understood_answer_the_message_before_it() {
     assert_eq!(stage.wrong(english("request ben>ann")).kind, Kind::Ended);
 }
 
+#[test]
+fn an_undelivered_message_of_either_side_of_one_state_can_be_sent_again() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="inform" from="a" to="b" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    let own = |words| say_in("own", words);
+    let library = library_with("own", text);
+    for name in [None, Some("ann"), Some("ben")] {
+        let library = Arc::clone(&library);
+        let mut stage = Stage::new(match name {
+            None => Monitor::observer(library),
+            Some(name) => Monitor::agent(library, name),
+        });
+        let all = ["request ann>ben", "agree ben>ann", "inform ann>ben"];
+        for (words, receiver) in all.into_iter().zip(["ben", "ann", "ben"]) {
+            stage.right(own(words));
+            stage.wrong(own(words));
+            let now = stage.now;
+            stage.monitor.undelivered(&own(words), receiver, now);
+            stage.right(own(words));
+        }
+    }
+}
+
 /// The monitors of all agents, and of this one.
 fn monitors(agent: &str) -> [Stage; 2] {
     [
@@ -410,6 +436,27 @@ fn each_participant_of_a_forgotten_conversation_may_be_in_a_later_state() {
     stage.right(english("cfp ann>ben").reply_with("4"));
     let bid = english("propose ben>ann").in_reply_to("2");
     assert_eq!(stage.check(&bid), UNKNOWN);
+}
+
+#[test]
+fn a_message_to_a_pattern_shows_the_state_of_its_members_only() {
+    let english = |text| say_in("fipa-auction-english", text);
+    let restarted = || {
+        let monitor = Monitor::agent(library(), "ann").with_history(History::Unknown);
+        Stage::new(monitor)
+    };
+    // A call to the members shows that the auction has begun for them.
+    let mut stage = restarted();
+    stage.right(english("inform ann>arm_.*"));
+    stage.right(english("cfp ann>arm_.*"));
+    let early = stage.wrong(english("accept-proposal ann>arm_.*"));
+    assert_eq!(early.state.as_deref(), Some("called"));
+    // It does not show it for ben. The inform may have been the end of an auction.
+    let mut stage = restarted();
+    stage.right(english("inform ann>ben"));
+    stage.right(english("inform ann>arm_.*"));
+    stage.right(english("cfp ann>arm_.*"));
+    assert_eq!(stage.check(&english("propose ben>ann")), UNKNOWN);
 }
 
 #[test]
