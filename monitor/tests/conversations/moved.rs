@@ -334,8 +334,3 @@ fn changed_bytes_do_no_harm() {
     }
     assert!(refused > 500 && restored > 100, "{refused} {restored}");
 }
-
-fn library_once() -> Arc<Library> {
-    static ONCE: std::sync::LazyLock<Arc<Library>> = std::sync::LazyLock::new(library);
-    Arc::clone(&ONCE)
-}
