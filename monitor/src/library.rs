@@ -243,6 +243,16 @@ mod tests {
     }
 
     #[test]
+    fn the_protocol_of_a_name_with_a_typing_error_is_found() {
+        let library = Library::standard();
+        let near = |name| library.near(name).map(Machine::name);
+        assert_eq!(near("fipa-reqest"), Some("fipa-request"));
+        assert_eq!(near("contract-nett"), Some("fipa-contract-net"));
+        assert_eq!(near("fipa-request"), None, "it is known");
+        assert_eq!(near("fipa-dance"), None);
+    }
+
+    #[test]
     fn added_protocols_take_precedence() {
         let mut library = Library::standard();
         let own = r#"<scxml initial="1">

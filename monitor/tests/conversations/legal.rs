@@ -498,6 +498,41 @@ fn an_undelivered_message_that_may_have_been_a_later_one_leaves_an_unknown_state
 }
 
 #[test]
+fn the_first_message_after_a_restart_may_begin_another_round() {
+    let text = |next| {
+        format!(
+            r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="inform" from="b" to="a" target="{next}"/>
+                <transition performative="refuse" from="b" to="a" target="3"/></state>
+            <state id="3" final="yes"/></scxml>"#
+        )
+    };
+    let own = |words| say_in("own", words);
+    for (next, history, is_known) in [
+        ("1", History::Unknown, false),
+        ("1", History::Complete, true),
+        ("3", History::Unknown, true),
+    ] {
+        let library = library_with("own", &text(next));
+        let monitor = Monitor::agent(library, "ann").with_history(history);
+        let mut stage = Stage::new(monitor);
+        stage.right(own("request ann>ben"));
+        let now = stage.now;
+        let request = own("request ann>ben");
+        stage.monitor.undelivered(&request, "ben", now);
+        stage.right(own("cancel ann>ben"));
+        stage.right(own("failure ben>ann"));
+        // After another round, the cancel does not show that the request arrived.
+        let verdict = stage.check(&own("request ann>ben"));
+        match is_known {
+            true => assert!(verdict.violation().is_some(), "{verdict:?}"),
+            false => assert_eq!(verdict, UNKNOWN),
+        }
+    }
+}
+
+#[test]
 fn messages_go_to_the_delegate_of_a_participant() {
     for name in [None, Some("ann")] {
         let mut stage = Stage::new(match name {
@@ -584,6 +619,13 @@ fn a_wrong_reply_names_the_expected_and_the_received_value() {
     assert_eq!((&*reply.expected, &*reply.received), ("q1", "q0"));
     let text = wrong.to_string();
     assert!(text.contains(r#"expected "q1", received "q0""#), "{text}");
+    // Each participant has its own value.
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben").reply_with("b"));
+    stage.right(say("cfp ann>cid").reply_with("c"));
+    let wrong = stage.wrong(say("propose cid>ann").in_reply_to("b"));
+    let reply = wrong.reply.as_ref().unwrap();
+    assert_eq!((&*reply.expected, &*reply.received), ("c", "b"));
 }
 
 #[test]
