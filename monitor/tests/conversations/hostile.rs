@@ -124,6 +124,41 @@ fn a_conversation_cannot_grow_beyond_the_share_of_a_peer() {
 }
 
 #[test]
+fn members_of_a_pattern_and_agents_with_several_roles_are_bounded() {
+    let share = 1 << 17;
+    let mut limits = Limits::default();
+    limits.bytes = share * 8;
+    let long = |number: usize| format!("{number:x<4000}");
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    stage.right(say("cfp ann>arm_.*"));
+    let mut taken = 0;
+    for number in 0..100 {
+        let answer = say("propose ben>ann")
+            .sender(long(number))
+            .reply_with("bid");
+        taken += usize::from(stage.check(&answer).is_accepted());
+        assert!(stage.monitor.bytes() <= share, "{number}");
+    }
+    assert!((20..40).contains(&taken), "{taken}");
+    // The agents in the `reply-to` of ben get both of its roles.
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="propose" from="b|c" to="a" target="3"/></state>
+        </scxml>"#;
+    let own = |words| say_in("own", words);
+    for (count, fits) in [(10, true), (20, false)] {
+        let library = library_with("own", text);
+        let mut stage = Stage::new(Monitor::observer(library).with_limits(limits));
+        stage.right(own("cfp ann>ben"));
+        stage.right(own("inform ann>ben"));
+        let answer = own("propose ben>ann").reply_to((0..count).map(long));
+        assert_eq!(stage.check(&answer).is_accepted(), fits, "{count}");
+        assert!(stage.monitor.bytes() <= share, "{count}");
+    }
+}
+
+#[test]
 fn the_copies_of_a_message_are_bounded() {
     let text = |to| {
         format!(
