@@ -277,6 +277,15 @@ mod tests {
     }
 
     #[test]
+    fn words_with_a_typing_error_are_near_a_standard_performative() {
+        assert_eq!(near_standard("reqest"), Some("request"));
+        assert_eq!(near_standard("Inform-iff"), Some("inform-if"));
+        for far in ["request", "my-act", "requ?est", "reques.", ""] {
+            assert_eq!(near_standard(far), None, "{far}");
+        }
+    }
+
+    #[test]
     fn common_members_are_found() {
         let set = |text| Acts::new(text).unwrap();
         assert_eq!(

@@ -10,6 +10,7 @@ use hashbrown::HashTable;
 use smallvec::SmallVec;
 
 use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::limits::MAX_DESIGNATED;
 use crate::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
 use crate::names::{Name, Names};
 use crate::parties::Parties;
@@ -412,6 +413,17 @@ impl Bound {
         removed.unwrap_or_default()
     }
 
+    /// Returns an upper bound of the bytes that so many more bindings allocate.
+    fn growth(&self, added: usize) -> usize {
+        match added {
+            0 => 0,
+            _ => {
+                let buffer = (self.len() + added).next_power_of_two();
+                buffer * size_of::<RoleBinding>() + size_of::<SmallVec<[RoleBinding; 2]>>()
+            }
+        }
+    }
+
     /// Bytes that the bindings have allocated.
     fn allocated(&self) -> usize {
         self.bindings.as_deref().map_or(0, |bindings| {
@@ -512,6 +524,11 @@ pub(crate) struct Copied {
     pub(crate) roles: (u32, u32),
 }
 
+impl Copied {
+    /// Maximum number of messages whose copies may mix.
+    pub(crate) const MAX: usize = 4;
+}
+
 /// Number of parties that are searched one by one.
 const FEW: usize = 8;
 
@@ -577,6 +594,30 @@ impl Conversation {
         });
         let texts = usize::try_from(self.charged_texts).unwrap_or(usize::MAX);
         self.parties.allocated() + self.bound.allocated() + rare + texts
+    }
+
+    /// Returns an upper bound of the bytes that so many more parties, role bindings and agents in `reply-to`
+    /// allocate, without their names.
+    pub(crate) fn growth(&self, parties: usize, bindings: usize, designated: usize) -> usize {
+        if [parties, bindings, designated] == [0; 3] {
+            return 0;
+        }
+        let rare = match &self.rare {
+            Some(_) => 0,
+            None => size_of::<Rare>(),
+        };
+        let count = self.parties.len() + parties;
+        let index = match parties {
+            0 => 0,
+            _ if count <= FEW => 0,
+            // A table has a byte more for each place, is at most seven eighths full, and ends with a group.
+            _ => (count * 8 / 7 + 1).next_power_of_two() * (size_of::<(Name, u32)>() + 1) + 16,
+        };
+        let designated = match designated {
+            0 => 0,
+            _ => MAX_DESIGNATED * size_of::<(u32, Name)>(),
+        };
+        self.parties.growth(parties) + self.bound.growth(bindings) + rare + index + designated
     }
 
     /// Takes a reference to a name for this conversation.
@@ -1263,6 +1304,81 @@ mod tests {
         assert_eq!(conversation.allocated(), size_of::<Details>());
         let party = conversation.parties.first().unwrap();
         assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
+    }
+
+    #[test]
+    fn what_the_rare_parts_allocate_is_counted() {
+        let mut conversation = Conversation::unused();
+        let mut before = 0;
+        let mut added = |change: &dyn Fn(&mut Rare)| {
+            change(conversation.rare());
+            let now = conversation.allocated();
+            now - std::mem::replace(&mut before, now)
+        };
+        assert_eq!(added(&|_| ()), size_of::<Rare>());
+        let bytes = added(&|rare| rare.reply_to.reserve_exact(3));
+        assert_eq!(bytes, 3 * size_of::<Name>());
+        let bytes = added(&|rare| rare.delegates.reserve_exact(3));
+        assert_eq!(bytes, 3 * size_of::<(u32, Name)>());
+        let bytes = added(&|rare| rare.alternatives.reserve_exact(3));
+        assert_eq!(bytes, 3 * size_of::<(u32, u16)>());
+        let bytes = added(&|rare| rare.copied.reserve_exact(3));
+        assert_eq!(bytes, 3 * size_of::<Copied>());
+        for receivers in [3, 5] {
+            let bytes = added(&|rare| {
+                rare.copied.push(Copied {
+                    fingerprint: 0,
+                    seen: Vec::with_capacity(receivers),
+                    roles: (0, 0),
+                });
+            });
+            assert_eq!(bytes, receivers * size_of::<u64>());
+        }
+        let asked = RoleBinding { role: 0, agent: 0 };
+        assert_eq!(added(&|rare| rare.asked.push(asked)), 0);
+        let bytes = added(&|rare| rare.asked.grow(5));
+        assert_eq!(bytes, 5 * size_of::<RoleBinding>());
+        let bytes = added(&|rare| {
+            let mut party = Party::new(NONE, 0);
+            party.ask(Side::Initiator, 7, "r7");
+            rare.unnamed = Some(Box::new(party));
+        });
+        assert_eq!(bytes, size_of::<Party>() + size_of::<Details>());
+        let bytes = added(&|rare| {
+            rare.index.insert_unique(spread(1), (1, 0), |_| 0);
+        });
+        assert!(bytes >= size_of::<(Name, u32)>());
+    }
+
+    #[test]
+    fn the_growth_of_a_conversation_is_bounded() {
+        for before in [0, 1, 2, 3, 8, 9, 100, 500] {
+            for added in [0, 1, 2, 7, 8, 90, 300, 600] {
+                let mut names = Names::new(std::hash::RandomState::new());
+                let mut conversation = Conversation::unused();
+                let mut grow = |conversation: &mut Conversation, numbers: Range<usize>| {
+                    for number in numbers {
+                        let agent = names.acquire(&number.to_string());
+                        conversation.add(Party::new(agent, 0));
+                        conversation.bound.push(RoleBinding { role: 0, agent });
+                    }
+                };
+                grow(&mut conversation, 0..before);
+                let bound = conversation.allocated() + conversation.growth(added, added, 64);
+                grow(&mut conversation, before..before + added);
+                for party in conversation.parties.iter_mut() {
+                    party.details();
+                }
+                for _ in 0..MAX_DESIGNATED {
+                    conversation.rare().delegates.push((0, 0));
+                }
+                let allocated = conversation.allocated();
+                assert!(
+                    allocated <= bound,
+                    "{before} and {added}: {allocated} > {bound}"
+                );
+            }
+        }
     }
 
     #[test]

@@ -243,6 +243,26 @@ mod tests {
     }
 
     #[test]
+    fn the_protocol_of_a_name_with_a_typing_error_is_found() {
+        let library = Library::standard();
+        let near = |name| library.near(name).map(Machine::name);
+        assert_eq!(near("fipa-reqest"), Some("fipa-request"));
+        assert_eq!(near("contract-nett"), Some("fipa-contract-net"));
+        assert_eq!(near("fipa-request"), None, "it is known");
+        assert_eq!(near("fipa-dance"), None);
+        // Long names are not compared.
+        let own = r#"<scxml initial="1">
+            <state id="1"><transition performative="inform" from="a" to="b" target="2"/></state>
+            <state id="2" final="yes"/></scxml>"#;
+        for (length, is_compared) in [(127, true), (128, false)] {
+            let mut library = Library::empty();
+            library.read(&"x".repeat(length), own).unwrap();
+            let name = "x".repeat(length + 1);
+            assert_eq!(library.near(&name).is_some(), is_compared, "{length}");
+        }
+    }
+
+    #[test]
     fn added_protocols_take_precedence() {
         let mut library = Library::standard();
         let own = r#"<scxml initial="1">

@@ -423,3 +423,21 @@ pub(crate) fn step<'m>(
         .iter()
         .find(|step| step.acts.contains(act) && step.from.includes(from) && step.to.includes(to))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_role_overlaps_each_role() {
+        let roles = |mask, anyone| Roles {
+            text: String::new(),
+            mask,
+            anyone,
+        };
+        let (one, other, any) = (roles(1, false), roles(6, false), roles(0, true));
+        assert!(one.overlaps(&one) && other.overlaps(&roles(4, false)));
+        assert!(any.overlaps(&one) && one.overlaps(&any) && any.overlaps(&any));
+        assert!(!one.overlaps(&other) && !other.overlaps(&one));
+    }
+}

@@ -11,12 +11,12 @@ use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
-    Conversation, Copied, Details, FAILED, Holders, NONE, NextState, Party, Rare, RoleBinding,
-    Side, act_number, is_final, is_over, state_name,
+    Conversation, Copied, FAILED, Holders, NONE, NextState, Party, RoleBinding, Side, act_number,
+    is_final, is_over, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
 use crate::fingerprints::Fingerprints;
-use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge};
+use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge, unbound};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope, step};
 use crate::memory::{Refused, Removed};
@@ -977,16 +977,15 @@ impl Monitor {
         let copied = copied.filter(|_| machine.scope == Scope::Conversation);
         if let Some((fingerprint, receiver)) = copied {
             let names = &mut self.names;
-            if is_another_copy(
-                &mut slot.conversation,
-                names,
-                observed,
-                fingerprint,
-                receiver,
-            ) {
-                let passed = Passed::in_state_of(&slot.conversation, machine, index);
-                self.charge(at);
-                return Ok(passed);
+            let copy = (fingerprint, receiver);
+            match take_copy(&mut slot.conversation, names, observed, copy, &self.limits) {
+                Some(Ok(())) => {
+                    let passed = Passed::in_state_of(&slot.conversation, machine, index);
+                    self.charge(at);
+                    return Ok(passed);
+                }
+                Some(Err(kind)) => return Err(fault(kind)),
+                None => {}
             }
         }
         let conversation = &slot.conversation;
@@ -1002,16 +1001,14 @@ impl Monitor {
             |made: &&Move| matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
         let added = self.moves.iter().filter(new).count();
         let grown = conversation.parties.len() + added;
-        let grows = added > 0
-            || !header.reply_to_names().is_empty()
-            || machine.scope == Scope::Conversation;
+        let moves = (self.moves.as_slice(), copied.is_some());
+        let growth = growth_by(machine, conversation, &self.names, observed, moves, header);
+        let size = || crate::table::Slot::COST + conversation.allocated() + growth;
         let agents = observed.receivers.len() + header.reply_to_names().len();
         if grown > self.limits.participants
             || conversation.bound.len() + agents > self.limits.participants + 1
             || is_crowded(conversation, &self.names, header)
-            || grows
-                && size_after(conversation, observed, &self.moves, header)
-                    > self.limits.share_of_bytes()
+            || growth > 0 && size() > self.limits.share_of_bytes()
         {
             return Err(fault(Kind::TooMany));
         }
@@ -1324,61 +1321,91 @@ fn is_crowded(conversation: &Conversation, names: &Names, header: &Header<'_>) -
     kept + reply_to.iter().filter(new).count() > MAX_DESIGNATED
 }
 
-/// Returns an upper bound of the bytes of a conversation after a message.
-fn size_after(
+/// Returns an upper bound of the bytes that a message adds to a conversation: with new participants, roles
+/// or agents in `reply-to`, or as the first of several copies.
+fn growth_by(
+    machine: &Machine,
     conversation: &Conversation,
+    names: &Names,
     observed: &ObservedMessage<'_>,
-    moves: &[Move],
+    (moves, is_copied): (&[Move], bool),
     header: &Header<'_>,
 ) -> usize {
-    let name = |name: &str| Names::cost(name.len());
-    let receivers = moves.iter().map(|made| match made.target {
-        MoveTarget::Receiver(number) => {
-            let receiver = observed.receivers.get(number);
-            size_of::<Party>()
-                + size_of::<Details>()
-                + receiver.map_or(0, |receiver| name(receiver))
+    let name = |name: &Cow<'_, str>| Names::cost(name.len());
+    let sender = Names::cost(observed.sender.len());
+    let reply_to = header.reply_to_names();
+    let designated = reply_to.iter().map(name).sum::<usize>();
+    match machine.scope {
+        Scope::Participant => {
+            let new = moves.iter().filter_map(|made| match made.target {
+                MoveTarget::Receiver(number) => observed.receivers.get(number).map(name),
+                MoveTarget::Sender => Some(sender),
+                MoveTarget::Party(_) | MoveTarget::Unnamed => None,
+            });
+            let growth = conversation.growth(new.clone().count(), 0, reply_to.len());
+            growth + new.sum::<usize>() + designated
         }
-        _ => 0,
-    });
-    let reply_to = header.reply_to_names().iter().map(|agent| name(agent));
-    let rare = match conversation.rare {
-        None if !header.reply_to_names().is_empty() => size_of::<Rare>(),
-        _ => 0,
-    };
-    let added = receivers.sum::<usize>() + reply_to.sum::<usize>() + name(observed.sender);
-    crate::table::Slot::COST + conversation.allocated() + added + rare
+        Scope::Conversation => {
+            let free = unbound(machine, conversation);
+            let roles = moves.first().map(|made| made.next_state.roles);
+            let (from, to) = roles.unwrap_or_default();
+            let begins = usize::from(from & free != 0);
+            let receivers = match to & free {
+                0 => &[],
+                _ => observed.receivers,
+            };
+            // The agents in the `reply-to` of a participant get each of its roles.
+            let held = || {
+                let bound = conversation.bound.iter();
+                let held = bound.filter(|bound| names.is(bound.agent, observed.sender));
+                (held.count() + begins).max(1)
+            };
+            let held = if reply_to.is_empty() { 0 } else { held() };
+            let bindings = begins + receivers.len() + held * reply_to.len();
+            let copies = match is_copied {
+                true => Copied::MAX * size_of::<Copied>() + size_of::<u64>(),
+                false => 0,
+            };
+            conversation.growth(0, bindings, reply_to.len())
+                + begins * sender
+                + receivers.iter().map(name).sum::<usize>()
+                + held * designated
+                + copies
+        }
+    }
 }
 
-/// Whether the message is another copy of the last one to several receivers. Its receiver then has the
-/// role of the receivers.
-fn is_another_copy(
+/// If the message is another copy of the last one to several receivers: gives its receiver the role of the
+/// receivers, unless there are too many.
+fn take_copy(
     conversation: &mut Conversation,
     names: &mut Names,
     observed: &ObservedMessage<'_>,
-    fingerprint: u64,
-    receiver: u64,
-) -> bool {
-    let Some(rare) = conversation.rare.as_deref_mut() else {
-        return false;
-    };
+    (fingerprint, receiver): (u64, u64),
+    limits: &Limits,
+) -> Option<Result<(), Kind>> {
+    let bytes = conversation.allocated() + conversation.growth(0, 1, 0);
+    let many = conversation.bound.len() >= limits.participants;
+    let rare = conversation.rare.as_deref_mut()?;
     let mut copied = rare.copied.iter_mut();
-    let Some(copied) = copied.find(|copied| copied.fingerprint == fingerprint) else {
-        return false;
-    };
+    let copied = copied.find(|copied| copied.fingerprint == fingerprint)?;
     if copied.seen.contains(&receiver) {
-        return false;
+        return None;
+    }
+    let name = observed.receivers.first()?;
+    let seen = (copied.seen.len() + 1).next_power_of_two() * size_of::<u64>();
+    let size = crate::table::Slot::COST + bytes + seen + Names::cost(name.len());
+    if many || copied.seen.len() == limits.participants || size > limits.share_of_bytes() {
+        return Some(Err(Kind::TooMany));
     }
     copied.seen.push(receiver);
     let (_, to) = copied.roles;
-    if to.count_ones() == 1
-        && let Some(name) = observed.receivers.first()
-    {
+    if to.count_ones() == 1 {
         let role = u8::try_from(to.trailing_zeros()).unwrap_or(0);
         let agent = conversation.acquire(names, name);
         conversation.bound.push(RoleBinding { role, agent });
     }
-    true
+    Some(Ok(()))
 }
 
 /// Keeps a message of which further copies may follow.
@@ -1388,11 +1415,9 @@ fn keep_copied(
     receiver: u64,
     roles: (u32, u32),
 ) {
-    /// Number of messages whose copies may mix.
-    const MAX: usize = 4;
     let copied = &mut conversation.rare().copied;
     copied.retain(|copied| copied.fingerprint != fingerprint);
-    if copied.len() == MAX {
+    if copied.len() == Copied::MAX {
         copied.remove(0);
     }
     copied.push(Copied {
@@ -1524,6 +1549,7 @@ mod tests {
     use fipa_acl::{Performative, Time};
 
     use super::*;
+    use crate::conversation::{Details, Rare};
     use crate::names::COMPARISONS;
 
     #[test]
@@ -1609,6 +1635,28 @@ mod tests {
                 assert!(made < 10 * MANY, "{protocol}: {made} comparisons");
             }
         }
+    }
+
+    #[test]
+    fn a_conversation_may_have_the_whole_share_of_a_peer() {
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let library = Arc::new(Library::standard());
+        let begun = |share| {
+            let limits = Limits {
+                bytes: share * 8,
+                ..Limits::default()
+            };
+            let mut monitor = Monitor::observer(Arc::clone(&library)).with_limits(limits);
+            let request = Header::new(Performative::Request).sender("ann");
+            let request = request.receivers(["ben"]).protocol("fipa-request");
+            let verdict = monitor.check(&request.conversation_id("1"), now);
+            (verdict.is_accepted(), monitor.bytes())
+        };
+        let (_, bytes) = begun(1 << 20);
+        // The conversation may need details and rare parts later.
+        let bound = bytes + size_of::<Details>() + size_of::<Rare>();
+        assert_eq!(begun(bound), (true, bytes));
+        assert_eq!(begun(bound - 1), (false, 0));
     }
 
     #[test]

@@ -51,6 +51,18 @@ impl Parties {
         };
         own + self.iter().map(Party::allocated).sum::<usize>()
     }
+
+    /// Returns an upper bound of the bytes that so many more parties allocate. Each party may still allocate
+    /// its details.
+    pub(crate) fn growth(&self, added: usize) -> usize {
+        let buffer = |len: usize| match len {
+            0 | 1 => 0,
+            many => many.next_power_of_two() * size_of::<Party>(),
+        };
+        let without_details = self.iter().filter(|party| party.details.is_none());
+        let details = (without_details.count() + added) * size_of::<Details>();
+        buffer(self.len() + added) - buffer(self.len()) + details
+    }
 }
 
 impl Default for Parties {

@@ -98,7 +98,14 @@ mod tests {
             assert!(one_edit_apart("fipa-request", near), "{near}");
             assert!(one_edit_apart(near, "fipa-request"), "{near}");
         }
-        for far in ["fipa-query", "fipa-rqeeust", "fipa-request-when", ""] {
+        for far in [
+            "fipa-query",
+            "fipa-rqeeust",
+            "fipa-rzeuest",
+            "fipa-rqzuest",
+            "fipa-request-when",
+            "",
+        ] {
             assert!(!one_edit_apart("fipa-request", far), "{far}");
         }
         assert!(!one_edit_apart("ab", "ac"));

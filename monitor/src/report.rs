@@ -191,3 +191,16 @@ fn agent_of(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shown_texts_end_with_a_whole_character() {
+        let long = format!("x{}", "\u{e4}".repeat(3_000));
+        assert_eq!(shown(&long), long[..MAX_SHOWN - 1]);
+        assert_eq!(shown(&long[1..]), long[1..=MAX_SHOWN]);
+        assert_eq!(shown("x"), "x");
+    }
+}

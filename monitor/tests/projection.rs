@@ -36,6 +36,13 @@ fn machine(text: &str) -> Machine {
     Machine::read("own", text).unwrap()
 }
 
+/// The standard protocols and this one.
+fn library_with(machine: Machine) -> Arc<Library> {
+    let mut library = Library::standard();
+    library.add(machine).unwrap();
+    Arc::new(library)
+}
+
 /// The states and messages of a projection: `state: act from>to`.
 fn shown(local: &Local) -> Vec<String> {
     let states = local.states().iter();
@@ -151,6 +158,18 @@ fn two_roles_must_not_decide_the_same_choice() {
 }
 
 #[test]
+fn messages_of_two_roles_may_cross() {
+    let crossing = machine(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="3"/>
+            <transition performative="confirm" from="a" to="b" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#,
+    );
+    assert_eq!(Projection::defects(&crossing), []);
+}
+
+#[test]
 fn a_choice_that_a_waiting_role_is_not_told_is_a_deadlock() {
     let found = defects(
         r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/>
@@ -186,11 +205,15 @@ struct Stage {
     now: SystemTime,
 }
 
+/// The monitor of an agent in the docking protocol.
 fn stage(agent: &str) -> Stage {
-    let mut library = Library::standard();
-    library.add(machine(DOCKING)).unwrap();
+    stage_with(machine(DOCKING), agent)
+}
+
+/// The monitor of an agent in this protocol.
+fn stage_with(machine: Machine, agent: &str) -> Stage {
     Stage {
-        monitor: Monitor::agent(Arc::new(library), agent),
+        monitor: Monitor::agent(library_with(machine), agent),
         now: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
     }
 }
@@ -270,10 +293,7 @@ fn a_message_may_overtake_one_of_another_sender() {
         <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
         <state id="4"><transition performative="agree" from="b" to="a" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(machine(text)).unwrap();
-    let mut stage = stage("ben");
-    stage.monitor = Monitor::agent(Arc::new(library), "ben");
+    let mut stage = stage_with(machine(text), "ben");
     // The inform of cid overtakes the request of ann.
     stage.right(&["inform cid>ben"]);
     let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
@@ -336,6 +356,18 @@ fn an_undelivered_message_can_be_sent_again() {
     assert_eq!(mediator.wrong("agree med>dro"), Kind::Ended);
     mediator.lost("not-understood med>old");
     mediator.right(&["inform old>med", "inform med>dro"]);
+    // Reports about other messages than the last one take nothing back.
+    let mut drone = stage("dro");
+    drone.right(&["request dro>med", "agree med>dro", "inform dro>sta"]);
+    drone.lost("request dro>med");
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
+    let (header, receiver) = header_of("inform dro>sta");
+    let now = drone.now;
+    let other = header.reply_with("other");
+    drone.monitor.undelivered(&other, receiver, now);
+    assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
+    drone.lost("inform dro>sta");
+    drone.right(&["inform dro>sta", "inform med>dro"]);
 }
 
 #[test]
@@ -347,12 +379,9 @@ fn a_message_of_another_role_leaves_the_last_one_open() {
         <state id="3"><transition performative="inform" from="b" to="a" target="5"/></state>
         <state id="4"><transition performative="request" from="a" to="c" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
     let joint = machine(text);
     assert!(joint.projection().is_some());
-    library.add(joint).unwrap();
-    let mut stage = stage("ann");
-    stage.monitor = Monitor::agent(Arc::new(library), "ann");
+    let mut stage = stage_with(joint, "ann");
     stage.right(&["request ann>ben", "request ann>cid", "inform ben>ann"]);
     stage.lost("request ann>cid");
     stage.right(&["request ann>cid"]);
@@ -366,12 +395,8 @@ fn an_agent_that_was_asked_to_take_one_role_may_claim_another() {
         <state id="2"><transition performative="request" from="b" to="c" target="3"/></state>
         <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
         <state id="4" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(machine(text)).unwrap();
-    let library = Arc::new(library);
     let asked = || {
-        let mut stage = stage("ann");
-        stage.monitor = Monitor::agent(Arc::clone(&library), "ann");
+        let mut stage = stage_with(machine(text), "ann");
         stage.right(&["request ann>ben"]);
         stage.lost("request ann>ben");
         stage
@@ -462,9 +487,7 @@ fn no_message_of_a_projected_protocol_is_refused() {
     let runs = number("FIPA_WALK_SEEDS").unwrap_or(2_000);
     let docking = machine(DOCKING);
     let locals = docking.projection().unwrap().locals();
-    let mut library = Library::standard();
-    library.add(docking.clone()).unwrap();
-    let library = Arc::new(library);
+    let library = library_with(docking.clone());
     let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
     let names = ["dro", "med", "sta"];
     let (mut said, mut ended, mut lost, mut unchecked) = (0, 0, 0, 0);

@@ -363,3 +363,36 @@ impl Part {
         None
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_run_allocates_is_counted() {
+        let text = r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="request" from="a" to="c" target="3"/></state>
+            <state id="3"><transition performative="own-act" from="c" to="b" target="4"/></state>
+            <state id="4"><transition performative="agree" from="b" to="a" target="5"/></state>
+            <state id="5" final="yes"/></scxml>"#;
+        let machine = Machine::read("own", text).unwrap();
+        let locals = machine.projection().map_or(&[][..], |it| it.locals());
+        let message = |act| Observed {
+            act,
+            own: false,
+            peers: u32::MAX,
+        };
+        let mut run = LocalRun::new(locals, u32::MAX);
+        let parts = |run: &LocalRun| run.parts.capacity() * size_of::<Part>();
+        assert!(run.parts.len() == 3 && run.allocated() == parts(&run));
+        // The message waits for the request.
+        run.take(locals, message(Act::Other("own-act"))).unwrap();
+        assert!(run.waits());
+        let [part] = &run.parts[..] else {
+            panic!("{run:?}")
+        };
+        let early = part.early.capacity() * size_of::<(u8, Performed)>() + "own-act".len();
+        assert_eq!(run.allocated(), parts(&run) + early);
+    }
+}

@@ -143,10 +143,8 @@ fn with_one_state_a_continuing_agent_has_the_role_of_the_initiator() {
         <state id="2"><transition performative="propose" from="b" to="a" target="3"/></state>
         <state id="3"><transition performative="accept-proposal" from="a" to="b" target="4"/></state>
         <state id="4" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
     let own = |words| say_in("own", words);
-    let library = Arc::new(library);
+    let library = library_with("own", text);
     let mut stage = Stage::new(Monitor::observer(Arc::clone(&library)));
     stage.right(own("cfp ann>ben").reply_to(["dan"]).reply_with("a"));
     stage.right(own("propose ben>dan").in_reply_to("a").reply_with("b"));
@@ -286,10 +284,8 @@ fn an_answer_that_may_lead_to_several_states_is_not_checked() {
         <state id="3"><transition performative="confirm" from="a" to="b" target="4"/></state>
         <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
     let own = |words| say_in("own", words);
-    let mut stage = Stage::new(Monitor::agent(Arc::new(library), "dan"));
+    let mut stage = Stage::new(Monitor::agent(library_with("own", text), "dan"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&own("inform ben>dan")), elsewhere);
     assert_eq!(stage.check(&own("confirm dan>ben")), elsewhere);

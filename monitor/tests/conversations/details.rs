@@ -3,9 +3,7 @@
 use super::*;
 
 fn stage_of(text: &str) -> Stage {
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    Stage::new(Monitor::observer(Arc::new(library)))
+    Stage::new(Monitor::observer(library_with("own", text)))
 }
 
 fn own(words: &'static str) -> Header<'static> {
@@ -35,6 +33,35 @@ fn expected_messages_are_those_of_the_concerned_participant() {
     );
     let violation = stage.wrong(say("confirm cid>ann"));
     assert_eq!(expected(&violation), Vec::<String>::new(), "it had refused");
+}
+
+#[test]
+fn after_an_undelivered_message_those_after_it_are_expected() {
+    let english = |text| say_in("fipa-auction-english", text);
+    for mut stage in [
+        Stage::observer(),
+        Stage::new(Monitor::agent(library(), "ann")),
+    ] {
+        stage.right(english("inform ann>ben").reply_with("opening"));
+        let call = |text| english("cfp ann>ben").reply_with(text);
+        for text in ["1", "2", "3"] {
+            stage.right(call(text));
+        }
+        let now = stage.now;
+        stage.monitor.undelivered(&call("3"), "ben", now);
+        let answers = [
+            "propose ben>ann".to_owned(),
+            "cfp, inform ann>ben".to_owned(),
+        ];
+        let violation = stage.wrong(english("confirm ben>ann"));
+        assert_eq!(violation.state.as_deref(), Some("undelivered"));
+        assert_eq!(expected(&violation), answers);
+        // A bid for an earlier call does not show whether the last one arrived.
+        let state = stage.right(english("propose ben>ann").in_reply_to("1"));
+        assert_eq!(state, "undelivered");
+        let violation = stage.wrong(english("confirm ben>ann"));
+        assert_eq!(expected(&violation), answers);
+    }
 }
 
 #[test]
@@ -101,9 +128,7 @@ fn the_initiator_need_not_be_the_first_role_of_the_file() {
     assert_eq!(stage.wrong(own("inform ann>ben")).kind, Kind::WrongSender);
     stage.right(own("inform ben>ann"));
     assert_eq!(stage.right(own("inform cid>ann")), "done");
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    let mut stage = Stage::new(Monitor::agent(Arc::new(library), "dan"));
+    let mut stage = Stage::new(Monitor::agent(library_with("own", text), "dan"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&own("inform ben>dan")), elsewhere);
     assert_eq!(stage.check(&own("propose cid>dan")), elsewhere);
@@ -132,11 +157,9 @@ fn the_limit_of_participants_is_exact() {
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
         <state id="3" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
     let mut limits = Limits::default();
     limits.participants = 2;
-    let monitor = Monitor::observer(Arc::new(library)).with_limits(limits);
+    let monitor = Monitor::observer(library_with("own", text)).with_limits(limits);
     assert!(monitor.library().find("own").is_some());
     let mut stage = Stage::new(monitor);
     stage.right(own("request ann>ben"));
@@ -358,16 +381,22 @@ fn the_initiator_may_name_itself_and_others_in_reply_to() {
     let mut stage = stage_of(ONE_STATE);
     stage.right(own("request ann>ben").reply_to(["ann", "dan"]));
     assert_eq!(stage.right(own("agree ben>ann,dan")), "3");
-    let mut library = Library::standard();
-    library
-        .add(Machine::read("own", ONE_STATE).unwrap())
-        .unwrap();
     let mut limits = Limits::default();
     limits.participants = 4;
-    let monitor = Monitor::observer(Arc::new(library)).with_limits(limits);
+    let monitor = Monitor::observer(library_with("own", ONE_STATE)).with_limits(limits);
     let mut stage = Stage::new(monitor);
     stage.right(own("request ann>ben").reply_to(["dan", "eve"]));
     assert_eq!(stage.right(own("agree ben>ann,dan,eve")), "3");
+}
+
+#[test]
+fn many_agents_in_reply_to_have_the_role_of_the_initiator() {
+    let names = || (0..20).map(|number| format!("d{number}"));
+    let mut stage = stage_of(ONE_STATE);
+    stage.right(own("request ann>ben").reply_to(names()));
+    let other = own("agree ben>ann").receivers(names().chain(["zoe".to_owned()]));
+    assert_eq!(stage.wrong(other).kind, Kind::WrongReceiver);
+    assert_eq!(stage.right(own("agree ben>ann").receivers(names())), "3");
 }
 
 #[test]

@@ -52,9 +52,7 @@ const LOCK: &str = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope=
     <state id="5" final="yes"/></scxml>"#;
 
 fn locking(monitor: impl FnOnce(Arc<Library>) -> Monitor) -> Stage {
-    let mut library = Library::standard();
-    library.add(Machine::read("lock", LOCK).unwrap()).unwrap();
-    Stage::new(monitor(Arc::new(library)))
+    Stage::new(monitor(library_with("lock", LOCK)))
 }
 
 fn lock(words: &'static str) -> Header<'static> {

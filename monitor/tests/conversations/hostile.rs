@@ -49,6 +49,152 @@ fn a_later_message_may_not_name_more_bytes_than_the_share_of_a_peer() {
 }
 
 #[test]
+fn a_conversation_at_its_share_of_bytes_continues_if_it_does_not_grow() {
+    let long = || "x".repeat(4_000);
+    let call = || {
+        let call = say("cfp ann>ben").receivers([long(), "ben".to_owned()]);
+        call.reply_with("call")
+    };
+    let called = |share: usize| {
+        let mut limits = Limits::default();
+        limits.bytes = share * 8;
+        let mut stage = Stage::new(Monitor::observer(library_once()).with_limits(limits));
+        let is_accepted = stage.check(&call()).is_accepted();
+        is_accepted.then_some((share, stage))
+    };
+    let (share, mut stage) = (4_000..8_000).find_map(called).unwrap();
+    // What an undelivered message needs is not limited.
+    let now = stage.now;
+    for receiver in [&*long(), "ben"] {
+        stage.monitor.undelivered(&call(), receiver, now);
+    }
+    assert!(stage.monitor.bytes() > share);
+    assert_eq!(stage.right(call()), "called");
+    let answer = |words| say(words).sender(long());
+    assert_eq!(stage.right(answer("propose ben>ann")), "proposed");
+    let accept = say("accept-proposal ann>ben").receivers([long()]);
+    assert_eq!(stage.right(accept), "accepted");
+    assert_eq!(stage.wrong(say("cfp ann>cid")).kind, Kind::TooMany);
+    let named = answer("inform ben>ann").reply_to(["dan"]);
+    assert_eq!(stage.wrong(named).kind, Kind::TooMany);
+    assert_eq!(stage.right(answer("inform ben>ann")), "done");
+}
+
+#[test]
+fn a_conversation_cannot_grow_beyond_the_share_of_a_peer() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="2"/></state>
+        </scxml>"#;
+    let library = library_with("plain", text);
+    let names = |length: usize, count| (0..count).map(move |number| format!("{number:x<length$}"));
+    for protocol in ["plain", "fipa-contract-net"] {
+        let cfp = || say_in(protocol, "cfp ann>ben").reply_with("call");
+        for (length, reply_to, share) in [(1, 0, 1 << 13), (9, 3, 1 << 14), (4_000, 0, 1 << 17)] {
+            let mut limits = Limits::default();
+            limits.bytes = share * 8;
+            let mut accepted = 0;
+            for count in 1..300 {
+                let monitor = Monitor::observer(Arc::clone(&library)).with_limits(limits);
+                let mut stage = Stage::new(monitor);
+                let header = cfp().receivers(names(length, count));
+                let verdict = stage.check(&header.reply_to(names(length + 1, reply_to)));
+                accepted += usize::from(verdict.is_accepted());
+                let bytes = stage.monitor.bytes();
+                assert!(bytes <= share, "{protocol}: {count} names: {bytes} bytes");
+            }
+            assert!((10..299).contains(&accepted), "{protocol}: {accepted}");
+            // In several messages.
+            let mut stage = Stage::new(Monitor::observer(Arc::clone(&library)).with_limits(limits));
+            stage.right(say_in(protocol, "cfp ann>ben"));
+            let mut refused = 0;
+            for number in 0..400 {
+                let name = format!("{number:x<length$}");
+                let header = match protocol {
+                    "plain" => say_in(protocol, "propose ben>ann").reply_to([name]),
+                    _ => cfp().receivers([name]),
+                };
+                refused += usize::from(!stage.check(&header).is_accepted());
+                let bytes = stage.monitor.bytes();
+                assert!(bytes <= share, "{protocol}: {number}: {bytes} bytes");
+            }
+            assert!(refused > 0, "{protocol}");
+        }
+    }
+}
+
+#[test]
+fn members_of_a_pattern_and_agents_with_several_roles_are_bounded() {
+    let share = 1 << 17;
+    let mut limits = Limits::default();
+    limits.bytes = share * 8;
+    let long = |number: usize| format!("{number:x<4000}");
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    stage.right(say("cfp ann>arm_.*"));
+    let mut taken = 0;
+    for number in 0..100 {
+        let answer = say("propose ben>ann")
+            .sender(long(number))
+            .reply_with("bid");
+        taken += usize::from(stage.check(&answer).is_accepted());
+        assert!(stage.monitor.bytes() <= share, "{number}");
+    }
+    assert!((20..40).contains(&taken), "{taken}");
+    // The agents in the `reply-to` of ben get both of its roles.
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="propose" from="b|c" to="a" target="3"/></state>
+        </scxml>"#;
+    let own = |words| say_in("own", words);
+    for (count, fits) in [(10, true), (20, false)] {
+        let library = library_with("own", text);
+        let mut stage = Stage::new(Monitor::observer(library).with_limits(limits));
+        stage.right(own("cfp ann>ben"));
+        stage.right(own("inform ann>ben"));
+        let answer = own("propose ben>ann").reply_to((0..count).map(long));
+        assert_eq!(stage.check(&answer).is_accepted(), fits, "{count}");
+        assert!(stage.monitor.bytes() <= share, "{count}");
+    }
+}
+
+#[test]
+fn the_copies_of_a_message_are_bounded() {
+    let text = |to| {
+        format!(
+            r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="{to}" target="2"/></state>
+            <state id="2"><transition performative="agree" from="b" to="a" target="2"/>
+                <transition performative="inform" from="a" to="c" target="2"/></state></scxml>"#
+        )
+    };
+    let own = |words| say_in("plain", words);
+    let receiver = |number: usize| format!("{number:x<100}");
+    for (to, share, participants, accepted) in [
+        ("b", 1 << 14, 1_000, 20..140),
+        // The initiator is one of the agents with roles.
+        ("b", 1 << 20, 30, 29..30),
+        ("b|c", 1 << 20, 30, 30..31),
+    ] {
+        let mut limits = Limits::default();
+        (limits.bytes, limits.participants) = (share * 8, participants);
+        let library = library_with("plain", &text(to));
+        let mut stage = Stage::new(Monitor::observer(library).with_limits(limits));
+        let mut taken = 0;
+        for number in 0..500 {
+            let copy = own("request ann>ben,cid").copy_for(receiver(number));
+            let verdict = stage.check(&copy);
+            let kind = verdict.violation().map(|violation| violation.kind);
+            assert!(kind.is_none_or(|kind| kind == Kind::TooMany), "{kind:?}");
+            taken += usize::from(kind.is_none());
+            assert!(stage.monitor.bytes() <= share, "{number}");
+        }
+        assert!(accepted.contains(&taken), "{taken}");
+        stage.right(own("agree ben>ann").sender(receiver(3)));
+    }
+}
+
+#[test]
 fn the_bytes_of_a_peer_are_bounded() {
     let mut limits = Limits::default();
     limits.bytes = 8 << 20;
@@ -298,10 +444,8 @@ fn an_outsider_reports_no_undelivered_message() {
         <state id="1"><transition performative="request" from="i" to="B" target="2"/></state>
         <state id="2"><transition performative="agree" from="B" to="i" target="3"/></state>
         <state id="3" final="yes"/></scxml>"#;
-    let mut all = Library::standard();
-    all.add(Machine::read("plain", text).unwrap()).unwrap();
     let own = |words| say_in("plain", words);
-    let mut stage = Stage::new(Monitor::observer(Arc::new(all)));
+    let mut stage = Stage::new(Monitor::observer(library_with("plain", text)));
     stage.right(own("request ann>ben"));
     let forged = stage.wrong(own("failure mallory>ann"));
     assert_eq!(forged.kind, Kind::Stranger);

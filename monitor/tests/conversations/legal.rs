@@ -255,6 +255,32 @@ fn messages_that_cross_a_not_understood_answer_the_message_before_it() {
     assert_eq!(stage.wrong(english("request ben>ann")).kind, Kind::Ended);
 }
 
+#[test]
+fn an_undelivered_message_of_either_side_of_one_state_can_be_sent_again() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="inform" from="a" to="b" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    let own = |words| say_in("own", words);
+    let library = library_with("own", text);
+    for name in [None, Some("ann"), Some("ben")] {
+        let library = Arc::clone(&library);
+        let mut stage = Stage::new(match name {
+            None => Monitor::observer(library),
+            Some(name) => Monitor::agent(library, name),
+        });
+        let all = ["request ann>ben", "agree ben>ann", "inform ann>ben"];
+        for (words, receiver) in all.into_iter().zip(["ben", "ann", "ben"]) {
+            stage.right(own(words));
+            stage.wrong(own(words));
+            let now = stage.now;
+            stage.monitor.undelivered(&own(words), receiver, now);
+            stage.right(own(words));
+        }
+    }
+}
+
 /// The monitors of all agents, and of this one.
 fn monitors(agent: &str) -> [Stage; 2] {
     [
@@ -413,6 +439,27 @@ fn each_participant_of_a_forgotten_conversation_may_be_in_a_later_state() {
 }
 
 #[test]
+fn a_message_to_a_pattern_shows_the_state_of_its_members_only() {
+    let english = |text| say_in("fipa-auction-english", text);
+    let restarted = || {
+        let monitor = Monitor::agent(library(), "ann").with_history(History::Unknown);
+        Stage::new(monitor)
+    };
+    // A call to the members shows that the auction has begun for them.
+    let mut stage = restarted();
+    stage.right(english("inform ann>arm_.*"));
+    stage.right(english("cfp ann>arm_.*"));
+    let early = stage.wrong(english("accept-proposal ann>arm_.*"));
+    assert_eq!(early.state.as_deref(), Some("called"));
+    // It does not show it for ben. The inform may have been the end of an auction.
+    let mut stage = restarted();
+    stage.right(english("inform ann>ben"));
+    stage.right(english("inform ann>arm_.*"));
+    stage.right(english("cfp ann>arm_.*"));
+    assert_eq!(stage.check(&english("propose ben>ann")), UNKNOWN);
+}
+
+#[test]
 fn an_undelivered_message_that_may_have_been_a_later_one_leaves_an_unknown_state() {
     let iterated = |text| say_in("fipa-iterated-contract-net", text);
     let restarted = || {
@@ -451,6 +498,41 @@ fn an_undelivered_message_that_may_have_been_a_later_one_leaves_an_unknown_state
 }
 
 #[test]
+fn the_first_message_after_a_restart_may_begin_another_round() {
+    let text = |next| {
+        format!(
+            r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="inform" from="b" to="a" target="{next}"/>
+                <transition performative="refuse" from="b" to="a" target="3"/></state>
+            <state id="3" final="yes"/></scxml>"#
+        )
+    };
+    let own = |words| say_in("own", words);
+    for (next, history, is_known) in [
+        ("1", History::Unknown, false),
+        ("1", History::Complete, true),
+        ("3", History::Unknown, true),
+    ] {
+        let library = library_with("own", &text(next));
+        let monitor = Monitor::agent(library, "ann").with_history(history);
+        let mut stage = Stage::new(monitor);
+        stage.right(own("request ann>ben"));
+        let now = stage.now;
+        let request = own("request ann>ben");
+        stage.monitor.undelivered(&request, "ben", now);
+        stage.right(own("cancel ann>ben"));
+        stage.right(own("failure ben>ann"));
+        // After another round, the cancel does not show that the request arrived.
+        let verdict = stage.check(&own("request ann>ben"));
+        match is_known {
+            true => assert!(verdict.violation().is_some(), "{verdict:?}"),
+            false => assert_eq!(verdict, UNKNOWN),
+        }
+    }
+}
+
+#[test]
 fn messages_go_to_the_delegate_of_a_participant() {
     for name in [None, Some("ann")] {
         let mut stage = Stage::new(match name {
@@ -479,9 +561,7 @@ fn messages_go_to_the_delegate_of_a_participant() {
         <state id="3"><transition performative="accept-proposal" from="a" to="b" target="4"/></state>
         <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
         <state id="5" final="yes"/></scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
     let own = |words| say_in("own", words);
     stage.right(own("cfp ann>ben"));
     stage.right(own("propose ben>ann").reply_to(["dan"]));
@@ -539,6 +619,13 @@ fn a_wrong_reply_names_the_expected_and_the_received_value() {
     assert_eq!((&*reply.expected, &*reply.received), ("q1", "q0"));
     let text = wrong.to_string();
     assert!(text.contains(r#"expected "q1", received "q0""#), "{text}");
+    // Each participant has its own value.
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben").reply_with("b"));
+    stage.right(say("cfp ann>cid").reply_with("c"));
+    let wrong = stage.wrong(say("propose cid>ann").in_reply_to("b"));
+    let reply = wrong.reply.as_ref().unwrap();
+    assert_eq!((&*reply.expected, &*reply.received), ("c", "b"));
 }
 
 #[test]
@@ -570,9 +657,7 @@ fn the_copies_of_a_multicast_are_one_message() {
         <state id="1"><transition performative="query-if" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="inform" from="b" to="a" target="2"/></state>
         </scxml>"#;
-    let mut library = Library::standard();
-    library.add(Machine::read("own", text).unwrap()).unwrap();
-    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
     let own = |words| say_in("own", words);
     let copy = |to: &'static str| own("query-if ann>ben,cid,dan").copy_for(to);
     stage.right(copy("ben"));

@@ -33,6 +33,19 @@ fn library() -> Arc<Library> {
     Arc::new(Library::standard())
 }
 
+/// The standard protocols, which are read once.
+fn library_once() -> Arc<Library> {
+    static ONCE: std::sync::LazyLock<Arc<Library>> = std::sync::LazyLock::new(library);
+    Arc::clone(&ONCE)
+}
+
+/// The standard protocols and one of this text.
+fn library_with(name: &str, text: &str) -> Arc<Library> {
+    let mut library = Library::standard();
+    library.add(Machine::read(name, text).unwrap()).unwrap();
+    Arc::new(library)
+}
+
 impl Stage {
     fn new(monitor: Monitor) -> Self {
         let now = SystemTime::UNIX_EPOCH + START;

@@ -6,7 +6,11 @@ use fipa_monitor::SnapshotError;
 use super::*;
 
 fn moved(stage: &Stage, agent: &str) -> Stage {
-    let mut monitor = Monitor::agent(library(), agent);
+    moved_with(library(), stage, agent)
+}
+
+fn moved_with(library: Arc<Library>, stage: &Stage, agent: &str) -> Stage {
+    let mut monitor = Monitor::agent(library, agent);
     let taken = stage.monitor.snapshot(stage.now);
     let restored = monitor.restore(&taken, stage.now).unwrap();
     assert_eq!(restored, stage.monitor.len());
@@ -81,6 +85,44 @@ fn the_next_monitor_has_the_same_states() {
     stage.right(query("inform ben>dan"));
     let broken = |words| request(words).conversation_id("broken");
     assert_eq!(stage.wrong(broken("agree ben>cid")).kind, Kind::Ended);
+}
+
+#[test]
+fn the_side_that_spoke_last_and_the_side_that_canceled_move_along() {
+    // Messages of the other side may cross a not-understood.
+    let mut ann = Stage::new(Monitor::agent(library(), "ann"));
+    ann.right(request("request ann>ben"));
+    ann.right(request("agree ben>ann"));
+    ann.right(request("not-understood ann>ben"));
+    let mut ann = moved(&ann, "ann");
+    assert_eq!(ann.right(request("inform ben>ann")), "not-understood");
+    let mut ben = Stage::new(Monitor::agent(library(), "ben"));
+    ben.right(request("request ann>ben"));
+    ben.right(request("not-understood ben>ann"));
+    let mut ben = moved(&ben, "ben");
+    assert_eq!(ben.right(request("cancel ann>ben")), "not-understood");
+    // Messages of the other side may cross a cancel.
+    let text = r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant"
+        fipa:cancel="anyone">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="a" to="b" target="2"/>
+            <transition performative="inform" from="b" to="a" target="2"/></state></scxml>"#;
+    let own = |words| say_in("own", words);
+    for (cancel, inform) in [
+        ("cancel ben>ann", "inform ann>ben"),
+        ("cancel ann>ben", "inform ben>ann"),
+    ] {
+        let canceling = &cancel[7..10];
+        let library = library_with("own", text);
+        let monitor = Monitor::agent(Arc::clone(&library), canceling);
+        let mut stage = Stage::new(monitor);
+        stage.right(own("request ann>ben").reply_with("q"));
+        stage.right(own(cancel).reply_with("x"));
+        // Either inform may be the answer to the cancel.
+        assert_eq!(stage.right(own(inform)), "cancelled");
+        let mut stage = moved_with(library, &stage, canceling);
+        assert_eq!(stage.right(own(inform)), "cancelled", "{canceling}");
+    }
 }
 
 #[test]
@@ -291,9 +333,4 @@ fn changed_bytes_do_no_harm() {
         assert!(monitor.is_empty() && monitor.bytes() == 0);
     }
     assert!(refused > 500 && restored > 100, "{refused} {restored}");
-}
-
-fn library_once() -> Arc<Library> {
-    static ONCE: std::sync::LazyLock<Arc<Library>> = std::sync::LazyLock::new(library);
-    Arc::clone(&ONCE)
 }

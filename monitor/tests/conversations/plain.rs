@@ -3,9 +3,7 @@
 use super::*;
 
 fn stage(text: &str) -> Stage {
-    let mut library = Library::standard();
-    library.add(Machine::read("lift", text).unwrap()).unwrap();
-    Stage::new(Monitor::observer(Arc::new(library)))
+    Stage::new(Monitor::observer(library_with("lift", text)))
 }
 
 /// A message of the protocol `lift`. The service `host-mts` reports that ben did not get a message.
