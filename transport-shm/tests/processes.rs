@@ -10,11 +10,10 @@ use std::io::{BufRead, BufReader, Lines};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::PermissionsExt as _;
 use std::process::{ChildStdout, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex};
+use std::sync::Arc;
 
 use bytes::Bytes;
-use common::{RecordingSink, TestDomain, attempt, location_of, mapping_of, parcel};
+use common::{GatedSink, RecordingSink, TestDomain, attempt, location_of, mapping_of, parcel};
 use fipa_acl::Letter;
 use fipa_testbed::{ChildGuard, ignored_test, until};
 use fipa_transport::{
@@ -321,32 +320,6 @@ fn a_letter_whose_receiver_is_killed_before_its_answer_is_unconfirmed() {
     domain.until_removed();
 }
 
-/// A sink whose thread waits within the first conclusion while the gate is closed.
-#[derive(Default)]
-struct GatedSink {
-    recorded: RecordingSink,
-    is_closed: Mutex<bool>,
-    opened: Condvar,
-    waits: AtomicBool,
-}
-
-impl Sink for GatedSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
-        self.recorded.arrived(arrival)
-    }
-
-    fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
-
-    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
-        self.recorded.concluded(attempt, conclusion);
-        let mut is_closed = self.is_closed.lock().unwrap();
-        self.waits.store(*is_closed, Ordering::SeqCst);
-        while *is_closed {
-            is_closed = self.opened.wait(is_closed).unwrap();
-        }
-    }
-}
-
 /// The sender looks for the answer after the receiver was killed.
 #[test]
 fn a_letter_whose_receiver_is_killed_after_its_answer_is_answered() {
@@ -364,9 +337,9 @@ fn a_letter_whose_receiver_is_killed_after_its_answer_is_answered() {
         sender.dispatch(one, &to, parcel(content.into())).unwrap();
         one
     };
-    *sink.is_closed.lock().unwrap() = true;
+    sink.close_gate();
     dispatch(vec![]);
-    until("the first conclusion", || sink.waits.load(Ordering::SeqCst));
+    until("the first conclusion", || sink.is_waiting());
     let before = sender.counters().answered_in_words;
     let answered = dispatch(vec![]);
     // When this letter has arrived, the one before it is answered.
@@ -375,8 +348,7 @@ fn a_letter_whose_receiver_is_killed_after_its_answer_is_answered() {
     assert!(lines.any(|line| line.starts_with("POSITION")));
     receiver.kill();
     assert_eq!(sent.conclusion_of(answered), None);
-    *sink.is_closed.lock().unwrap() = false;
-    sink.opened.notify_all();
+    sink.open_gate();
     until("conclusion", || sent.conclusion_of(answered).is_some());
     let accepted = Some(Conclusion::Answered(Answer::Accepted));
     assert_eq!(sent.conclusion_of(answered), accepted);

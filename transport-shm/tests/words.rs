@@ -5,10 +5,10 @@
 mod common;
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, mpsc};
 
 use bytes::Bytes;
-use common::{RecordingSink, TestDomain, attempt, open, parcel};
+use common::{GatedSink, RecordingSink, TestDomain, attempt, open, parcel};
 use fipa_acl::Letter;
 use fipa_testbed::until;
 use fipa_transport::{
@@ -224,6 +224,55 @@ fn a_late_answer_to_an_abandoned_letter_is_not_that_to_the_next_one() {
         }
         done.store(true, Ordering::Relaxed);
     });
+}
+
+/// The answer comes after the last poll, while the sender still states that it polls: the receiver does not ring.
+#[test]
+fn a_sender_that_stops_polling_finds_the_answer() {
+    let domain = TestDomain::new();
+    let sender = domain.endpoint();
+    let sink = Arc::new(GatedSink::default());
+    sender.listen(sink.clone()).unwrap();
+    let sent = &sink.recorded;
+    let (receiver, _) = domain.listening();
+    send_until_answered_in_a_word((&sender, sent), &receiver);
+    // The runtime's thread does nothing else.
+    let (end, ended) = mpsc::channel::<()>();
+    let (start, started) = mpsc::channel();
+    domain.runtime.spawn(async move {
+        start.send(()).unwrap();
+        let _ = ended.recv();
+    });
+    started.recv().unwrap();
+    for _ in 0..20 {
+        let before = sender.counters().answered_in_words;
+        sink.close_gate();
+        let first = dispatch(&sender, &receiver, &Bytes::new());
+        std::thread::scope(|scope| {
+            let driving = scope.spawn(|| {
+                while sent.conclusion_of(first).is_none() {
+                    sender.drive();
+                }
+            });
+            until("the first conclusion", || {
+                receiver.drive();
+                sink.is_waiting()
+            });
+            let (rung, arrived) = (receiver.counters().rung, receiver.counters().arrived);
+            let second = dispatch(&sender, &receiver, &Bytes::new());
+            until("the second letter", || {
+                receiver.drive();
+                receiver.counters().arrived > arrived
+            });
+            assert_eq!(receiver.counters().rung, rung);
+            assert_eq!(sent.conclusion_of(second), None);
+            sink.open_gate();
+            driving.join().unwrap();
+            assert_eq!(sent.conclusion_of(second), Some(accepted()));
+        });
+        assert_eq!(sender.counters().answered_in_words, before + 2);
+    }
+    drop(end);
 }
 
 /// A sender joins its domain again while a receiver is within its letter. The receiver has the earlier status page
