@@ -123,7 +123,7 @@ impl<const N: usize> LentWords<N> {
     pub(crate) fn lend(&self, words: &AnswerWords<N>) -> (u64, WordPlace) {
         let taken = self.take();
         // After the word was taken: tokens of parcels in one word are in the order in which they have it.
-        let token = self.next_token.fetch_add(STEP, Ordering::Relaxed);
+        let token = self.token();
         let Some(word) = taken else {
             return (token, WordPlace::NONE);
         };
@@ -134,6 +134,11 @@ impl<const N: usize> LentWords<N> {
         }
         let page = self.page;
         (token, WordPlace { page, word })
+    }
+
+    /// Returns the token of the next parcel, which needs no word.
+    pub(crate) fn token(&self) -> u64 {
+        self.next_token.fetch_add(STEP, Ordering::Relaxed)
     }
 
     fn take(&self) -> Option<u32> {

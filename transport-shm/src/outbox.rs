@@ -76,6 +76,8 @@ pub(crate) struct Outbox {
     lender: Arc<WordLender>,
     /// The status page of the mailbox's process, on which parcels are announced.
     page: Arc<StatusPage>,
+    /// Whether the process answers parcels late. Such a process does not answer in words.
+    answers_late: bool,
     budget: Arc<Budget>,
     pool: Arc<Pool>,
     tally: Arc<Tally>,
@@ -154,9 +156,9 @@ pub(crate) enum Posted {
 /// The way of looking for answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum AnswerLook {
-    /// For answers on the connections that are open.
+    /// For answers in words, and on the open connections for answers to parcels without a word.
     Quick,
-    /// Also for new connections, and for parcels that were dropped without an answer.
+    /// For all answers, also on new connections, and for parcels that were dropped without an answer.
     Thorough,
     /// As `Thorough`, after the end of the process: no further answer will come.
     Ended,
@@ -238,6 +240,8 @@ impl Outbox {
             loans: AtomicUsize::new(0),
             retired: AtomicBool::new(false),
             lender: opening.lender,
+            // Set before the mailbox can be opened.
+            answers_late: opening.page.words().answers_late(),
             page: opening.page,
             budget: opening.budget,
             pool: opening.pool,
@@ -290,7 +294,7 @@ impl Outbox {
         };
         let front = usize::try_from(header.front_len()).unwrap_or(usize::MAX);
         let offsets = PieceOffsets::for_lengths(front, content_here, tail).ok_or_else(too_large)?;
-        let answer = self.lender.lend();
+        let answer = self.lender.lend(!self.answers_late);
 
         let mut state = self.state.lock();
         if self.is_retired() {
@@ -634,7 +638,7 @@ impl Outbox {
         let (sent, end) = match state.queue.front()?.end(look) {
             Some(end) => (state.queue.pop_front()?, end),
             // Otherwise the process answers in the order of the queue, or drops parcels unanswered.
-            None if self.page.words().answers_late() => ended_behind_front(&mut state, look)?,
+            None if self.answers_late => ended_behind_front(&mut state, look)?,
             None => return None,
         };
         self.waiting.decrement();
@@ -662,7 +666,7 @@ impl Outbox {
         }
         let state = self.state.lock();
         state.queue.front().is_some_and(Sent::has_answer)
-            || self.page.words().answers_late() && state.queue.iter().skip(1).any(Sent::has_answer)
+            || self.answers_late && state.queue.iter().skip(1).any(Sent::has_answer)
     }
 
     /// Abandons an attempt. Returns whether the attempt was here.
@@ -788,7 +792,8 @@ impl Sent {
     }
 
     fn end_of(&self, pending: &Pending, look: AnswerLook) -> Option<End> {
-        if look == AnswerLook::Quick && !pending.has_response() {
+        // Most parcels with a word are answered there, so responses are looked for less often.
+        if look == AnswerLook::Quick && (self.answer.has_word() || !pending.has_response()) {
             return None;
         }
         let ended = look == AnswerLook::Ended;

@@ -492,9 +492,12 @@ impl WordLender {
         Self { page, lent }
     }
 
-    /// Lends a word to the next parcel.
-    pub(crate) fn lend(self: &Arc<Self>) -> AnswerPlace {
-        let (token, word) = self.lent.lend(self.page.answers());
+    /// Returns the token of the next parcel, and lends it a word if the receiver may answer there.
+    pub(crate) fn lend(self: &Arc<Self>, with_word: bool) -> AnswerPlace {
+        let (token, word) = match with_word {
+            true => self.lent.lend(self.page.answers()),
+            false => (self.lent.token(), WordPlace::NONE),
+        };
         AnswerPlace {
             lender: Arc::clone(self),
             token,
@@ -519,6 +522,10 @@ impl AnswerPlace {
 
     pub(crate) fn word(&self) -> WordPlace {
         self.word
+    }
+
+    pub(crate) fn has_word(&self) -> bool {
+        self.word != WordPlace::NONE
     }
 
     /// The code of the answer in the word, if there is one.
