@@ -62,7 +62,7 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
                 seed.extend(fipa_transport_shm::fuzzing::VERSION.to_le_bytes());
                 seed.extend([0; 4]);
                 seed.extend(7_u64.to_le_bytes());
-                seed.extend([0; 24]);
+                seed.extend([0; 40]);
                 seed.extend(parcel.iter().take(4000));
                 seed
             });

@@ -48,7 +48,7 @@ const TAIL: usize = 1;
 
 /// An iceoryx2 answer of the same length as the transport's.
 type RawAck = [u8; 184];
-type RawHeader = [u64; 13];
+type RawHeader = [u64; 15];
 type RawClient = Client<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
 type RawPending = PendingResponse<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
 type RawServer = Server<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;

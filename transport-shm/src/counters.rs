@@ -26,6 +26,8 @@ pub struct ShmCounters {
     pub loans_copied: u64,
     /// Rings of other processes' doorbells: system calls that a polling receiver saves.
     pub rung: u64,
+    /// Parcels whose answer came in a word of shared memory, without a response of iceoryx2.
+    pub answered_in_words: u64,
     /// Parcels whose answer was deferred.
     pub deferred: u64,
     /// Parcels from other processes that were malformed or could not be answered.
@@ -48,14 +50,14 @@ macro_rules! tally {
     };
 }
 
-tally!(arrived in_place copied_small copied_full borrowed sent referring loans_sent loans_copied rung deferred refused peers_gone);
+tally!(arrived in_place copied_small copied_full borrowed sent referring loans_sent loans_copied rung answered_in_words deferred refused peers_gone);
 
 /// Increments a counter by one.
 pub(crate) fn count(counter: &AtomicU64) {
     counter.fetch_add(1, Ordering::Relaxed);
 }
 
-/// Increments by one a counter that only the thread that drains the mailbox writes.
+/// Increments by one a counter that only the thread that works on the mailbox writes.
 pub(crate) fn count_alone(counter: &AtomicU64) {
     let before = counter.load(Ordering::Relaxed);
     counter.store(before.wrapping_add(1), Ordering::Relaxed);

@@ -6,12 +6,26 @@ use std::sync::Arc;
 use fipa_transport::{Answer, Incarnation, Ticket};
 use parking_lot::Mutex;
 
+use crate::answer_words::WordPlace;
 use crate::inbox::{BorrowLimits, RequestOwner};
-use crate::layout::{Ack, UninitAck};
+use crate::layout::{Ack, UninitAck, code_of};
+use crate::presence::StatusPage;
 
-/// A parcel without an answer, and the memory for the answer.
+/// The way of an answer to its sender.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a box would be an allocation for each answer"
+)]
+pub(crate) enum AnswerWay {
+    /// A response of iceoryx2.
+    Response(UninitAck),
+    /// A word on the status page of the sender.
+    Word(Arc<StatusPage>, WordPlace),
+}
+
+/// A parcel without an answer, and the place of the answer.
 pub(crate) struct UnansweredParcel {
-    answer: UninitAck,
+    way: AnswerWay,
     token: u64,
     sender: Incarnation,
     // After the answer: dropping the request closes the channel of the response.
@@ -22,13 +36,13 @@ pub(crate) struct UnansweredParcel {
 
 impl UnansweredParcel {
     pub(crate) fn new(
-        answer: UninitAck,
+        way: AnswerWay,
         token: u64,
         sender: Incarnation,
         owner: RequestOwner,
     ) -> Self {
         Self {
-            answer,
+            way,
             token,
             sender,
             owner,
@@ -36,18 +50,41 @@ impl UnansweredParcel {
         }
     }
 
+    pub(crate) fn owner(&self) -> &RequestOwner {
+        &self.owner
+    }
+
+    /// Whether this answer needs a response, and there is no memory for one.
+    pub(crate) fn lacks_response(&self, answer: &Answer) -> bool {
+        matches!(self.way, AnswerWay::Word(..)) && code_of(answer).is_none()
+    }
+
+    /// Replaces the way of the answer.
+    pub(crate) fn set_response(&mut self, response: UninitAck) {
+        self.way = AnswerWay::Response(response);
+    }
+
     /// Answers the parcel, and releases it.
     pub(crate) fn send(self, answer: &Answer) {
-        let answer = self.answer.write_payload(Ack::new(answer, self.token));
-        // Fails if the sender has ended, which then needs no answer.
-        let _ = answer.send();
+        match self.way {
+            AnswerWay::Response(response) => {
+                let response = response.write_payload(Ack::new(answer, self.token));
+                // Fails if the sender has ended, which then needs no answer.
+                let _ = response.send();
+            }
+            AnswerWay::Word(page, place) => {
+                if let Some(code) = code_of(answer) {
+                    page.answers().answer(place, self.token, code);
+                }
+            }
+        }
     }
 
     /// Counts the slot of the parcel as held by a late answer. False at the limits.
     pub(crate) fn hold(&mut self, limits: &Arc<BorrowLimits>) -> bool {
         let (sender, counted) = match &self.owner {
             RequestOwner::Unshared(active) => (active.origin().value(), false),
-            RequestOwner::Content { sender, .. } => (*sender, true),
+            RequestOwner::Content(held) => (held.sender(), true),
         };
         let limits = Arc::clone(limits);
         let begun = limits.begin_late_answer(sender, counted);

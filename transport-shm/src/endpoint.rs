@@ -32,7 +32,7 @@ use crate::outbox::{AnswerLook, MemoryLock, Opening, Outbox};
 use crate::peer_segments::PeerSegments;
 use crate::peers::{BacklogLimits, BacklogStep, Concluded, Dispatched, OpenOutbox, Peer};
 use crate::pool::Pool;
-use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, wait_for_polls};
+use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, WordLender, wait_for_polls};
 use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 
@@ -61,6 +61,7 @@ pub(crate) struct Endpoint {
     backlogs: Arc<BacklogThreads>,
     closing: Arc<Closing>,
     presence: RwLock<Option<Presence>>,
+    lender: Arc<WordLender>,
     doorbell: Arc<Doorbell>,
     /// Number of requests for a cleanup.
     dirty: AtomicU64,
@@ -166,6 +167,7 @@ impl Endpoint {
             node: Mutex::new(Some(node)),
             backlogs: Arc::default(),
             closing: Arc::default(),
+            lender: presence.lender().clone(),
             presence: RwLock::new(Some(presence)),
             doorbell,
             dirty: AtomicU64::new(0),
@@ -336,7 +338,11 @@ impl Endpoint {
         unannounced: bool,
         answers: AnswerLook,
     ) -> bool {
-        let mut found = inbox.drain(sink, &self.answered, unannounced);
+        let page_of = |sender| {
+            let peers = self.peers.read();
+            peers.get(&sender).map(|peer| Arc::clone(peer.page()))
+        };
+        let mut found = inbox.drain(sink, &self.answered, &page_of, unannounced);
         let has_ended =
             self.ended.load(Ordering::SeqCst) && self.ended.swap(false, Ordering::SeqCst);
         if has_ended || self.waits_for_answers() {
@@ -542,6 +548,7 @@ impl Endpoint {
             node,
             service: &service,
             own: self.config.incarnation,
+            lender: self.lender.clone(),
             page: Arc::clone(peer.page()),
             waiting: self.waiting.clone(),
             max_loans: self.config.max_loans,

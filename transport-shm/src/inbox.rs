@@ -15,9 +15,10 @@ use iceoryx2::prelude::{BackpressureStrategy, Node, PortFactory, ServiceName};
 use parking_lot::Mutex;
 
 use crate::ShmConfig;
+use crate::answer_words::WordPlace;
 use crate::answered::Answered;
 use crate::counters::{Tally, count, count_alone};
-use crate::deferred::{LateAnswers, UnansweredParcel};
+use crate::deferred::{AnswerWay, LateAnswers, UnansweredParcel};
 use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
 use crate::memory::MappedPtr;
 use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
@@ -56,6 +57,9 @@ pub(crate) fn location_of(of: Incarnation) -> Location {
         Err(_) => unreachable!("16 hexadecimal digits are an address"),
     }
 }
+
+/// Finds the status page of a process that is open.
+type PageOf<'a> = &'a dyn Fn(Incarnation) -> Option<Arc<StatusPage>>;
 
 /// The server of this process's mailbox. Used by one thread at a time.
 pub(crate) struct Inbox {
@@ -156,6 +160,7 @@ impl Inbox {
         &mut self,
         sink: &dyn Sink,
         answered: &Answered,
+        page_of: PageOf<'_>,
         unannounced: bool,
     ) -> bool {
         for done in 0..BATCH {
@@ -166,7 +171,7 @@ impl Inbox {
             }
             match self.receive() {
                 Ok(Some(active)) => {
-                    if let Some(sender) = self.take(active, sink) {
+                    if let Some(sender) = self.take(active, sink, page_of) {
                         answered.add(sender);
                     }
                 }
@@ -211,31 +216,33 @@ impl Inbox {
 
     // Apart from the poll, which mostly finds nothing.
     #[inline(never)]
-    fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
+    fn take(
+        &mut self,
+        active: Active,
+        sink: &dyn Sink,
+        page_of: PageOf<'_>,
+    ) -> Option<Incarnation> {
         count_alone(&self.tally.arrived);
         // A copy in private memory: the sender could still change the original.
         let header: Header = *active.user_header();
         let sender = header.sender();
-        // Loaned before the parcel is handed over: a parcel that cannot be answered must not be
+        // Found before the parcel is handed over: a parcel that cannot be answered must not be
         // accepted. If it is dropped here, iceoryx2 reports that to the sender.
-        let Ok(answer) = active.loan_uninit() else {
+        let Some(way) = self.answer_way(&header, &active, page_of) else {
             count(&self.tally.refused);
             return Some(sender);
         };
-        if !self.prepare_answers(&answer) {
-            count(&self.tally.refused);
-            return Some(sender);
-        }
         let (parcel, owner) = self.read(&header, active);
         let parcel = match parcel {
             Ok(parcel) => parcel,
             Err(refusal) => {
                 count(&self.tally.refused);
-                UnansweredParcel::new(answer, header.token(), sender, owner).send(&refusal);
+                let unanswered = UnansweredParcel::new(way, header.token(), sender, owner);
+                self.answer(unanswered, &refusal);
                 return sender.is_known().then_some(sender);
             }
         };
-        let mut unanswered = Some(UnansweredParcel::new(answer, header.token(), sender, owner));
+        let mut unanswered = Some(UnansweredParcel::new(way, header.token(), sender, owner));
         let ticket = self.defer(&parcel, &mut unanswered);
         let arrival = Arrival {
             parcel,
@@ -265,9 +272,43 @@ impl Inbox {
             ),
         };
         if let Some(unanswered) = unanswered {
-            unanswered.send(&answer);
+            self.answer(unanswered, &answer);
         }
         Some(sender)
+    }
+
+    /// Finds a way to answer a parcel: a word, if the status page of the sender is open and the
+    /// answer is not deferred. `None` if there is no memory for a response.
+    fn answer_way(
+        &mut self,
+        header: &Header,
+        active: &Active,
+        page_of: PageOf<'_>,
+    ) -> Option<AnswerWay> {
+        let place = header.word();
+        if self.deferred.is_none()
+            && place != WordPlace::NONE
+            && let Some(page) = page_of(header.sender())
+            && page.answers().has(place)
+        {
+            return Some(AnswerWay::Word(page, place));
+        }
+        let response = active.loan_uninit().ok()?;
+        self.prepare_answers(&response)
+            .then_some(AnswerWay::Response(response))
+    }
+
+    fn answer(&mut self, mut parcel: UnansweredParcel, answer: &Answer) {
+        if parcel.lacks_response(answer) {
+            let response = parcel.owner().loan_response();
+            let Some(response) = response.filter(|it| self.prepare_answers(it)) else {
+                // The parcel was not accepted. iceoryx2 reports to its sender that it is dropped.
+                count(&self.tally.refused);
+                return;
+            };
+            parcel.set_response(response);
+        }
+        parcel.send(answer);
     }
 
     /// Takes a letter that may be answered later to the deferred ones, before the sink has it: the
@@ -345,10 +386,14 @@ impl Inbox {
             ];
             let mut front = Bytes::from(around.concat());
             let tail = front.split_off(offsets.content - offsets.start);
-            let sender = active.origin().value();
-            let _content = self.borrow_content(NonNull::from(content), active);
-            let parcel = parcel.parcel_of_pieces(front, _content.clone(), tail);
-            (parcel, RequestOwner::Content { _content, sender })
+            let bytes = MappedPtr(NonNull::from(content));
+            let request = self.hold(active);
+            let content = Bytes::from_owner(BorrowedContent {
+                bytes,
+                _request: Arc::clone(&request),
+            });
+            let parcel = parcel.parcel_of_pieces(front, content, tail);
+            (parcel, RequestOwner::Content(request))
         } else {
             let body = Bytes::copy_from_slice(&payload[offsets.start..offsets.end]);
             (parcel.parcel(body), RequestOwner::Unshared(active))
@@ -402,14 +447,13 @@ impl Inbox {
         false
     }
 
-    /// Hands out content in place. It must lie in the payload of `active`, and
-    /// [`Self::try_begin_borrow`] must have returned true for it.
-    fn borrow_content(&self, content: NonNull<[u8]>, active: Active) -> Bytes {
+    /// Holds a request whose content is handed out in place. [`Self::try_begin_borrow`] must have
+    /// returned true for it.
+    fn hold(&self, active: Active) -> Arc<HeldRequest> {
         count_alone(&self.tally.in_place);
-        Bytes::from_owner(BorrowedContent {
-            bytes: MappedPtr(content),
+        Arc::new(HeldRequest {
             sender: active.origin().value(),
-            active: Some(active),
+            active: Mutex::new(Some(active)),
             borrows: self.borrows.clone(),
         })
     }
@@ -422,25 +466,37 @@ fn debug(error: impl std::fmt::Debug) -> String {
 /// The owner of a request: this value alone, or the handed-out content.
 pub(crate) enum RequestOwner {
     Unshared(Active),
-    /// The content owns the request, whose slot is counted as held by this sender.
-    Content {
-        _content: Bytes,
-        sender: u128,
-    },
+    /// The content owns the request, too.
+    Content(Arc<HeldRequest>),
 }
 
-/// Content in the payload of a sender's request, which is read in place.
-struct BorrowedContent {
-    bytes: MappedPtr<[u8]>,
+impl RequestOwner {
+    /// Loans memory for a response.
+    fn loan_response(&self) -> Option<UninitAck> {
+        match self {
+            Self::Unshared(active) => active.loan_uninit().ok(),
+            Self::Content(request) => request.active.lock().as_ref()?.loan_uninit().ok(),
+        }
+    }
+}
+
+/// A request whose content is read in place, and whose slot is counted as held by its sender.
+pub(crate) struct HeldRequest {
     /// `Some` until this is dropped.
-    active: Option<Active>,
+    active: Mutex<Option<Active>>,
     sender: u128,
     borrows: Arc<BorrowLimits>,
 }
 
-impl Drop for BorrowedContent {
+impl HeldRequest {
+    pub(crate) fn sender(&self) -> u128 {
+        self.sender
+    }
+}
+
+impl Drop for HeldRequest {
     fn drop(&mut self) {
-        let active = self.active.take();
+        let active = self.active.get_mut().take();
         if !self.borrows.peer_segments.owner().is_this() {
             // In a forked child, a release would take the memory from the parent.
             std::mem::forget(active);
@@ -452,9 +508,15 @@ impl Drop for BorrowedContent {
     }
 }
 
+/// Content in the payload of a sender's request, which is read in place.
+struct BorrowedContent {
+    bytes: MappedPtr<[u8]>,
+    _request: Arc<HeldRequest>,
+}
+
 impl AsRef<[u8]> for BorrowedContent {
     fn as_ref(&self) -> &[u8] {
-        // SAFETY: the range is in the payload of the request in `active`, which stays mapped as long
+        // SAFETY: the range is in the payload of the held request, which stays mapped as long
         // as that exists: the server keeps the connection of an ended sender while content is held
         // there, and `BorrowLimits::begin` bounds the number of such connections below the number
         // that it keeps. An honest sender does not write there after sending; see the crate's

@@ -17,6 +17,8 @@ use iceoryx2::response::Response as IceoryxResponse;
 use iceoryx2::response_mut_uninit::ResponseMutUninit;
 use zerocopy::{FromBytes, IntoBytes};
 
+use crate::answer_words::WordPlace;
+use crate::presence::AnswerPlace;
 use crate::segment::ContentReference;
 pub(crate) use crate::variant::Svc;
 
@@ -34,7 +36,7 @@ pub(crate) const ALIGNMENT: usize = 8;
 
 /// Version of this layout and of the status page. iceoryx2 refuses other versions, because their
 /// types have other names.
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 
 /// The user header of every request.
 ///
@@ -42,12 +44,17 @@ const VERSION: u32 = 4;
 /// parcel's body. The body omits the content if that is in a segment.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("fipa-mail-header-4")]
+#[type_name("fipa-mail-header-5")]
 pub(crate) struct Header {
     version: u32,
     start: u32,
     sender: u64,
     token: u64,
+    /// Number of the sender's status page; 0 if the parcel has no word there.
+    page: u64,
+    /// Index of the word for the answer.
+    word: u32,
+    reserved: u32,
     /// Number of the segment that holds the content; 0 if the content is in the payload.
     segment: u64,
     generation: u64,
@@ -61,6 +68,9 @@ impl Default for Header {
             start: 0,
             sender: 0,
             token: 0,
+            page: 0,
+            word: 0,
+            reserved: 0,
             segment: 0,
             generation: 0,
             parcel: [0; HEADER_LEN],
@@ -69,15 +79,24 @@ impl Default for Header {
 }
 
 impl Header {
-    /// Creates a header for content in the payload. The answer repeats `token`.
-    pub(crate) fn new(parcel: &ParcelHeader, start: u32, sender: Incarnation, token: u64) -> Self {
+    /// Creates a header for content in the payload. The answer repeats the token of `answer`.
+    pub(crate) fn new(
+        parcel: &ParcelHeader,
+        start: u32,
+        sender: Incarnation,
+        answer: &AnswerPlace,
+    ) -> Self {
+        let WordPlace { page, word } = answer.word();
         let mut bytes = [0; HEADER_LEN];
         bytes.copy_from_slice(parcel.as_bytes());
         Self {
             version: VERSION,
             start,
             sender: sender.as_u64(),
-            token,
+            token: answer.token(),
+            page,
+            word,
+            reserved: 0,
             segment: 0,
             generation: 0,
             parcel: bytes,
@@ -110,6 +129,14 @@ impl Header {
 
     pub(crate) fn token(&self) -> u64 {
         self.token
+    }
+
+    /// The word for the answer.
+    pub(crate) fn word(&self) -> WordPlace {
+        WordPlace {
+            page: self.page,
+            word: self.word,
+        }
     }
 
     fn start(&self) -> usize {
@@ -162,10 +189,9 @@ impl Ack {
             detail: [0; Answer::MAX_DETAIL],
         };
         match answer {
-            Answer::Accepted => ack.code = ACCEPTED,
-            Answer::Custody => ack.code = CUSTODY,
-            Answer::Busy => ack.code = BUSY,
-            Answer::Moved => ack.code = MOVED,
+            Answer::Accepted | Answer::Custody | Answer::Busy | Answer::Moved => {
+                ack.code = code_of(answer).unwrap_or(0);
+            }
             Answer::Delivered { via } => {
                 ack.code = DELIVERED;
                 ack.reason = kind_code(*via);
@@ -197,10 +223,6 @@ impl Ack {
             return None;
         }
         Some(match self.code {
-            ACCEPTED => Answer::Accepted,
-            CUSTODY => Answer::Custody,
-            BUSY => Answer::Busy,
-            MOVED => Answer::Moved,
             DELIVERED => Answer::Delivered {
                 via: kind_of_code(self.reason)?,
             },
@@ -215,8 +237,30 @@ impl Ack {
                     String::from_utf8_lossy(detail),
                 )
             }
-            _ => return None,
+            code => return answer_of(code),
         })
+    }
+}
+
+/// The code of an answer that has no data.
+pub(crate) fn code_of(answer: &Answer) -> Option<u8> {
+    match answer {
+        Answer::Accepted => Some(ACCEPTED),
+        Answer::Custody => Some(CUSTODY),
+        Answer::Busy => Some(BUSY),
+        Answer::Moved => Some(MOVED),
+        _ => None,
+    }
+}
+
+/// The answer without data that has this code.
+pub(crate) fn answer_of(code: u8) -> Option<Answer> {
+    match code {
+        ACCEPTED => Some(Answer::Accepted),
+        CUSTODY => Some(Answer::Custody),
+        BUSY => Some(Answer::Busy),
+        MOVED => Some(Answer::Moved),
+        _ => None,
     }
 }
 
@@ -277,7 +321,7 @@ pub(crate) mod fuzzing {
     use super::*;
 
     /// Bytes of a request's header before the parcel's.
-    const OWN: usize = 40;
+    const OWN: usize = 56;
     /// Bytes of a request's header, as [`header`] takes them.
     pub const HEADER_LEN: usize = OWN + super::HEADER_LEN;
     /// The version of the layout that [`header`] reads.
@@ -301,8 +345,11 @@ pub(crate) mod fuzzing {
             start: (number(0) >> 32) as u32,
             sender: number(8),
             token: number(16),
-            segment: number(24),
-            generation: number(32),
+            page: number(24),
+            word: number(32) as u32,
+            reserved: 0,
+            segment: number(40),
+            generation: number(48),
             parcel,
         };
         let Some(parcel) = header.parcel() else {

@@ -1,8 +1,9 @@
 //! Letters between the processes of one host, through shared memory.
 //!
 //! Every process has one mailbox: an iceoryx2 request-response service of which it is the only
-//! server. A parcel is one request, whose memory the receiver reads in place; the answer is the
-//! response. The receiver name in the parcel selects the agent inside the process.
+//! server. A parcel is one request, whose memory the receiver reads in place. The answer is a word on
+//! the status page of the sender, or the response if it has data. The receiver name in the parcel
+//! selects the agent inside the process.
 //!
 //! * [`ShmTransport`] is the transport, [`ShmConfig`] its configuration.
 //! * [`cleanup_dead`] removes the files of killed processes. Every endpoint also does so by itself.
@@ -14,6 +15,7 @@
 //! | `endpoint` | the endpoint: mailbox, peers, polling, cleanup |
 //! | `inbox`, `outbox` | receiving and sending side of a mailbox |
 //! | `layout` | types and byte layout in shared memory |
+//! | `answer_words`, `deferred` | answers in words; parcels that are answered later |
 //! | `loan` | memory that is handed out before its letter is sent |
 //! | `segment`, `pool`, `peer_segments` | content stored once for several receivers: file format, sending side, receiving side |
 //! | `presence` | liveness FIFO, doorbell and status page of a process |
@@ -34,8 +36,12 @@
 //! are copied into private memory first. Only content is read in place; two reads of it give the
 //! same bytes only if the sender is honest. A process whose announcements are wrong makes another one
 //! poll more slowly; its own parcels may then be found late, and those of others by the next wake-up
-//! or the next poll without work.
+//! or the next poll without work. A process that writes to words of another one without a parcel makes
+//! outcomes of that one false, or leaves its parcels unconfirmed.
 
+mod answer_words;
+#[cfg(test)]
+mod answer_words_tests;
 mod answered;
 mod combiner;
 mod config;

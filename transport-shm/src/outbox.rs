@@ -4,20 +4,20 @@ use std::collections::VecDeque;
 use std::ops::Range;
 use std::os::fd::OwnedFd;
 use std::ptr::NonNull;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering, fence};
 use std::sync::{Arc, Weak};
 
 use bytes::Bytes;
 use fipa_transport::wire::{ParcelHeader, Pieces};
 use fipa_transport::{
-    AttemptId, Body, Conclusion, Incarnation, Parcel, TransportError, TransportErrorKind,
+    Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, TransportError, TransportErrorKind,
 };
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::DegradationAction;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
 use parking_lot::{Mutex, MutexGuard};
 
-use crate::counters::{Tally, count};
+use crate::counters::{Tally, count, count_alone};
 use crate::domain_files::DomainFiles;
 use crate::errors::{
     allocating, create_error, loan_error, open_error, retired, send_error, too_large, window_full,
@@ -26,13 +26,13 @@ use crate::errors::{
 use crate::fork::Owner;
 use crate::layout::{
     ALIGNMENT, Ack, Header, InitRequest, MailClient, Pending, PieceOffsets, Response, Svc,
-    UninitRequest,
+    UninitRequest, answer_of,
 };
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
 use crate::peers::Concluded;
 use crate::pool::Pool;
-use crate::presence::StatusPage;
+use crate::presence::{AnswerPlace, StatusPage, WordLender};
 use crate::storage;
 
 /// Length in bytes of the chunks of the first memory segment, headers included.
@@ -72,9 +72,12 @@ pub(crate) struct Outbox {
     waiting: UnansweredCount,
     loans: AtomicUsize,
     retired: AtomicBool,
-    token: AtomicU64,
+    /// The words in which parcels of this process are answered.
+    lender: Arc<WordLender>,
     /// The status page of the mailbox's process, on which parcels are announced.
     page: Arc<StatusPage>,
+    /// Whether the process answers parcels late. Such a process does not answer in words.
+    answers_late: bool,
     budget: Arc<Budget>,
     pool: Arc<Pool>,
     tally: Arc<Tally>,
@@ -117,7 +120,7 @@ struct Segment {
 #[derive(Debug)]
 struct Sent {
     attempt: AttemptId,
-    token: u64,
+    answer: AnswerPlace,
     memory: SentMemory,
 }
 
@@ -153,9 +156,9 @@ pub(crate) enum Posted {
 /// The way of looking for answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum AnswerLook {
-    /// For answers on the connections that are open.
+    /// For answers in words, and on the open connections for answers to parcels without a word.
     Quick,
-    /// Also for new connections, and for parcels that were dropped without an answer.
+    /// For all answers, also on new connections, and for parcels that were dropped without an answer.
     Thorough,
     /// As `Thorough`, after the end of the process: no further answer will come.
     Ended,
@@ -176,6 +179,7 @@ pub(crate) struct Opening<'a> {
     pub(crate) node: &'a Node<Svc>,
     pub(crate) service: &'a ServiceName,
     pub(crate) own: Incarnation,
+    pub(crate) lender: Arc<WordLender>,
     pub(crate) page: Arc<StatusPage>,
     /// Number of unanswered parcels of all outboxes.
     pub(crate) waiting: Arc<AtomicUsize>,
@@ -218,12 +222,6 @@ impl Outbox {
             return Err(shortage_error(shortage));
         }
         let client = client.map_err(create_error)?;
-        let start = getrandom::u64().map_err(|e| {
-            TransportError::new(
-                TransportErrorKind::Closed,
-                format_args!("cannot get random numbers: {e}"),
-            )
-        })?;
         let outbox = Self {
             client,
             own: opening.own,
@@ -241,7 +239,9 @@ impl Outbox {
             },
             loans: AtomicUsize::new(0),
             retired: AtomicBool::new(false),
-            token: AtomicU64::new(start),
+            lender: opening.lender,
+            // Set before the mailbox can be opened.
+            answers_late: opening.page.words().answers_late(),
             page: opening.page,
             budget: opening.budget,
             pool: opening.pool,
@@ -294,7 +294,7 @@ impl Outbox {
         };
         let front = usize::try_from(header.front_len()).unwrap_or(usize::MAX);
         let offsets = PieceOffsets::for_lengths(front, content_here, tail).ok_or_else(too_large)?;
-        let token = self.token.fetch_add(1, Ordering::Relaxed);
+        let answer = self.lender.lend(!self.answers_late);
 
         let mut state = self.state.lock();
         if self.is_retired() {
@@ -317,12 +317,17 @@ impl Outbox {
             {
                 Some(request) => {
                     let start = loan.front() - front;
-                    let header = Header::new(&header, offset(start)?, self.own, token);
+                    let header = Header::new(&header, offset(start)?, self.own, &answer);
                     if !self.send_loan(&loan, request, header, start, &pieces, content)? {
                         return Ok(Posted::Retired);
                     }
                     count(&self.tally.loans_sent);
-                    self.queue(state, attempt, token, SentMemory::Loaned(loan), unanswered);
+                    let sent = Sent {
+                        attempt,
+                        answer,
+                        memory: SentMemory::Loaned(loan),
+                    };
+                    self.queue(state, sent, unanswered);
                     return Ok(Posted::Sent);
                 }
                 None => count(&self.tally.loans_copied),
@@ -336,7 +341,7 @@ impl Outbox {
                 None => return Ok(Posted::Contended),
             },
         };
-        let header = Header::new(&header, offset(offsets.start)?, self.own, token);
+        let header = Header::new(&header, offset(offsets.start)?, self.own, &answer);
         *request.user_header_mut() = header.referring(reference);
         let payload = request.payload_mut();
         let room = offsets.start..payload.len();
@@ -369,23 +374,17 @@ impl Outbox {
             }
             None => SentMemory::Own(pending),
         };
-        self.queue(state, attempt, token, memory, unanswered);
+        let sent = Sent {
+            attempt,
+            answer,
+            memory,
+        };
+        self.queue(state, sent, unanswered);
         Ok(Posted::Sent)
     }
 
-    fn queue(
-        &self,
-        mut state: MutexGuard<'_, State>,
-        attempt: AttemptId,
-        token: u64,
-        memory: SentMemory,
-        unanswered: UnansweredGuard<'_>,
-    ) {
-        state.queue.push_back(Sent {
-            attempt,
-            token,
-            memory,
-        });
+    fn queue(&self, mut state: MutexGuard<'_, State>, sent: Sent, unanswered: UnansweredGuard<'_>) {
+        state.queue.push_back(sent);
         unanswered.keep();
         let answered = state.answered.take();
         if let Some(Sent {
@@ -639,10 +638,13 @@ impl Outbox {
         let (sent, end) = match state.queue.front()?.end(look) {
             Some(end) => (state.queue.pop_front()?, end),
             // Otherwise the process answers in the order of the queue, or drops parcels unanswered.
-            None if self.page.words().answers_late() => ended_behind_front(&mut state, look)?,
+            None if self.answers_late => ended_behind_front(&mut state, look)?,
             None => return None,
         };
         self.waiting.decrement();
+        if end.in_word {
+            count_alone(&self.tally.answered_in_words);
+        }
         sent.forget();
         let answered = AnsweredParcel {
             _answer: end.answer,
@@ -664,7 +666,7 @@ impl Outbox {
         }
         let state = self.state.lock();
         state.queue.front().is_some_and(Sent::has_answer)
-            || self.page.words().answers_late() && state.queue.iter().skip(1).any(Sent::has_answer)
+            || self.answers_late && state.queue.iter().skip(1).any(Sent::has_answer)
     }
 
     /// Abandons an attempt. Returns whether the attempt was here.
@@ -691,11 +693,24 @@ fn ended_behind_front(state: &mut State, look: AnswerLook) -> Option<(Sent, End)
     Some((state.queue.remove(place)?, end))
 }
 
+/// The conclusion of a parcel with this answer, or with a malformed one.
+fn concluded_by(answer: Option<Answer>) -> Conclusion {
+    match answer {
+        Some(answer) => Conclusion::Answered(answer),
+        None => Conclusion::Unconfirmed(TransportError::new(
+            TransportErrorKind::Incompatible,
+            "the answer is malformed",
+        )),
+    }
+}
+
 /// The end of a parcel.
 struct End {
     conclusion: Conclusion,
     /// The memory of the answer.
     answer: Option<Response>,
+    /// Whether the answer is in the word of the parcel.
+    in_word: bool,
 }
 
 impl From<Conclusion> for End {
@@ -703,6 +718,7 @@ impl From<Conclusion> for End {
         Self {
             conclusion,
             answer: None,
+            in_word: false,
         }
     }
 }
@@ -745,6 +761,9 @@ impl UnansweredCount {
 
 impl Sent {
     fn has_answer(&self) -> bool {
+        if self.answer.code().is_some() {
+            return true;
+        }
         let look = PendingResponse::has_response;
         match &self.memory {
             SentMemory::Own(pending) | SentMemory::Referring { pending, .. } => look(pending),
@@ -752,7 +771,19 @@ impl Sent {
         }
     }
 
+    /// The end that the word of the parcel states.
+    fn end_in_word(&self) -> Option<End> {
+        Some(End {
+            conclusion: concluded_by(answer_of(self.answer.code()?)),
+            answer: None,
+            in_word: true,
+        })
+    }
+
     fn end(&self, look: AnswerLook) -> Option<End> {
+        if let Some(end) = self.end_in_word() {
+            return Some(end);
+        }
         let look = |pending: &Pending| self.end_of(pending, look);
         match &self.memory {
             SentMemory::Own(pending) | SentMemory::Referring { pending, .. } => look(pending),
@@ -761,7 +792,8 @@ impl Sent {
     }
 
     fn end_of(&self, pending: &Pending, look: AnswerLook) -> Option<End> {
-        if look == AnswerLook::Quick && !pending.has_response() {
+        // Most parcels with a word are answered there, so responses are looked for less often.
+        if look == AnswerLook::Quick && (self.answer.has_word() || !pending.has_response()) {
             return None;
         }
         let ended = look == AnswerLook::Ended;
@@ -773,18 +805,17 @@ impl Sent {
         let dropped = matches!(answer, Ok(None)) && !pending.is_connected();
         if dropped {
             // The answer may have come in between.
+            fence(Ordering::Acquire);
+            if let Some(end) = self.end_in_word() {
+                return Some(end);
+            }
             answer = pending.receive();
         }
         match answer {
             Ok(Some(ack)) => Some(End {
-                conclusion: match ack.answer(self.token) {
-                    Some(answer) => Conclusion::Answered(answer),
-                    None => Conclusion::Unconfirmed(TransportError::new(
-                        TransportErrorKind::Incompatible,
-                        "the answer is malformed",
-                    )),
-                },
+                conclusion: concluded_by(ack.answer(self.answer.token())),
                 answer: Some(ack),
+                in_word: false,
             }),
             Ok(None) if ended => broken("the other process ended before it answered".into()),
             Ok(None) if dropped => broken("the other process dropped it without an answer".into()),

@@ -9,6 +9,7 @@
 //! * The status page (`.page` in `/dev/shm`). It states whether the process is polling, so that no
 //!   peer needs to ring, and counts how often the process has cleared its doorbell. Peers announce their
 //!   parcels there, so that a poll of an empty mailbox is one load. The module `wakeup` has the rules.
+//!   Peers also answer parcels of the process there; the module `answer_words` has the rules.
 //!
 //! A process that sends content to several receivers also has segments (see `segment`).
 
@@ -27,6 +28,7 @@ use rustix::mm::ProtFlags;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use crate::answer_words::{AnswerWords, LentWords, WordPlace};
 use crate::domain_files::files_in;
 use crate::fork::Owner;
 use crate::memory::{Mapping, PAGE, SHM, open_owned};
@@ -161,6 +163,7 @@ pub(crate) struct Presence {
     owner: Owner,
     doorbell: Arc<Doorbell>,
     page: Arc<StatusPage>,
+    lender: Arc<WordLender>,
     /// Locked for as long as the process runs; never read.
     _locked: File,
     // Last: the other files exist as long as this one is open.
@@ -196,14 +199,18 @@ impl Presence {
             let text = format!("cannot allocate the status page in {SHM}: {e}");
             io::Error::new(e.kind(), text)
         })?;
+        let random = [getrandom::u64(), getrandom::u64()].map(|it| it.map_err(io::Error::other));
+        let [number, token] = random;
         // The lock shows that the process runs after another program has removed the liveness FIFO.
         flock(&page, FlockOperation::NonBlockingLockExclusive)?;
+        let mapped = Arc::new(StatusPage::map(&page)?);
         Ok(Self {
             paths: paths.clone(),
             own,
             owner: Owner::this(),
             doorbell: Arc::new(Doorbell(doorbell)),
-            page: Arc::new(StatusPage::map(&page)?),
+            lender: Arc::new(WordLender::new(Arc::clone(&mapped), [number?, token?])),
+            page: mapped,
             _locked: page,
             _live,
         })
@@ -216,6 +223,11 @@ impl Presence {
     /// The status page.
     pub(crate) fn page(&self) -> &Arc<StatusPage> {
         &self.page
+    }
+
+    /// The words in which peers answer parcels of this process.
+    pub(crate) fn lender(&self) -> &Arc<WordLender> {
+        &self.lender
     }
 }
 
@@ -426,6 +438,17 @@ fn ring(mut doorbell: &File) {
     let _ = doorbell.write(&[1]);
 }
 
+/// The contents of a status page.
+#[repr(C)]
+struct PageLayout {
+    status: StatusWords,
+    /// Keeps apart what peers write when they send, and when they answer.
+    _apart: [u64; 15],
+    answers: AnswerWords,
+}
+
+const _: () = assert!(size_of::<PageLayout>() <= PAGE);
+
 /// A mapped status page.
 #[derive(Debug)]
 pub(crate) struct StatusPage(Mapping);
@@ -435,14 +458,85 @@ impl StatusPage {
         Mapping::new(file, PAGE, ProtFlags::READ | ProtFlags::WRITE).map(Self)
     }
 
-    /// The words that processes share.
-    pub(crate) fn words(&self) -> &StatusWords {
-        // SAFETY: the mapping exists as long as self, is aligned to a page and longer than
-        // `StatusWords`, of which every bit pattern is valid. Every process maps the page for
-        // reading and writing and accesses these words atomically. The page exists: the process that
+    fn layout(&self) -> &PageLayout {
+        // SAFETY: the mapping exists as long as self, is aligned to a page and at least as long as
+        // `PageLayout`, of which every bit pattern is valid. Every process maps the page for
+        // reading and writing and accesses its words atomically. The page exists: the process that
         // creates the file writes it first, and `PeerProcess::open` checks the length and the
         // owner. No process of the domain shortens the file, and other users have no access to it.
-        unsafe { self.0.start().cast::<StatusWords>().as_ref() }
+        unsafe { self.0.start().cast::<PageLayout>().as_ref() }
+    }
+
+    /// The words about polling, wake-ups and announcements.
+    pub(crate) fn words(&self) -> &StatusWords {
+        &self.layout().status
+    }
+
+    /// The words in which peers answer parcels of the process.
+    pub(crate) fn answers(&self) -> &AnswerWords {
+        &self.layout().answers
+    }
+}
+
+/// The words of this process, which it lends to its parcels.
+#[derive(Debug)]
+pub(crate) struct WordLender {
+    page: Arc<StatusPage>,
+    lent: LentWords,
+}
+
+impl WordLender {
+    fn new(page: Arc<StatusPage>, random: [u64; 2]) -> Self {
+        let lent = LentWords::new(random);
+        page.answers().set_page(lent.page());
+        Self { page, lent }
+    }
+
+    /// Returns the token of the next parcel, and lends it a word if the receiver may answer there.
+    pub(crate) fn lend(self: &Arc<Self>, with_word: bool) -> AnswerPlace {
+        let (token, word) = match with_word {
+            true => self.lent.lend(self.page.answers()),
+            false => (self.lent.token(), WordPlace::NONE),
+        };
+        AnswerPlace {
+            lender: Arc::clone(self),
+            token,
+            word,
+        }
+    }
+}
+
+/// The token of a parcel, and the word that is lent to it, if any.
+#[derive(Debug)]
+pub(crate) struct AnswerPlace {
+    lender: Arc<WordLender>,
+    token: u64,
+    word: WordPlace,
+}
+
+impl AnswerPlace {
+    /// The token, which answers repeat.
+    pub(crate) fn token(&self) -> u64 {
+        self.token
+    }
+
+    pub(crate) fn word(&self) -> WordPlace {
+        self.word
+    }
+
+    pub(crate) fn has_word(&self) -> bool {
+        self.word != WordPlace::NONE
+    }
+
+    /// The code of the answer in the word, if there is one.
+    pub(crate) fn code(&self) -> Option<u8> {
+        self.lender.page.answers().code(self.word, self.token)
+    }
+}
+
+impl Drop for AnswerPlace {
+    fn drop(&mut self) {
+        self.lender.lent.give_back(self.word);
     }
 }
 

@@ -14,6 +14,8 @@
 )]
 #![expect(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
+#[path = "../src/answer_words.rs"]
+mod answer_words;
 #[path = "../src/combiner.rs"]
 mod combiner;
 #[path = "../src/wakeup.rs"]
@@ -87,11 +89,12 @@ mod sync {
 
 use std::convert::Infallible;
 
+use answer_words::{AnswerWords, LentWords, WordPlace};
 use combiner::Combiner;
 use loom::sync::Arc;
 use loom::sync::Condvar;
 use loom::thread;
-use sync::{AtomicU64, Ordering};
+use sync::{AtomicBool, AtomicU64, Ordering, fence};
 use wakeup::{Account, RingState, StatusWords};
 
 /// Explores all executions of the model, up to the maximum number of preemptions.
@@ -432,5 +435,114 @@ fn a_request_for_work_is_never_lost() {
             other.join().unwrap();
         }
         assert_eq!(*combiner.lock(), 2);
+    });
+}
+
+/// The words for answers, and their sender's account of them.
+fn page<const N: usize>() -> Arc<(AnswerWords<N>, LentWords<N>)> {
+    let (words, lent) = (AnswerWords::default(), LentWords::new([7, 1 << 20]));
+    words.set_page(lent.page());
+    Arc::new((words, lent))
+}
+
+/// The receiver of the parcel with this token and word answers it.
+fn start_receiver<const N: usize>(
+    page: &Arc<(AnswerWords<N>, LentWords<N>)>,
+    (token, place): (u64, WordPlace),
+    code: u8,
+) -> thread::JoinHandle<()> {
+    let page = Arc::clone(page);
+    thread::spawn(move || {
+        assert!(page.0.has(place));
+        page.0.answer(place, token, code);
+    })
+}
+
+#[test]
+fn a_sender_that_stops_polling_is_woken_for_an_answer_in_a_word() {
+    explore(|| {
+        let (process, page) = (Process::new(), page::<1>());
+        let (token, place) = page.1.lend(&page.0);
+        let receiver = {
+            let (process, page) = (Arc::clone(&process), Arc::clone(&page));
+            thread::spawn(move || {
+                page.0.answer(place, token, 1);
+                RingState::new().wake(&process.words, || false, || process.ring());
+            })
+        };
+        let is_answered = || page.0.code(place, token) == Some(1);
+        let polling = process.words.begin_polling();
+        let found = is_answered();
+        drop(polling);
+        if !found && !is_answered() {
+            process.sleep();
+            process.words.count_wakeup();
+            assert!(is_answered());
+        }
+        receiver.join().unwrap();
+    });
+}
+
+/// The channel of iceoryx2 is a flag, written and read relaxed.
+#[test]
+fn a_sender_that_finds_the_channel_closed_finds_the_answer() {
+    explore(|| {
+        let page = page::<1>();
+        let closed = Arc::new(AtomicBool::new(false));
+        let (token, place) = page.1.lend(&page.0);
+        let receiver = {
+            let (page, closed) = (Arc::clone(&page), Arc::clone(&closed));
+            thread::spawn(move || {
+                page.0.answer(place, token, 1);
+                closed.store(true, Ordering::Relaxed);
+            })
+        };
+        if closed.load(Ordering::Relaxed) {
+            fence(Ordering::Acquire);
+            assert_eq!(page.0.code(place, token), Some(1));
+        }
+        receiver.join().unwrap();
+    });
+}
+
+#[test]
+fn the_late_answer_to_an_abandoned_parcel_changes_no_other_answer() {
+    explore(|| {
+        let page = page::<1>();
+        let abandoned = page.1.lend(&page.0);
+        let late = start_receiver(&page, abandoned, 3);
+        page.1.give_back(abandoned.1);
+        let (token, place) = page.1.lend(&page.0);
+        assert_eq!(place, abandoned.1);
+        let receiver = start_receiver(&page, (token, place), 1);
+        assert!([None, Some(1)].contains(&page.0.code(place, token)));
+        receiver.join().unwrap();
+        assert_eq!(page.0.code(place, token), Some(1));
+        late.join().unwrap();
+        assert_eq!(page.0.code(place, token), Some(1));
+    });
+}
+
+#[test]
+fn threads_that_send_have_different_words() {
+    explore(|| {
+        let page = page::<1>();
+        let send = |page: &(AnswerWords<1>, LentWords<1>), code| {
+            let (token, place) = page.1.lend(&page.0);
+            if place != WordPlace::NONE {
+                assert_eq!(page.0.code(place, token), None);
+                page.0.answer(place, token, code);
+                assert_eq!(page.0.code(place, token), Some(code));
+                page.1.give_back(place);
+            }
+        };
+        let other = {
+            let page = Arc::clone(&page);
+            thread::spawn(move || send(&page, 2))
+        };
+        send(&page, 1);
+        other.join().unwrap();
+        // No word is lost.
+        assert_ne!(page.1.lend(&page.0).1, WordPlace::NONE);
     });
 }

@@ -6,16 +6,20 @@
 
 mod common;
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Lines};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::PermissionsExt as _;
-use std::process::Stdio;
+use std::process::{ChildStdout, Stdio};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use common::{TestDomain, attempt, location_of, mapping_of, parcel};
+use common::{GatedSink, RecordingSink, TestDomain, attempt, location_of, mapping_of, parcel};
+use fipa_acl::Letter;
 use fipa_testbed::{ChildGuard, ignored_test, until};
-use fipa_transport::{Answer, Conclusion, Incarnation, Transport, TransportErrorKind};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Conclusion, Incarnation, Kind, LegacySource, Sink, Transport,
+    TransportErrorKind, Verdict,
+};
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
@@ -29,7 +33,7 @@ struct Process {
 
 impl Process {
     /// Roles: `receive` keeps what arrives, and `drop` drops it; `tell` also prints the position of
-    /// its content; `send` sends to a process in a loop, and `many` does so with content for
+    /// its content; `halt` never returns from the first letter with content; `send` sends to a process in a loop, and `many` does so with content for
     /// several receivers; `clean` cleans up and ends.
     fn start(domain: &TestDomain, role: &str, to: Incarnation) -> Self {
         let config = domain.config();
@@ -45,13 +49,18 @@ impl Process {
                 ),
             )
             .stdout(match role {
-                "tell" => Stdio::piped(),
+                "tell" | "halt" => Stdio::piped(),
                 _ => Stdio::null(),
             });
         Self {
             child: ChildGuard::start(&mut command),
             incarnation: config.incarnation,
         }
+    }
+
+    /// The lines that the process prints.
+    fn lines(&mut self) -> Lines<BufReader<ChildStdout>> {
+        BufReader::new(self.child.child().stdout.take().unwrap()).lines()
     }
 
     fn signal(&self, signal: &str) {
@@ -90,13 +99,18 @@ fn process_entry() {
         .build()
         .unwrap();
     let endpoint = ShmTransport::new(config, runtime.handle().clone()).unwrap();
-    let sink = Arc::new(common::RecordingSink::default());
-    endpoint.listen(sink.clone()).unwrap();
+    if role == "halt" {
+        endpoint.listen(Arc::new(HaltingSink)).unwrap();
+    }
+    let sink = Arc::new(RecordingSink::default());
+    if role != "halt" {
+        endpoint.listen(sink.clone()).unwrap();
+    }
     let content = Bytes::from(vec![7; 5000]);
     let mut seen = 0;
     loop {
         match role {
-            "receive" => std::thread::park(),
+            "receive" | "halt" => std::thread::park(),
             "drop" => {
                 sink.arrived.lock().unwrap().clear();
                 std::thread::sleep(std::time::Duration::from_millis(1));
@@ -166,8 +180,7 @@ fn receivers_in_two_processes_read_the_same_memory() {
         let one = attempt();
         sender.dispatch(one, &to, parcel(content.clone())).unwrap();
         until("answer", || sent.conclusion_of(one).is_some());
-        let lines = BufReader::new(receiver.child.child().stdout.take().unwrap()).lines();
-        let mut lines = lines.map_while(Result::ok);
+        let mut lines = receiver.lines().map_while(Result::ok);
         let reported = lines.find(|line| line.starts_with("POSITION"));
         assert_eq!(reported, Some(expected.clone()));
     }
@@ -243,6 +256,103 @@ fn attempts_to_a_killed_receiver_are_concluded() {
     until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))
     });
+    sender.close();
+    domain.until_removed();
+}
+
+/// A sink whose first call with content does not return.
+struct HaltingSink;
+
+impl Sink for HaltingSink {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        if let fipa_transport::Body::Letter(letter) = &arrival.parcel.body
+            && !letter.payload().content.is_empty()
+        {
+            println!("\nHALTED");
+            loop {
+                std::thread::park();
+            }
+        }
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
+
+    fn concluded(&self, _: AttemptId, _: Conclusion) {}
+}
+
+/// Waits until the process answers in words.
+fn wait_until_answered_in_a_word(sender: &ShmTransport, sink: &RecordingSink, to: Incarnation) {
+    let before = sender.counters().answered_in_words;
+    until("an answer in a word", || {
+        let one = attempt();
+        sender
+            .dispatch(one, &location_of(to), parcel(Bytes::new()))
+            .unwrap();
+        until("answer", || sink.conclusion_of(one).is_some());
+        sender.counters().answered_in_words > before
+    });
+}
+
+#[test]
+fn a_letter_whose_receiver_is_killed_before_its_answer_is_unconfirmed() {
+    let domain = TestDomain::new();
+    let (sender, sent) = domain.listening();
+    let mut receiver = Process::start(&domain, "halt", Incarnation::from_u64(1));
+    receiver.wait_until_up(&sender);
+    wait_until_answered_in_a_word(&sender, &sent, receiver.incarnation);
+    let before = sender.counters().answered_in_words;
+    let to = location_of(receiver.incarnation);
+    let [taken, waiting] = [attempt(), attempt()];
+    for (one, content) in [(taken, vec![1; 3000]), (waiting, vec![])] {
+        sender.dispatch(one, &to, parcel(content.into())).unwrap();
+    }
+    let mut lines = receiver.lines().map_while(Result::ok);
+    assert!(lines.any(|line| line == "HALTED"));
+    receiver.kill();
+    for one in [taken, waiting] {
+        until("conclusion", || sent.conclusion_of(one).is_some());
+        let end = sent.conclusion_of(one).unwrap();
+        assert!(matches!(end, Conclusion::Unconfirmed(_)), "{end:?}");
+    }
+    assert_eq!(sender.counters().answered_in_words, before);
+    sender.close();
+    domain.until_removed();
+}
+
+/// The sender looks for the answer after the receiver was killed.
+#[test]
+fn a_letter_whose_receiver_is_killed_after_its_answer_is_answered() {
+    let domain = TestDomain::new();
+    let sender = domain.endpoint();
+    let sink = Arc::new(GatedSink::default());
+    sender.listen(sink.clone()).unwrap();
+    let sent = &sink.recorded;
+    let mut receiver = Process::start(&domain, "tell", Incarnation::from_u64(1));
+    receiver.wait_until_up(&sender);
+    wait_until_answered_in_a_word(&sender, sent, receiver.incarnation);
+    let to = location_of(receiver.incarnation);
+    let dispatch = |content: Vec<u8>| {
+        let one = attempt();
+        sender.dispatch(one, &to, parcel(content.into())).unwrap();
+        one
+    };
+    sink.close_gate();
+    dispatch(vec![]);
+    until("the first conclusion", || sink.is_waiting());
+    let before = sender.counters().answered_in_words;
+    let answered = dispatch(vec![]);
+    // When this letter has arrived, the one before it is answered.
+    dispatch(vec![1; 3000]);
+    let mut lines = receiver.lines().map_while(Result::ok);
+    assert!(lines.any(|line| line.starts_with("POSITION")));
+    receiver.kill();
+    assert_eq!(sent.conclusion_of(answered), None);
+    sink.open_gate();
+    until("conclusion", || sent.conclusion_of(answered).is_some());
+    let accepted = Some(Conclusion::Answered(Answer::Accepted));
+    assert_eq!(sent.conclusion_of(answered), accepted);
+    assert!(sender.counters().answered_in_words > before);
     sender.close();
     domain.until_removed();
 }

@@ -7,7 +7,7 @@
 use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -17,7 +17,7 @@ use fipa_transport::{
     Parcel, Sink, Stream, Transport, TransportErrorKind, Verdict,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
-use std::sync::Mutex;
+use std::sync::{Condvar, Mutex};
 use tokio::runtime::Runtime;
 
 /// A domain with a unique name, removed at the end.
@@ -172,6 +172,51 @@ impl RecordingSink {
             Body::Letter(letter) => letter.payload().content.clone(),
             other => panic!("{other:?}"),
         }
+    }
+}
+
+/// A sink whose thread waits within a conclusion while the gate is closed.
+#[derive(Default)]
+pub(crate) struct GatedSink {
+    pub(crate) recorded: RecordingSink,
+    is_closed: Mutex<bool>,
+    opened: Condvar,
+    waits: AtomicBool,
+}
+
+impl GatedSink {
+    pub(crate) fn close_gate(&self) {
+        *self.is_closed.lock().unwrap() = true;
+    }
+
+    pub(crate) fn open_gate(&self) {
+        *self.is_closed.lock().unwrap() = false;
+        self.opened.notify_all();
+    }
+
+    /// Whether a thread waits within a conclusion.
+    pub(crate) fn is_waiting(&self) -> bool {
+        self.waits.load(Ordering::SeqCst)
+    }
+}
+
+impl Sink for GatedSink {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        self.recorded.arrived(arrival)
+    }
+
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {
+        self.recorded.arrived_unframed(letter, via, from);
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        self.recorded.concluded(attempt, conclusion);
+        let mut is_closed = self.is_closed.lock().unwrap();
+        while *is_closed {
+            self.waits.store(true, Ordering::SeqCst);
+            is_closed = self.opened.wait(is_closed).unwrap();
+        }
+        self.waits.store(false, Ordering::SeqCst);
     }
 }
 
