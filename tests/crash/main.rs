@@ -7,7 +7,7 @@
 //!
 //! `FIPA_CRASH_SEED` repeats the random decisions of a run, but not its timing. `FIPA_CRASH_KILLS`
 //! is the minimum number of kills. The soak is a longer run:
-//! `cargo test --release --test crash -- --ignored --nocapture soak`.
+//! `cargo test --release --all-features -p fipa --test crash -- --ignored --nocapture soak`.
 
 #![expect(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 #![expect(
