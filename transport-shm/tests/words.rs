@@ -211,7 +211,8 @@ fn a_late_answer_to_an_abandoned_letter_is_not_that_to_the_next_one() {
             let taken = late.counters().arrived;
             let abandoned = dispatch(&sender, late, &Bytes::new());
             until("the letter", || late.counters().arrived > taken);
-            assert_eq!(sender.abandon(abandoned), Abandoned::Unconfirmed);
+            let end = sender.abandon(abandoned, &late.location());
+            assert_eq!(end, Abandoned::Unconfirmed);
             let following = dispatch(&sender, next, &Bytes::new());
             drop(late_waits);
             // The answer to a later letter shows that the first one has its answer.
