@@ -208,6 +208,14 @@ pub(crate) fn is_word(text: &str) -> bool {
 mod tests {
     use super::*;
 
+    /// A host from which an agent moves might send other numbers.
+    #[test]
+    fn the_numbers_of_performatives_are_known() {
+        // None, the 22 performatives of FIPA00037, and any other.
+        assert!((0..=22).chain([255]).all(Act::is_number));
+        assert!(!(23..255).any(Act::is_number));
+    }
+
     #[test]
     fn standard_names_are_the_sets_of_their_patterns() {
         for text in [

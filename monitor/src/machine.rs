@@ -429,6 +429,14 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_protocol_is_called_by_its_names_in_any_case() {
+        let library = crate::Library::standard();
+        let request = library.find("fipa-request").unwrap();
+        assert!(request.is_called("fipa-request") && request.is_called("FIPA-Request"));
+        assert!(!request.is_called("fipa-request-when"));
+    }
+
+    #[test]
     fn any_role_overlaps_each_role() {
         let roles = |mask, anyone| Roles {
             text: String::new(),
