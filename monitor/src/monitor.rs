@@ -1384,20 +1384,22 @@ fn take_copy(
     (fingerprint, receiver): (u64, u64),
     limits: &Limits,
 ) -> Option<Result<(), Kind>> {
-    let bytes = conversation.allocated() + conversation.growth(0, 1, 0);
-    let many = conversation.bound.len() >= limits.participants;
-    let rare = conversation.rare.as_deref_mut()?;
-    let mut copied = rare.copied.iter_mut();
-    let copied = copied.find(|copied| copied.fingerprint == fingerprint)?;
+    let mut all = conversation.rare.as_deref()?.copied.iter().enumerate();
+    let (place, copied) = all.find(|(_, copied)| copied.fingerprint == fingerprint)?;
     if copied.seen.contains(&receiver) {
         return None;
     }
     let name = observed.receivers.first()?;
     let seen = (copied.seen.len() + 1).next_power_of_two() * size_of::<u64>();
+    let bytes = conversation.allocated() + conversation.growth(0, 1, 0);
     let size = crate::table::Slot::COST + bytes + seen + Names::cost(name.len());
-    if many || copied.seen.len() == limits.participants || size > limits.share_of_bytes() {
+    if conversation.bound.len() >= limits.participants
+        || copied.seen.len() == limits.participants
+        || size > limits.share_of_bytes()
+    {
         return Some(Err(Kind::TooMany));
     }
+    let copied = conversation.rare().copied.get_mut(place)?;
     copied.seen.push(receiver);
     let (_, to) = copied.roles;
     if to.count_ones() == 1 {

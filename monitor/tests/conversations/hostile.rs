@@ -63,7 +63,7 @@ fn a_conversation_at_its_share_of_bytes_continues_if_it_does_not_grow() {
         is_accepted.then_some((share, stage))
     };
     let (share, mut stage) = (4_000..8_000).find_map(called).unwrap();
-    // What an undelivered message needs is not limited.
+    // The bytes that an undelivered message needs are not limited.
     let now = stage.now;
     for receiver in [&*long(), "ben"] {
         stage.monitor.undelivered(&call(), receiver, now);
