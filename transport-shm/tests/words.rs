@@ -56,6 +56,19 @@ struct AnsweringSink {
     held: Mutex<Vec<Arrival>>,
 }
 
+impl AnsweringSink {
+    /// Lets a receiver listen with such a sink, which accepts the letters, until one is answered in a word.
+    fn listen(sender: (&ShmTransport, &RecordingSink), receiver: &ShmTransport) -> Arc<Self> {
+        let sink = Arc::new(Self {
+            answer: Mutex::new(Answer::Accepted),
+            held: Mutex::default(),
+        });
+        receiver.listen(sink.clone()).unwrap();
+        send_until_answered_in_a_word(sender, receiver);
+        sink
+    }
+}
+
 impl Sink for AnsweringSink {
     fn arrived(&self, arrival: Arrival) -> Verdict {
         self.held.lock().unwrap().push(arrival);
@@ -72,12 +85,7 @@ fn answers_without_data_need_no_response() {
     let domain = TestDomain::new();
     let (sender, sent) = domain.listening();
     let receiver = domain.endpoint();
-    let sink = Arc::new(AnsweringSink {
-        answer: Mutex::new(Answer::Accepted),
-        held: Mutex::default(),
-    });
-    receiver.listen(sink.clone()).unwrap();
-    send_until_answered_in_a_word((&sender, &sent), &receiver);
+    let sink = AnsweringSink::listen((&sender, &sent), &receiver);
     open(&sender, &receiver.location());
     let content = |len: usize| Bytes::from(vec![7; len]);
     let loaned = || {
@@ -122,12 +130,7 @@ fn content_in_place_is_refused_with_a_response() {
     let domain = TestDomain::new();
     let (sender, sent) = domain.listening();
     let receiver = domain.endpoint();
-    let sink = Arc::new(AnsweringSink {
-        answer: Mutex::new(Answer::Accepted),
-        held: Mutex::default(),
-    });
-    receiver.listen(sink.clone()).unwrap();
-    send_until_answered_in_a_word((&sender, &sent), &receiver);
+    let sink = AnsweringSink::listen((&sender, &sent), &receiver);
     *sink.answer.lock().unwrap() = Answer::OutOfOrder { last: 3 };
     for _ in 0..3 * domain.config().window {
         sink.held.lock().unwrap().clear();
