@@ -381,6 +381,68 @@ fn a_gateway_answers_which_letters_it_has() {
     assert_eq!(asked(&mut gateway, 5, 5, 70), without);
 }
 
+#[test]
+fn a_gateway_answers_that_the_receivers_queue_is_full() {
+    let mut gateway = Service::new(true);
+    gateway.arrive(0, 5, 70);
+    let (attempt, _) = gateway.dispatched().unwrap();
+    gateway.answer(1, attempt, Answer::Busy);
+    let asked = |gateway: &mut Service, ms| {
+        gateway.receive(ms, Kind::Shm, parcel(5, 70, Body::Predecessor))
+    };
+    assert_eq!(asked(&mut gateway, 2), Verdict::Now(Answer::Busy));
+    gateway.arrive(3, 6, 71);
+    let (ms, attempt, _) = gateway.wait_for_dispatch(3, 1000).unwrap();
+    gateway.answer(ms, attempt, Answer::Accepted);
+    // The queue has room again, and letter 6 has no answer yet.
+    let question = parcel(6, 71, Body::Predecessor);
+    let answer = gateway.receive(ms, Kind::Shm, question);
+    assert_eq!(answer, Verdict::Now(Answer::Accepted));
+}
+
+/// The receiver is asked behind a custodian that answers like this. Returns the reason for a letter that
+/// came back and waits behind one in custody until its deadline, and the times of the questions in milliseconds.
+fn reason_behind_custody(answer: &Answer) -> (Option<FailureReason>, Vec<u64>) {
+    let mut gateway = Service::new(true);
+    gateway.arrive(0, 5, 70);
+    let (first, _) = gateway.dispatched().unwrap();
+    gateway.answer(0, first, Answer::Custody);
+    let behind = Parcel {
+        after: 5,
+        remaining: Duration::from_millis(3500),
+        ..parcel(6, 71, Body::Letter(letter()))
+    };
+    gateway.receive(0, Kind::Shm, behind);
+    let (second, _) = gateway.dispatched().unwrap();
+    gateway.answer(0, second, Answer::Returned { uncertain: false });
+    let (mut ms, mut asked) = (0, Vec::new());
+    while let Some((later, attempt, note)) = gateway.wait_for_dispatch(ms, 10_000) {
+        match note.body {
+            Body::Predecessor => {
+                gateway.answer(later, attempt, answer.clone());
+                asked.push(later);
+            }
+            Body::Report(Report::Settled(Outcome::Failed { reason, .. })) => {
+                assert_eq!(note.sequence, 6);
+                return (Some(reason), asked);
+            }
+            other => panic!("{other:?}"),
+        }
+        ms = later;
+    }
+    (None, asked)
+}
+
+#[test]
+fn a_letter_behind_one_whose_custodian_tells_of_a_full_queue_fails_for_that_reason() {
+    let (reason, asked) = reason_behind_custody(&Answer::Busy);
+    assert_eq!(reason, Some(FailureReason::QueueFull));
+    assert_eq!(asked, [1000, 2000, 3000]);
+    let (reason, asked) = reason_behind_custody(&Answer::Accepted);
+    assert_eq!(reason, Some(FailureReason::TimedOut));
+    assert_eq!(asked, [1000, 3000]);
+}
+
 /// Brings a gateway into the state in which an attempt may have delivered the letter in its custody, and in
 /// which its directory no longer has the receiver.
 fn with_absent_receiver() -> Service {
@@ -556,6 +618,36 @@ fn predecessors_have_two_round_trips_to_arrive() {
     assert_eq!(patience(&mut gateway, 1000), 400);
 }
 
+/// With a wait for each of them, letters of a long lane would come back slower than their sender sends
+/// them again.
+#[test]
+fn letters_behind_one_without_its_predecessor_are_returned_with_it() {
+    let mut gateway = Service::new(true);
+    let mut attempts = Vec::new();
+    for sequence in 101..=110 {
+        let letter = Parcel {
+            after: sequence - 1,
+            ..parcel(sequence, 800 + sequence, Body::Letter(letter()))
+        };
+        gateway.receive(0, Kind::Shm, letter);
+        attempts.extend(gateway.dispatched());
+    }
+    for (attempt, _) in attempts {
+        gateway.answer(0, attempt, Answer::OutOfOrder { last: 0 });
+    }
+    let mut returned = Vec::new();
+    let mut ms = 0;
+    while let Some((later, attempt, report)) = gateway.wait_for_dispatch(ms, 10_000) {
+        let is_return = matches!(report.body, Body::Report(Report::Returned { .. }));
+        assert!(is_return, "{report:?}");
+        gateway.answer(later, attempt, Answer::Accepted);
+        returned.push((later, report.sequence));
+        ms = later;
+    }
+    let expected: Vec<_> = (101..=110).map(|sequence| (50, sequence)).collect();
+    assert_eq!(returned, expected);
+}
+
 #[test]
 fn a_gateway_that_ends_returns_the_letters_in_its_custody() {
     let mut gateway = Service::new(true);
@@ -612,6 +704,28 @@ fn a_gateway_that_ends_returns_the_letters_in_its_custody() {
     assert!(!gateway.core.has_open_reports());
     // Further letters stay with the services before it.
     assert_eq!(gateway.arrive(ms, 9, 74), Verdict::Now(Answer::Busy));
+}
+
+/// With a round over the routes of its own, each letter would wait for the end of the one before it.
+#[test]
+fn letters_whose_routes_all_failed_are_sent_again_together() {
+    let mut sender = Service::new(false);
+    let mut attempts = Vec::new();
+    for _ in 0..5 {
+        sender.send();
+        attempts.extend(sender.dispatched());
+    }
+    let handed: Vec<_> = attempts.iter().map(|(_, it)| it.sequence).collect();
+    for (attempt, _) in attempts {
+        let broken = TransportError::new(TransportErrorKind::Broken, "");
+        sender.conclude(0, attempt, Conclusion::NotSent(broken));
+    }
+    let (_, _, first) = sender.wait_for_dispatch(0, 10_000).unwrap();
+    let mut again = vec![first.sequence];
+    while let Some((_, parcel)) = sender.dispatched() {
+        again.push(parcel.sequence);
+    }
+    assert_eq!(again, handed);
 }
 
 /// Sends letters one after the other. The first attempt of each ends like this, the second one goes into

@@ -64,7 +64,9 @@ pub enum Body {
     /// There is room again for letters of this stream, after [`crate::Answer::Busy`].
     Credit,
     /// The predecessor of the letter with this stream and sequence has changed to a lower one: the
-    /// `after` of this parcel. Sent to the service that the letter was handed to.
+    /// `after` of this parcel. Sent to the service that the letter was handed to, which answers
+    /// [`crate::Answer::Accepted`] if it has the letter, [`crate::Answer::Busy`] if it has the letter and the
+    /// receiver's queue is full, and [`crate::Answer::Returned`] if it does not have the letter.
     Predecessor,
 }
 

@@ -823,21 +823,21 @@ impl Core {
                 Verdict::Now(Answer::Accepted)
             }
             Body::Predecessor => {
-                let mut is_here = false;
+                let mut answer = None;
                 if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(parcel.stream)) {
                     let letter = (parcel.sequence, parcel.after, parcel.transfer);
                     self.with_lane(now, *lane, |lane, table| {
-                        is_here = lane.handle_predecessor_note(now.instant, &from, letter, table);
+                        answer = lane.handle_predecessor_note(now.instant, &from, letter, table);
                     });
                 }
                 self.send_failures(now);
                 // A report that is on its way tells more than that the letter is gone.
                 let (sequence, transfer) = (parcel.sequence, parcel.transfer);
                 let is_reported = self.table.is_reporting(parcel.stream, sequence, transfer);
-                let is_here = is_here || is_reported;
-                Verdict::Now(match is_here {
-                    true => Answer::Accepted,
-                    false => Answer::Returned { uncertain: true },
+                Verdict::Now(match answer {
+                    Some(answer) => answer,
+                    None if is_reported => Answer::Accepted,
+                    None => Answer::Returned { uncertain: true },
                 })
             }
         }
@@ -896,7 +896,8 @@ impl Core {
         // A refused note has changed nothing.
         let arrived = matches!(
             conclusion,
-            Conclusion::Answered(Answer::Accepted | Answer::Returned { .. }) | Conclusion::Handed
+            Conclusion::Answered(Answer::Accepted | Answer::Busy | Answer::Returned { .. })
+                | Conclusion::Handed
         );
         if arrived && let Some(sent) = note.sent {
             let took = now.instant.saturating_duration_since(sent);
@@ -907,7 +908,8 @@ impl Core {
         if !again || matches!(conclusion, Conclusion::Answered(_)) {
             self.table.note_ended(&note);
         }
-        if note.parcel.body == Body::Predecessor && is_denied(&conclusion) {
+        let is_busy = matches!(conclusion, Conclusion::Answered(Answer::Busy));
+        if note.parcel.body == Body::Predecessor && (is_busy || is_denied(&conclusion)) {
             let Parcel {
                 stream,
                 sequence,
@@ -916,8 +918,9 @@ impl Core {
             } = note.parcel;
             if let Some(lane) = self.lane_of(stream, &note.parcel.receiver) {
                 let letter = (stream.receiver, sequence, transfer);
-                self.with_lane(now, lane, |lane, table| {
-                    lane.custodian_denied(now.instant, letter, table);
+                self.with_lane(now, lane, |lane, table| match is_busy {
+                    true => lane.custodian_busy(now.instant, letter),
+                    false => lane.custodian_denied(now.instant, letter, table),
                 });
             }
             return;

@@ -130,8 +130,7 @@ impl Lane {
                 }
             }
             Answer::Busy => {
-                self.busy = true;
-                self.was_busy = Some(now);
+                self.was_full(now);
                 let delivery = &mut self.letters[index];
                 delivery.progress.busy = true;
                 delivery.progress.tried.clear();
@@ -451,6 +450,9 @@ impl Lane {
             },
             Outcome::Failed { reason, .. } => {
                 delivery.progress.attempts = attempts;
+                if reason == FailureReason::QueueFull {
+                    self.was_full(now);
+                }
                 match reason {
                     FailureReason::NoSuchAgent => {
                         let departure = Departure::Unknown { refused: None };

@@ -7,7 +7,7 @@
 
 use std::time::{Duration, Instant};
 
-use fipa_transport::{Hop, Incarnation, TransportError, TransportErrorKind};
+use fipa_transport::{Answer, Hop, Incarnation, TransportError, TransportErrorKind};
 
 use super::super::attempts::{AttemptTable, Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, HoldDecision};
@@ -21,7 +21,7 @@ use super::delivery::{Holding, State};
 const LEAST_PATIENCE: Duration = Duration::from_millis(50);
 const MOST_PATIENCE: Duration = Duration::from_secs(1);
 /// Time in custody after which the custodian is asked whether it has the letter, and the pause
-/// until it is asked again.
+/// until it is asked again. The custodian of a receiver with a full queue is asked after the shorter time.
 pub(super) const ASK_CUSTODIAN_AFTER: Duration = Duration::from_secs(1);
 const ASK_CUSTODIAN_AGAIN: Duration = Duration::from_secs(2);
 /// The pause when the custodian did not have another letter of this lane.
@@ -53,21 +53,22 @@ impl Lane {
 
     /// Handles a note with the current predecessor of this letter, which also asks whether the
     /// letter of this hand-over is here. Accepted only from the service that handed it over.
-    /// Returns whether the letter is here.
+    /// Returns the answer, or `None` if the letter is not here.
     pub(crate) fn handle_predecessor_note(
         &mut self,
         now: Instant,
         from: &Hop,
         (sequence, after, transfer): (u64, u64, u64),
         table: &mut AttemptTable,
-    ) -> bool {
+    ) -> Option<Answer> {
         let index = self.index(sequence);
-        let index = index.filter(|index| self.letters[*index].came_from(from, transfer));
-        if let Some(index) = index {
-            self.lower_predecessor(index, after, table);
-            self.pump(now, table);
-        }
-        index.is_some()
+        let index = index.filter(|index| self.letters[*index].came_from(from, transfer))?;
+        self.lower_predecessor(index, after, table);
+        self.pump(now, table);
+        Some(match self.busy {
+            true => Answer::Busy,
+            false => Answer::Accepted,
+        })
     }
 
     /// Maximum time for the predecessor of the letter at `index` to arrive.
@@ -134,22 +135,37 @@ impl Lane {
     pub(crate) fn custodian_denied(
         &mut self,
         now: Instant,
-        (registration, sequence, transfer): (Incarnation, u64, u64),
+        letter: (Incarnation, u64, u64),
         table: &mut AttemptTable,
     ) {
-        let Some(index) = self.index(sequence) else {
-            return;
-        };
-        let delivery = &self.letters[index];
-        let is_meant = delivery.registration == registration
-            && matches!(delivery.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
-        if is_meant {
+        if let Some(index) = self.in_custody(letter) {
             let text = "the gateway that had the letter in custody does not have it";
             self.custodian_lost(now, index, text, table);
             // It may have lost others, too.
             self.ask_custodian_at(now + ASK_CUSTODIAN_ON);
             self.pump(now, table);
         }
+    }
+
+    /// Handles the answer of a custodian that it has the letter of this hand-over, and that the
+    /// receiver's queue is full.
+    pub(crate) fn custodian_busy(&mut self, now: Instant, letter: (Incarnation, u64, u64)) {
+        if self.in_custody(letter).is_some() {
+            self.was_full(now);
+            self.ask_custodian_at(now + ASK_CUSTODIAN_AFTER);
+        }
+    }
+
+    /// The letter of this registration, sequence and hand-over, if its custodian has it.
+    fn in_custody(
+        &self,
+        (registration, sequence, transfer): (Incarnation, u64, u64),
+    ) -> Option<usize> {
+        let index = self.index(sequence)?;
+        let delivery = &self.letters[index];
+        let is_meant = delivery.registration == registration
+            && matches!(delivery.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
+        is_meant.then_some(index)
     }
 
     /// Handles the loss of the custodian, or of the letter at the custodian.
@@ -246,8 +262,19 @@ impl Lane {
 
     /// Returns a letter to the services that handed it over.
     pub(super) fn return_letter(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
-        let uncertain = self.letters[index].progress.uncertain;
+        let delivery = &self.letters[index];
+        let (sequence, uncertain) = (delivery.sequence, delivery.progress.uncertain);
         self.settle(now, index, Settlement::Returned { uncertain }, table);
+        // The letter behind it cannot be taken before it. With a wait of its own, a lane would return
+        // one letter for each wait.
+        if let Some(next) = self.letters.get_mut(index)
+            && next.is_waiting()
+            && next.after >= sequence
+        {
+            next.progress.hold = Some(Holding::Until(now));
+            self.holds = true;
+            self.due_at(now);
+        }
     }
 
     /// Lets letters that wait for the arrival of this one wait for it in the lane.

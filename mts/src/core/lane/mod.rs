@@ -559,6 +559,14 @@ impl Lane {
             self.fail(now, index, reason, table);
             return true;
         }
+        // The next round is one of all letters: with a round of its own, each would wait for the end of the one
+        // before it.
+        work::steps(self.letters.len());
+        for other in &mut self.letters {
+            if other.is_waiting() {
+                other.progress.tried.clear();
+            }
+        }
         self.pause(now);
         false
     }

@@ -1,6 +1,8 @@
 //! Reasons for letters whose deadline passed before they were dispatched: the attempts of the
 //! letters before them.
 
+use std::time::Instant;
+
 use fipa_sds::Entry;
 use fipa_transport::{Attempt, FailureReason, Location, TransportError, TransportErrorKind};
 
@@ -31,6 +33,12 @@ impl Lane {
         if !self.failed.is_empty() {
             self.failed.retain(|attempt| attempt.location != *location);
         }
+    }
+
+    /// Records that the receiver's queue is full.
+    pub(super) fn was_full(&mut self, now: Instant) {
+        self.busy = true;
+        self.was_busy = Some(now);
     }
 
     /// The reason for the letter at `index`, which waits and whose deadline has passed. A letter
