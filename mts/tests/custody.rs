@@ -38,9 +38,9 @@ impl Service {
         Self::with_view(forwards, |directory| directory)
     }
 
-    /// Creates a service that sends letters, and whose directory shows the agent on another host.
-    fn of_another_host() -> Self {
-        Self::with_view(false, |directory| Arc::new(Abroad(directory)))
+    /// Creates a service whose directory shows the agent on another host.
+    fn towards_another_host(forwards: bool) -> Self {
+        Self::with_view(forwards, |directory| Arc::new(Abroad(directory)))
     }
 
     fn with_view(forwards: bool, view: impl FnOnce(Arc<MemoryDirectory>) -> Arc<dyn View>) -> Self {
@@ -445,8 +445,7 @@ fn a_letter_behind_one_whose_custodian_tells_of_a_full_queue_fails_for_that_reas
 
 /// Brings a gateway into the state in which an attempt may have delivered the letter in its custody, and in
 /// which its directory no longer has the receiver.
-fn with_absent_receiver() -> Service {
-    let mut gateway = Service::new(true);
+fn with_absent_receiver(mut gateway: Service) -> Service {
     gateway.arrive(0, 5, 70);
     let (attempt, _) = gateway.dispatched().unwrap();
     gateway.directory.deregister("arm", ARM).unwrap();
@@ -459,7 +458,7 @@ fn with_absent_receiver() -> Service {
 
 #[test]
 fn a_letter_that_may_have_arrived_is_sent_again_when_its_receiver_returns() {
-    let mut gateway = with_absent_receiver();
+    let mut gateway = with_absent_receiver(Service::towards_another_host(true));
     assert_eq!(gateway.wait_for_dispatch(20, 900), None);
     let arm = Registration::new("arm", ARM, vec![shm(NEXT)]);
     gateway.directory.register(arm).unwrap();
@@ -478,7 +477,7 @@ fn a_letter_that_may_have_arrived_is_sent_again_when_its_receiver_returns() {
 
 #[test]
 fn a_letter_that_may_have_arrived_waits_one_second_for_its_receiver() {
-    let mut gateway = with_absent_receiver();
+    let mut gateway = with_absent_receiver(Service::towards_another_host(true));
     let (ms, _, report) = gateway.wait_for_dispatch(20, 10_000).unwrap();
     assert!((1_000..1_100).contains(&ms), "{ms} ms");
     let Body::Report(Report::Settled(Outcome::Failed { reason, .. })) = report.body else {
@@ -508,7 +507,7 @@ fn without_receiver(mut sender: Service, letters: usize) -> Service {
 
 #[test]
 fn a_sender_sends_a_letter_again_when_its_receiver_on_another_host_returns() {
-    let mut sender = without_receiver(Service::of_another_host(), 1);
+    let mut sender = without_receiver(Service::towards_another_host(false), 1);
     assert_eq!(sender.wait_for_dispatch(20, 900), None);
     let arm = Registration::new("arm", ARM, vec![shm(NEXT)]);
     sender.directory.register(arm).unwrap();
@@ -522,7 +521,7 @@ fn a_sender_sends_a_letter_again_when_its_receiver_on_another_host_returns() {
 
 #[test]
 fn letters_that_may_have_arrived_wait_one_second_together_for_their_receiver_on_another_host() {
-    let mut sender = without_receiver(Service::of_another_host(), 3);
+    let mut sender = without_receiver(Service::towards_another_host(false), 3);
     let mut failed = Vec::new();
     for ms in (20..10_000).step_by(10) {
         let now = sender.at(ms);
@@ -546,14 +545,15 @@ fn letters_that_may_have_arrived_wait_one_second_together_for_their_receiver_on_
 #[test]
 fn a_letter_that_may_have_arrived_does_not_wait_for_a_receiver_of_this_host() {
     let mut sender = without_receiver(Service::new(false), 1);
-    let is_unconfirmed = matches!(
-        sender.outcome(),
-        Some(Outcome::Failed {
-            reason: FailureReason::Unconfirmed,
-            ..
-        })
-    );
-    assert!(is_unconfirmed);
+    let is_unconfirmed = |outcome: &Outcome| matches!(outcome, Outcome::Failed { reason, .. } if *reason == FailureReason::Unconfirmed);
+    let outcome = sender.outcome().unwrap();
+    assert!(is_unconfirmed(&outcome), "{outcome:?}");
+    let mut gateway = with_absent_receiver(Service::new(true));
+    let (_, report) = gateway.dispatched().unwrap();
+    let Body::Report(Report::Settled(outcome)) = report.body else {
+        panic!("{report:?}");
+    };
+    assert!(is_unconfirmed(&outcome), "{outcome:?}");
 }
 
 #[test]

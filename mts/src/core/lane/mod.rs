@@ -661,9 +661,8 @@ impl Lane {
     /// example. A registration that has a successor does not return, and neither does one of this host.
     fn may_return(&mut self, now: Instant, index: usize, table: &AttemptTable) -> bool {
         let registration = self.letters[index].registration;
-        let is_known_here = !self.is_abroad && !self.is_custody();
         let has_successor = table.view.named(&self.receiver).is_some();
-        if is_known_here || has_successor || table.departed.contains(now, registration) {
+        if !self.is_abroad || has_successor || table.departed.contains(now, registration) {
             return false;
         }
         let until = match self.absent {
