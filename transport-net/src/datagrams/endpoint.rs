@@ -73,6 +73,20 @@ impl<P> Default for State<P> {
     }
 }
 
+impl<P> State<P> {
+    /// Returns the protocol of an open endpoint.
+    fn open(&mut self) -> Result<&mut P, TransportError> {
+        match (self.phase, self.core.as_mut()) {
+            (Phase::Open, Some(core)) => Ok(core),
+            (Phase::New, _) => Err(TransportError::new(
+                TransportErrorKind::Closed,
+                "`listen` has not been called",
+            )),
+            _ => Err(ConnectionEnd::Closed.after()),
+        }
+    }
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     New,
@@ -193,22 +207,20 @@ impl<P: Protocol> Endpoint<P> {
         send: impl FnOnce(&mut P, Instant) -> Result<Option<u32>, TransportError>,
     ) -> Result<(), TransportError> {
         let mut state = self.state.lock();
-        let now = Instant::now();
-        let core = match (state.phase, state.core.as_mut()) {
-            (Phase::Open, Some(core)) => core,
-            (Phase::New, _) => {
-                return Err(TransportError::new(
-                    TransportErrorKind::Closed,
-                    "`listen` has not been called",
-                ));
-            }
-            _ => return Err(ConnectionEnd::Closed.after()),
-        };
-        if let Some(fresh) = send(core, now)? {
+        if let Some(fresh) = send(state.open()?, Instant::now())? {
             self.dial(&mut state, fresh, to.address());
         }
         self.flush_and_wake(&mut state);
         Ok(())
+    }
+
+    /// Calls a function of the open protocol after which there is nothing to send and no event.
+    #[cfg(feature = "udt")]
+    pub(crate) fn queue<T>(
+        &self,
+        queue: impl FnOnce(&mut P) -> Result<T, TransportError>,
+    ) -> Result<T, TransportError> {
+        queue(self.state.lock().open()?)
     }
 
     /// Calls a function of the protocol, and sends what it has to send.

@@ -3,6 +3,8 @@
 use std::net::IpAddr;
 use std::time::Duration;
 
+use fipa_transport::{TransportError, TransportErrorKind};
+
 use crate::Identity;
 use crate::rate_limit::{Rates, is_one_peer};
 use crate::stream::budget::BudgetLimits;
@@ -108,6 +110,27 @@ impl UdtLimits {
                 false => each.saturating_mul(2),
             },
         }
+    }
+
+    /// Checks whether a letter of this length can be queued behind so many letters, with so many bytes,
+    /// to the same location.
+    ///
+    /// # Errors
+    /// When too much is queued.
+    pub(super) fn check_room(
+        &self,
+        (count, bytes): (usize, usize),
+        len: usize,
+    ) -> Result<(), TransportError> {
+        if count >= self.max_in_flight.max(1)
+            || (bytes > 0 && bytes.saturating_add(len) > self.max_queued_bytes)
+        {
+            let detail = format!(
+                "{count} letters of {bytes} bytes wait for this legacy peer (max_in_flight, max_queued_bytes)"
+            );
+            return Err(TransportError::new(TransportErrorKind::Congested, detail));
+        }
+        Ok(())
     }
 
     pub(super) fn rates(&self) -> Rates {

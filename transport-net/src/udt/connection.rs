@@ -160,6 +160,14 @@ impl Connection {
     }
 
     /// Returns the sender, if this side opened the connection.
+    pub(crate) fn sender(&self) -> Option<&Sender> {
+        match &self.role {
+            Role::Dialling(_, sender) | Role::Sending(sender) => Some(sender),
+            Role::Receiving(_) => None,
+        }
+    }
+
+    /// Returns the sender to change it, if this side opened the connection.
     pub(crate) fn sender_mut(&mut self) -> Option<&mut Sender> {
         match &mut self.role {
             Role::Dialling(_, sender) | Role::Sending(sender) => Some(sender),

@@ -10,9 +10,11 @@
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
+use fipa_acl::Letter;
 use fipa_transport::{
     Abandoned, AttemptId, Conclusion, Location, TransportError, TransportErrorKind, quota_address,
 };
@@ -26,6 +28,7 @@ use super::packet::{
 };
 use super::receiver::{Arrived, Receiver};
 use super::sequence;
+use super::untranslated::{Translation, Untranslated};
 use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
@@ -64,8 +67,10 @@ pub(crate) struct Core {
     dialled: HashMap<Location, u32>,
     /// Connections opened by peers, by their origin.
     accepted: HashMap<Origin, u32>,
+    /// Letters that no connection has yet.
+    untranslated: Untranslated,
     outbox: VecDeque<Outbound>,
-    /// Conclusions of connections that have ended.
+    /// Conclusions of connections that have ended, and of letters that could not be translated.
     concluded: VecDeque<(AttemptId, Conclusion)>,
     rate_limits: PeerRateLimits,
     byte_budget: ByteBudget,
@@ -114,6 +119,7 @@ impl Core {
             sockets: HashMap::new(),
             dialled: HashMap::new(),
             accepted: HashMap::new(),
+            untranslated: Untranslated::default(),
             outbox: VecDeque::new(),
             concluded: VecDeque::new(),
             rate_limits: PeerRateLimits::default(),
@@ -135,9 +141,68 @@ impl Core {
         self.counters.refused_nonsense - 1
     }
 
-    /// Queues a letter, in the dialect of the peer. Returns the number of the connection if it is
-    /// new; the caller then calls [`begin`](Self::begin) or [`cannot_begin`](Self::cannot_begin).
+    /// Queues a letter for its translation. Returns whether the caller must start the task that
+    /// translates letters: it calls [`begin_translation`](Self::begin_translation) and
+    /// [`handle_translated`](Self::handle_translated) by turns.
+    ///
+    /// # Errors
+    /// When there is no room for the letter, or for the connection that it needs.
     pub(crate) fn dispatch(
+        &mut self,
+        attempt: AttemptId,
+        to: &Location,
+        receiver: Arc<str>,
+        letter: Letter,
+    ) -> Result<bool, TransportError> {
+        let waiting = self.untranslated.load(to);
+        let dialled = self.dialled.get(to);
+        let entry = dialled.and_then(|number| self.connections.get(*number));
+        let load = match entry.and_then(|entry| entry.connection.sender()) {
+            Some(sender) => {
+                let queued = sender.load();
+                (waiting.0 + queued.0, waiting.1 + queued.1)
+            }
+            None if waiting.0 == 0 && !self.has_room_for_another_location() => {
+                return Err(ConnectionEnd::TooManyConnections.after());
+            }
+            None => waiting,
+        };
+        self.limits.check_room(load, letter.len())?;
+        Ok(self.untranslated.push(attempt, to, receiver, letter))
+    }
+
+    /// Returns the next letter to be translated. `None` ends the task that translates letters.
+    pub(crate) fn begin_translation(&mut self) -> Option<Translation> {
+        self.untranslated.begin()
+    }
+
+    /// Queues the letter that has been translated, or concludes it as not sent. A letter whose attempt
+    /// has ended is dropped. Returns the number of the connection if it is new; the caller then calls
+    /// [`begin`](Self::begin) or [`cannot_begin`](Self::cannot_begin).
+    pub(crate) fn handle_translated(
+        &mut self,
+        now: Instant,
+        translated: Result<[Bytes; 2], TransportError>,
+    ) -> Option<u32> {
+        let (attempt, to) = self.untranslated.finish()?;
+        let sent = translated.and_then(|pieces| self.send(now, attempt, &to, pieces));
+        sent.unwrap_or_else(|error| {
+            let conclusion = Conclusion::NotSent(error);
+            self.concluded.push_back((attempt, conclusion));
+            None
+        })
+    }
+
+    /// Concludes the letters that wait for their translation as not sent.
+    pub(crate) fn end_translations(&mut self) {
+        let conclusion = Conclusion::NotSent(ConnectionEnd::Closed.after());
+        let waiting = self.untranslated.clear();
+        let concluded = waiting.map(|attempt| (attempt, conclusion.clone()));
+        self.concluded.extend(concluded);
+    }
+
+    /// Queues a letter in the dialect of the peer. Returns the number of the connection if it is new.
+    fn send(
         &mut self,
         now: Instant,
         attempt: AttemptId,
@@ -162,6 +227,14 @@ impl Core {
         }
         self.connections.touch(number);
         Ok(there.is_none().then_some(number))
+    }
+
+    /// Whether a further location can get a connection, besides the locations whose letters wait for
+    /// their translation.
+    fn has_room_for_another_location(&self) -> bool {
+        let waiting = self.untranslated.locations();
+        let needed = waiting.filter(|to| !self.dialled.contains_key(to)).count();
+        self.connections.len() + needed < self.limits.max_connections
     }
 
     /// Ends the connections that are bound to addresses that this host no longer has. `local`
@@ -213,7 +286,17 @@ impl Core {
 
     /// Ends an attempt to this location.
     pub(crate) fn abandon(&mut self, attempt: AttemptId, to: &Location) -> Abandoned {
-        self.concluded.retain(|(other, _)| *other != attempt);
+        if self.untranslated.abandon(attempt, to) {
+            return Abandoned::NotSent;
+        }
+        let mut concluded = self.concluded.iter();
+        let concluded = concluded.position(|(other, _)| *other == attempt);
+        if let Some((_, conclusion)) = concluded.and_then(|place| self.concluded.remove(place)) {
+            return match conclusion {
+                Conclusion::NotSent(_) => Abandoned::NotSent,
+                _ => Abandoned::Unconfirmed,
+            };
+        }
         let Some(number) = self.dialled.get(to) else {
             return Abandoned::Unconfirmed;
         };
@@ -342,8 +425,9 @@ impl Core {
         }
     }
 
-    /// Ends every connection.
+    /// Ends every connection, and concludes every letter.
     pub(crate) fn close(&mut self, now: Instant) {
+        self.end_translations();
         for number in self.connections.numbers() {
             self.end(now, number, &ConnectionEnd::Closed);
         }

@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use fipa_acl::Letter;
 use fipa_transport::{AttemptId, Conclusion, Kind, Location};
 
 use super::config::UdtLimits;
@@ -173,15 +174,22 @@ impl UdtPackets {
             return;
         };
         let attempt = AttemptId(self.dispatched);
-        let letter = [Bytes::from(vec![1; len / 2 + 1]), Bytes::from(vec![2; len])];
-        let Ok(fresh) = self.core.dispatch(self.now, attempt, &to, letter) else {
+        let pieces = [Bytes::from(vec![1; len / 2 + 1]), Bytes::from(vec![2; len])];
+        let [envelope, message] = pieces.clone();
+        let letter = Letter::new(envelope, message);
+        let dispatched = self.core.dispatch(attempt, &to, "arm".into(), letter);
+        if dispatched.is_err() {
             return;
-        };
+        }
         self.dispatched += 1;
         self.proved.insert(address(peer));
-        if let Some(fresh) = fresh {
+        if self.core.begin_translation().is_some()
+            && let Some(fresh) = self.core.handle_translated(self.now, Ok(pieces))
+        {
             self.core.begin(self.now, fresh, vec![path(peer)]);
         }
+        // Ends the task.
+        assert!(self.core.begin_translation().is_none(), "one letter");
         self.flush();
     }
 

@@ -5,8 +5,10 @@
 //! * [`core`]: the protocol without sockets and clock, with the [`connection`]s in it. A connection
 //!   has a [`sender`] with its [`rate`] control, or a [`receiver`] with its measurement of
 //!   [`arrivals`].
-//! * [`endpoint`]: the core as a [`Protocol`](crate::datagrams::Protocol). The tasks around it, with
-//!   their sockets, are in [`crate::datagrams`], which it shares with UDP.
+//! * [`untranslated`]: the letters that wait for their translation into the dialect of the peer.
+//! * [`endpoint`]: the core as a [`Protocol`](crate::datagrams::Protocol), and the task that translates
+//!   letters. The other tasks, with their sockets, are in [`crate::datagrams`], which it shares with
+//!   UDP.
 //!
 //! Absent are streams, the rendezvous of two clients, and messages out of order, which fipa_services
 //! does not use.
@@ -28,6 +30,7 @@ mod sender;
 mod sequence;
 #[cfg(test)]
 mod simulation;
+mod untranslated;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -41,9 +44,9 @@ use tokio::runtime::Handle;
 pub use self::config::{UdtConfig, UdtLimits};
 use self::core::Core;
 pub use self::counters::UdtCounters;
+use self::endpoint::Translator;
 use crate::datagrams::Random;
 use crate::datagrams::endpoint::Endpoint;
-use crate::legacy::dialect::translate;
 
 /// The time after which an acknowledgment is sent at the latest, and the period of the rate control
 /// (draft-gg-udt-03 section 4).
@@ -53,7 +56,8 @@ const SYN: Duration = Duration::from_millis(10);
 ///
 /// The first letter to a location opens a connection. That connection carries all letters to the
 /// location until it has been idle for a while; letters arrive once and in order. The peer answers
-/// over a connection of its own. A letter that the peer has acknowledged is concluded as
+/// over a connection of its own. A task translates letters into the dialect of the peer before they are
+/// sent. A letter that the peer has acknowledged is concluded as
 /// [handed](fipa_transport::Conclusion::Handed): it is in the receive buffer of the peer.
 ///
 /// An address is a numeric `address:port` or `name:port`.
@@ -63,6 +67,7 @@ const SYN: Duration = Duration::from_millis(10);
 pub struct UdtTransport {
     config: UdtConfig,
     endpoint: Arc<Endpoint<Core>>,
+    runtime: Handle,
 }
 
 impl std::fmt::Debug for UdtTransport {
@@ -78,8 +83,9 @@ impl UdtTransport {
     pub fn new(config: UdtConfig, runtime: Handle) -> Self {
         let listen = config.listen.clone();
         Self {
-            endpoint: Endpoint::new(listen, config.identity.incarnation, runtime),
+            endpoint: Endpoint::new(listen, config.identity.incarnation, runtime.clone()),
             config,
+            runtime,
         }
     }
 
@@ -129,21 +135,17 @@ impl Transport for UdtTransport {
             ));
         };
         let max = self.config.limits.max_letter;
-        let too_large = |len: usize| {
-            let detail = format!("the letter has {len} bytes; the limit is {max} (max_letter)");
-            TransportError::new(TransportErrorKind::TooLarge, detail)
-        };
         if letter.len() > max {
-            return Err(too_large(letter.len()));
+            return Err(too_large(letter.len(), max));
         }
-        let pieces = translate(&letter, &parcel.receiver, to.signature(), None)
-            .map_err(|error| TransportError::new(error.fault(), error))?;
-        let len = pieces.iter().map(bytes::Bytes::len).sum();
-        if len > max {
-            return Err(too_large(len));
+        let starts = self
+            .endpoint
+            .queue(|core| core.dispatch(attempt, to, parcel.receiver, letter))?;
+        if starts {
+            let translator = Translator::new(Arc::clone(&self.endpoint), max);
+            self.runtime.spawn(translator.run());
         }
-        self.endpoint
-            .dispatch(to, |core, now| core.dispatch(now, attempt, to, pieces))
+        Ok(())
     }
 
     fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
@@ -163,4 +165,9 @@ impl Drop for UdtTransport {
     fn drop(&mut self) {
         self.close();
     }
+}
+
+fn too_large(len: usize, max: usize) -> TransportError {
+    let detail = format!("the letter has {len} bytes; the limit is {max} (max_letter)");
+    TransportError::new(TransportErrorKind::TooLarge, detail)
 }

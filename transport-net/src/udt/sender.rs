@@ -12,7 +12,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use fipa_transport::{Abandoned, AttemptId, Conclusion, TransportError, TransportErrorKind};
+use fipa_transport::{Abandoned, AttemptId, Conclusion, TransportError};
 
 use super::SYN;
 use super::config::UdtLimits;
@@ -144,24 +144,16 @@ impl Sender {
             attempt: Some(attempt),
             pieces,
         };
-        let (count, bytes) = (self.waiting.len() + self.begun.len(), self.bytes);
         let len = outgoing.len();
-        let UdtLimits {
-            max_in_flight,
-            max_queued_bytes,
-            ..
-        } = self.limits;
-        if count >= max_in_flight.max(1)
-            || (bytes > 0 && bytes.saturating_add(len) > max_queued_bytes)
-        {
-            let detail = format!(
-                "{count} letters of {bytes} bytes wait for this legacy peer (max_in_flight, max_queued_bytes)"
-            );
-            return Err(TransportError::new(TransportErrorKind::Congested, detail));
-        }
+        self.limits.check_room(self.load(), len)?;
         self.bytes += len;
         self.waiting.push_back(outgoing);
         Ok(())
+    }
+
+    /// Returns the number of letters that wait or are not acknowledged, and of their bytes.
+    pub(crate) fn load(&self) -> (usize, usize) {
+        (self.waiting.len() + self.begun.len(), self.bytes)
     }
 
     /// Ends an attempt. The letter is not sent if no packet of it was sent.
@@ -488,6 +480,8 @@ pub(crate) fn payload_of(max_packet: u32) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use fipa_transport::TransportErrorKind;
+
     use super::*;
 
     const TO: u32 = 7;

@@ -6,7 +6,10 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use fipa_transport::{Abandoned, AttemptId, Conclusion, Kind, Location, TransportErrorKind};
+use fipa_acl::Letter;
+use fipa_transport::{
+    Abandoned, AttemptId, Conclusion, Kind, Location, TransportError, TransportErrorKind,
+};
 
 use super::config::UdtLimits;
 use super::core::{Core, CoreEvent};
@@ -14,6 +17,7 @@ use super::packet::{
     self, CONCLUSION, Control, DATAGRAMS, Data, HANDSHAKE_LEN, Handshake, Packet, Position,
     REFUSAL, REQUEST, VERSION,
 };
+use super::untranslated::Translation;
 use crate::datagrams::{Path, Transmit};
 
 const A: usize = 0;
@@ -30,6 +34,8 @@ struct LinkConditions {
     capacity: u64,
     /// Longest delay of that kind in microseconds; longer ones are losses.
     queue: u64,
+    /// Longest time of the translation of a letter in microseconds.
+    translation: u64,
 }
 
 const FAIR: LinkConditions = LinkConditions {
@@ -38,6 +44,7 @@ const FAIR: LinkConditions = LinkConditions {
     delay: (100, 200),
     capacity: 1_000_000,
     queue: 1_000_000,
+    translation: 0,
 };
 
 /// Packets in flight: time of arrival and number; receiver, sender and contents.
@@ -48,6 +55,8 @@ struct Simulation {
     random: fastrand::Rng,
     conditions: LinkConditions,
     cores: [Core; 2],
+    /// The letter that each side translates, and the time at which the translation ends.
+    translations: [Option<(Instant, Translation)>; 2],
     wire: Wire,
     /// Time until which the link from each side is busy.
     busy: [Instant; 2],
@@ -89,6 +98,12 @@ fn letter(number: u64, len: usize) -> [Bytes; 2] {
     [bytes.slice(..middle), bytes.slice(middle..)]
 }
 
+/// Returns the pieces of a letter unchanged.
+fn pieces(translation: &Translation) -> [Bytes; 2] {
+    let letter = &translation.letter;
+    [letter.envelope(), letter.payload().to_bytes()]
+}
+
 fn to(who: usize) -> Location {
     Location::new(Kind::Udt, &address(who).to_string()).unwrap()
 }
@@ -101,6 +116,7 @@ impl Simulation {
             random: fastrand::Rng::with_seed(seed),
             conditions,
             cores: [core(A, seed, limits, now), core(B, seed, limits, now)],
+            translations: [None, None],
             wire: BTreeMap::new(),
             busy: [now; 2],
             count: 0,
@@ -112,20 +128,44 @@ impl Simulation {
     }
 
     fn send(&mut self, from: usize, number: u64, len: usize) -> Result<(), TransportErrorKind> {
-        let attempt = AttemptId(number);
-        let fresh = self.cores[from]
-            .dispatch(self.now, attempt, &to(1 - from), letter(number, len))
+        let [envelope, message] = letter(number, len);
+        let letter = Letter::new(envelope, message);
+        self.cores[from]
+            .dispatch(AttemptId(number), &to(1 - from), "arm".into(), letter)
             .map_err(|error| error.fault)?;
-        if let Some(fresh) = fresh {
-            self.cores[from].begin(self.now, fresh, vec![path(address(1 - from))]);
-        }
         self.flush();
         Ok(())
+    }
+
+    /// Translates the letters of one side, as far as there is time.
+    fn translate(&mut self, who: usize) {
+        loop {
+            if let Some((ends, _)) = &self.translations[who]
+                && *ends > self.now
+            {
+                return;
+            }
+            if let Some((_, translation)) = self.translations[who].take() {
+                let fresh = self.cores[who].handle_translated(self.now, Ok(pieces(&translation)));
+                if let Some(fresh) = fresh {
+                    self.cores[who].begin(self.now, fresh, vec![path(address(1 - who))]);
+                }
+            }
+            let Some(next) = self.cores[who].begin_translation() else {
+                return;
+            };
+            let took = match self.conditions.translation {
+                0 => 0,
+                longest => self.random.u64(..longest),
+            };
+            self.translations[who] = Some((self.now + Duration::from_micros(took), next));
+        }
     }
 
     /// Sends all pending packets and handles all events.
     fn flush(&mut self) {
         for who in [A, B] {
+            self.translate(who);
             loop {
                 while let Some(event) = self.cores[who].poll_event() {
                     self.handle(who, event);
@@ -192,7 +232,10 @@ impl Simulation {
 
     /// Returns the time of the next event.
     fn next(&self) -> Option<Instant> {
+        let translated = |who: usize| self.translations[who].as_ref().map(|(ends, _)| *ends);
         let next = [
+            translated(A),
+            translated(B),
             self.wire.keys().next().map(|(at, _)| *at),
             self.cores[A].poll_timeout(),
             self.cores[B].poll_timeout(),
@@ -350,6 +393,7 @@ fn guarantees_hold_under_loss_reordering_and_duplication() {
             loss: [0.01, 0.05, 0.3][seed as usize % 3],
             twice: 0.1,
             delay: (100, [300, 5_000, 30_000][seed as usize / 3 % 3]),
+            translation: [0, 1_000, 50_000][seed as usize % 3],
             ..FAIR
         };
         run(seed, conditions);
@@ -366,6 +410,7 @@ fn guarantees_hold_over_narrow_links() {
             delay: (50, random.u64(60..20_000)),
             capacity: random.u64(2_000..100_000),
             queue: random.u64(2_000..50_000),
+            ..FAIR
         };
         run(seed, conditions);
     });
@@ -710,8 +755,13 @@ fn peers_without_access_are_neither_answered_nor_dialled() {
     assert!(simulation.cores[B].poll_transmit(now).is_some());
     let location = Location::new(Kind::Udt, &stranger.to_string()).unwrap();
     let core = &mut simulation.cores[B];
-    let fresh = core.dispatch(now, AttemptId(1), &location, letter(1, 9));
-    core.begin(now, fresh.unwrap().unwrap(), vec![path(stranger)]);
+    let [envelope, message] = letter(1, 9);
+    let letter = Letter::new(envelope, message);
+    let starts = core.dispatch(AttemptId(1), &location, "arm".into(), letter);
+    assert!(starts.unwrap());
+    let translation = core.begin_translation().unwrap();
+    let fresh = core.handle_translated(now, Ok(pieces(&translation)));
+    core.begin(now, fresh.unwrap(), vec![path(stranger)]);
     assert!(core.poll_transmit(now).is_none());
     assert!(matches!(
         core.poll_event(),
@@ -761,4 +811,157 @@ fn connections_of_a_removed_address_end() {
     assert_eq!(simulation.cores[A].counters().connections, 1);
     simulation.cores[A].lost(now, &lost, |_| Some(address(A).ip()));
     assert_eq!(simulation.cores[A].counters().connections, 0);
+}
+
+/// Conditions under which a translation takes a while.
+const SLOW: LinkConditions = LinkConditions {
+    translation: 1_000_000,
+    ..FAIR
+};
+
+#[test]
+fn letters_are_not_sent_before_their_translation() {
+    let mut simulation = Simulation::new(1, SLOW, &UdtLimits::default());
+    for number in 1..=3 {
+        simulation.send(A, number, 10).unwrap();
+    }
+    assert_eq!(simulation.cores[A].counters().connections, 0);
+    assert_eq!(simulation.cores[A].poll_timeout(), None);
+    let attempts = BTreeSet::from([1, 2, 3]);
+    simulation.until_concluded(A, &attempts);
+    assert_eq!(simulation.check(A, &attempts), 3);
+}
+
+#[test]
+fn letters_that_are_abandoned_before_their_translation_ends_are_never_sent() {
+    let mut simulation = Simulation::new(1, SLOW, &UdtLimits::default());
+    for number in 1..=4 {
+        simulation.send(A, number, 10).unwrap();
+    }
+    assert!(simulation.translations[A].is_some(), "the first letter");
+    for abandoned in [1, 3] {
+        let core = &mut simulation.cores[A];
+        let end = core.abandon(AttemptId(abandoned), &to(B));
+        assert_eq!(end, Abandoned::NotSent);
+        let again = core.abandon(AttemptId(abandoned), &to(B));
+        assert_eq!(again, Abandoned::Unconfirmed, "it is unknown");
+    }
+    let attempts = BTreeSet::from([2, 4]);
+    simulation.until_concluded(A, &attempts);
+    simulation.pass(Duration::from_secs(5));
+    assert_eq!(simulation.check(A, &attempts), 2);
+    assert_eq!(simulation.arrived[B], [2, 4]);
+    assert_eq!(simulation.concluded[A].len(), 2);
+}
+
+#[test]
+fn a_letter_that_cannot_be_translated_opens_no_connection() {
+    let mut simulation = Simulation::new(1, SLOW, &UdtLimits::default());
+    for number in 1..=2 {
+        simulation.send(A, number, 10).unwrap();
+        let error = TransportError::new(TransportErrorKind::Inexpressible, "for a test");
+        let core = &mut simulation.cores[A];
+        let fresh = core.handle_translated(simulation.now, Err(error.clone()));
+        assert_eq!(fresh, None);
+        simulation.translations[A] = None;
+        if number == 1 {
+            let event = core.poll_event();
+            assert!(
+                matches!(&event, Some(CoreEvent::Concluded(AttemptId(1), Conclusion::NotSent(it))) if *it == error),
+                "{event:?}"
+            );
+        } else {
+            // Abandoned before the conclusion has been reported.
+            assert_eq!(core.abandon(AttemptId(2), &to(B)), Abandoned::NotSent);
+        }
+        assert!(core.poll_event().is_none());
+        assert!(core.begin_translation().is_none());
+    }
+    assert_eq!(simulation.cores[A].counters().connections, 0);
+    simulation.send(A, 3, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([3]));
+    assert_eq!(simulation.check(A, &BTreeSet::from([3])), 1);
+}
+
+#[test]
+fn closing_concludes_letters_before_their_translation_as_not_sent() {
+    let mut simulation = Simulation::new(1, SLOW, &UdtLimits::default());
+    let attempts: BTreeSet<u64> = (1..=3).collect();
+    for number in &attempts {
+        simulation.send(A, *number, 10).unwrap();
+    }
+    let now = simulation.now;
+    simulation.cores[A].close(now);
+    simulation.flush();
+    for attempt in &attempts {
+        assert!(matches!(
+            &simulation.concluded[A][&AttemptId(*attempt)][..],
+            [Conclusion::NotSent(error)] if error.fault == TransportErrorKind::Closed
+        ));
+    }
+    // The first translation ends afterwards.
+    simulation.pass(Duration::from_secs(5));
+    assert_eq!(simulation.check(A, &attempts), 0);
+    assert_eq!(simulation.cores[A].counters().connections, 0);
+}
+
+#[test]
+fn letters_before_their_translation_count_for_the_limits() {
+    let limits = UdtLimits {
+        max_in_flight: 3,
+        max_queued_bytes: 1000,
+        max_connections: 2,
+        ..UdtLimits::default()
+    };
+    let mut simulation = Simulation::new(1, SLOW, &limits);
+    simulation.send(A, 1, 10).unwrap();
+    let congested = Err(TransportErrorKind::Congested);
+    assert_eq!(simulation.send(A, 9, 995), congested, "too many bytes");
+    simulation.until_concluded(A, &BTreeSet::from([1]));
+    // One letter that is under way, and two that wait.
+    simulation.cut = true;
+    simulation.send(A, 2, 10).unwrap();
+    while simulation.translations[A].is_some() {
+        simulation.step();
+    }
+    for number in 3..=4 {
+        simulation.send(A, number, 10).unwrap();
+    }
+    assert_eq!(simulation.send(A, 9, 10), congested, "too many letters");
+    // Each location needs a connection.
+    let location = |n: u8| Location::new(Kind::Udt, &format!("192.0.2.{n}:7790")).unwrap();
+    let mut dispatch = |attempt: u64, n: u8| {
+        let letter = Letter::new(Bytes::from_static(b"x"), Bytes::new());
+        let core = &mut simulation.cores[A];
+        let queued = core.dispatch(AttemptId(attempt), &location(n), "arm".into(), letter);
+        queued.map_err(|error| error.fault)
+    };
+    assert_eq!(dispatch(10, 77), Ok(false));
+    assert_eq!(dispatch(11, 78), congested.map(|()| false));
+    assert_eq!(dispatch(12, 77), Ok(false));
+}
+
+#[test]
+fn a_letter_that_outgrows_its_room_by_the_translation_is_concluded_as_not_sent() {
+    let limits = UdtLimits {
+        max_queued_bytes: 1000,
+        ..UdtLimits::default()
+    };
+    let mut simulation = Simulation::new(1, SLOW, &limits);
+    simulation.cut = true;
+    for (number, len) in [(1, 10), (2, 991)] {
+        simulation.send(A, number, 10).unwrap();
+        let translated = [Bytes::from(vec![0; len]), Bytes::new()];
+        let core = &mut simulation.cores[A];
+        core.handle_translated(simulation.now, Ok(translated));
+        simulation.translations[A] = None;
+        assert!(core.begin_translation().is_none());
+    }
+    simulation.flush();
+    let concluded = &simulation.concluded[A];
+    assert_eq!(concluded.len(), 1, "the first letter waits: {concluded:?}");
+    assert!(matches!(
+        &concluded[&AttemptId(2)][..],
+        [Conclusion::NotSent(error)] if error.fault == TransportErrorKind::Congested
+    ));
 }
