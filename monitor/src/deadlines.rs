@@ -49,6 +49,7 @@ impl Deadlines {
 
     /// Removes stale deadlines if there may be more of them than of valid ones. `counts` tells
     /// whether a deadline is valid.
+    #[inline]
     pub(crate) fn keep_few(&mut self, counts: impl Fn(&Deadline) -> bool) {
         const SOME: usize = 1_024;
         if self.heap.len() > 2 * self.counted + SOME {

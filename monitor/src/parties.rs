@@ -29,6 +29,23 @@ impl Parties {
         }
     }
 
+    // Most conversations have one party.
+    #[cold]
+    fn none_or_many(&self) -> &[Party] {
+        match self {
+            Self::Many(all) => all,
+            _ => &[],
+        }
+    }
+
+    #[cold]
+    fn none_or_many_mut(&mut self) -> &mut [Party] {
+        match self {
+            Self::Many(all) => all,
+            _ => &mut [],
+        }
+    }
+
     /// Removes the parties. A buffer of the first one is kept.
     pub(crate) fn clear(&mut self) {
         let mut buffer = match std::mem::take(self) {
@@ -74,21 +91,21 @@ impl Default for Parties {
 impl Deref for Parties {
     type Target = [Party];
 
+    #[inline]
     fn deref(&self) -> &[Party] {
         match self {
-            Self::None(_) => &[],
             Self::One(party) => std::slice::from_ref(party),
-            Self::Many(all) => all,
+            others => others.none_or_many(),
         }
     }
 }
 
 impl DerefMut for Parties {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [Party] {
         match self {
-            Self::None(_) => &mut [],
             Self::One(party) => std::slice::from_mut(party),
-            Self::Many(all) => all,
+            others => others.none_or_many_mut(),
         }
     }
 }
