@@ -155,6 +155,17 @@ struct StepValues {
     cancel: u64,
 }
 
+impl Details {
+    /// Bytes of the details and of what they have allocated.
+    fn allocated(&self) -> usize {
+        let worlds = self.worlds.as_deref();
+        size_of::<Self>()
+            + worlds.map_or(0, |Worlds { missing, arrived }| {
+                size_of::<Worlds>() + missing.allocated() + arrived.allocated()
+            })
+    }
+}
+
 /// The party if a message that was reported as failed has not arrived, and if it has arrived. The next
 /// message shows which is true.
 #[derive(Debug, Clone)]
@@ -220,15 +231,9 @@ impl Party {
     }
 
     /// Bytes that the party has allocated.
+    #[inline]
     pub(crate) fn allocated(&self) -> usize {
-        let Some(details) = self.details.as_deref() else {
-            return 0;
-        };
-        let worlds = details.worlds.as_deref();
-        size_of::<Details>()
-            + worlds.map_or(0, |Worlds { missing, arrived }| {
-                size_of::<Worlds>() + missing.allocated() + arrived.allocated()
-            })
+        self.details.as_deref().map_or(0, Details::allocated)
     }
 
     /// Records the message that is about to change the party, and whether it is a cancel.
@@ -434,6 +439,7 @@ impl Bound {
     }
 
     /// Bytes that the bindings have allocated.
+    #[inline]
     fn allocated(&self) -> usize {
         self.bindings.as_deref().map_or(0, |bindings| {
             let spilled = match bindings.spilled() {
@@ -691,13 +697,23 @@ impl Conversation {
     /// Finds the party of an agent: a participant, or an agent that continues in its place.
     #[inline]
     pub(crate) fn party(&self, names: &Names, agent: &str) -> Option<(usize, &Party)> {
-        let parties: &[Party] = &self.parties;
-        let found = match parties.len() {
-            0..=FEW => parties.iter().position(|party| names.is(party.peer, agent)),
-            _ => self.indexed(names, agent),
+        match &self.parties {
+            Parties::One(only) if names.is(only.peer, agent) => Some((0, only)),
+            _ => self.other_party(names, agent),
+        }
+    }
+
+    fn other_party(&self, names: &Names, agent: &str) -> Option<(usize, &Party)> {
+        let found = match &self.parties {
+            Parties::None(_) | Parties::One(_) => None,
+            Parties::Many(parties) if parties.len() <= FEW => {
+                let mut parties = parties.iter();
+                parties.position(|party| names.is(party.peer, agent))
+            }
+            Parties::Many(_) => self.indexed(names, agent),
         };
         let found = found.or_else(|| self.delegating(names, agent))?;
-        parties.get(found).map(|party| (found, party))
+        self.parties.get(found).map(|party| (found, party))
     }
 
     /// Finds a participant among many.
@@ -848,7 +864,23 @@ impl NextState {
 }
 
 /// Returns the state after a message, or the kind of violation.
+#[inline]
 pub(crate) fn next_state(
+    machine: &Machine,
+    party: &Party,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
+    match party.state {
+        AFTER_NOT_UNDERSTOOD | CANCELLING | CANCELLED | FAILED => {
+            after_common_step(machine, party, message)
+        }
+        _ if party.echo => after_common_step(machine, party, message),
+        own => in_state(machine, party, own, message),
+    }
+}
+
+/// Returns the state after a message that follows a cancel, a not-understood or a failure.
+fn after_common_step(
     machine: &Machine,
     party: &Party,
     message: &PartyMessage<'_>,

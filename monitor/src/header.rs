@@ -190,8 +190,9 @@ impl<'a> Header<'a> {
         self.receivers.len() + members.sum::<usize>()
     }
 
-    pub(crate) fn group_members(&self) -> impl Iterator<Item = &Cow<'a, str>> {
-        self.groups.iter().flat_map(|(_, members)| members)
+    /// The members of each group.
+    pub(crate) fn groups(&self) -> impl Iterator<Item = &[Cow<'a, str>]> {
+        self.groups.iter().map(|(_, members)| members.as_slice())
     }
 
     /// Returns the receivers, if these are not the names in the header: groups are replaced by their

@@ -226,14 +226,19 @@ impl Monitor {
         self.last = now;
         match self.take(header, now) {
             Ok(passed) => self.accepted(&passed),
-            Err(Denied::Unchecked(why)) => Verdict::Unchecked(why),
+            Err(denied) => self.denied(header, denied),
+        }
+    }
+
+    #[cold]
+    fn denied(&mut self, header: &Header<'_>, denied: Denied) -> Verdict<'_> {
+        match denied {
+            Denied::Unchecked(why) => Verdict::Unchecked(why),
             // A service that reports a failure follows no protocol.
-            Err(Denied::Fault(..) | Denied::NotOpened(_))
-                if header.undelivered_name().is_some() =>
-            {
+            Denied::Fault(..) | Denied::NotOpened(_) if header.undelivered_name().is_some() => {
                 Verdict::Unchecked(Unchecked::UnknownHistory)
             }
-            Err(denied) => {
+            denied => {
                 let key = |from, to: &str| self.key_of_refused(header, from, to);
                 let sender = header.sender_name().unwrap_or_default();
                 if header.act() == NOT_UNDERSTOOD {
@@ -324,13 +329,22 @@ impl Monitor {
         let Some(machine) = self.library.machine(passed.machine) else {
             return Verdict::Unchecked(Unchecked::UnknownProtocol);
         };
+        let own = machine.state(passed.state);
+        let (state, ended, over) = match own {
+            Some(own) => (own.id(), own.is_final(), own.is_over()),
+            None => (
+                state_name(machine, passed.state),
+                is_final(machine, passed.state),
+                is_over(machine, passed.state),
+            ),
+        };
         Verdict::Accepted(Accepted {
             protocol: machine.name(),
-            state: state_name(machine, passed.state),
-            own: machine.state(passed.state).is_some(),
+            state,
+            own: own.is_some(),
             opened: passed.opened,
-            ended: is_final(machine, passed.state),
-            over: is_over(machine, passed.state),
+            ended,
+            over,
             complete: passed.complete,
             late: passed.late,
             void: passed.void,
@@ -427,7 +441,7 @@ impl Monitor {
             || reply_to.len() > MAX_DESIGNATED
             || too_long_one(receivers)
             || too_long_one(reply_to)
-            || header.group_members().any(|name| too_long(name))
+            || header.groups().any(too_long_one)
     }
 
     fn without_conversation(&self, header: &Header<'_>) -> Denied {
@@ -520,10 +534,15 @@ impl Monitor {
 
     /// 2 if the sender and a receiver take part in the conversation or in one within it, 1 if the
     /// sender does.
+    #[inline]
     fn rank(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
-        if self.links(&slot.conversation, sender, observed) {
-            return 2;
+        match self.links(&slot.conversation, sender, observed) {
+            true => 2,
+            false => self.rank_without_link(slot, sender, observed),
         }
+    }
+
+    fn rank_without_link(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
         let children = std::iter::successors(Some(slot.child), |at| Some(self.table.sibling(*at)));
         let children = children.map_while(|at| self.table.slot(at));
         let inner = || children.clone().map(|slot| &slot.conversation);
@@ -1029,8 +1048,13 @@ impl Monitor {
         let is_new = |made: &&Move| made.target.is_new();
         let added = self.moves.iter().filter(is_new).count();
         let grown = conversation.parties.len() + added;
-        let moves = (self.moves.as_slice(), copied.is_some());
-        let growth = growth_by(machine, conversation, &self.names, observed, moves, header);
+        let adds = added > 0 || !header.reply_to_names().is_empty();
+        let growth = if adds || machine.scope == Scope::Conversation {
+            let moves = (self.moves.as_slice(), copied.is_some());
+            growth_by(machine, conversation, &self.names, observed, moves, header)
+        } else {
+            0
+        };
         let size = || Slot::COST + conversation.allocated() + growth;
         let agents = observed.receivers.len() + header.reply_to_names().len();
         if grown > self.limits.participants
@@ -1101,7 +1125,9 @@ impl Monitor {
         if !is_charged {
             self.charge(at);
         }
-        self.keep_deadlines_few();
+        if self.deadlines.are_many() {
+            self.remove_stale_deadlines();
+        }
         Ok(passed)
     }
 
@@ -1303,9 +1329,7 @@ impl Monitor {
         library.machine(self.table.slot(at)?.conversation.machine)
     }
 
-    /// Removes stale deadlines if there are too many.
-    #[inline]
-    fn keep_deadlines_few(&mut self) {
+    fn remove_stale_deadlines(&mut self) {
         let table = &self.table;
         let counts = |deadline: &Deadline| {
             let slot = table.slot(deadline.at);
@@ -1314,12 +1338,13 @@ impl Monitor {
             let party = parties.and_then(|parties| parties.get(deadline.party as usize));
             party.is_some_and(|party| party.deadline == deadline.due)
         };
-        self.deadlines.keep_few(counts);
+        self.deadlines.remove_stale(counts);
     }
 }
 
 impl Passed {
     /// The result of a message that changes nothing.
+    #[inline]
     pub(crate) fn in_state_of(conversation: &Conversation, machine: &Machine, index: u16) -> Self {
         let parties = &conversation.parties;
         Self {
@@ -1368,13 +1393,9 @@ fn growth_by(
     (moves, is_copied): (&[Move], bool),
     header: &Header<'_>,
 ) -> usize {
-    let reply_to = header.reply_to_names();
-    let adds = reply_to.len() + moves.iter().filter(|made| made.target.is_new()).count();
-    if machine.scope == Scope::Participant && adds == 0 {
-        return 0;
-    }
     let name = |name: &Cow<'_, str>| Names::cost(name.len());
     let sender = Names::cost(observed.sender.len());
+    let reply_to = header.reply_to_names();
     let designated = reply_to.iter().map(name).sum::<usize>();
     match machine.scope {
         Scope::Participant => {

@@ -60,13 +60,16 @@ impl Parties {
     }
 
     /// Bytes that the parties have allocated.
+    #[inline]
     pub(crate) fn allocated(&self) -> usize {
-        let own = match self {
+        match self {
+            Self::One(party) => party.allocated(),
             Self::None(buffer) => buffer.as_ref().map_or(0, |_| size_of::<Details>()),
-            Self::One(_) => 0,
-            Self::Many(all) => all.capacity() * size_of::<Party>(),
-        };
-        own + self.iter().map(Party::allocated).sum::<usize>()
+            Self::Many(all) => {
+                let own = all.capacity() * size_of::<Party>();
+                own + all.iter().map(Party::allocated).sum::<usize>()
+            }
+        }
     }
 
     /// Returns an upper bound of the bytes that so many more parties allocate. Each party may still allocate

@@ -174,12 +174,14 @@ impl Slot {
     }
 
     /// Bytes of the conversation.
+    #[inline]
     fn cost(&self) -> u32 {
         let cost = Self::COST + self.conversation.allocated();
         u32::try_from(cost).unwrap_or(u32::MAX)
     }
 
     /// Whether the peer of the conversation is charged with its present size.
+    #[inline]
     pub(crate) fn is_charged(&self) -> bool {
         self.conversation.cost == self.cost()
     }
