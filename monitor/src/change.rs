@@ -45,7 +45,7 @@ pub(crate) struct Change<'a> {
 }
 
 impl Change<'_> {
-    pub(crate) fn make(&mut self, conversation: &mut Conversation, made: Move) {
+    pub(crate) fn make(&mut self, conversation: &mut Conversation, made: &Move) {
         let fresh = |peer| Party::new(peer, self.machine.initial);
         let index = match made.target {
             MoveTarget::Party(index) => index,
@@ -72,7 +72,7 @@ impl Change<'_> {
                 return;
             }
         };
-        self.opened |= matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
+        self.opened |= made.target.is_new();
         if let Some(party) = conversation.parties.get_mut(index) {
             self.opened |= party.acts == [0; 2];
             self.move_party(party, made);
@@ -86,10 +86,11 @@ impl Change<'_> {
         }
     }
 
-    fn move_party(&mut self, party: &mut Party, made: Move) {
+    fn move_party(&mut self, party: &mut Party, made: &Move) {
         let Move {
             side, next_state, ..
         } = made;
+        let side = *side;
         if let Some(world) = next_state.world {
             party.settle(world);
         }
@@ -191,9 +192,6 @@ impl Change<'_> {
         moves: &[Move],
         header: &Header<'_>,
     ) {
-        if header.reply_to_names().is_empty() {
-            return;
-        }
         if self.machine.scope == Scope::Conversation {
             let sender = self.observed.sender;
             let bound = conversation.bound.iter();

@@ -54,7 +54,9 @@ impl From<SystemTime> for Now {
 }
 
 pub(crate) fn span_millis(span: Duration) -> u64 {
-    u64::try_from(span.as_millis()).unwrap_or(u64::MAX)
+    // The same as `Duration::as_millis`, without 128 bits.
+    let seconds = span.as_secs().saturating_mul(1_000);
+    seconds.saturating_add(u64::from(span.subsec_millis()))
 }
 
 #[cfg(test)]

@@ -155,6 +155,17 @@ struct StepValues {
     cancel: u64,
 }
 
+impl Details {
+    /// Bytes of the details and of what they have allocated.
+    fn allocated(&self) -> usize {
+        let worlds = self.worlds.as_deref();
+        size_of::<Self>()
+            + worlds.map_or(0, |Worlds { missing, arrived }| {
+                size_of::<Worlds>() + missing.allocated() + arrived.allocated()
+            })
+    }
+}
+
 /// The party if a message that was reported as failed has not arrived, and if it has arrived. The next
 /// message shows which is true.
 #[derive(Debug, Clone)]
@@ -220,15 +231,9 @@ impl Party {
     }
 
     /// Bytes that the party has allocated.
+    #[inline]
     pub(crate) fn allocated(&self) -> usize {
-        let Some(details) = self.details.as_deref() else {
-            return 0;
-        };
-        let worlds = details.worlds.as_deref();
-        size_of::<Details>()
-            + worlds.map_or(0, |Worlds { missing, arrived }| {
-                size_of::<Worlds>() + missing.allocated() + arrived.allocated()
-            })
+        self.details.as_deref().map_or(0, Details::allocated)
     }
 
     /// Records the message that is about to change the party, and whether it is a cancel.
@@ -237,14 +242,7 @@ impl Party {
         let (own_asked, deadline) = (self.asked[index], self.deadline);
         let has_values = cancels || [reply_with, own_asked, deadline] != [0; 3];
         if has_values {
-            let details = self.details();
-            details.step = StepValues {
-                reply_with,
-                own_asked,
-                displaced: details.earlier[index][EARLIER - 1],
-                deadline,
-                cancel: details.cancel,
-            };
+            self.keep_values(index, reply_with);
         }
         self.last_step = Some(LastStep {
             side,
@@ -259,6 +257,18 @@ impl Party {
             cancels,
             has_values,
         });
+    }
+
+    fn keep_values(&mut self, index: usize, reply_with: u64) {
+        let (own_asked, deadline) = (self.asked[index], self.deadline);
+        let details = self.details();
+        details.step = StepValues {
+            reply_with,
+            own_asked,
+            displaced: details.earlier[index][EARLIER - 1],
+            deadline,
+            cancel: details.cancel,
+        };
     }
 
     /// Decides that a message which was reported as failed has arrived, or has not.
@@ -331,12 +341,16 @@ impl Party {
     }
 
     /// Records the `reply-with` of a message, of which `text` is the text.
+    #[inline]
     pub(crate) fn ask(&mut self, side: Side, reply_with: u64, text: &str) {
-        let index = side_index(side);
-        let before = std::mem::replace(&mut self.asked[index], reply_with);
-        if before == 0 && reply_with == 0 {
-            return;
+        let before = std::mem::replace(&mut self.asked[side_index(side)], reply_with);
+        if before != 0 || reply_with != 0 {
+            self.keep_asked(side, before, text);
         }
+    }
+
+    fn keep_asked(&mut self, side: Side, before: u64, text: &str) {
+        let index = side_index(side);
         let details = self.details();
         if before != 0 {
             details.earlier[index].rotate_right(1);
@@ -425,6 +439,7 @@ impl Bound {
     }
 
     /// Bytes that the bindings have allocated.
+    #[inline]
     fn allocated(&self) -> usize {
         self.bindings.as_deref().map_or(0, |bindings| {
             let spilled = match bindings.spilled() {
@@ -496,6 +511,29 @@ pub(crate) struct Rare {
     pub(crate) copied: Vec<Copied>,
     /// The parties by their peers, if there are more than [`FEW`].
     index: HashTable<(Name, u32)>,
+}
+
+impl Rare {
+    /// Bytes of these parts, and those that they have allocated.
+    fn allocated(&self) -> usize {
+        let unnamed = self.unnamed.as_deref();
+        let copies = self.copied.iter();
+        size_of::<Self>()
+            + self.reply_to.capacity() * size_of::<Name>()
+            + unnamed.map_or(0, |party| size_of::<Party>() + party.allocated())
+            + self.delegates.capacity() * size_of::<(u32, Name)>()
+            + self.alternatives.capacity() * size_of::<(u32, u16)>()
+            + self.copied.capacity() * size_of::<Copied>()
+            + copies
+                .map(|copied| 8 * copied.seen.capacity())
+                .sum::<usize>()
+            + match self.asked.spilled() {
+                true => self.asked.capacity() * size_of::<RoleBinding>(),
+                false => 0,
+            }
+            + self.index.allocation_size()
+            + self.local.as_ref().map_or(0, LocalRun::allocated)
+    }
 }
 
 /// The last message of the monitored agent in a conversation that its role sees.
@@ -570,28 +608,9 @@ impl Conversation {
     }
 
     /// Bytes that the conversation has allocated.
+    #[inline]
     pub(crate) fn allocated(&self) -> usize {
-        let rare = self.rare.as_deref().map_or(0, |rare| {
-            let copies = rare.copied.iter();
-            size_of::<Rare>()
-                + rare.reply_to.capacity() * size_of::<Name>()
-                + rare
-                    .unnamed
-                    .as_deref()
-                    .map_or(0, |party| size_of::<Party>() + party.allocated())
-                + rare.delegates.capacity() * size_of::<(u32, Name)>()
-                + rare.alternatives.capacity() * size_of::<(u32, u16)>()
-                + rare.copied.capacity() * size_of::<Copied>()
-                + copies
-                    .map(|copied| 8 * copied.seen.capacity())
-                    .sum::<usize>()
-                + match rare.asked.spilled() {
-                    true => rare.asked.capacity() * size_of::<RoleBinding>(),
-                    false => 0,
-                }
-                + rare.index.allocation_size()
-                + rare.local.as_ref().map_or(0, LocalRun::allocated)
-        });
+        let rare = self.rare.as_deref().map_or(0, Rare::allocated);
         let texts = usize::try_from(self.charged_texts).unwrap_or(usize::MAX);
         self.parties.allocated() + self.bound.allocated() + rare + texts
     }
@@ -676,23 +695,40 @@ impl Conversation {
     }
 
     /// Finds the party of an agent: a participant, or an agent that continues in its place.
+    #[inline]
     pub(crate) fn party(&self, names: &Names, agent: &str) -> Option<(usize, &Party)> {
-        let found = if self.parties.len() <= FEW {
-            let mut parties = self.parties.iter();
-            parties.position(|party| names.is(party.peer, agent))
-        } else {
-            let index = self.rare.as_deref().map(|rare| &rare.index);
-            names.known(agent).zip(index).and_then(|(peer, index)| {
-                let found = index.find(spread(peer), |(known, _)| *known == peer);
-                found.and_then(|(_, at)| usize::try_from(*at).ok())
-            })
+        match &self.parties {
+            Parties::One(only) if names.is(only.peer, agent) => Some((0, only)),
+            _ => self.other_party(names, agent),
+        }
+    }
+
+    fn other_party(&self, names: &Names, agent: &str) -> Option<(usize, &Party)> {
+        let found = match &self.parties {
+            Parties::None(_) | Parties::One(_) => None,
+            Parties::Many(parties) if parties.len() <= FEW => {
+                let mut parties = parties.iter();
+                parties.position(|party| names.is(party.peer, agent))
+            }
+            Parties::Many(_) => self.indexed(names, agent),
         };
-        let found = found.or_else(|| {
-            let mut delegates = self.delegates().iter();
-            let delegate = delegates.find(|(_, delegate)| names.is(*delegate, agent));
-            delegate.and_then(|(at, _)| usize::try_from(*at).ok())
-        })?;
+        let found = found.or_else(|| self.delegating(names, agent))?;
         self.parties.get(found).map(|party| (found, party))
+    }
+
+    /// Finds a participant among many.
+    fn indexed(&self, names: &Names, agent: &str) -> Option<usize> {
+        let index = &self.rare.as_deref()?.index;
+        let peer = names.known(agent)?;
+        let (_, at) = index.find(spread(peer), |(known, _)| *known == peer)?;
+        usize::try_from(*at).ok()
+    }
+
+    /// Finds the participant in whose place an agent continues.
+    fn delegating(&self, names: &Names, agent: &str) -> Option<usize> {
+        let mut delegates = self.delegates().iter();
+        let (at, _) = delegates.find(|(_, delegate)| names.is(*delegate, agent))?;
+        usize::try_from(*at).ok()
     }
 
     pub(crate) fn delegates(&self) -> &[(u32, Name)] {
@@ -828,7 +864,23 @@ impl NextState {
 }
 
 /// Returns the state after a message, or the kind of violation.
+#[inline]
 pub(crate) fn next_state(
+    machine: &Machine,
+    party: &Party,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
+    match party.state {
+        AFTER_NOT_UNDERSTOOD | CANCELLING | CANCELLED | FAILED => {
+            after_common_step(machine, party, message)
+        }
+        _ if party.echo => after_common_step(machine, party, message),
+        own => in_state(machine, party, own, message),
+    }
+}
+
+/// Returns the state after a message that follows a cancel, a not-understood or a failure.
+fn after_common_step(
     machine: &Machine,
     party: &Party,
     message: &PartyMessage<'_>,
@@ -1045,24 +1097,31 @@ fn in_state(
     let Some(here) = machine.state(state) else {
         return Err(Kind::Unexpected);
     };
-    let taken = step(&here.steps, message.act, message.from, message.to);
-    let proxied = || {
-        let mut embedded = here.embedded.iter();
-        embedded.any(|sub| {
-            let to = sub.proxied_to.as_ref();
-            sub.from.includes(message.from) && to.is_some_and(|to| to.includes(message.to))
-        })
+    let Some(step) = step(&here.steps, message.act, message.from, message.to) else {
+        return without_step(machine, party, state, message);
     };
-    if let Some(step) = taken {
-        return Ok(match in_reply(party, message)? {
-            Reply::ToLast => NextState::taking(step),
-            Reply::ToEarlier => NextState {
-                void: true,
-                ..NextState::to(state)
-            },
-        });
-    }
-    if proxied() {
+    Ok(match in_reply(party, message)? {
+        Reply::ToLast => NextState::taking(step),
+        Reply::ToEarlier => NextState {
+            void: true,
+            ..NextState::to(state)
+        },
+    })
+}
+
+/// Returns the state after a message for which one of the protocol's own states has no transition.
+fn without_step(
+    machine: &Machine,
+    party: &Party,
+    state: u16,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
+    let embedded = machine.state(state).map(|here| here.embedded.iter());
+    let proxied = embedded.into_iter().flatten().any(|sub| {
+        let to = sub.proxied_to.as_ref();
+        sub.from.includes(message.from) && to.is_some_and(|to| to.includes(message.to))
+    });
+    if proxied {
         return Ok(NextState::to(state));
     }
     if let Some(next_state) = by_default(machine, party, state, message) {

@@ -47,14 +47,17 @@ impl Deadlines {
         self.heap.pop().map(|Reverse(deadline)| deadline)
     }
 
-    /// Removes stale deadlines if there may be more of them than of valid ones. `counts` tells
-    /// whether a deadline is valid.
-    pub(crate) fn keep_few(&mut self, counts: impl Fn(&Deadline) -> bool) {
+    /// Whether there may be more stale deadlines than valid ones.
+    #[inline]
+    pub(crate) fn are_many(&self) -> bool {
         const SOME: usize = 1_024;
-        if self.heap.len() > 2 * self.counted + SOME {
-            self.heap.retain(|Reverse(deadline)| counts(deadline));
-            self.counted = self.heap.len();
-        }
+        self.heap.len() > 2 * self.counted + SOME
+    }
+
+    /// Removes stale deadlines. `counts` tells whether a deadline is valid.
+    pub(crate) fn remove_stale(&mut self, counts: impl Fn(&Deadline) -> bool) {
+        self.heap.retain(|Reverse(deadline)| counts(deadline));
+        self.counted = self.heap.len();
     }
 }
 
@@ -81,7 +84,9 @@ mod tests {
         assert_eq!(deadlines.pop_before(6), None);
         for due in 0..100_000 {
             deadlines.push(deadline(due));
-            deadlines.keep_few(|deadline| deadline.due % 100 == 0);
+            if deadlines.are_many() {
+                deadlines.remove_stale(|deadline| deadline.due % 100 == 0);
+            }
         }
         assert!(deadlines.heap.len() < 4_000, "{}", deadlines.heap.len());
     }
@@ -98,7 +103,9 @@ mod tests {
                     party: 0,
                 });
             }
-            deadlines.keep_few(|_| counts);
+            if deadlines.are_many() {
+                deadlines.remove_stale(|_| counts);
+            }
             deadlines.len()
         };
         assert_eq!(left(1_024, false), 1_024);

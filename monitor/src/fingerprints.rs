@@ -28,10 +28,12 @@ impl Fingerprints {
     }
 
     /// Returns the fingerprint of a text, and 0 for none.
+    #[inline]
     pub(crate) fn of(&self, text: Option<&str>) -> u64 {
-        let Some(text) = text else {
-            return 0;
-        };
+        text.map_or(0, |text| self.of_text(text))
+    }
+
+    fn of_text(&self, text: &str) -> u64 {
         let [first, second] = self.keys;
         let mut hasher = SipHasher13::new_with_keys(first, second);
         hasher.write(text.as_bytes());

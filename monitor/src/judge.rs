@@ -53,6 +53,13 @@ pub(crate) enum MoveTarget {
     Sender,
 }
 
+impl MoveTarget {
+    /// Whether the move adds a party with a name.
+    pub(crate) fn is_new(self) -> bool {
+        matches!(self, Self::Receiver(_) | Self::Sender)
+    }
+}
+
 /// The kind of a violation, and the party with the violated state.
 #[derive(Debug, Clone)]
 pub(crate) struct Fault {

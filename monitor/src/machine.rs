@@ -195,14 +195,15 @@ impl Machine {
 
     /// Whether `name` is the name or an alias of the protocol. Case is ignored.
     #[must_use]
+    #[inline]
     pub fn is_called(&self, name: &str) -> bool {
         // Comparing bytes is several times as fast, and nearly all messages have this name.
-        self.name == name
-            || self.name.eq_ignore_ascii_case(name)
-            || self
-                .aliases
-                .iter()
-                .any(|alias| alias.eq_ignore_ascii_case(name))
+        self.name == name || self.is_called_in_any_case(name)
+    }
+
+    fn is_called_in_any_case(&self, name: &str) -> bool {
+        let mut names = std::iter::once(&self.name).chain(&self.aliases);
+        names.any(|known| known.eq_ignore_ascii_case(name))
     }
 
     /// The state to which a transition of this machine leads.

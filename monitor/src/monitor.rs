@@ -23,7 +23,7 @@ use crate::memory::{Refused, Removed};
 use crate::names::{Name, Names};
 use crate::report::violation;
 use crate::roles::take_back_local;
-use crate::table::{List, Table};
+use crate::table::{List, Slot, Table};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
 use crate::{Header, History, Library, Limits, Now, Policy};
 
@@ -226,14 +226,19 @@ impl Monitor {
         self.last = now;
         match self.take(header, now) {
             Ok(passed) => self.accepted(&passed),
-            Err(Denied::Unchecked(why)) => Verdict::Unchecked(why),
+            Err(denied) => self.denied(header, denied),
+        }
+    }
+
+    #[cold]
+    fn denied(&mut self, header: &Header<'_>, denied: Denied) -> Verdict<'_> {
+        match denied {
+            Denied::Unchecked(why) => Verdict::Unchecked(why),
             // A service that reports a failure follows no protocol.
-            Err(Denied::Fault(..) | Denied::NotOpened(_))
-                if header.undelivered_name().is_some() =>
-            {
+            Denied::Fault(..) | Denied::NotOpened(_) if header.undelivered_name().is_some() => {
                 Verdict::Unchecked(Unchecked::UnknownHistory)
             }
-            Err(denied) => {
+            denied => {
                 let key = |from, to: &str| self.key_of_refused(header, from, to);
                 let sender = header.sender_name().unwrap_or_default();
                 if header.act() == NOT_UNDERSTOOD {
@@ -270,10 +275,11 @@ impl Monitor {
         let act = header.act();
         let reply_with = self.fingerprints.of(header.reply_with_text());
         let library = Arc::clone(&self.library);
-        let mains: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
-        for main in mains {
-            let mut at = main;
-            let mut next = self.table.slot(main).map_or(NONE, |slot| slot.child);
+        let mains = self.table.find_all(id);
+        let mains = mains.map(|(main, slot)| (main, slot.child));
+        let mains: SmallVec<[(u32, u32); MAX_ALIKE]> = mains.collect();
+        for (main, child) in mains {
+            let (mut at, mut next) = (main, child);
             loop {
                 let machine = self.machine_of(&library, at);
                 let named = header.protocol_name();
@@ -323,13 +329,22 @@ impl Monitor {
         let Some(machine) = self.library.machine(passed.machine) else {
             return Verdict::Unchecked(Unchecked::UnknownProtocol);
         };
+        let own = machine.state(passed.state);
+        let (state, ended, over) = match own {
+            Some(own) => (own.id(), own.is_final(), own.is_over()),
+            None => (
+                state_name(machine, passed.state),
+                is_final(machine, passed.state),
+                is_over(machine, passed.state),
+            ),
+        };
         Verdict::Accepted(Accepted {
             protocol: machine.name(),
-            state: state_name(machine, passed.state),
-            own: machine.state(passed.state).is_some(),
+            state,
+            own: own.is_some(),
             opened: passed.opened,
-            ended: is_final(machine, passed.state),
-            over: is_over(machine, passed.state),
+            ended,
+            over,
             complete: passed.complete,
             late: passed.late,
             void: passed.void,
@@ -355,18 +370,17 @@ impl Monitor {
                 None => Denied::Unchecked(Unchecked::TooLarge),
             });
         }
-        let agent = self.agent.clone();
-        let agent = agent.as_deref();
-        let own = agent == Some(sender);
+        let own = self.agent.as_deref() == Some(sender);
         let other = header.other_receivers();
         let mut receivers = other.as_deref().unwrap_or(header.receiver_names());
         let mut own_receiver = None;
-        let member;
-        if let Some(agent) = agent.filter(|_| !own) {
-            own_receiver = receivers.iter().position(|receiver| *receiver == agent);
+        let (member, members);
+        if let Some(agent) = self.agent.as_ref().filter(|_| !own) {
+            own_receiver = receivers.iter().position(|receiver| **receiver == **agent);
             if own_receiver.is_none() {
-                member = [Cow::Borrowed(agent)];
-                (receivers, own_receiver) = (&member, Some(0));
+                member = Arc::clone(agent);
+                members = [Cow::Borrowed(&*member)];
+                (receivers, own_receiver) = (&members, Some(0));
             }
         }
         if receivers.is_empty() {
@@ -383,7 +397,7 @@ impl Monitor {
             undelivered_to: header.undelivered_name(),
             own_receiver,
         };
-        let Some(main) = self.place(id, header, &observed) else {
+        let Some((main, slot)) = self.place(id, header, &observed) else {
             if observed.undelivered_to.is_some() {
                 return unchecked(Unchecked::UnknownHistory);
             }
@@ -395,29 +409,20 @@ impl Monitor {
             };
             return self.open(id, NONE, machine, header, &observed, now);
         };
-        let machine = self.machine_of(&self.library, main);
+        let machine = self.library.machine(slot.conversation.machine);
         let follows = |name| {
             machine.is_some_and(|machine: &Machine| machine.is_called(name))
                 || self.is_cancel_of(main, name, observed.sender, observed.act)
         };
         if header.protocol_name().is_none_or(follows) {
-            let projection = machine.and_then(|machine| machine.projection.clone());
-            let slot = self.table.slot(main);
-            let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
-            if let Some(projection) = projection
-                && rare.is_some_and(|rare| rare.local.is_some())
+            if slot.conversation.is_local()
+                && let Some(projection) = machine.and_then(|machine| machine.projection.clone())
             {
                 let passed = self.advance_local(main, &projection, &observed, now);
                 return passed.map_err(|denied| self.recheck_local(id, main, denied));
             }
             let passed = self.advance(main, header, &observed, now);
-            return passed.map_err(|denied| {
-                if observed.undelivered_to.is_some() {
-                    return denied;
-                }
-                let denied = self.recheck_delegated(main, &observed, denied, now);
-                self.recheck_beginning(main, denied)
-            });
+            return passed.map_err(|denied| self.recheck(main, &observed, denied, now));
         }
         let library = Arc::clone(&self.library);
         self.embedded(&library, main, header, &observed, now)
@@ -426,7 +431,7 @@ impl Monitor {
     fn is_too_large(&self, header: &Header<'_>, id: &str, sender: &str) -> bool {
         let too_long = |text: &str| text.len() > MAX_TEXT;
         let (receivers, reply_to) = (header.receiver_names(), header.reply_to_names());
-        let named = receivers.iter().chain(reply_to);
+        let too_long_one = |names: &[Cow<'_, str>]| names.iter().any(|name| too_long(name));
         too_long(id)
             || too_long(sender)
             || header.peer_name().is_some_and(too_long)
@@ -434,9 +439,9 @@ impl Monitor {
             || header.receiver_count() > self.limits.participants
             || header.addressed().len() > self.limits.participants
             || reply_to.len() > MAX_DESIGNATED
-            || named
-                .chain(header.group_members())
-                .any(|name| too_long(name))
+            || too_long_one(receivers)
+            || too_long_one(reply_to)
+            || header.groups().any(too_long_one)
     }
 
     fn without_conversation(&self, header: &Header<'_>) -> Denied {
@@ -462,39 +467,53 @@ impl Monitor {
 
     /// Finds the conversation of a message among those with its identifier: the one in which sender and
     /// receiver take part. Otherwise, an agent that does not lead one of them can begin another.
-    fn place(&self, id: &str, header: &Header<'_>, observed: &ObservedMessage<'_>) -> Option<u32> {
+    fn place(
+        &self,
+        id: &str,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+    ) -> Option<(u32, &Slot)> {
         // One search: hashing the identifier is a large part of a check.
-        let alike: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
-        let mut local = alike.iter();
-        if let Some(at) = local.find(|at| self.fits_role(**at, header, observed)) {
-            return Some(*at);
-        }
+        let mut found = self.table.find_all(id);
+        let first = found.next()?;
+        let fits_role = |slot: &Slot| self.fits_role(&slot.conversation, header, observed);
         // A service stands for the agent that did not get a message.
         let sender = observed.undelivered_to.unwrap_or(observed.sender);
-        if let [only] = alike.as_slice()
-            && self.rank(*only, sender, observed) == 2
-        {
-            return Some(*only);
-        }
-        let ranked = alike.iter().map(|at| {
-            let rank = self.rank(*at, sender, observed);
-            let slot = self.table.slot(*at);
-            // Other agents may take part in a conversation that began elsewhere.
-            let joined = rank == 0 && slot.is_some_and(|slot| slot.conversation.joined);
-            let serial = self.table.serial(*at);
-            (
-                rank,
-                joined,
-                self.has_protocol(*at, header, observed),
-                serial,
-                *at,
-            )
-        });
+        let Some(second) = found.next() else {
+            // Nearly all identifiers have one conversation.
+            let (_, slot) = first;
+            if fits_role(slot) || self.rank(slot, sender, observed) == 2 {
+                return Some(first);
+            }
+            return self.place_among(id, &[first], header, observed);
+        };
+        let alike = [first, second].into_iter().chain(found);
+        let alike: SmallVec<[(u32, &Slot); MAX_ALIKE]> = alike.collect();
+        let local = alike.iter().find(|(_, slot)| fits_role(slot)).copied();
+        local.or_else(|| self.place_among(id, &alike, header, observed))
+    }
+
+    /// Finds the conversation of a message among those with its identifier, of which the roles of agents
+    /// show none.
+    #[inline(never)]
+    fn place_among<'s>(
+        &self,
+        id: &str,
+        alike: &[(u32, &'s Slot)],
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+    ) -> Option<(u32, &'s Slot)> {
+        let sender = observed.undelivered_to.unwrap_or(observed.sender);
         // Of several, the last that began.
-        let best = ranked.max();
-        let (rank, .., at) = best?;
-        if rank == 2 || self.single {
-            return Some(at);
+        let (at, slot) = *alike.iter().max_by_key(|(at, slot)| {
+            let rank = self.rank(slot, sender, observed);
+            // Other agents may take part in a conversation that began elsewhere.
+            let joined = rank == 0 && slot.conversation.joined;
+            let has_protocol = self.has_protocol(*at, header, observed);
+            (rank, joined, has_protocol, self.table.serial(*at), *at)
+        })?;
+        if self.single || self.rank(slot, sender, observed) == 2 {
+            return Some((at, slot));
         }
         if observed.undelivered_to.is_some() {
             return None;
@@ -510,63 +529,75 @@ impl Monitor {
             // The monitor may have removed the conversation of the message.
             _ => self.is_certain(id),
         };
-        stays.then_some(at)
+        stays.then_some((at, slot))
     }
 
     /// 2 if the sender and a receiver take part in the conversation or in one within it, 1 if the
     /// sender does.
-    fn rank(&self, main: u32, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
-        let any = |takes_part: &dyn Fn(&Conversation) -> bool| {
-            let mut at = main;
-            let mut slot = self.table.slot(main);
-            let first = slot.map_or(NONE, |slot| slot.child);
-            while let Some(here) = slot {
-                if takes_part(&here.conversation) {
-                    return true;
-                }
-                at = if at == main {
-                    first
-                } else {
-                    self.table.sibling(at)
-                };
-                slot = self.table.slot(at);
-            }
-            false
-        };
-        let has = |conversation: &Conversation, agent: &str| {
-            conversation.is_local() && self.agent.as_deref() == Some(agent)
-                || conversation.takes_part(&self.names, agent)
-                || conversation.is_designated(&self.names, agent)
-        };
-        let sends = |conversation: &Conversation| {
-            conversation.unnamed().is_some() || has(conversation, sender)
-        };
-        let receives = |conversation: &Conversation| {
-            let mut receivers = observed.receivers.iter().take(MAX_LOOKED_AT);
-            receivers.any(|receiver| has(conversation, receiver))
-        };
-        // With a state for each participant, these exchange messages with the initiator only.
-        let linked = |conversation: &Conversation| {
-            let machine = self.library.machine(conversation.machine);
-            if machine.is_none_or(|machine| machine.scope == Scope::Conversation) {
-                return sends(conversation) && receives(conversation);
-            }
-            let names = &self.names;
-            let leads = |agent: &str| {
-                names.is(conversation.initiator, agent) || conversation.is_designated(names, agent)
-            };
-            let answers = |agent: &str| {
-                conversation.unnamed().is_some() || conversation.party(names, agent).is_some()
-            };
-            let receivers = || observed.receivers.iter().take(MAX_LOOKED_AT);
-            leads(sender) && receivers().any(|receiver| answers(receiver))
-                || answers(sender) && receivers().any(|receiver| leads(receiver))
-        };
-        let embeds = self.table.slot(main).is_some_and(|slot| slot.child != NONE);
-        if any(&linked) || embeds && any(&sends) && any(&receives) {
+    #[inline]
+    fn rank(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
+        match self.links(&slot.conversation, sender, observed) {
+            true => 2,
+            false => self.rank_without_link(slot, sender, observed),
+        }
+    }
+
+    fn rank_without_link(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
+        let children = std::iter::successors(Some(slot.child), |at| Some(self.table.sibling(*at)));
+        let children = children.map_while(|at| self.table.slot(at));
+        let inner = || children.clone().map(|slot| &slot.conversation);
+        let all = || inner().chain([&slot.conversation]);
+        let sends = |conversation: &Conversation| self.sends_in(conversation, sender);
+        let receives = |conversation: &Conversation| self.receives_in(conversation, observed);
+        let embeds = slot.child != NONE;
+        if embeds
+            && (inner().any(|conversation| self.links(conversation, sender, observed))
+                || all().any(sends) && all().any(receives))
+        {
             return 2;
         }
-        u8::from(any(&sends))
+        u8::from(all().any(sends))
+    }
+
+    /// Whether a message of this sender fits the agents of the conversation.
+    #[inline]
+    fn links(
+        &self,
+        conversation: &Conversation,
+        sender: &str,
+        observed: &ObservedMessage<'_>,
+    ) -> bool {
+        let machine = self.library.machine(conversation.machine);
+        if machine.is_none_or(|machine| machine.scope == Scope::Conversation) {
+            return self.sends_in(conversation, sender) && self.receives_in(conversation, observed);
+        }
+        // With a state for each participant, these exchange messages with the initiator only.
+        let names = &self.names;
+        let leads = |agent: &str| {
+            names.is(conversation.initiator, agent) || conversation.is_designated(names, agent)
+        };
+        let answers = |agent: &str| {
+            conversation.unnamed().is_some() || conversation.party(names, agent).is_some()
+        };
+        let receivers = || observed.receivers.iter().take(MAX_LOOKED_AT);
+        leads(sender) && receivers().any(|receiver| answers(receiver))
+            || answers(sender) && receivers().any(|receiver| leads(receiver))
+    }
+
+    fn sends_in(&self, conversation: &Conversation, sender: &str) -> bool {
+        conversation.unnamed().is_some() || self.has(conversation, sender)
+    }
+
+    fn receives_in(&self, conversation: &Conversation, observed: &ObservedMessage<'_>) -> bool {
+        let mut receivers = observed.receivers.iter().take(MAX_LOOKED_AT);
+        receivers.any(|receiver| self.has(conversation, receiver))
+    }
+
+    /// Whether the agent takes part in the conversation, or may.
+    fn has(&self, conversation: &Conversation, agent: &str) -> bool {
+        conversation.is_local() && self.agent.as_deref() == Some(agent)
+            || conversation.takes_part(&self.names, agent)
+            || conversation.is_designated(&self.names, agent)
     }
 
     /// Whether the protocol of a message is that of the conversation or of one within it, or may begin
@@ -639,6 +670,22 @@ impl Monitor {
             };
         }
         true
+    }
+
+    /// Reconsiders the refusal of a message in a conversation of which the monitor may not know all.
+    #[cold]
+    fn recheck(
+        &mut self,
+        at: u32,
+        observed: &ObservedMessage<'_>,
+        denied: Denied,
+        now: Now,
+    ) -> Denied {
+        if observed.undelivered_to.is_some() {
+            return denied;
+        }
+        let denied = self.recheck_delegated(at, observed, denied, now);
+        self.recheck_beginning(at, denied)
     }
 
     /// If a conversation may have begun before the monitor, a violation is none: it shows that the
@@ -847,7 +894,7 @@ impl Monitor {
             NONE => 0,
             peer => Names::cost(self.names.text(peer).len()),
         };
-        let bytes = crate::table::Slot::COST + id.len() + peer_cost;
+        let bytes = Slot::COST + id.len() + peer_cost;
         self.evict(parent, peer, 1, bytes);
         let at = self.table.insert(id, parent, peer, machine, now.millis());
         if let Some(slot) = self.table.slot_mut(at) {
@@ -894,7 +941,8 @@ impl Monitor {
     /// Removes the least recently active conversation with this identifier, if there are too many of
     /// them. Those that the monitored agent began stay.
     fn evict_alike(&mut self, id: &str) -> Result<(), Denied> {
-        let alike: SmallVec<[u32; MAX_ALIKE]> = self.table.find_all(id).collect();
+        let alike = self.table.find_all(id).map(|(at, _)| at);
+        let alike: SmallVec<[u32; MAX_ALIKE]> = alike.collect();
         if alike.len() < MAX_ALIKE {
             return Ok(());
         }
@@ -997,13 +1045,17 @@ impl Monitor {
             &mut self.moves,
         )
         .map_err(|fault| Denied::Fault(fault, at))?;
-        let new =
-            |made: &&Move| matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
-        let added = self.moves.iter().filter(new).count();
+        let is_new = |made: &&Move| made.target.is_new();
+        let added = self.moves.iter().filter(is_new).count();
         let grown = conversation.parties.len() + added;
-        let moves = (self.moves.as_slice(), copied.is_some());
-        let growth = growth_by(machine, conversation, &self.names, observed, moves, header);
-        let size = || crate::table::Slot::COST + conversation.allocated() + growth;
+        let adds = added > 0 || !header.reply_to_names().is_empty();
+        let growth = if adds || machine.scope == Scope::Conversation {
+            let moves = (self.moves.as_slice(), copied.is_some());
+            growth_by(machine, conversation, &self.names, observed, moves, header)
+        } else {
+            0
+        };
+        let size = || Slot::COST + conversation.allocated() + growth;
         let agents = observed.receivers.len() + header.reply_to_names().len();
         if grown > self.limits.participants
             || conversation.bound.len() + agents > self.limits.participants + 1
@@ -1038,20 +1090,24 @@ impl Monitor {
             if machine.scope == Scope::Conversation {
                 change.bind(&mut slot.conversation, made.next_state.roles);
             }
-            change.make(&mut slot.conversation, *made);
+            change.make(&mut slot.conversation, made);
         }
-        if change.names_designated(&slot.conversation, &self.moves) {
-            change.designate(&mut slot.conversation, header);
-        } else {
-            change.delegate(&mut slot.conversation, &self.moves, header);
+        if !header.reply_to_names().is_empty() {
+            if change.names_designated(&slot.conversation, &self.moves) {
+                change.designate(&mut slot.conversation, header);
+            } else {
+                change.delegate(&mut slot.conversation, &self.moves, header);
+            }
         }
         let (opened, moved) = (change.opened, change.state);
         let (late, void) = (change.late, change.void);
         if let Some(((fingerprint, receiver), roles)) = copied.zip(roles) {
             keep_copied(&mut slot.conversation, fingerprint, receiver, roles);
         }
-        let moves = (self.moves.as_slice(), before);
-        keep_alternatives(machine, &mut slot.conversation, observed, moves);
+        if let Some(before) = before {
+            let moves = (self.moves.as_slice(), before);
+            keep_alternatives(machine, &mut slot.conversation, observed, moves);
+        }
         let passed = Passed::in_state_of(&slot.conversation, machine, index);
         let passed = Passed {
             state: moved.unwrap_or(passed.state),
@@ -1060,12 +1116,18 @@ impl Monitor {
             void,
             ..passed
         };
-        let is_main = slot.parent == NONE;
-        if is_main {
+        let is_charged = slot.is_charged();
+        // A conversation that is not complete is not over.
+        let is_touched = slot.parent != NONE || !passed.complete && slot.touch(List::Open, now_ms);
+        if !is_touched {
             self.touch(at, now_ms);
         }
-        self.charge(at);
-        self.keep_deadlines_few();
+        if !is_charged {
+            self.charge(at);
+        }
+        if self.deadlines.are_many() {
+            self.remove_stale_deadlines();
+        }
         Ok(passed)
     }
 
@@ -1094,7 +1156,7 @@ impl Monitor {
     /// Updates the time and the list of a main conversation.
     pub(crate) fn touch(&mut self, at: u32, now: u64) {
         let library = &self.library;
-        let over = |slot: &crate::table::Slot| {
+        let over = |slot: &Slot| {
             let conversation = &slot.conversation;
             let machine = library.machine(conversation.machine);
             conversation.unnamed().is_none()
@@ -1108,8 +1170,8 @@ impl Monitor {
         };
         let mut all_over = over(slot);
         let mut child = slot.child;
-        while let Some(slot) = self.table.slot(child) {
-            all_over &= over(slot);
+        while all_over && let Some(slot) = self.table.slot(child) {
+            all_over = over(slot);
             child = self.table.sibling(child);
         }
         let list = if all_over { List::Ended } else { List::Open };
@@ -1267,8 +1329,7 @@ impl Monitor {
         library.machine(self.table.slot(at)?.conversation.machine)
     }
 
-    /// Removes stale deadlines if there are too many.
-    fn keep_deadlines_few(&mut self) {
+    fn remove_stale_deadlines(&mut self) {
         let table = &self.table;
         let counts = |deadline: &Deadline| {
             let slot = table.slot(deadline.at);
@@ -1277,12 +1338,13 @@ impl Monitor {
             let party = parties.and_then(|parties| parties.get(deadline.party as usize));
             party.is_some_and(|party| party.deadline == deadline.due)
         };
-        self.deadlines.keep_few(counts);
+        self.deadlines.remove_stale(counts);
     }
 }
 
 impl Passed {
     /// The result of a message that changes nothing.
+    #[inline]
     pub(crate) fn in_state_of(conversation: &Conversation, machine: &Machine, index: u16) -> Self {
         let parties = &conversation.parties;
         Self {
@@ -1392,7 +1454,7 @@ fn take_copy(
     let name = observed.receivers.first()?;
     let seen = (copied.seen.len() + 1).next_power_of_two() * size_of::<u64>();
     let bytes = conversation.allocated() + conversation.growth(0, 1, 0);
-    let size = crate::table::Slot::COST + bytes + seen + Names::cost(name.len());
+    let size = Slot::COST + bytes + seen + Names::cost(name.len());
     if conversation.bound.len() >= limits.participants
         || copied.seen.len() == limits.participants
         || size > limits.share_of_bytes()
@@ -1438,7 +1500,16 @@ struct PartiesBefore {
 }
 
 impl PartiesBefore {
-    fn of(conversation: &Conversation, machine: &Machine) -> Self {
+    /// Returns the parties of a conversation that may have begun before the monitor.
+    #[inline]
+    fn of(conversation: &Conversation, machine: &Machine) -> Option<Self> {
+        let rare = conversation.rare.as_deref();
+        let may_continue = rare.is_some_and(|rare| rare.may_continue);
+        may_continue.then(|| Self::known(conversation, machine))
+    }
+
+    #[cold]
+    fn known(conversation: &Conversation, machine: &Machine) -> Self {
         let mut parties = conversation.parties.iter();
         // With one state for all participants, the party exists before the first message.
         let is_new =
@@ -1454,8 +1525,9 @@ impl PartiesBefore {
     }
 }
 
-/// If the conversation may have begun before the monitor: notes the other states to which the first
+/// In a conversation that may have begun before the monitor: notes the other states to which the first
 /// message to a party may have led, and removes those which a later message does not fit.
+#[cold]
 fn keep_alternatives(
     machine: &Machine,
     conversation: &mut Conversation,
@@ -1466,9 +1538,6 @@ fn keep_alternatives(
     let Some(rare) = conversation.rare.as_deref_mut() else {
         return;
     };
-    if !rare.may_continue {
-        return;
-    }
     let index = |at: usize| u32::try_from(at).unwrap_or(NONE);
     let is_moved = |party: u32| {
         let mut steps = moves.iter().filter(|made| {

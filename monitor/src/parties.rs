@@ -29,6 +29,23 @@ impl Parties {
         }
     }
 
+    // Most conversations have one party.
+    #[cold]
+    fn none_or_many(&self) -> &[Party] {
+        match self {
+            Self::Many(all) => all,
+            _ => &[],
+        }
+    }
+
+    #[cold]
+    fn none_or_many_mut(&mut self) -> &mut [Party] {
+        match self {
+            Self::Many(all) => all,
+            _ => &mut [],
+        }
+    }
+
     /// Removes the parties. A buffer of the first one is kept.
     pub(crate) fn clear(&mut self) {
         let mut buffer = match std::mem::take(self) {
@@ -43,13 +60,16 @@ impl Parties {
     }
 
     /// Bytes that the parties have allocated.
+    #[inline]
     pub(crate) fn allocated(&self) -> usize {
-        let own = match self {
+        match self {
+            Self::One(party) => party.allocated(),
             Self::None(buffer) => buffer.as_ref().map_or(0, |_| size_of::<Details>()),
-            Self::One(_) => 0,
-            Self::Many(all) => all.capacity() * size_of::<Party>(),
-        };
-        own + self.iter().map(Party::allocated).sum::<usize>()
+            Self::Many(all) => {
+                let own = all.capacity() * size_of::<Party>();
+                own + all.iter().map(Party::allocated).sum::<usize>()
+            }
+        }
     }
 
     /// Returns an upper bound of the bytes that so many more parties allocate. Each party may still allocate
@@ -74,21 +94,21 @@ impl Default for Parties {
 impl Deref for Parties {
     type Target = [Party];
 
+    #[inline]
     fn deref(&self) -> &[Party] {
         match self {
-            Self::None(_) => &[],
             Self::One(party) => std::slice::from_ref(party),
-            Self::Many(all) => all,
+            others => others.none_or_many(),
         }
     }
 }
 
 impl DerefMut for Parties {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [Party] {
         match self {
-            Self::None(_) => &mut [],
             Self::One(party) => std::slice::from_mut(party),
-            Self::Many(all) => all,
+            others => others.none_or_many_mut(),
         }
     }
 }

@@ -95,19 +95,24 @@ impl Monitor {
     }
 
     /// Whether the message fits the conversation as the role of the agent sees it.
+    #[inline]
     pub(crate) fn fits_role(
         &self,
-        at: u32,
+        conversation: &Conversation,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
     ) -> bool {
-        let slot = self
-            .table
-            .slot(at)
-            .filter(|slot| slot.conversation.is_local() && observed.undelivered_to.is_none());
-        let Some(conversation) = slot.map(|slot| &slot.conversation) else {
-            return false;
-        };
+        conversation.is_local()
+            && observed.undelivered_to.is_none()
+            && self.fits_local(conversation, header, observed)
+    }
+
+    fn fits_local(
+        &self,
+        conversation: &Conversation,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+    ) -> bool {
         let machine = self.library.machine(conversation.machine);
         let named = header.protocol_name();
         let called = |machine: &&Machine| named.is_none_or(|name| machine.is_called(name));

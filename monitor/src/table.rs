@@ -172,6 +172,31 @@ impl Slot {
     pub(crate) fn list(&self) -> List {
         self.list
     }
+
+    /// Bytes of the conversation.
+    #[inline]
+    fn cost(&self) -> u32 {
+        let cost = Self::COST + self.conversation.allocated();
+        u32::try_from(cost).unwrap_or(u32::MAX)
+    }
+
+    /// Whether the peer of the conversation is charged with its present size.
+    #[inline]
+    pub(crate) fn is_charged(&self) -> bool {
+        self.conversation.cost == self.cost()
+    }
+
+    /// Updates the time of a main conversation, if it keeps its place in the lists. Returns whether it does.
+    pub(crate) fn touch(&mut self, list: List, now: u64) -> bool {
+        let listed = self.touched.saturating_sub(u64::from(self.since_listed));
+        // The clock may have been set back.
+        let since = u16::try_from(now.saturating_sub(listed)).unwrap_or(u16::MAX);
+        let stays = self.list == list && since < PRECISION;
+        if stays {
+            (self.touched, self.since_listed) = (now, since);
+        }
+        stays
+    }
 }
 
 impl Table {
@@ -208,10 +233,14 @@ impl Table {
 
     /// The conversations with this identifier, at most [`MAX_ALIKE`](crate::limits::MAX_ALIKE).
     #[inline]
-    pub(crate) fn find_all<'t>(&'t self, id: &'t str) -> impl Iterator<Item = u32> + 't {
+    pub(crate) fn find_all<'t>(
+        &'t self,
+        id: &str,
+    ) -> impl Iterator<Item = (u32, &'t Slot)> + use<'t> {
         let Fingerprint { tag, rest } = self.fingerprint(id);
         let alike = self.by_id.find_all(tag);
-        alike.filter(move |at| self.slot(*at).is_some_and(|slot| slot.id_rest == rest))
+        let alike = alike.filter_map(|at| Some((at, self.slot(at)?)));
+        alike.filter(move |(_, slot)| slot.id_rest == rest)
     }
 
     fn fingerprint(&self, id: &str) -> Fingerprint {
@@ -226,7 +255,7 @@ impl Table {
 
     #[cfg(test)]
     pub(crate) fn find(&self, id: &str) -> Option<u32> {
-        self.find_all(id).next()
+        self.find_all(id).next().map(|(at, _)| at)
     }
 
     /// The main conversations: the time of the last message, the serial number and the slot.
@@ -352,8 +381,7 @@ impl Table {
         let Some(slot) = self.slot_mut(at) else {
             return false;
         };
-        let cost = Slot::COST + slot.conversation.allocated();
-        let stored = u32::try_from(cost).unwrap_or(u32::MAX);
+        let stored = slot.cost();
         let before = std::mem::replace(&mut slot.conversation.cost, stored);
         if stored == before {
             return false;
@@ -409,14 +437,10 @@ impl Table {
         let Some(slot) = self.slot_mut(at) else {
             return;
         };
-        let listed = slot.touched.saturating_sub(u64::from(slot.since_listed));
-        slot.touched = now;
-        // The clock may have been set back.
-        let since = u16::try_from(now.saturating_sub(listed)).unwrap_or(u16::MAX);
-        if slot.list == list && since < PRECISION {
-            slot.since_listed = since;
+        if slot.touch(list, now) {
             return;
         }
+        slot.touched = now;
         self.unlink(at);
         self.append(at, list);
     }
