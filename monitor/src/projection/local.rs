@@ -341,22 +341,32 @@ impl Part {
         if self.early.len() == MAX_EARLY {
             return None;
         }
-        let mut reached = vec![self.state];
+        // The messages of the sender that wait already. Its messages arrive in their order.
+        let of_sender = self.early.iter();
+        let of_sender = of_sender.filter(|(from, _)| message.peers == 1 << from);
+        let waiting: Vec<&Performed> = of_sender.map(|(_, act)| act).collect();
+        let mut reached = vec![(self.state, 0)];
         let mut next = 0;
-        while let Some(state) = reached.get(next).and_then(|at| local.state(*at)) {
+        while let Some((at, taken)) = reached.get(next).copied() {
             next += 1;
-            for step in &state.steps {
+            let steps = local.state(at).map_or(&[][..], LocalState::steps);
+            for step in steps.iter().filter(|step| step.label.from != self.role) {
                 let Label { from, act, .. } = &step.label;
                 let fits = message.peers & (1 << from) != 0 && act.is(message.act);
-                if next > 1 && *from != self.role && fits {
+                if next > 1 && fits && taken == waiting.len() {
                     let mut part = self.clone();
                     part.early.push((*from, act.clone()));
                     return Some((part, *from));
                 }
-                // Only messages of other senders can be under way.
-                let others = *from != self.role && message.peers != 1 << from;
-                if others && !reached.contains(&step.target) && reached.len() < MAX_SEARCHED {
-                    reached.push(step.target);
+                // Messages of other senders can be under way.
+                let taken = match message.peers == 1 << from {
+                    true if waiting.get(taken) == Some(&act) => taken + 1,
+                    true => continue,
+                    false => taken,
+                };
+                let after = (step.target, taken);
+                if !reached.contains(&after) && reached.len() < MAX_SEARCHED {
+                    reached.push(after);
                 }
             }
         }
