@@ -810,6 +810,15 @@ impl NextState {
         }
     }
 
+    /// A void message after one that was reported as failed: it does not show whether that one has arrived.
+    fn void_in_failed(party: &Party) -> Self {
+        Self {
+            resume: party.resume,
+            void: true,
+            ..Self::to(FAILED)
+        }
+    }
+
     fn not_understood_in(state: u16) -> Self {
         Self {
             resume: state,
@@ -871,6 +880,7 @@ pub(crate) fn next_state(
             // arrive. It then counts in the state before.
             match (&taken, in_state(second)) {
                 (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
+                (Ok(void), Ok(_)) if void.void => Ok(NextState::void_in_failed(party)),
                 (Err(_), Ok(other)) => Ok(other),
                 _ => taken,
             }
@@ -918,12 +928,7 @@ fn in_worlds(
     let arrived = in_world(World::Arrived);
     match (&taken, arrived) {
         (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
-        // A void message shows nothing.
-        (Ok(void), Ok(_)) if void.void => Ok(NextState {
-            void: true,
-            resume: party.resume,
-            ..NextState::to(FAILED)
-        }),
+        (Ok(void), Ok(_)) if void.void => Ok(NextState::void_in_failed(party)),
         (Err(_), Ok(other)) => Ok(other),
         _ => taken,
     }
@@ -1264,6 +1269,34 @@ mod tests {
     }
 
     #[test]
+    fn a_shortened_fingerprint_depends_on_all_bits() {
+        let fingerprint = 0x0123_4567_89ab_cdef;
+        for bit in 0..64 {
+            assert_ne!(short(fingerprint ^ (1 << bit)), short(fingerprint), "{bit}");
+        }
+        // 0 stands for none.
+        assert_ne!(short(0x0000_0001_0000_0001), 0);
+    }
+
+    #[test]
+    fn a_message_that_is_taken_back_leaves_those_before_it() {
+        // Up to more than there are earlier ones.
+        for count in 0..=8 {
+            let mut party = Party::new(NONE, 0);
+            for asked in 1..=count {
+                party.ask(Side::Initiator, asked, "");
+            }
+            let before = (party.asked, *party.earlier(0));
+            party.begin_step(Side::Initiator, 1, 99, false);
+            party.ask(Side::Initiator, 99, "");
+            assert_ne!((party.asked, *party.earlier(0)), before, "{count}");
+            assert!(party.take_back(Side::Initiator, 1, 99));
+            party.settle(World::Missing);
+            assert_eq!((party.asked, *party.earlier(0)), before, "{count}");
+        }
+    }
+
+    #[test]
     fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut conversation = Conversation::unused();
@@ -1304,6 +1337,44 @@ mod tests {
         assert_eq!(conversation.allocated(), size_of::<Details>());
         let party = conversation.parties.first().unwrap();
         assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
+    }
+
+    #[test]
+    fn what_a_conversation_counts_is_what_it_allocates() {
+        let mut conversation = Conversation::unused();
+        let fill = |conversation: &mut Conversation| {
+            for agent in 0..20 {
+                conversation.add(Party::new(agent, 0));
+                conversation.bound.push(RoleBinding { role: 0, agent });
+            }
+            for party in conversation.parties.iter_mut().take(7) {
+                party.begin_step(Side::Initiator, 1, 7, false);
+                party.ask(Side::Initiator, 7, "r7");
+            }
+            // An uncertain one has two worlds.
+            assert!(conversation.parties[0].take_back(Side::Initiator, 1, 7));
+            let mut unnamed = Party::new(NONE, 0);
+            unnamed.ask(Side::Initiator, 7, "r7");
+            let rare = conversation.rare();
+            rare.unnamed = Some(Box::new(unnamed));
+            rare.reply_to.extend(0..3);
+            rare.delegates.extend((0..5).map(|agent| (0, agent)));
+            rare.alternatives.extend((0..7).map(|state| (0, state)));
+            let asked = |agent| RoleBinding { role: 0, agent };
+            rare.asked.extend((0..3).map(asked));
+            for receivers in [2, 9] {
+                rare.copied.push(Copied {
+                    fingerprint: 0,
+                    seen: (0..receivers).collect(),
+                    roles: (0, 0),
+                });
+            }
+        };
+        let measured = allocation_counter::measure(|| fill(&mut conversation));
+        let allocated = i64::try_from(conversation.allocated()).unwrap();
+        assert_eq!(allocated, measured.bytes_current);
+        let measured = allocation_counter::measure(|| conversation.clear());
+        assert_eq!(measured.bytes_current, -allocated);
     }
 
     #[test]
