@@ -286,9 +286,9 @@ impl Party {
         };
         let cancels = act == act_number(CANCEL);
         let Some(step) = self.last_step.take_if(|step| is_it(step)) else {
-            // A message of the other side may have crossed the cancel.
+            // A message of the other side may have crossed the cancel, or was taken for its answer.
             if cancels
-                && self.state == CANCELLING
+                && (self.state == CANCELLING || self.state == CANCELLED && self.echo)
                 && self.canceling_side == side
                 && self.cancel() == reply_with
             {
@@ -611,7 +611,7 @@ impl Conversation {
             0 => 0,
             _ if count <= FEW => 0,
             // A table has a byte more for each place, is at most seven eighths full, and ends with a group.
-            _ => (count * 8 / 7 + 1).next_power_of_two() * (size_of::<(Name, u32)>() + 1) + 16,
+            _ => (count * 8 / 7).next_power_of_two() * (size_of::<(Name, u32)>() + 1) + 16,
         };
         let designated = match designated {
             0 => 0,
@@ -1423,8 +1423,9 @@ mod tests {
 
     #[test]
     fn the_growth_of_a_conversation_is_bounded() {
-        for before in [0, 1, 2, 3, 8, 9, 100, 500] {
-            for added in [0, 1, 2, 7, 8, 90, 300, 600] {
+        // At 14 and 448, the index is full.
+        for before in [0, 1, 2, 3, 8, 9, 14, 100, 500] {
+            for added in [0, 1, 2, 5, 7, 8, 90, 348, 600] {
                 let mut names = Names::new(std::hash::RandomState::new());
                 let mut conversation = Conversation::unused();
                 let mut grow = |conversation: &mut Conversation, numbers: Range<usize>| {
@@ -1448,6 +1449,9 @@ mod tests {
                     allocated <= bound,
                     "{before} and {added}: {allocated} > {bound}"
                 );
+                // A further role binding needs no more than itself.
+                let further = conversation.bound.growth(1);
+                assert_eq!(conversation.growth(0, 1, 0), further);
             }
         }
     }

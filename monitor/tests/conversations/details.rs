@@ -217,6 +217,26 @@ fn an_undelivered_cancel_that_a_message_crossed_is_taken_back() {
             false => drop(stage.wrong(cancel("y"))),
         }
     }
+    // Without `in-reply-to`, the message may have been the answer.
+    for (answered, is_taken_back) in [(None, true), (Some("x"), false)] {
+        let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+        stage.right(subscribe("subscribe ann>ben"));
+        stage.right(subscribe("agree ben>ann"));
+        let cancel = || subscribe("cancel ann>ben").reply_with("x");
+        stage.right(cancel());
+        let inform = subscribe("inform ben>ann");
+        let inform = match answered {
+            Some(text) => inform.in_reply_to(text),
+            None => inform,
+        };
+        assert_eq!(stage.right(inform), "cancelled");
+        let now = stage.now;
+        stage.monitor.undelivered(&cancel(), "ben", now);
+        match is_taken_back {
+            true => assert_eq!(stage.right(cancel()), "cancelling"),
+            false => assert_eq!(stage.wrong(cancel()).kind, Kind::Ended),
+        }
+    }
 }
 
 #[test]
@@ -678,4 +698,19 @@ fn the_cancel_protocol_is_a_subprotocol_where_the_file_says_so() {
     assert_eq!(stage.right(own("agree ben>ann")), "3");
     assert_eq!(stage.right(cancel("inform ben>ann")), "cancelled");
     assert_eq!(stage.right(own("inform ben>ann")), "4");
+}
+
+#[test]
+fn an_agent_may_send_to_itself_in_its_role() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="n" to="n" target="2"/></state>
+        <state id="2"><transition performative="inform" from="n" to="n" target="2"/>
+            <subprotocol name="fipa-request" from="n"/></state></scxml>"#,
+    );
+    stage.right(own("request ann>ann,ben"));
+    stage.right(own("inform ann>ben"));
+    stage.right(own("inform ben>ann"));
+    assert_eq!(stage.right(request("request ann>ben")), "requested");
+    assert_eq!(stage.monitor.len(), 2);
 }

@@ -258,6 +258,26 @@ fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
 }
 
 #[test]
+fn a_message_that_fits_after_an_uncertain_one_is_no_late_one() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="5"/>
+            <transition performative="inform" from="a" to="b" target="3"/></state>
+        <state id="3"><transition performative="cfp" from="a" to="b" target="4"/></state>
+        <state id="4"><transition performative="propose" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let own = |words| say_in("own", words);
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
+    for words in ["request ann>ben", "inform ann>ben", "cfp ann>ben"] {
+        stage.right(own(words));
+    }
+    let now = stage.now;
+    stage.monitor.undelivered(&own("cfp ann>ben"), "ben", now);
+    // It has crossed the inform, or answers the call, which has arrived then.
+    assert_eq!(stage.right(own("propose ben>ann")), "5");
+}
+
+#[test]
 fn a_message_before_the_last_is_not_taken_back() {
     for mut stage in monitors("ann") {
         stage.right(request("request ann>ben"));
