@@ -483,6 +483,9 @@ pub(crate) struct Rare {
     pub(crate) local: Option<LocalRun>,
     /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
     pub(crate) claimed: bool,
+    /// Whether the state is uncertain, because an agent that may have claimed its role wrongly has ended the
+    /// conversation, or because another agent may have that role.
+    pub(crate) contested: bool,
     /// Whether the last message of the monitored agent was reported as undelivered.
     pub(crate) undelivered: bool,
     /// Whether only a message of an agent that claimed a role has shown that such a message arrived.
