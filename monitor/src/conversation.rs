@@ -1452,6 +1452,11 @@ mod tests {
                     allocated <= bound,
                     "{before} and {added}: {allocated} > {bound}"
                 );
+                if before == 0 {
+                    // Two bindings are in the place of a pointer.
+                    let inline = 2 * size_of::<RoleBinding>();
+                    assert!(bound <= allocated + inline, "{added}: {bound}");
+                }
                 // A further role binding needs no more than itself.
                 let further = conversation.bound.growth(1);
                 assert_eq!(conversation.growth(0, 1, 0), further);

@@ -353,12 +353,22 @@ fn each_agent_checks_what_it_sees() {
     assert_eq!(station.wrong("inform sta>med"), Kind::Unexpected);
     assert_eq!(station.wrong("agree med>sta"), Kind::Unexpected);
     station.right(&["confirm sta>med"]);
+    let now = station.now;
+    let wrong = station.monitor.check(&header_of("agree med>sta").0, now);
+    assert_eq!(wrong.violation().unwrap().state.as_deref(), Some("4"));
     // It does not know the drone yet, but the mediator is not the drone.
     assert_eq!(station.wrong("inform med>sta"), Kind::Unexpected);
     station.right(&["inform dro>sta"]);
     assert_eq!(station.wrong("inform sta>dro"), Kind::Unexpected);
     station.right(&["inform sta>med"]);
     assert_eq!(station.wrong("inform sta>med"), Kind::Ended);
+    let mut drone = stage("dro");
+    for (words, opened) in [("request dro>med", true), ("agree med>dro", false)] {
+        let Verdict::Accepted(accepted) = drone.check(words) else {
+            panic!("{words}");
+        };
+        assert_eq!(accepted.opened, opened, "{words}");
+    }
     let mut drone = stage("dro");
     drone.right(&["request dro>med"]);
     assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
@@ -708,7 +718,28 @@ fn early_messages_are_taken_in_the_order_of_their_senders() {
     assert_eq!(dan.check("inform cid>dan"), unknown);
     let mut dan = stage_with(machine(text), "dan");
     dan.right(&["confirm cid>dan"]);
-    assert_eq!(dan.check("inform cid>dan"), unknown);
+    for words in ["inform cid>dan", "confirm cid>dan"] {
+        assert_eq!(dan.check(words), unknown, "{words}");
+    }
+}
+
+#[test]
+fn an_early_message_decides_a_choice_of_its_sender() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="d" target="2"/></state>
+        <state id="2"><transition performative="query-if" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="d" target="4"/>
+            <transition performative="refuse" from="c" to="d" target="5"/></state>
+        <state id="4"><transition performative="inform" from="d" to="a" target="6"/></state>
+        <state id="5"><transition performative="failure" from="d" to="a" target="6"/></state>
+        <state id="6" final="yes"/></scxml>"#;
+    for (early, last) in [
+        ("inform cid>dan", "inform dan>ann"),
+        ("refuse cid>dan", "failure dan>ann"),
+    ] {
+        let mut dan = stage_with(machine(text), "dan");
+        dan.right(&[early, "request ann>dan", last]);
+    }
 }
 
 #[test]

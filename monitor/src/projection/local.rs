@@ -336,7 +336,7 @@ impl Part {
         })
     }
 
-    /// The part with a message whose turn comes after messages of other roles.
+    /// The part with a message whose turn comes after messages of other roles. It does not fit now.
     fn keeping(&self, local: &Local, message: Observed<'_>) -> Option<(Self, u8)> {
         if self.early.len() == MAX_EARLY {
             return None;
@@ -353,7 +353,7 @@ impl Part {
             for step in steps.iter().filter(|step| step.label.from != self.role) {
                 let Label { from, act, .. } = &step.label;
                 let fits = message.peers & (1 << from) != 0 && act.is(message.act);
-                if next > 1 && fits && taken == waiting.len() {
+                if fits && taken == waiting.len() {
                     let mut part = self.clone();
                     part.early.push((*from, act.clone()));
                     return Some((part, *from));

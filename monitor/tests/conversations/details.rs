@@ -169,6 +169,16 @@ fn the_limit_of_participants_is_exact() {
     let mut stage = limited(library_with("own", text));
     stage.right(own("request ann>ben,cid"));
     assert_eq!(stage.right(own("agree cid>ann")), "3");
+    let mut stage = limited(library_with("own", text));
+    stage.right(own("request ann>ben,cid").reply_to(["1", "2", "3"]));
+    let three = text.replace(
+        r#"to="a" target="3"/>"#,
+        r#"to="a" target="3"/>
+        <transition performative="inform" from="a" to="c" target="2"/>"#,
+    );
+    let mut stage = limited(library_with("own", &three));
+    stage.right(own("request ann>ben,cid"));
+    assert_eq!(stage.wrong(own("inform ann>dan")).kind, Kind::TooMany);
     let mut stage = limited(library());
     let call = say("cfp ann>ben,cid").reply_to(["1", "2", "3"]);
     assert_eq!(stage.right(call), "called");
@@ -217,6 +227,15 @@ fn an_undelivered_cancel_that_a_message_crossed_is_taken_back() {
             false => drop(stage.wrong(cancel("y"))),
         }
     }
+    // An answer shows that the cancel arrived.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    let cancel = || subscribe("cancel ann>ben").reply_with("x");
+    stage.right(subscribe("subscribe ann>ben"));
+    stage.right(cancel());
+    stage.right(subscribe("not-understood ben>ann").in_reply_to("x"));
+    let now = stage.now;
+    stage.monitor.undelivered(&cancel(), "ben", now);
+    assert_eq!(stage.wrong(cancel()).kind, Kind::Ended);
     // Without `in-reply-to`, the message may have been the answer.
     for (answered, is_taken_back) in [(None, true), (Some("x"), false)] {
         let mut stage = Stage::new(Monitor::agent(library(), "ann"));
@@ -647,10 +666,13 @@ fn the_only_role_of_a_protocol_is_that_of_an_agent_in_reply_to() {
     let mut stage = stage_of(
         r#"<scxml initial="1">
         <state id="1"><transition performative="inform" from=".*" to=".*" target="2"/></state>
-        <state id="2"><transition performative="confirm" from=".*" to="b" target="2"/></state>
+        <state id="2"><transition performative="confirm" from=".*" to="b" target="2"/>
+            <transition performative="disconfirm" from="b" to=".*" target="2"/></state>
         </scxml>"#,
     );
     stage.right(own("inform ann>ben").reply_to(["dan"]));
+    assert_eq!(stage.wrong(own("agree ann>dan")).kind, Kind::Unexpected);
+    stage.right(own("disconfirm dan>ann").conversation_id("c"));
     for _ in 0..2 {
         stage.right(own("confirm ann>dan"));
     }
@@ -713,4 +735,20 @@ fn an_agent_may_send_to_itself_in_its_role() {
     stage.right(own("inform ben>ann"));
     assert_eq!(stage.right(request("request ann>ben")), "requested");
     assert_eq!(stage.monitor.len(), 2);
+}
+
+#[test]
+fn an_agent_may_name_others_with_its_first_message_in_a_role() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="c" to="a" target="3"/></state>
+        <state id="3"><transition performative="agree" from="c" to="a" target="4"/></state>
+        <state id="4"><transition performative="confirm" from="a" to="c" target="4"/></state>
+        </scxml>"#,
+    );
+    stage.right(own("request ann>ben"));
+    stage.right(own("inform cid>ann").reply_to(["dan"]));
+    stage.wrong(own("agree ben>ann"));
+    assert_eq!(stage.right(own("agree dan>ann")), "4");
 }

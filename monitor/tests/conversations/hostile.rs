@@ -475,7 +475,7 @@ fn a_report_of_a_service_is_no_violation_and_begins_nothing() {
     // A report to an agent that takes no part changes nothing.
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
-    let lost = request("failure mts>dan").undelivered_to("ben");
+    let lost = request("failure mts>ann,dan").undelivered_to("ben");
     assert_eq!(stage.check(&lost), unknown);
     assert_eq!(stage.right(request("agree ben>ann")), "agreed");
 }
@@ -504,19 +504,62 @@ fn the_oldest_conversation_of_a_peer_cannot_grow_beyond_its_share() {
 #[test]
 fn no_conversation_is_evicted_before_the_limit_of_bytes() {
     const COUNT: usize = 40;
-    let filled = |bytes| {
-        let mut limits = Limits::default();
-        limits.bytes = bytes;
-        let mut stage = Stage::new(Monitor::agent(library_once(), "ben").with_limits(limits));
-        for number in 0..COUNT {
-            let header = request("request ben>ann");
-            stage.right(header.conversation_id(format!("{number:02}")));
-        }
-        (stage.monitor.len(), stage.monitor.bytes())
+    // The conversations of the agent count toward the total, and those of a peer toward its share.
+    for (words, parts) in [("request ben>ann", 1), ("request ann>ben", 8)] {
+        let filled = |bytes| {
+            let mut limits = Limits::default();
+            limits.bytes = bytes * parts;
+            let mut stage = Stage::new(Monitor::agent(library_once(), "ben").with_limits(limits));
+            for number in 0..COUNT {
+                stage.right(request(words).conversation_id(format!("{number:02}")));
+            }
+            (stage.monitor.len(), stage.monitor.bytes())
+        };
+        let (_, bytes) = filled(1 << 20);
+        assert_eq!(filled(bytes), (COUNT, bytes));
+        assert_eq!(filled(bytes - 1), (COUNT - 1, bytes / COUNT * (COUNT - 1)));
+    }
+}
+
+#[test]
+fn no_message_exceeds_a_share_of_any_size() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="inform" from="a|b" to="a|b" target="3"/></state>
+        </scxml>"#;
+    let library = library_with("own", text);
+    let long = |name: &str| format!("{name:x<100}");
+    let ask = |to: &str| {
+        let header = say_in("own", "request ann>ben,cid,dan").sender(long("ann"));
+        header.reply_with("q").copy_for(long(to))
     };
-    let (_, bytes) = filled(1 << 20);
-    assert_eq!(filled(bytes), (COUNT, bytes));
-    assert_eq!(filled(bytes - 1), (COUNT - 1, bytes / COUNT * (COUNT - 1)));
+    let mut accepted = [0; 3];
+    for share in 400..3_000 {
+        let mut limits = Limits::default();
+        limits.bytes = share * 8;
+        let monitor = Monitor::observer(Arc::clone(&library)).with_limits(limits);
+        let mut stage = Stage::new(monitor);
+        for (to, accepted) in ["ben", "cid", "dan"].into_iter().zip(&mut accepted) {
+            *accepted += usize::from(stage.check(&ask(to)).is_accepted());
+            let bytes = stage.monitor.bytes();
+            assert!(bytes <= share, "{to}: {bytes} > {share}");
+        }
+        // What adds no agent needs no space.
+        if stage.monitor.len() == 1 && accepted[0] > 0 {
+            let header = |words, from, to| {
+                let header = say_in("own", words).sender(long(from));
+                header.receivers([long(to)])
+            };
+            stage.right(header("agree ben>ann", "ben", "ann"));
+            stage.right(header("inform ann>ben", "ann", "ben"));
+        }
+    }
+    let [first, second, third] = accepted;
+    assert!(
+        first > second && second > third && third > 0,
+        "{accepted:?}"
+    );
 }
 
 #[test]

@@ -208,6 +208,16 @@ fn an_undelivered_message_can_be_sent_again() {
     }
     stage.monitor.undelivered(&ask(), "cid", now);
     assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+    let of_mallory = request("request mallory>ben").reply_with("q");
+    stage.monitor.undelivered(&of_mallory, "ben", now);
+    assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+    // A participant that a `reply-to` names is a participant.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_to(["ben"]));
+    let agree = || request("agree ben>ann").reply_with("a");
+    stage.right(agree());
+    stage.monitor.undelivered(&agree(), "ann", now);
+    assert_eq!(stage.right(agree()), "agreed");
 }
 
 #[test]

@@ -586,6 +586,20 @@ fn conversations_that_no_monitor_writes_are_refused() {
             |it| it.delegates.push((1, "dan".to_owned())),
             malformed("an unknown participant"),
         ),
+        (
+            |it| {
+                it.parties = names(1);
+                it.delegates.push((0, "ben".to_owned()));
+            },
+            Ok(1),
+        ),
+        (
+            |it| {
+                it.parties = names(1);
+                it.delegates.push((0, "dan".to_owned()));
+            },
+            malformed("a conversation without the agent"),
+        ),
     ];
     for (number, (change, expected)) in per_participant.into_iter().enumerate() {
         let found = restored(change, Written::per_participant);
