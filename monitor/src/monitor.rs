@@ -11,8 +11,8 @@ use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
-    Conversation, Copied, FAILED, Holders, NONE, NextState, Party, RoleBinding, Side, act_number,
-    is_final, is_over, state_name,
+    CANCELLED, CANCELLING, Conversation, Copied, FAILED, Holders, NONE, NextState, Party,
+    RoleBinding, Side, act_number, is_final, is_over, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
 use crate::fingerprints::Fingerprints;
@@ -1529,10 +1529,10 @@ fn keep_alternatives(
             MoveTarget::Receiver(_) | MoveTarget::Sender => false,
         })
     };
-    // Every protocol allows these in any state, but a message may also be a step of this protocol.
+    // A cancel and its answers fit any state, but a message may also be a step of the protocol.
     let fits_any_state = |made: &Move| {
         let NextState { state, crossed, .. } = made.next_state;
-        made.next_state.answers_cancel || machine.state(state).is_none() && !crossed
+        made.next_state.answers_cancel || [CANCELLING, CANCELLED].contains(&state) && !crossed
     };
     let alternatives = std::mem::take(&mut rare.alternatives);
     let kept = alternatives.into_iter().flat_map(|(party, state)| {

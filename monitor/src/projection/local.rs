@@ -404,5 +404,15 @@ mod tests {
         };
         let early = part.early.capacity() * size_of::<(u8, Performed)>() + "own-act".len();
         assert_eq!(run.allocated(), parts(&run) + early);
+        // A sent message may not have arrived.
+        let mut run = LocalRun::new(locals, u32::MAX);
+        let request = Observed {
+            own: true,
+            ..message(Act::named("request"))
+        };
+        run.take(locals, request).unwrap();
+        let before = run.without_last.capacity() * size_of::<Part>();
+        assert!(before > 0);
+        assert_eq!(run.allocated(), parts(&run) + before);
     }
 }
