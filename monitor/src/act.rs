@@ -223,6 +223,7 @@ mod tests {
             "query-if",
             "REFUSE",
             "agree|refuse",
+            "agree|agree",
             "failure|not-understood",
         ] {
             let acts = Acts::new(text).unwrap();

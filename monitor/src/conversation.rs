@@ -296,9 +296,9 @@ impl Party {
         };
         let cancels = act == act_number(CANCEL);
         let Some(step) = self.last_step.take_if(|step| is_it(step)) else {
-            // A message of the other side may have crossed the cancel.
+            // A message of the other side may have crossed the cancel, or was taken for its answer.
             if cancels
-                && self.state == CANCELLING
+                && (self.state == CANCELLING || self.state == CANCELLED && self.echo)
                 && self.canceling_side == side
                 && self.cancel() == reply_with
             {
@@ -498,6 +498,9 @@ pub(crate) struct Rare {
     pub(crate) local: Option<LocalRun>,
     /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
     pub(crate) claimed: bool,
+    /// Whether the state is uncertain, because an agent that may have claimed its role wrongly has ended the
+    /// conversation, or because another agent may have that role.
+    pub(crate) contested: bool,
     /// Whether the last message of the monitored agent was reported as undelivered.
     pub(crate) undelivered: bool,
     /// Whether only a message of an agent that claimed a role has shown that such a message arrived.
@@ -630,7 +633,7 @@ impl Conversation {
             0 => 0,
             _ if count <= FEW => 0,
             // A table has a byte more for each place, is at most seven eighths full, and ends with a group.
-            _ => (count * 8 / 7 + 1).next_power_of_two() * (size_of::<(Name, u32)>() + 1) + 16,
+            _ => (count * 8 / 7).next_power_of_two() * (size_of::<(Name, u32)>() + 1) + 16,
         };
         let designated = match designated {
             0 => 0,
@@ -846,6 +849,15 @@ impl NextState {
         }
     }
 
+    /// A void message after one that was reported as failed: it does not show whether that one has arrived.
+    fn void_in_failed(party: &Party) -> Self {
+        Self {
+            resume: party.resume,
+            void: true,
+            ..Self::to(FAILED)
+        }
+    }
+
     fn not_understood_in(state: u16) -> Self {
         Self {
             resume: state,
@@ -923,6 +935,7 @@ fn after_common_step(
             // arrive. It then counts in the state before.
             match (&taken, in_state(second)) {
                 (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
+                (Ok(void), Ok(_)) if void.void => Ok(NextState::void_in_failed(party)),
                 (Err(_), Ok(other)) => Ok(other),
                 _ => taken,
             }
@@ -970,12 +983,7 @@ fn in_worlds(
     let arrived = in_world(World::Arrived);
     match (&taken, arrived) {
         (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
-        // A void message shows nothing.
-        (Ok(void), Ok(_)) if void.void => Ok(NextState {
-            void: true,
-            resume: party.resume,
-            ..NextState::to(FAILED)
-        }),
+        (Ok(void), Ok(_)) if void.void => Ok(NextState::void_in_failed(party)),
         (Err(_), Ok(other)) => Ok(other),
         _ => taken,
     }
@@ -1323,6 +1331,34 @@ mod tests {
     }
 
     #[test]
+    fn a_shortened_fingerprint_depends_on_all_bits() {
+        let fingerprint = 0x0123_4567_89ab_cdef;
+        for bit in 0..64 {
+            assert_ne!(short(fingerprint ^ (1 << bit)), short(fingerprint), "{bit}");
+        }
+        // 0 stands for none.
+        assert_ne!(short(0x0000_0001_0000_0001), 0);
+    }
+
+    #[test]
+    fn a_message_that_is_taken_back_leaves_those_before_it() {
+        // Up to more than there are earlier ones.
+        for count in 0..=8 {
+            let mut party = Party::new(NONE, 0);
+            for asked in 1..=count {
+                party.ask(Side::Initiator, asked, "");
+            }
+            let before = (party.asked, *party.earlier(0));
+            party.begin_step(Side::Initiator, 1, 99, false);
+            party.ask(Side::Initiator, 99, "");
+            assert_ne!((party.asked, *party.earlier(0)), before, "{count}");
+            assert!(party.take_back(Side::Initiator, 1, 99));
+            party.settle(World::Missing);
+            assert_eq!((party.asked, *party.earlier(0)), before, "{count}");
+        }
+    }
+
+    #[test]
     fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut conversation = Conversation::unused();
@@ -1363,6 +1399,44 @@ mod tests {
         assert_eq!(conversation.allocated(), size_of::<Details>());
         let party = conversation.parties.first().unwrap();
         assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
+    }
+
+    #[test]
+    fn what_a_conversation_counts_is_what_it_allocates() {
+        let mut conversation = Conversation::unused();
+        let fill = |conversation: &mut Conversation| {
+            for agent in 0..20 {
+                conversation.add(Party::new(agent, 0));
+                conversation.bound.push(RoleBinding { role: 0, agent });
+            }
+            for party in conversation.parties.iter_mut().take(7) {
+                party.begin_step(Side::Initiator, 1, 7, false);
+                party.ask(Side::Initiator, 7, "r7");
+            }
+            // An uncertain one has two worlds.
+            assert!(conversation.parties[0].take_back(Side::Initiator, 1, 7));
+            let mut unnamed = Party::new(NONE, 0);
+            unnamed.ask(Side::Initiator, 7, "r7");
+            let rare = conversation.rare();
+            rare.unnamed = Some(Box::new(unnamed));
+            rare.reply_to.extend(0..3);
+            rare.delegates.extend((0..5).map(|agent| (0, agent)));
+            rare.alternatives.extend((0..7).map(|state| (0, state)));
+            let asked = |agent| RoleBinding { role: 0, agent };
+            rare.asked.extend((0..3).map(asked));
+            for receivers in [2, 9] {
+                rare.copied.push(Copied {
+                    fingerprint: 0,
+                    seen: (0..receivers).collect(),
+                    roles: (0, 0),
+                });
+            }
+        };
+        let measured = allocation_counter::measure(|| fill(&mut conversation));
+        let allocated = i64::try_from(conversation.allocated()).unwrap();
+        assert_eq!(allocated, measured.bytes_current);
+        let measured = allocation_counter::measure(|| conversation.clear());
+        assert_eq!(measured.bytes_current, -allocated);
     }
 
     #[test]
@@ -1411,8 +1485,9 @@ mod tests {
 
     #[test]
     fn the_growth_of_a_conversation_is_bounded() {
-        for before in [0, 1, 2, 3, 8, 9, 100, 500] {
-            for added in [0, 1, 2, 7, 8, 90, 300, 600] {
+        // At 14 and 448, the index is full.
+        for before in [0, 1, 2, 3, 8, 9, 14, 100, 500] {
+            for added in [0, 1, 2, 5, 7, 8, 90, 348, 600] {
                 let mut names = Names::new(std::hash::RandomState::new());
                 let mut conversation = Conversation::unused();
                 let mut grow = |conversation: &mut Conversation, numbers: Range<usize>| {
@@ -1436,6 +1511,14 @@ mod tests {
                     allocated <= bound,
                     "{before} and {added}: {allocated} > {bound}"
                 );
+                if before == 0 {
+                    // Two bindings are in the place of a pointer.
+                    let inline = 2 * size_of::<RoleBinding>();
+                    assert!(bound <= allocated + inline, "{added}: {bound}");
+                }
+                // A further role binding needs no more than itself.
+                let further = conversation.bound.growth(1);
+                assert_eq!(conversation.growth(0, 1, 0), further);
             }
         }
     }

@@ -20,6 +20,7 @@ use crate::conversation::{ELSEWHERE, NONE, Party, Side, act_number, side_index};
 use crate::judge::ObservedMessage;
 use crate::machine::{Cancel, Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
+use crate::names::Names;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 use crate::{Header, Now};
 
@@ -144,10 +145,12 @@ impl Monitor {
             // The roles of the agents are unknown too.
             Scope::Conversation => (conversation.parties.len().checked_sub(1), ELSEWHERE),
         };
+        let added = conversation.growth(1, 0, 0) + Names::cost(observed.sender.len());
+        let grown = crate::table::Slot::COST + conversation.allocated() + added;
         let peer = match known.and_then(|known| conversation.parties.get(known)) {
             Some(party) => party.peer,
             None if conversation.parties.len() == self.limits.participants => return,
-            None if conversation.allocated() > self.limits.share_of_bytes() => return,
+            None if grown > self.limits.share_of_bytes() => return,
             None if machine.scope == Scope::Conversation => NONE,
             None => conversation.acquire(&mut self.names, observed.sender),
         };

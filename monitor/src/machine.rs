@@ -438,6 +438,20 @@ mod tests {
     }
 
     #[test]
+    fn the_initiator_may_be_any_role_of_the_file() {
+        let text = r#"<scxml initial="1">
+            <state id="0"><transition performative="agree" from="b" to="a" target="2"/></state>
+            <state id="1"><transition performative="request" from="a" to="b" target="0"/></state>
+            <state id="2" final="yes"/></scxml>"#;
+        let machine = Machine::read("own", text).unwrap();
+        assert_eq!((machine.initiator(), machine.initiator), ("a", 1));
+        let [request, agree] = ["request", "agree"].map(Act::named);
+        assert!(machine.is_sent_by_initiator(request) && !machine.is_sent_by_initiator(agree));
+        assert!(machine.is_answer(agree) && !machine.is_answer(request));
+        assert!(machine.shows_initiator(agree) && !machine.shows_initiator(request));
+    }
+
+    #[test]
     fn any_role_overlaps_each_role() {
         let roles = |mask, anyone| Roles {
             text: String::new(),

@@ -11,8 +11,8 @@ use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::change::{Change, expire, expire_party};
 use crate::clock::span_millis;
 use crate::conversation::{
-    Conversation, Copied, FAILED, Holders, NONE, NextState, Party, RoleBinding, Side, act_number,
-    is_final, is_over, state_name,
+    CANCELLED, CANCELLING, Conversation, Copied, FAILED, Holders, NONE, NextState, Party,
+    RoleBinding, Side, act_number, is_final, is_over, state_name,
 };
 use crate::deadlines::{Deadline, Deadlines};
 use crate::fingerprints::Fingerprints;
@@ -894,8 +894,8 @@ impl Monitor {
             NONE => 0,
             peer => Names::cost(self.names.text(peer).len()),
         };
-        let bytes = Slot::COST + id.len() + peer_cost;
-        self.evict(parent, peer, 1, bytes);
+        // Its bytes are charged, and others evicted for them, when the message has been accepted.
+        self.evict(parent, peer, 1);
         let at = self.table.insert(id, parent, peer, machine, now.millis());
         if let Some(slot) = self.table.slot_mut(at) {
             slot.conversation.charge(peer_cost);
@@ -967,19 +967,19 @@ impl Monitor {
             && let Some(slot) = self.table.slot(at)
         {
             let main = if slot.parent == NONE { at } else { slot.parent };
-            self.evict(main, self.table.peer(at), 0, 0);
+            self.evict(main, self.table.peer(at), 0);
         }
     }
 
-    /// Removes conversations until there is space for so many more of this peer, with so many bytes.
-    /// The conversation `keep` is kept.
-    pub(crate) fn evict(&mut self, keep: u32, peer: Name, more: usize, bytes: usize) {
+    /// Removes conversations until the limits hold, with so many more of this peer. The conversation `keep`
+    /// is kept.
+    pub(crate) fn evict(&mut self, keep: u32, peer: Name, more: usize) {
         loop {
             let full = self.table.len() + more > self.limits.conversations.max(1);
-            let heavy = self.table.bytes() + bytes > self.limits.bytes;
+            let heavy = self.table.bytes() > self.limits.bytes;
             let (count, held) = self.table.of_peer(peer);
             let over = peer != NONE
-                && (held + bytes > self.limits.share_of_bytes()
+                && (held > self.limits.share_of_bytes()
                     || count + more > self.limits.share_of_conversations());
             if !full && !heavy && !over {
                 return;
@@ -1048,17 +1048,18 @@ impl Monitor {
         let is_new = |made: &&Move| made.target.is_new();
         let added = self.moves.iter().filter(is_new).count();
         let grown = conversation.parties.len() + added;
+        let moves = self.moves.as_slice();
+        let bindings = NewBindings::by(machine, conversation, &self.names, observed, moves, header);
         let adds = added > 0 || !header.reply_to_names().is_empty();
         let growth = if adds || machine.scope == Scope::Conversation {
-            let moves = (self.moves.as_slice(), copied.is_some());
-            growth_by(machine, conversation, &self.names, observed, moves, header)
+            let moves = (moves, &bindings, copied.is_some());
+            growth_by(machine, conversation, observed, moves, header)
         } else {
             0
         };
         let size = || Slot::COST + conversation.allocated() + growth;
-        let agents = observed.receivers.len() + header.reply_to_names().len();
         if grown > self.limits.participants
-            || conversation.bound.len() + agents > self.limits.participants + 1
+            || conversation.bound.len() + bindings.count() > self.limits.participants + 1
             || is_crowded(conversation, &self.names, header)
             || growth > 0 && size() > self.limits.share_of_bytes()
         {
@@ -1383,14 +1384,71 @@ fn is_crowded(conversation: &Conversation, names: &Names, header: &Header<'_>) -
     kept + reply_to.iter().filter(new).count() > MAX_DESIGNATED
 }
 
+/// The role bindings that a message adds at most, with one state for all participants.
+#[derive(Debug, Default)]
+struct NewBindings {
+    /// Of the sender: 0 or 1.
+    sender: usize,
+    /// Of the receivers: one each, or none.
+    receivers: usize,
+    /// Of the agents in the `reply-to` of a participant: each role of the participant.
+    delegates: usize,
+}
+
+impl NewBindings {
+    fn by(
+        machine: &Machine,
+        conversation: &Conversation,
+        names: &Names,
+        observed: &ObservedMessage<'_>,
+        moves: &[Move],
+        header: &Header<'_>,
+    ) -> Self {
+        let Some(made) = moves
+            .first()
+            .filter(|_| machine.scope == Scope::Conversation)
+        else {
+            return Self::default();
+        };
+        let free = unbound(machine, conversation);
+        let (from, to) = made.next_state.roles;
+        // A pattern of several roles binds none.
+        let binds = |roles: u32| roles & free != 0 && roles.count_ones() == 1;
+        let sender = usize::from(binds(from));
+        let reply_to = header.reply_to_names().len();
+        let leads = || conversation.speaks_for_initiator(names, observed.sender);
+        let delegates = match reply_to {
+            0 => 0,
+            _ if leads() => 0,
+            _ => {
+                let bound = conversation.bound.iter();
+                let held = bound.filter(|bound| names.is(bound.agent, observed.sender));
+                (held.count() + sender) * reply_to
+            }
+        };
+        Self {
+            sender,
+            receivers: if binds(to) {
+                observed.receivers.len()
+            } else {
+                0
+            },
+            delegates,
+        }
+    }
+
+    fn count(&self) -> usize {
+        self.sender + self.receivers + self.delegates
+    }
+}
+
 /// Returns an upper bound of the bytes that a message adds to a conversation: with new participants, roles
 /// or agents in `reply-to`, or as the first of several copies.
 fn growth_by(
     machine: &Machine,
     conversation: &Conversation,
-    names: &Names,
     observed: &ObservedMessage<'_>,
-    (moves, is_copied): (&[Move], bool),
+    (moves, bindings, is_copied): (&[Move], &NewBindings, bool),
     header: &Header<'_>,
 ) -> usize {
     let name = |name: &Cow<'_, str>| Names::cost(name.len());
@@ -1408,30 +1466,20 @@ fn growth_by(
             growth + new.sum::<usize>() + designated
         }
         Scope::Conversation => {
-            let free = unbound(machine, conversation);
-            let roles = moves.first().map(|made| made.next_state.roles);
-            let (from, to) = roles.unwrap_or_default();
-            let begins = usize::from(from & free != 0);
-            let receivers = match to & free {
+            let receivers = match bindings.receivers {
                 0 => &[],
                 _ => observed.receivers,
             };
-            // The agents in the `reply-to` of a participant get each of its roles.
-            let held = || {
-                let bound = conversation.bound.iter();
-                let held = bound.filter(|bound| names.is(bound.agent, observed.sender));
-                (held.count() + begins).max(1)
-            };
-            let held = if reply_to.is_empty() { 0 } else { held() };
-            let bindings = begins + receivers.len() + held * reply_to.len();
+            // The agents in `reply-to` have a name each, and one for each binding.
+            let held = bindings.delegates.checked_div(reply_to.len());
             let copies = match is_copied {
                 true => Copied::MAX * size_of::<Copied>() + size_of::<u64>(),
                 false => 0,
             };
-            conversation.growth(0, bindings, reply_to.len())
-                + begins * sender
+            conversation.growth(0, bindings.count(), reply_to.len())
+                + bindings.sender * sender
                 + receivers.iter().map(name).sum::<usize>()
-                + held * designated
+                + held.unwrap_or(0).max(1) * designated
                 + copies
         }
     }
@@ -1539,27 +1587,38 @@ fn keep_alternatives(
         return;
     };
     let index = |at: usize| u32::try_from(at).unwrap_or(NONE);
-    let is_moved = |party: u32| {
+    let step_of = |party: u32| {
         let mut steps = moves.iter().filter(|made| {
             let NextState { void, state, .. } = made.next_state;
             !void && !made.reported && state != FAILED
         });
-        steps.any(|made| match made.target {
+        steps.find(|made| match made.target {
             MoveTarget::Party(at) => index(at) == party,
             MoveTarget::Unnamed => party == NONE,
             MoveTarget::Receiver(_) | MoveTarget::Sender => false,
         })
     };
+    // A cancel and its answers fit any state, but a message may also be a step of the protocol.
+    let fits_any_state = |made: &Move| {
+        let NextState { state, crossed, .. } = made.next_state;
+        made.next_state.answers_cancel || [CANCELLING, CANCELLED].contains(&state) && !crossed
+    };
     let alternatives = std::mem::take(&mut rare.alternatives);
-    let kept = alternatives.into_iter().filter_map(|(party, state)| {
-        if state == FAILED || !is_moved(party) {
-            return Some((party, state));
-        }
-        let state = machine.state(state)?;
-        let step = step(&state.steps, observed.act, u32::MAX, u32::MAX)?;
-        Some((party, step.target))
+    let kept = alternatives.into_iter().flat_map(|(party, state)| {
+        let made = step_of(party).filter(|_| state != FAILED);
+        let stays = made.is_none_or(fits_any_state);
+        let step = made.and_then(|_| {
+            let state = machine.state(state)?;
+            step(&state.steps, observed.act, u32::MAX, u32::MAX)
+        });
+        let stays = stays.then_some((party, state));
+        stays
+            .into_iter()
+            .chain(step.map(|step| (party, step.target)))
     });
     rare.alternatives = kept.collect();
+    rare.alternatives.sort_unstable();
+    rare.alternatives.dedup();
     let first = &machine.initial().steps;
     let Some(first) = step(first, observed.act, u32::MAX, u32::MAX) else {
         return;
@@ -1645,6 +1704,43 @@ mod tests {
             "{:?}",
             monitor.deadlines.len()
         );
+    }
+
+    #[test]
+    fn embedded_conversations_have_references_to_the_peer_of_theirs() {
+        let mut monitor = Monitor::agent(Arc::new(Library::standard()), "ben");
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let hour = Duration::from_secs(3_600);
+        let mut say = |words: &'static str, protocol, id, now| {
+            let (act, agents) = words.split_once(' ').unwrap();
+            let (from, to) = agents.split_once('>').unwrap();
+            let header = Header::new(act.parse().unwrap()).sender(from);
+            let header = header.receivers([to]).protocol(protocol);
+            assert!(
+                monitor
+                    .check(&header.conversation_id(id), now)
+                    .is_accepted()
+            );
+        };
+        say("request zed>ben", "fipa-request", "1", now);
+        say("request ann>ben", "fipa-request", "2", now);
+        say("proxy ann>ben", "fipa-brokering", "3", now);
+        say("agree ben>ann", "fipa-brokering", "3", now);
+        say("request ben>cid", "fipa-request", "3", now);
+        say("query-if ben>cid", "fipa-query", "3", now);
+        say("cfp ben>cid", "fipa-contract-net", "3", now);
+        say("agree ben>zed", "fipa-request", "1", now + 20 * hour);
+        say("agree ben>ann", "fipa-request", "2", now + 20 * hour);
+        let held = |monitor: &Monitor, name| {
+            let name = monitor.names.known(name);
+            name.map(|name| monitor.table.of_peer(name).0)
+        };
+        let both = |monitor: &Monitor| ["zed", "ann"].map(|name| held(monitor, name));
+        assert_eq!(both(&monitor), [Some(1), Some(5)]);
+        monitor.handle_timeout(now + 25 * hour);
+        assert_eq!(both(&monitor), [Some(1), Some(1)]);
+        monitor.handle_timeout(now + 50 * hour);
+        assert_eq!(monitor.names.len(), 0);
     }
 
     #[test]

@@ -164,6 +164,26 @@ mod tests {
     }
 
     #[test]
+    fn a_reference_in_use_is_counted() {
+        let mut names = Names::new(RandomState::new());
+        names.acquire("alice");
+        let bob = names.acquire("bob");
+        assert_eq!(names.acquire_again(bob), bob);
+        names.release(bob);
+        assert_eq!(names.known("bob"), Some(bob));
+        names.release(bob);
+        assert_eq!(names.known("bob"), None);
+        assert_eq!(names.len(), 1);
+    }
+
+    #[test]
+    fn a_reference_is_charged_with_its_text_and_its_entries() {
+        for (len, charged) in [(0, 64), (24, 64), (25, 65), (4_096, 4_136)] {
+            assert_eq!(Names::cost(len), charged, "{len}");
+        }
+    }
+
+    #[test]
     fn buffers_of_long_names_are_not_kept() {
         for (len, kept) in [(40, true), (64, true), (65, false), (1_000, false)] {
             let mut names = Names::new(RandomState::new());

@@ -105,16 +105,16 @@ pub(crate) fn violation(
     }
     if kind == Kind::WrongReply {
         let sender = header.sender_name().unwrap_or_default();
-        let mut parties = conversation.parties.iter();
-        let name = participant.as_deref();
-        let party = match (machine.scope, name) {
-            (Scope::Participant, Some(name)) => conversation.party(names, name),
-            _ => None,
-        };
-        let party = party.map(|(_, party)| party).or_else(|| parties.next());
-        let by_initiator = match (machine.scope, party) {
-            (Scope::Participant, Some(party)) => !names.is(party.peer, sender),
-            _ => conversation.speaks_for_initiator(names, sender),
+        let (party, by_initiator) = match participant.as_deref() {
+            Some(name) => {
+                let party = conversation.party(names, name).map(|(_, party)| party);
+                (party.or(conversation.unnamed()), name != sender)
+            }
+            // With one state for all participants.
+            None => {
+                let leads = conversation.speaks_for_initiator(names, sender);
+                (conversation.parties.first(), leads)
+            }
         };
         let other = usize::from(by_initiator);
         violation.reply = party.map(|party| ReplyMismatch {

@@ -76,14 +76,15 @@ impl Monitor {
     }
 
     /// A violation is none if the state is uncertain: the conversation may have begun before the monitor, a
-    /// message waits for its turn, or there is another conversation with this identifier. An agent that
-    /// guesses an identifier can cause the last two.
+    /// message waits for its turn, two agents may have one role, or there is another conversation with this
+    /// identifier. An agent that guesses an identifier can cause the last three.
     pub(crate) fn recheck_local(&self, id: &str, at: u32, denied: Denied) -> Denied {
         let uncertain = |at: u32| {
             let slot = self.table.slot(at);
             let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
             rare.is_some_and(|rare| {
-                rare.may_continue || rare.local.as_ref().is_some_and(LocalRun::waits)
+                let waits = || rare.local.as_ref().is_some_and(LocalRun::waits);
+                rare.may_continue || rare.contested || waits()
             })
         };
         match denied {
@@ -230,7 +231,10 @@ impl Monitor {
                 if let Some(party) = conversation.parties.first_mut() {
                     party.state = AFTER_NOT_UNDERSTOOD;
                 }
-                conversation.rare().last_sent = observed.own.then(|| last_sent(true, bound));
+                let rare = conversation.rare();
+                rare.last_sent = observed.own.then(|| last_sent(true, bound));
+                // The sender may have claimed its role.
+                rare.contested |= rare.claimed && !observed.own;
                 let passed = Passed::in_state_of(conversation, machine, index);
                 self.touch(at, now.millis());
                 Ok(passed)
@@ -248,6 +252,7 @@ impl Monitor {
             }
             // Another agent may have claimed the role of the sender.
             Err(_) if peers == 0 && !observed.own && conversation.rare().claimed => {
+                conversation.rare().contested = true;
                 Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
             Err(NotLocal::Ended) => fault(Kind::Ended, state),

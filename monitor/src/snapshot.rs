@@ -216,7 +216,7 @@ impl Monitor {
             }
             self.touch(main, now.millis());
             let peer = self.table.peer(main);
-            self.evict(main, peer, 0, 0);
+            self.evict(main, peer, 0);
         }
         self.last = now;
         Ok(self.len())
@@ -312,7 +312,8 @@ fn write_party(
     now: Now,
     out: &mut Vec<u8>,
 ) -> Option<()> {
-    if party.state == FAILED || party.worlds().is_some() {
+    // Only such a party has [`Worlds`](crate::conversation::Worlds).
+    if party.state == FAILED {
         return None;
     }
     let peer = Some(party.peer).filter(|peer| *peer != NONE);

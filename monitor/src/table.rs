@@ -659,6 +659,20 @@ mod tests {
     }
 
     #[test]
+    fn hashes_and_tags_are_spread() {
+        use std::collections::HashSet;
+
+        // The tables use the upper and the lower bits of a hash.
+        let lower: HashSet<u64> = (0..256).map(|name| spread(name) & 0xff).collect();
+        let upper: HashSet<u64> = (0..256).map(|name| spread(name) >> 57).collect();
+        assert_eq!((lower.len(), upper.len()), (256, 128));
+        let table = Table::new(&RandomState::new());
+        let tags = (0..256).map(|number: u32| table.fingerprint(&number.to_string()).tag);
+        let tags: HashSet<u32> = tags.collect();
+        assert!(tags.len() > 250, "{}", tags.len());
+    }
+
+    #[test]
     fn buffers_of_long_ids_are_not_kept() {
         for (len, kept) in [(100, true), (128, true), (129, false), (1_000, false)] {
             let mut table = Table::new(&RandomState::new());

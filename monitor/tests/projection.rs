@@ -200,6 +200,94 @@ fn a_choice_that_a_waiting_role_is_not_told_is_a_deadlock() {
     );
 }
 
+/// The pairs of equal defects.
+fn repeated(found: &[Defect]) -> usize {
+    let after = |at: usize| found.iter().skip(at + 1);
+    let equal = found.iter().enumerate();
+    equal
+        .map(|(at, one)| after(at).filter(|other| *other == one).count())
+        .sum()
+}
+
+#[test]
+fn few_defects_of_an_exploration_are_reported_once() {
+    // The queries wait for a receiver that has gone on.
+    let acts =
+        "agree|refuse|propose|confirm|disconfirm|failure|inform-if|inform-ref|query-if|query-ref";
+    let text = |acts| {
+        format!(
+            r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="{acts}" from="a" to="b" target="3"/>
+                <transition performative="inform" from="b" to="c" target="4"/></state>
+            <state id="3" final="yes"/><state id="4" final="yes"/>"#
+        )
+    };
+    for (acts, count) in [("agree|refuse", 2), (acts, 8)] {
+        let found = defects(&text(acts));
+        let waits = |defect: &&Defect| matches!(defect, Defect::Unexpected { .. });
+        assert_eq!(found.iter().filter(waits).count(), count, "{found:?}");
+        assert_eq!(repeated(&found), 0, "{found:?}");
+    }
+}
+
+#[test]
+fn roles_that_take_crossing_messages_for_different_choices_wait_for_ever() {
+    let found = defects(
+        r#"<state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="confirm" from="a" to="b" target="3"/>
+            <transition performative="inform" from="b" to="a" target="4"/></state>
+        <state id="3"><transition performative="inform" from="b" to="a" target="5"/></state>
+        <state id="4"><transition performative="confirm" from="a" to="b" target="6"/></state>
+        <state id="5"><transition performative="query-if" from="a" to="c" target="7"/></state>
+        <state id="6"><transition performative="refuse" from="a" to="b" target="7"/></state>
+        <state id="7" final="yes"/>"#,
+    );
+    let waiting = vec![("b".to_owned(), "6".to_owned())];
+    let deadlock = Defect::Deadlock { waiting };
+    assert!(found.contains(&deadlock), "{found:?}");
+    assert_eq!(deadlock.to_string(), r#"deadlock: b waits in state "6""#);
+    let waiting = [("b", "6"), ("c", "5")].map(|(role, state)| (role.into(), state.into()));
+    let both = Defect::Deadlock {
+        waiting: waiting.into(),
+    };
+    let text = r#"deadlock: b waits in state "6", c waits in state "5""#;
+    assert_eq!(both.to_string(), text);
+}
+
+/// Each agent has a clock, so that a timeout counts as told.
+#[test]
+fn a_timeout_may_lead_to_a_state_that_no_message_shows() {
+    let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="c" target="3"/>
+            <transition f:after="10s" target="4"/></state>
+        <state id="3"><transition performative="agree" from="c" to="a" target="6"/></state>
+        <state id="4"><transition performative="refuse" from="b" to="c" target="5"/>
+            <transition f:after="10s" target="3"/></state>
+        <state id="5"><transition performative="failure" from="a" to="c" target="6"/></state>
+        <state id="6" final="yes"/></scxml>"#;
+    let timed = machine(text);
+    let projection = timed.projection().unwrap();
+    assert_eq!(
+        shown(&projection.locals()[0]),
+        [
+            "1: request a>b 2|3|4|5",
+            "2|3|4|5: agree c>a 6",
+            "2|3|4|5: failure a>c 6",
+        ]
+    );
+    assert_eq!(
+        shown(&projection.locals()[1]),
+        [
+            "1: request a>b 2|3|4|6",
+            "2|3|4|6: inform b>c 3|6",
+            "2|3|4|6: refuse b>c 5|6",
+        ]
+    );
+    let mut ann = stage_with(timed, "ann");
+    ann.right(&["request ann>ben", "failure ann>cid"]);
+}
+
 struct Stage {
     monitor: Monitor,
     now: SystemTime,
@@ -265,12 +353,22 @@ fn each_agent_checks_what_it_sees() {
     assert_eq!(station.wrong("inform sta>med"), Kind::Unexpected);
     assert_eq!(station.wrong("agree med>sta"), Kind::Unexpected);
     station.right(&["confirm sta>med"]);
+    let now = station.now;
+    let wrong = station.monitor.check(&header_of("agree med>sta").0, now);
+    assert_eq!(wrong.violation().unwrap().state.as_deref(), Some("4"));
     // It does not know the drone yet, but the mediator is not the drone.
     assert_eq!(station.wrong("inform med>sta"), Kind::Unexpected);
     station.right(&["inform dro>sta"]);
     assert_eq!(station.wrong("inform sta>dro"), Kind::Unexpected);
     station.right(&["inform sta>med"]);
     assert_eq!(station.wrong("inform sta>med"), Kind::Ended);
+    let mut drone = stage("dro");
+    for (words, opened) in [("request dro>med", true), ("agree med>dro", false)] {
+        let Verdict::Accepted(accepted) = drone.check(words) else {
+            panic!("{words}");
+        };
+        assert_eq!(accepted.opened, opened, "{words}");
+    }
     let mut drone = stage("dro");
     drone.right(&["request dro>med"]);
     assert_eq!(drone.wrong("inform dro>sta"), Kind::Unexpected);
@@ -436,6 +534,14 @@ fn an_outsider_ends_no_conversation_of_roles() {
     drone.right(&["request dro>med"]);
     drone.lost("request dro>med");
     drone.right(&["request dro>other", "refuse other>dro"]);
+    // So it is with two receivers.
+    let mut drone = stage("dro");
+    let both = header_of("request dro>med").0.receivers(["med", "old"]);
+    let now = drone.now;
+    assert!(drone.monitor.check(&both, now).is_accepted());
+    drone.monitor.undelivered(&both, "med", now);
+    assert_eq!(drone.wrong("refuse mallory>dro"), Kind::Unexpected);
+    drone.right(&["refuse old>dro"]);
     // An agent that sends the first message has its role, also if the message was not delivered.
     let mut drone = stage("dro");
     drone.right(&["request dro>med"]);
@@ -469,6 +575,10 @@ fn an_outsider_ends_no_conversation_of_roles() {
     assert_eq!(station.check("inform dro>sta"), unknown);
     station.right(&["inform sta>med"]);
     let mut station = stage("sta");
+    station.right(&["query-if med>sta", "confirm sta>med", "inform mallory>sta"]);
+    station.right(&["not-understood mallory>sta"]);
+    assert_eq!(station.check("inform sta>med"), unknown);
+    let mut station = stage("sta");
     station.right(&["query-if med>sta"]);
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(station.check("not-understood mallory>sta"), elsewhere);
@@ -485,9 +595,24 @@ fn no_message_of_a_projected_protocol_is_refused() {
             .map(|text| text.parse::<u64>().unwrap())
     };
     let runs = number("FIPA_WALK_SEEDS").unwrap_or(2_000);
-    let docking = machine(DOCKING);
-    let locals = docking.projection().unwrap().locals();
-    let library = library_with(docking.clone());
+    // Two messages of the last role may overtake one of the first.
+    let relay = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="query-if" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
+        <state id="4"><transition performative="confirm" from="c" to="b" target="5"/></state>
+        <state id="5"><transition performative="agree" from="b" to="a" target="6"/></state>
+        <state id="6" final="yes"/></scxml>"#;
+    for (text, few) in [(DOCKING, 8), (relay, 16)] {
+        let (said, lost, unchecked) = walk(&machine(text), runs);
+        assert!(said > runs * 4 && lost > runs / 8 && unchecked > runs / few);
+    }
+}
+
+/// Returns the numbers of messages, of undelivered ones and of unchecked ones.
+fn walk(protocol: &Machine, runs: u64) -> (u64, u64, u64) {
+    let locals = protocol.projection().unwrap().locals();
+    let library = library_with(protocol.clone());
     let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
     let names = ["dro", "med", "sta"];
     let (mut said, mut ended, mut lost, mut unchecked) = (0, 0, 0, 0);
@@ -564,5 +689,135 @@ fn no_message_of_a_projected_protocol_is_refused() {
         );
     }
     assert_eq!(ended as u64, runs);
-    assert!(said > runs * 4 && lost > runs / 8 && unchecked > runs / 8);
+    (said, lost, unchecked)
+}
+
+#[test]
+fn early_messages_are_taken_in_the_order_of_their_senders() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="d" target="2"/></state>
+        <state id="2"><transition performative="request" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="d" target="4"/></state>
+        <state id="4"><transition performative="confirm" from="c" to="d" target="5"/></state>
+        <state id="5"><transition performative="request" from="c" to="b" target="6"/></state>
+        <state id="6"><transition performative="agree" from="b" to="d" target="7"/></state>
+        <state id="7"><transition performative="inform" from="d" to="a" target="8"/></state>
+        <state id="8" final="yes"/></scxml>"#;
+    // The messages of ben and cid overtake that of ann.
+    let mut dan = stage_with(machine(text), "dan");
+    dan.right(&["agree ben>dan", "inform cid>dan", "confirm cid>dan"]);
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    assert_eq!(dan.check("inform dan>ann"), unknown);
+    dan.right(&["request ann>dan", "inform dan>ann"]);
+    // The messages of cid arrive in their order.
+    let mut dan = stage_with(machine(text), "dan");
+    dan.right(&["inform cid>dan", "confirm cid>dan", "request ann>dan"]);
+    dan.right(&["agree ben>dan", "inform dan>ann"]);
+    let mut dan = stage_with(machine(text), "dan");
+    dan.right(&["inform cid>dan"]);
+    assert_eq!(dan.check("inform cid>dan"), unknown);
+    let mut dan = stage_with(machine(text), "dan");
+    dan.right(&["confirm cid>dan"]);
+    for words in ["inform cid>dan", "confirm cid>dan"] {
+        assert_eq!(dan.check(words), unknown, "{words}");
+    }
+}
+
+#[test]
+fn an_early_message_decides_a_choice_of_its_sender() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="d" target="2"/></state>
+        <state id="2"><transition performative="query-if" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="d" target="4"/>
+            <transition performative="refuse" from="c" to="d" target="5"/></state>
+        <state id="4"><transition performative="inform" from="d" to="a" target="6"/></state>
+        <state id="5"><transition performative="failure" from="d" to="a" target="6"/></state>
+        <state id="6" final="yes"/></scxml>"#;
+    for (early, last) in [
+        ("inform cid>dan", "inform dan>ann"),
+        ("refuse cid>dan", "failure dan>ann"),
+    ] {
+        let mut dan = stage_with(machine(text), "dan");
+        dan.right(&[early, "request ann>dan", last]);
+    }
+}
+
+#[test]
+fn an_agent_sends_no_early_message_of_another_role() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="d" target="2"/></state>
+        <state id="2"><transition performative="query-if" from="a" to="b" target="3"/></state>
+        <state id="3"><transition performative="agree" from="b" to="d" target="4"/></state>
+        <state id="4"><transition performative="cfp" from="b" to="c" target="5"/></state>
+        <state id="5"><transition performative="confirm" from="c" to="d" target="6"/></state>
+        <state id="6"><transition performative="inform" from="c" to="a" target="7"/></state>
+        <state id="7"><transition performative="disconfirm" from="a" to="d" target="8"/></state>
+        <state id="8"><transition performative="inform" from="d" to="a" target="9"/></state>
+        <state id="9" final="yes"/></scxml>"#;
+    let begun = || {
+        let mut dan = stage_with(machine(text), "dan");
+        dan.right(&["request ann>dan"]);
+        dan
+    };
+    let mut dan = begun();
+    for words in ["confirm ann>dan", "propose ann>dan", "agree ann>dan"] {
+        assert_eq!(dan.wrong(words), Kind::Unexpected, "{words}");
+    }
+    let mut dan = begun();
+    dan.right(&["disconfirm ann>dan", "confirm cid>dan", "agree ben>dan"]);
+    dan.right(&["inform dan>ann"]);
+}
+
+#[test]
+fn a_conversation_is_over_when_the_role_has_nothing_more_to_do() {
+    let text = |answer| {
+        format!(
+            r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="inform" from="b" to="c" target="3"/>{answer}</state>
+            <state id="3" final="yes"/></scxml>"#
+        )
+    };
+    let refusal = r#"<transition performative="refuse" from="b" to="a" target="3"/>"#;
+    for (answer, is_over) in [("", true), (refusal, false)] {
+        let mut ann = stage_with(machine(&text(answer)), "ann");
+        let Verdict::Accepted(accepted) = ann.check("request ann>ben") else {
+            panic!("{answer}");
+        };
+        // Without an answer, ben may have informed cid.
+        assert_eq!((accepted.over, accepted.complete), (is_over, true));
+        ann.now += Duration::from_secs(100);
+        ann.monitor.handle_timeout(ann.now);
+        assert_eq!(ann.monitor.is_empty(), is_over);
+        if !is_over {
+            ann.right(&["refuse ben>ann"]);
+        }
+    }
+}
+
+#[test]
+fn the_report_of_a_service_is_no_message_of_a_role() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="b" to="c" target="3"/></state>
+        <state id="3"><transition performative="failure" from="c" to="a" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    let mut ann = stage_with(machine(text), "ann");
+    let other = |words| header_of(words).0.protocol("fipa-request");
+    ann.right(&["request ann>ben"]);
+    // Another conversation with this identifier.
+    for words in ["request eve>ann", "agree ann>eve"] {
+        let now = ann.now;
+        assert!(ann.monitor.check(&other(words), now).is_accepted());
+    }
+    let lost = Header::new(Performative::Failure)
+        .sender("mts")
+        .receivers(["ann"])
+        .conversation_id("c")
+        .undelivered_to("eve");
+    let Verdict::Accepted(accepted) = ann.monitor.check(&lost, ann.now) else {
+        panic!("it belongs to the other conversation");
+    };
+    assert_eq!(accepted.state, "undelivered");
+    ann.right(&["failure cid>ann"]);
 }

@@ -336,27 +336,37 @@ impl Part {
         })
     }
 
-    /// The part with a message whose turn comes after messages of other roles.
+    /// The part with a message whose turn comes after messages of other roles. It does not fit now.
     fn keeping(&self, local: &Local, message: Observed<'_>) -> Option<(Self, u8)> {
         if self.early.len() == MAX_EARLY {
             return None;
         }
-        let mut reached = vec![self.state];
+        // The messages of the sender that wait already. Its messages arrive in their order.
+        let of_sender = self.early.iter();
+        let of_sender = of_sender.filter(|(from, _)| message.peers == 1 << from);
+        let waiting: Vec<&Performed> = of_sender.map(|(_, act)| act).collect();
+        let mut reached = vec![(self.state, 0)];
         let mut next = 0;
-        while let Some(state) = reached.get(next).and_then(|at| local.state(*at)) {
+        while let Some((at, taken)) = reached.get(next).copied() {
             next += 1;
-            for step in &state.steps {
+            let steps = local.state(at).map_or(&[][..], LocalState::steps);
+            for step in steps.iter().filter(|step| step.label.from != self.role) {
                 let Label { from, act, .. } = &step.label;
                 let fits = message.peers & (1 << from) != 0 && act.is(message.act);
-                if next > 1 && *from != self.role && fits {
+                if fits && taken == waiting.len() {
                     let mut part = self.clone();
                     part.early.push((*from, act.clone()));
                     return Some((part, *from));
                 }
-                // Only messages of other senders can be under way.
-                let others = *from != self.role && message.peers != 1 << from;
-                if others && !reached.contains(&step.target) && reached.len() < MAX_SEARCHED {
-                    reached.push(step.target);
+                // Messages of other senders can be under way.
+                let taken = match message.peers == 1 << from {
+                    true if waiting.get(taken) == Some(&act) => taken + 1,
+                    true => continue,
+                    false => taken,
+                };
+                let after = (step.target, taken);
+                if !reached.contains(&after) && reached.len() < MAX_SEARCHED {
+                    reached.push(after);
                 }
             }
         }
@@ -394,5 +404,15 @@ mod tests {
         };
         let early = part.early.capacity() * size_of::<(u8, Performed)>() + "own-act".len();
         assert_eq!(run.allocated(), parts(&run) + early);
+        // A sent message may not have arrived.
+        let mut run = LocalRun::new(locals, u32::MAX);
+        let request = Observed {
+            own: true,
+            ..message(Act::named("request"))
+        };
+        run.take(locals, request).unwrap();
+        let before = run.without_last.capacity() * size_of::<Part>();
+        assert!(before > 0);
+        assert_eq!(run.allocated(), parts(&run) + before);
     }
 }

@@ -338,10 +338,8 @@ impl Unseen {
         loop {
             let known = told.len() + timed.len();
             let all = told.union(&timed).filter_map(|state| machine.state(*state));
-            let targets: Vec<u16> = all
-                .filter_map(|state| Some(state.timeout?.target))
-                .filter(|target| !told.contains(target))
-                .collect();
+            let targets = all.filter_map(|state| Some(state.timeout?.target));
+            let targets: Vec<u16> = targets.collect();
             timed.extend(targets);
             hidden(&mut timed);
             timed.retain(|state| !told.contains(state));

@@ -370,6 +370,17 @@ fn the_limits_apply_to_conversations_that_began_elsewhere() {
     stage.right(say("accept-proposal dan>3"));
     let fourth = stage.wrong(say("accept-proposal dan>4"));
     assert_eq!(fourth.kind, Kind::WrongReceiver);
+    // Bytes: the answers of too long names are not kept.
+    let share = 1 << 14;
+    let mut small = Limits::default();
+    small.bytes = share * 8;
+    let mut stage = Stage::new(Monitor::agent(library(), "dan").with_limits(small));
+    for number in 0..20 {
+        let answer = say("propose ben>dan").sender(format!("{number:x<2000}"));
+        assert_eq!(stage.check(&answer.reply_with("bid")), elsewhere);
+        assert!(stage.monitor.bytes() <= share, "{number}");
+    }
+    assert!(stage.monitor.bytes() > share / 2);
     // Embedded conversations.
     let monitor = Monitor::agent(library(), "ann").with_limits(limits);
     let mut stage = Stage::new(monitor);

@@ -164,6 +164,37 @@ fn the_limit_of_participants_is_exact() {
     let mut stage = Stage::new(monitor);
     stage.right(own("request ann>ben"));
     stage.right(own("agree ben>ann"));
+    // Each agent counts once.
+    let limited = |library| Stage::new(Monitor::observer(library).with_limits(limits));
+    let mut stage = limited(library_with("own", text));
+    stage.right(own("request ann>ben,cid"));
+    assert_eq!(stage.right(own("agree cid>ann")), "3");
+    let mut stage = limited(library_with("own", text));
+    stage.right(own("request ann>ben,cid").reply_to(["1", "2", "3"]));
+    let three = text.replace(
+        r#"to="a" target="3"/>"#,
+        r#"to="a" target="3"/>
+        <transition performative="inform" from="a" to="c" target="2"/>"#,
+    );
+    let mut stage = limited(library_with("own", &three));
+    stage.right(own("request ann>ben,cid"));
+    assert_eq!(stage.wrong(own("inform ann>dan")).kind, Kind::TooMany);
+    let mut stage = limited(library());
+    let call = say("cfp ann>ben,cid").reply_to(["1", "2", "3"]);
+    assert_eq!(stage.right(call), "called");
+    stage.right(say("propose ben>ann,1"));
+    assert_eq!(stage.wrong(say("cfp ann>dan")).kind, Kind::TooMany);
+    // The receivers of the whole message count.
+    let mut stage = limited(library_with("own", text));
+    for (count, is_checked) in [(2, true), (3, false)] {
+        let names = (0..count).map(|number| format!("{number}"));
+        let copy = own("request ann>ben").receivers(names).copy_for("0");
+        let verdict = stage.check(&copy.conversation_id("copies"));
+        match is_checked {
+            true => assert!(verdict.is_accepted(), "{verdict:?}"),
+            false => assert_eq!(verdict, Verdict::Unchecked(Unchecked::TooLarge)),
+        }
+    }
 }
 
 #[test]
@@ -194,6 +225,35 @@ fn an_undelivered_cancel_that_a_message_crossed_is_taken_back() {
         match is_taken_back {
             true => assert_eq!(stage.right(cancel("y")), "cancelling"),
             false => drop(stage.wrong(cancel("y"))),
+        }
+    }
+    // An answer shows that the cancel arrived.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    let cancel = || subscribe("cancel ann>ben").reply_with("x");
+    stage.right(subscribe("subscribe ann>ben"));
+    stage.right(cancel());
+    stage.right(subscribe("not-understood ben>ann").in_reply_to("x"));
+    let now = stage.now;
+    stage.monitor.undelivered(&cancel(), "ben", now);
+    assert_eq!(stage.wrong(cancel()).kind, Kind::Ended);
+    // Without `in-reply-to`, the message may have been the answer.
+    for (answered, is_taken_back) in [(None, true), (Some("x"), false)] {
+        let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+        stage.right(subscribe("subscribe ann>ben"));
+        stage.right(subscribe("agree ben>ann"));
+        let cancel = || subscribe("cancel ann>ben").reply_with("x");
+        stage.right(cancel());
+        let inform = subscribe("inform ben>ann");
+        let inform = match answered {
+            Some(text) => inform.in_reply_to(text),
+            None => inform,
+        };
+        assert_eq!(stage.right(inform), "cancelled");
+        let now = stage.now;
+        stage.monitor.undelivered(&cancel(), "ben", now);
+        match is_taken_back {
+            true => assert_eq!(stage.right(cancel()), "cancelling"),
+            false => assert_eq!(stage.wrong(cancel()).kind, Kind::Ended),
         }
     }
 }
@@ -541,4 +601,154 @@ fn a_cancel_has_one_answer_that_is_told_apart() {
     // The next message is one of the subscription.
     let next = news("inform ben>ann").in_reply_to("x");
     assert_eq!(stage.right(next), going_on);
+}
+
+#[test]
+fn the_answer_to_a_cancel_is_no_step_of_the_protocol() {
+    let text = r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform|failure" from="b" to="a" target="2"/>
+            <transition performative="agree" from="a" to="b" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    for (crossing, answer, state) in [
+        ("failure ben>ann", "inform ben>ann", "cancelled"),
+        ("failure ben>ann", "failure ben>ann", "2"),
+        (
+            "failure ben>ann",
+            "not-understood ben>ann",
+            "not-understood",
+        ),
+        ("inform ben>ann", "failure ben>ann", "2"),
+    ] {
+        let library = library_with("own", text);
+        for monitor in [
+            Monitor::observer(Arc::clone(&library)),
+            Monitor::agent(Arc::clone(&library), "ann"),
+        ] {
+            let mut stage = Stage::new(monitor);
+            stage.right(own("request ann>ben").reply_with("q"));
+            stage.right(own("inform ben>ann").reply_with("r"));
+            stage.right(own("cancel ann>ben").reply_with("x"));
+            // This may be the answer to the cancel. The next message shows that it is not.
+            stage.right(own(crossing));
+            let answer = own(answer).in_reply_to("x").reply_with("z");
+            assert_eq!(stage.right(answer), state);
+            if state == "2" {
+                assert_eq!(stage.right(own("agree ann>ben").in_reply_to("r")), "3");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_message_to_several_names_of_one_party_is_one_step() {
+    let text = r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="3"/>
+            <transition performative="reject-proposal" from="a" to="b" target="4"/></state>
+        <state id="3"><transition performative="inform" from="b" to="a" target="3"/>
+            <transition performative="reject-proposal" from="a" to="b" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    // The last message crosses the rejection, so it fits the state before it.
+    let mut stage = stage_of(text);
+    stage.right(own("cfp ann>arm_.*,leg_.*"));
+    stage.right(own("reject-proposal ann>arm_.*,leg_.*"));
+    assert_eq!(stage.right(own("propose arm_1>ann")), "4");
+    let mut stage = stage_of(text);
+    stage.right(own("cfp ann>ben"));
+    stage.right(own("propose ben>ann").reply_to(["dan"]));
+    stage.right(own("reject-proposal ann>ben,dan"));
+    assert_eq!(stage.right(own("inform ben>ann")), "4");
+}
+
+#[test]
+fn the_only_role_of_a_protocol_is_that_of_an_agent_in_reply_to() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="inform" from=".*" to=".*" target="2"/></state>
+        <state id="2"><transition performative="confirm" from=".*" to="b" target="2"/>
+            <transition performative="disconfirm" from="b" to=".*" target="2"/></state>
+        </scxml>"#,
+    );
+    stage.right(own("inform ann>ben").reply_to(["dan"]));
+    assert_eq!(stage.wrong(own("agree ann>dan")).kind, Kind::Unexpected);
+    stage.right(own("disconfirm dan>ann").conversation_id("c"));
+    for _ in 0..2 {
+        stage.right(own("confirm ann>dan"));
+    }
+    assert_eq!(stage.wrong(own("confirm ann>ben")).kind, Kind::Stranger);
+}
+
+#[test]
+fn of_conversations_with_one_identifier_the_one_with_the_protocol_is_meant() {
+    let broker = |words| say_in("fipa-brokering", words);
+    let mut stage = stage_of(ONE_STATE);
+    stage.right(broker("proxy ann>ben"));
+    stage.right(broker("agree ben>ann"));
+    stage.right(say_in("fipa-query", "query-if ben>dan"));
+    stage.right(request("request ben>cid"));
+    // A later conversation has the same agents, and another protocol.
+    stage.right(own("request eve>ben,cid"));
+    assert_eq!(stage.monitor.len(), 4);
+    assert_eq!(stage.right(request("agree cid>ben")), "agreed");
+    assert_eq!(stage.right(own("agree cid>eve")), "3");
+}
+
+#[test]
+fn the_cancel_protocol_is_a_subprotocol_where_the_file_says_so() {
+    let cancel = |words| say_in("fipa-cancel", words);
+    // Another protocol within the conversation does not matter.
+    let mut stage = Stage::observer();
+    let broker = |words| say_in("fipa-brokering", words);
+    stage.right(broker("proxy ann>bro"));
+    stage.right(broker("agree bro>ann"));
+    stage.right(request("request bro>ben"));
+    assert_eq!(stage.right(cancel("cancel ann>bro")), "cancelling");
+    assert_eq!(stage.monitor.len(), 2);
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><subprotocol name="fipa-cancel" from="a"/>
+            <transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="inform" from="b" to="a" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#,
+    );
+    stage.right(own("request ann>ben"));
+    stage.right(cancel("cancel ann>ben"));
+    assert_eq!(stage.monitor.len(), 2);
+    // It goes on where it cannot begin.
+    assert_eq!(stage.right(own("agree ben>ann")), "3");
+    assert_eq!(stage.right(cancel("inform ben>ann")), "cancelled");
+    assert_eq!(stage.right(own("inform ben>ann")), "4");
+}
+
+#[test]
+fn an_agent_may_send_to_itself_in_its_role() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="n" to="n" target="2"/></state>
+        <state id="2"><transition performative="inform" from="n" to="n" target="2"/>
+            <subprotocol name="fipa-request" from="n"/></state></scxml>"#,
+    );
+    stage.right(own("request ann>ann,ben"));
+    stage.right(own("inform ann>ben"));
+    stage.right(own("inform ben>ann"));
+    assert_eq!(stage.right(request("request ann>ben")), "requested");
+    assert_eq!(stage.monitor.len(), 2);
+}
+
+#[test]
+fn an_agent_may_name_others_with_its_first_message_in_a_role() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="c" to="a" target="3"/></state>
+        <state id="3"><transition performative="agree" from="c" to="a" target="4"/></state>
+        <state id="4"><transition performative="confirm" from="a" to="c" target="4"/></state>
+        </scxml>"#,
+    );
+    stage.right(own("request ann>ben"));
+    stage.right(own("inform cid>ann").reply_to(["dan"]));
+    stage.wrong(own("agree ben>ann"));
+    assert_eq!(stage.right(own("agree dan>ann")), "4");
 }

@@ -131,3 +131,22 @@ fn guards_are_attributes_of_transitions_with_a_state_per_participant() {
         assert!(wrong.to_string().contains(problem), "{wrong}");
     }
 }
+
+#[test]
+fn a_message_that_crosses_a_cancel_reaches_no_guarded_state() {
+    let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant" f:cancel="anyone">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="accept-proposal" from="a" to="b" target="4" f:at-most="1"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    let own = |words| say_in("own", words);
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
+    stage.right(own("cfp ann>ben,cid"));
+    for words in ["propose ben>ann", "propose cid>ann"] {
+        stage.right(own(words));
+    }
+    for words in ["cancel ben>ann", "cancel cid>ann"] {
+        assert_eq!(stage.right(own(words)), "cancelling");
+    }
+    assert_eq!(stage.right(own("accept-proposal ann>ben")), "cancelling");
+}

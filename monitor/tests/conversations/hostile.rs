@@ -472,6 +472,12 @@ fn a_report_of_a_service_is_no_violation_and_begins_nothing() {
     let lost = say("failure mts>ann").undelivered_to("arm_1");
     stage.right(lost);
     assert_eq!(stage.monitor.len(), 1);
+    // A report to an agent that takes no part changes nothing.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    let lost = request("failure mts>ann,dan").undelivered_to("ben");
+    assert_eq!(stage.check(&lost), unknown);
+    assert_eq!(stage.right(request("agree ben>ann")), "agreed");
 }
 
 /// Within a second, the list of conversations is not sorted anew.
@@ -493,4 +499,107 @@ fn the_oldest_conversation_of_a_peer_cannot_grow_beyond_its_share() {
         assert!(stage.monitor.bytes() <= 1 << 20);
     }
     assert!(stage.monitor.len() < 20);
+}
+
+#[test]
+fn no_conversation_is_evicted_before_the_limit_of_bytes() {
+    const COUNT: usize = 40;
+    // The conversations of the agent count toward the total, and those of a peer toward its share.
+    for (words, parts) in [("request ben>ann", 1), ("request ann>ben", 8)] {
+        let filled = |bytes| {
+            let mut limits = Limits::default();
+            limits.bytes = bytes * parts;
+            let mut stage = Stage::new(Monitor::agent(library_once(), "ben").with_limits(limits));
+            for number in 0..COUNT {
+                stage.right(request(words).conversation_id(format!("{number:02}")));
+            }
+            (stage.monitor.len(), stage.monitor.bytes())
+        };
+        let (_, bytes) = filled(1 << 20);
+        assert_eq!(filled(bytes), (COUNT, bytes));
+        assert_eq!(filled(bytes - 1), (COUNT - 1, bytes / COUNT * (COUNT - 1)));
+    }
+}
+
+#[test]
+fn no_message_exceeds_a_share_of_any_size() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="inform" from="a|b" to="a|b" target="3"/></state>
+        </scxml>"#;
+    let library = library_with("own", text);
+    let long = |name: &str| format!("{name:x<100}");
+    let ask = |to: &str| {
+        let header = say_in("own", "request ann>ben,cid,dan").sender(long("ann"));
+        header.reply_with("q").copy_for(long(to))
+    };
+    let mut accepted = [0; 3];
+    for share in 400..3_000 {
+        let mut limits = Limits::default();
+        limits.bytes = share * 8;
+        let monitor = Monitor::observer(Arc::clone(&library)).with_limits(limits);
+        let mut stage = Stage::new(monitor);
+        for (to, accepted) in ["ben", "cid", "dan"].into_iter().zip(&mut accepted) {
+            *accepted += usize::from(stage.check(&ask(to)).is_accepted());
+            let bytes = stage.monitor.bytes();
+            assert!(bytes <= share, "{to}: {bytes} > {share}");
+        }
+        // What adds no agent needs no space.
+        if stage.monitor.len() == 1 && accepted[0] > 0 {
+            let header = |words, from, to| {
+                let header = say_in("own", words).sender(long(from));
+                header.receivers([long(to)])
+            };
+            stage.right(header("agree ben>ann", "ben", "ann"));
+            stage.right(header("inform ann>ben", "ann", "ben"));
+        }
+    }
+    let [first, second, third] = accepted;
+    assert!(
+        first > second && second > third && third > 0,
+        "{accepted:?}"
+    );
+}
+
+#[test]
+fn a_conversation_beyond_the_share_of_its_peer_evicts_others_if_the_whole_is_too_large() {
+    let long = || "x".repeat(4_000);
+    let call = || {
+        let call = say("cfp ann>ben").receivers([long(), "ben".to_owned()]);
+        call.reply_with("call")
+    };
+    let observer = |share: usize| {
+        let mut limits = Limits::default();
+        limits.bytes = share * 8;
+        Stage::new(Monitor::observer(library_once()).with_limits(limits))
+    };
+    let called = |share: usize| {
+        let mut stage = observer(share);
+        let is_accepted = stage.check(&call()).is_accepted();
+        is_accepted.then_some((share, stage.monitor.bytes()))
+    };
+    let (share, bytes) = (4_000..8_000).find_map(called).unwrap();
+    let mut stage = observer(share);
+    // Other peers have nearly all of the rest.
+    let mut small = 0;
+    for number in 0.. {
+        let before = stage.monitor.bytes();
+        if before + small + bytes > share * 8 {
+            break;
+        }
+        let header = request("request dan>ben").sender(format!("{number:03}"));
+        stage.right(header.conversation_id(format!("{number:03}")));
+        small = stage.monitor.bytes() - before;
+    }
+    stage.right(call());
+    assert_eq!(stage.monitor.forgotten(), 0);
+    // The bytes that an undelivered message needs are not limited by the share.
+    let now = stage.now;
+    for receiver in [&*long(), "ben"] {
+        stage.monitor.undelivered(&call(), receiver, now);
+    }
+    assert!(stage.monitor.forgotten() > 0);
+    assert!(stage.monitor.bytes() <= share * 8);
+    assert_eq!(stage.right(call()), "called");
 }

@@ -208,6 +208,16 @@ fn an_undelivered_message_can_be_sent_again() {
     }
     stage.monitor.undelivered(&ask(), "cid", now);
     assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+    let of_mallory = request("request mallory>ben").reply_with("q");
+    stage.monitor.undelivered(&of_mallory, "ben", now);
+    assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+    // A participant that a `reply-to` names is a participant.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_to(["ben"]));
+    let agree = || request("agree ben>ann").reply_with("a");
+    stage.right(agree());
+    stage.monitor.undelivered(&agree(), "ann", now);
+    assert_eq!(stage.right(agree()), "agreed");
 }
 
 #[test]
@@ -235,6 +245,57 @@ fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
             let again = dutch("inform ann>ben").reply_with("again");
             assert_eq!(stage.right(again.in_reply_to("bid")), "closed");
         }
+        // A letter of the message transport service reports it.
+        for is_repeated in [false, true] {
+            let mut stage = Stage::observer();
+            stage.right(dutch("inform ann>ben").reply_with("opening"));
+            stage.right(dutch("cfp ann>ben").reply_with("price"));
+            stage.right(closing());
+            let lost = dutch("failure mts>ann").undelivered_to("ben");
+            assert_eq!(stage.right(lost), "undelivered");
+            if !is_repeated {
+                // A bid that names the call may also have crossed a closing that arrived.
+                let state = answered.map_or("bidding", |_| "undelivered");
+                assert_eq!(stage.right(bid().reply_with("bid")), state);
+            }
+            assert_eq!(stage.right(closing()), "closed");
+            // The bid crosses the second closing.
+            if is_repeated {
+                assert_eq!(stage.right(bid().reply_with("bid")), "closed");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_message_that_fits_after_an_uncertain_one_is_no_late_one() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="5"/>
+            <transition performative="inform" from="a" to="b" target="3"/></state>
+        <state id="3"><transition performative="cfp" from="a" to="b" target="4"/></state>
+        <state id="4"><transition performative="propose" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let own = |words| say_in("own", words);
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
+    for words in ["request ann>ben", "inform ann>ben", "cfp ann>ben"] {
+        stage.right(own(words));
+    }
+    let now = stage.now;
+    stage.monitor.undelivered(&own("cfp ann>ben"), "ben", now);
+    // It has crossed the inform, or answers the call, which has arrived then.
+    assert_eq!(stage.right(own("propose ben>ann")), "5");
+}
+
+#[test]
+fn a_message_before_the_last_is_not_taken_back() {
+    for mut stage in monitors("ann") {
+        stage.right(request("request ann>ben"));
+        stage.right(request("not-understood ben>ann"));
+        let now = stage.now;
+        let before = request("request ann>ben");
+        stage.monitor.undelivered(&before, "ben", now);
+        assert_eq!(stage.wrong(request("agree ben>ann")).kind, Kind::Ended);
     }
 }
 
@@ -438,6 +499,72 @@ fn each_participant_of_a_forgotten_conversation_may_be_in_a_later_state() {
     assert_eq!(stage.check(&bid), UNKNOWN);
 }
 
+/// An announcement, calls, the end and what follows it. The announcement looks like the end.
+const AUCTION: &str = r#"
+    <state id="1"><transition performative="inform" from="a" to="b" target="2"/></state>
+    <state id="2"><transition performative="cfp" from="a" to="b" target="3"/>
+        <transition performative="inform" from="a" to="b" target="2"/>
+        <transition performative="propose" from="b" to="a" target="2"/></state>
+    <state id="3"><transition performative="inform" from="a" to="b" target="4"/></state>
+    <state id="4"><transition performative="inform" from="a" to="b" target="4"/>
+        <transition performative="request" from="a" to="b" target="5"/></state>
+    <state id="5" final="yes"/></scxml>"#;
+
+#[test]
+fn a_forgotten_conversation_of_one_state_may_be_in_a_later_state() {
+    let own = |words| say_in("own", words);
+    let restarted = || {
+        let library = library_with("own", &format!(r#"<scxml initial="1">{AUCTION}"#));
+        Stage::new(Monitor::observer(library).with_history(History::Unknown))
+    };
+    let mut stage = restarted();
+    stage.right(own("inform ann>ben"));
+    assert_eq!(stage.check(&own("request ann>ben")), UNKNOWN);
+    // A call shows that the auction has begun, and a later message like the first one does not change it.
+    let mut stage = restarted();
+    for words in ["inform ann>ben", "cfp ann>ben", "inform ann>ben"] {
+        stage.right(own(words));
+    }
+    assert_eq!(stage.wrong(own("cfp ann>ben")).kind, Kind::Unexpected);
+}
+
+#[test]
+fn a_message_that_changes_no_state_shows_none() {
+    let own = |words| say_in("own", words);
+    let head = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">"#;
+    let library = library_with("own", &format!("{head}{AUCTION}"));
+    let all: [&dyn Fn(&mut Stage); 4] = [
+        // A void answer.
+        &|stage| {
+            stage.right(own("inform ann>ben").reply_with("2"));
+            stage.right(own("propose ben>ann").in_reply_to("1"));
+        },
+        // A cancel that was not delivered.
+        &|stage| {
+            stage.right(own("cancel ann>ben"));
+            let lost = own("failure mts>ann").undelivered_to("ben");
+            assert_eq!(stage.right(lost), "2");
+        },
+        // A cancel that failed.
+        &|stage| {
+            stage.right(own("cancel ann>ben"));
+            assert_eq!(stage.right(own("failure ben>ann")), "2");
+        },
+        &|stage| {
+            stage.right(own("cancel ann>ben").reply_with("x"));
+            assert_eq!(stage.right(own("failure ben>ann").in_reply_to("x")), "2");
+        },
+    ];
+    for between in all {
+        let monitor = Monitor::agent(Arc::clone(&library), "ann").with_history(History::Unknown);
+        let mut stage = Stage::new(monitor);
+        stage.right(own("inform ann>ben").reply_with("1"));
+        between(&mut stage);
+        // The inform may have been the end.
+        assert_eq!(stage.check(&own("request ann>ben")), UNKNOWN);
+    }
+}
+
 #[test]
 fn a_message_to_a_pattern_shows_the_state_of_its_members_only() {
     let english = |text| say_in("fipa-auction-english", text);
@@ -451,7 +578,11 @@ fn a_message_to_a_pattern_shows_the_state_of_its_members_only() {
     stage.right(english("cfp ann>arm_.*"));
     let early = stage.wrong(english("accept-proposal ann>arm_.*"));
     assert_eq!(early.state.as_deref(), Some("called"));
-    // It does not show it for ben. The inform may have been the end of an auction.
+    // The inform alone may have been the end of an auction.
+    let mut stage = restarted();
+    stage.right(english("inform ann>arm_.*"));
+    assert_eq!(stage.check(&english("request ann>arm_.*")), UNKNOWN);
+    // A call does not show the state of ben.
     let mut stage = restarted();
     stage.right(english("inform ann>ben"));
     stage.right(english("inform ann>arm_.*"));
@@ -489,10 +620,22 @@ fn an_undelivered_message_that_may_have_been_a_later_one_leaves_an_unknown_state
     stage.right(call());
     let early = stage.wrong(iterated("accept-proposal ann>ben"));
     assert_eq!(early.kind, Kind::OutOfOrder);
+    // So it is after a report of another message.
+    let mut stage = restarted();
+    stage.right(call());
+    let other = iterated("cfp ann>ben").reply_with("1");
+    stage.monitor.undelivered(&other, "ben", now);
+    stage.wrong(iterated("accept-proposal ann>ben"));
     // A monitor that knows all conversations knows that this one had not begun.
+    let named = || call().reply_to(["dan"]);
+    for call in [call(), named()] {
+        let mut stage = Stage::observer();
+        stage.right(call.clone());
+        stage.monitor.undelivered(&call, "ben", now);
+        stage.wrong(iterated("accept-proposal ann>ben"));
+    }
     let mut stage = Stage::new(Monitor::agent(library(), "ann"));
     stage.right(call());
-    let now = stage.now;
     stage.monitor.undelivered(&call(), "ben", now);
     stage.wrong(iterated("accept-proposal ann>ben"));
 }
@@ -626,6 +769,25 @@ fn a_wrong_reply_names_the_expected_and_the_received_value() {
     let wrong = stage.wrong(say("propose cid>ann").in_reply_to("b"));
     let reply = wrong.reply.as_ref().unwrap();
     assert_eq!((&*reply.expected, &*reply.received), ("c", "b"));
+    // So it is for each side, and for the agents that continue in its place.
+    for (words, expected) in [
+        ("inform ben>ann", "accept"),
+        ("inform dan>ann", "accept"),
+        ("reject-proposal ann>ben", "bid"),
+        ("reject-proposal eve>ben", "bid"),
+        ("reject-proposal ann>dan", "bid"),
+    ] {
+        let mut stage = Stage::observer();
+        stage.right(say("cfp ann>ben").reply_to(["eve"]).reply_with("call"));
+        let bid = say("propose ben>ann").in_reply_to("call");
+        stage.right(bid.reply_to(["dan"]).reply_with("bid"));
+        if expected == "accept" {
+            stage.right(say("accept-proposal ann>ben").reply_with("accept"));
+        }
+        let wrong = stage.wrong(say(words).in_reply_to("other"));
+        assert_eq!(wrong.kind, Kind::WrongReply, "{words}");
+        assert_eq!(wrong.reply.unwrap().expected, expected, "{words}");
+    }
 }
 
 #[test]
@@ -671,6 +833,39 @@ fn the_copies_of_a_multicast_are_one_message() {
     assert_eq!(stage.wrong(copy("cid")).kind, Kind::Unexpected);
     let alone = own("query-if ann>eve").copy_for("eve");
     assert_eq!(stage.wrong(alone).kind, Kind::WrongReceiver);
+    // The receiver may be a coalition.
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
+    for member in ["ben", "cid"] {
+        stage.right(own("query-if ann>platoon").copy_for(member));
+    }
+}
+
+#[test]
+fn the_copies_of_several_messages_may_mix() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="query-if" from="a" to="b" target="3"/></state>
+        <state id="3"><transition performative="inform" from="a" to="b" target="4"/></state>
+        <state id="4"><transition performative="confirm" from="a" to="b" target="5"/></state>
+        <state id="5"><transition performative="agree" from="a" to="b" target="6"/></state>
+        <state id="6" final="yes"/></scxml>"#;
+    let mut stage = Stage::new(Monitor::observer(library_with("own", text)));
+    let copy = |words, to: &'static str| say_in("own", words).copy_for(to);
+    let all = [
+        "request ann>ben,cid",
+        "query-if ann>ben,cid",
+        "inform ann>ben,cid",
+        "confirm ann>ben,cid",
+        "agree ann>ben,cid",
+    ];
+    for words in all {
+        stage.right(copy(words, "ben"));
+    }
+    // Of five messages, the first is forgotten.
+    for (number, words) in all.into_iter().enumerate() {
+        let verdict = stage.check(&copy(words, "cid"));
+        assert_eq!(verdict.is_accepted(), number > 0, "{words}: {verdict:?}");
+    }
 }
 
 #[test]

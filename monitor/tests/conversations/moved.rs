@@ -85,6 +85,13 @@ fn the_next_monitor_has_the_same_states() {
     stage.right(query("inform ben>dan"));
     let broken = |words| request(words).conversation_id("broken");
     assert_eq!(stage.wrong(broken("agree ben>cid")).kind, Kind::Ended);
+    // Nothing crosses a cancel that has its answer.
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(news("subscribe ben>ann"));
+    stage.right(news("cancel ben>ann").reply_with("x"));
+    stage.right(news("inform ann>ben").in_reply_to("x"));
+    let mut stage = moved(&stage, "ben");
+    assert_eq!(stage.wrong(news("inform ann>ben")).kind, Kind::Ended);
 }
 
 #[test]
@@ -171,6 +178,27 @@ fn uncertain_conversations_are_left_out() {
         unknown
     );
     assert_eq!(next.check(&request("cancel ben>ann")), unknown);
+    next.right(request("agree ann>ben").conversation_id("e"));
+    // So are conversations with a message that a service reported, those of protocols with several roles, and
+    // those whose first message may have been a later one.
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="c" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    let with_own = library_with("own", text);
+    let mut stage = Stage::new(Monitor::agent(Arc::clone(&with_own), "ben"));
+    stage.right(request("request ben>ann"));
+    stage.right(request("failure mts>ben").undelivered_to("ann"));
+    stage.right(say_in("own", "request ann>ben").conversation_id("own"));
+    stage.monitor.set_history(History::Unknown);
+    let iterated = say_in("fipa-iterated-contract-net", "cfp ben>ann");
+    stage.right(iterated.conversation_id("calls"));
+    // This message can only be the first one.
+    stage.right(request("request ben>ann").conversation_id("e"));
+    assert_eq!(stage.monitor.len(), 4);
+    let mut next = Monitor::agent(with_own, "ben").with_history(History::Unknown);
+    assert_eq!(next.restore(&stage.monitor.snapshot(now), now), Ok(1));
+    let mut next = Stage { monitor: next, now };
     next.right(request("agree ann>ben").conversation_id("e"));
     // An observer belongs to no agent.
     let empty = Stage::observer().monitor.snapshot(now);
@@ -333,4 +361,281 @@ fn changed_bytes_do_no_harm() {
         assert!(monitor.is_empty() && monitor.bytes() == 0);
     }
     assert!(refused > 500 && restored > 100, "{refused} {restored}");
+}
+
+#[test]
+fn a_snapshot_has_at_most_the_bytes_of_the_limit() {
+    // The names of its states make a snapshot larger than the conversations are.
+    let text = format!(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="{0}"/></state>
+        <state id="{0}"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#,
+        "x".repeat(250)
+    );
+    let library = library_with("own", &text);
+    let own = |number: u8| say_in("own", "request ben>ann").conversation_id(format!("{number:02}"));
+    let taken = |bytes| {
+        let mut limits = Limits::default();
+        limits.bytes = bytes;
+        let monitor = Monitor::agent(Arc::clone(&library), "ben").with_limits(limits);
+        let mut stage = Stage::new(monitor);
+        for number in 0..20 {
+            stage.right(own(number));
+        }
+        assert_eq!(stage.monitor.len(), 20);
+        stage.monitor.snapshot(stage.now)
+    };
+    let whole = taken(1 << 20);
+    assert_eq!(taken(whole.len()).len(), whole.len());
+    let less = taken(whole.len() - 1);
+    let mut stage = Stage::new(Monitor::agent(Arc::clone(&library), "ben"));
+    assert_eq!(stage.monitor.restore(&less, stage.now), Ok(19));
+    // The latest are kept.
+    let answer =
+        |number: u8| say_in("own", "agree ann>ben").conversation_id(format!("{number:02}"));
+    for number in 1..20 {
+        assert_eq!(stage.right(answer(number)), "3");
+    }
+    assert!(!stage.check(&answer(0)).is_accepted());
+}
+
+/// A conversation of a snapshot, as another program may write it.
+struct Written {
+    protocol: &'static str,
+    id: String,
+    initiator: String,
+    /// Names of participants, each in this state.
+    parties: Vec<String>,
+    state: &'static str,
+    flags: u8,
+    unnamed: u8,
+    bound: Vec<(u8, String)>,
+    reply_to: Vec<String>,
+    delegates: Vec<(u32, String)>,
+}
+
+fn names(count: usize) -> Vec<String> {
+    (0..count).map(|number| format!("{number}")).collect()
+}
+
+fn with_ben(count: usize) -> Vec<String> {
+    [names(count), vec!["ben".to_owned()]].concat()
+}
+
+/// These agents, each with an index.
+fn indexed<N: Copy>(index: N, count: usize) -> Vec<(N, String)> {
+    let names = names(count).into_iter();
+    names.map(|name| (index, name)).collect()
+}
+
+impl Written {
+    /// A conversation in which ann has asked ben, with a state for each participant.
+    fn per_participant() -> Self {
+        Self {
+            protocol: "fipa-request",
+            id: "c".to_owned(),
+            initiator: "ann".to_owned(),
+            parties: vec!["ben".to_owned()],
+            state: "requested",
+            flags: 1,
+            unnamed: 0,
+            bound: Vec::new(),
+            reply_to: Vec::new(),
+            delegates: Vec::new(),
+        }
+    }
+
+    /// The same with one state.
+    fn per_conversation() -> Self {
+        Self {
+            protocol: "own",
+            parties: vec![String::new()],
+            state: "2",
+            bound: vec![(0, "ann".to_owned()), (1, "ben".to_owned())],
+            ..Self::per_participant()
+        }
+    }
+
+    /// Appends the conversation to the snapshot of a monitor without one.
+    fn after(&self, empty: &[u8]) -> Vec<u8> {
+        fn count(out: &mut Vec<u8>, count: usize) {
+            out.extend(u32::try_from(count).unwrap().to_le_bytes());
+        }
+        fn text(out: &mut Vec<u8>, text: &str) {
+            out.extend(u16::try_from(text.len()).unwrap().to_le_bytes());
+            out.extend(text.as_bytes());
+        }
+        let party = |out: &mut Vec<u8>, name: &str| {
+            text(out, name);
+            for _ in 0..3 {
+                out.push(0);
+                text(out, self.state);
+            }
+            out.extend([self.flags, 19, 0]);
+            // The values of `reply-with` of each side, of the cancel, and the deadline: none.
+            out.extend([0; 2 * (8 + 2 + 6 * 4) + 8 + 8]);
+        };
+        let mut out = empty[..empty.len() - 4].to_vec();
+        count(&mut out, 1);
+        for name in [self.protocol, &self.id, "ann", &self.initiator] {
+            text(&mut out, name);
+        }
+        count(&mut out, self.parties.len());
+        for name in &self.parties {
+            party(&mut out, name);
+        }
+        out.push(self.unnamed);
+        if self.unnamed == 1 {
+            party(&mut out, "");
+        }
+        count(&mut out, self.bound.len());
+        for (role, name) in &self.bound {
+            out.push(*role);
+            text(&mut out, name);
+        }
+        count(&mut out, self.reply_to.len());
+        for name in &self.reply_to {
+            text(&mut out, name);
+        }
+        count(&mut out, self.delegates.len());
+        for (party, name) in &self.delegates {
+            count(&mut out, *party as usize);
+            text(&mut out, name);
+        }
+        count(&mut out, 0);
+        out
+    }
+}
+
+#[test]
+fn conversations_that_no_monitor_writes_are_refused() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    let library = library_with("own", text);
+    let mut limits = Limits::default();
+    limits.participants = 100;
+    let restored = |change: fn(&mut Written), written: fn() -> Written| {
+        let mut stage = Stage::new(Monitor::agent(Arc::clone(&library), "ben").with_limits(limits));
+        let empty = stage.monitor.snapshot(stage.now);
+        let mut written = written();
+        change(&mut written);
+        let restored = stage.monitor.restore(&written.after(&empty), stage.now);
+        if restored.is_ok() {
+            let answer = say_in(written.protocol, "agree ben>ann");
+            stage.right(answer.conversation_id(written.id.clone()));
+        } else {
+            assert!(stage.monitor.is_empty() && stage.monitor.bytes() == 0);
+        }
+        restored
+    };
+    let malformed = |what| Err(SnapshotError::Malformed(what));
+    let too_large = |what| Err(SnapshotError::TooLarge(what));
+    let unfit = "participants that do not fit the protocol";
+    let per_participant: Vec<(fn(&mut Written), _)> = vec![
+        (|_| (), Ok(1)),
+        (|it| it.flags = 7, Ok(1)),
+        (|it| it.flags = 8, malformed("a flag")),
+        (|it| it.id = "x".repeat(4_096), Ok(1)),
+        (
+            |it| it.id = "x".repeat(4_097),
+            too_large("length of a name"),
+        ),
+        (
+            |it| it.initiator.clear(),
+            malformed("an agent without name"),
+        ),
+        (|it| it.state = "lifted", malformed("an unknown state")),
+        (|it| it.parties = with_ben(99), Ok(1)),
+        (
+            |it| it.parties = with_ben(100),
+            too_large("number of participants"),
+        ),
+        (
+            |it| it.parties = names(3),
+            malformed("a conversation without the agent"),
+        ),
+        (|it| it.parties.push("ben".to_owned()), malformed(unfit)),
+        (|it| it.parties.push(String::new()), malformed(unfit)),
+        (|it| it.parties.clear(), malformed(unfit)),
+        (|it| it.unnamed = 1, Ok(1)),
+        (|it| it.unnamed = 2, malformed("a flag")),
+        (|it| it.bound.push((0, "ann".to_owned())), malformed(unfit)),
+        (|it| it.reply_to = names(64), Ok(1)),
+        (
+            |it| it.reply_to = names(65),
+            too_large("number of agents in reply-to"),
+        ),
+        (
+            |it| {
+                it.reply_to = names(30);
+                it.delegates = indexed(0, 34);
+            },
+            Ok(1),
+        ),
+        (
+            |it| {
+                it.reply_to = names(30);
+                it.delegates = indexed(0, 35);
+            },
+            too_large("number of agents in reply-to"),
+        ),
+        (
+            |it| it.delegates.push((1, "dan".to_owned())),
+            malformed("an unknown participant"),
+        ),
+        (
+            |it| {
+                it.parties = names(1);
+                it.delegates.push((0, "ben".to_owned()));
+            },
+            Ok(1),
+        ),
+        (
+            |it| {
+                it.parties = names(1);
+                it.delegates.push((0, "dan".to_owned()));
+            },
+            malformed("a conversation without the agent"),
+        ),
+    ];
+    for (number, (change, expected)) in per_participant.into_iter().enumerate() {
+        let found = restored(change, Written::per_participant);
+        assert_eq!(found, expected, "{number}");
+    }
+    let per_conversation: Vec<(fn(&mut Written), _)> = vec![
+        (|_| (), Ok(1)),
+        (|it| it.bound.extend(indexed(1, 99)), Ok(1)),
+        (
+            |it| it.bound.extend(indexed(1, 100)),
+            too_large("number of agents with roles"),
+        ),
+        (
+            |it| it.bound[1].1 = "cid".to_owned(),
+            malformed("a conversation without the agent"),
+        ),
+        (|it| it.bound[1].0 = 2, malformed("an unknown role")),
+        (|it| it.unnamed = 1, malformed(unfit)),
+        (|it| it.parties.push(String::new()), malformed(unfit)),
+        (|it| it.parties = names(1), malformed(unfit)),
+        (|it| it.parties.clear(), malformed(unfit)),
+        (
+            |it| it.delegates.push((0, "dan".to_owned())),
+            malformed(unfit),
+        ),
+        (|it| it.reply_to.push("dan".to_owned()), Ok(1)),
+        (
+            |it| {
+                it.initiator = "ben".to_owned();
+                it.reply_to.push("dan".to_owned());
+            },
+            malformed("a conversation that continues elsewhere"),
+        ),
+    ];
+    for (number, (change, expected)) in per_conversation.into_iter().enumerate() {
+        let found = restored(change, Written::per_conversation);
+        assert_eq!(found, expected, "{number}");
+    }
 }

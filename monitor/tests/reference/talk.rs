@@ -323,9 +323,14 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                 true => (&talk.previous, &**before),
                 false => (&**before, &talk.previous),
             };
-            // A void message counts in the other state, if it is not void there.
+            // A void message counts in the other state, if it is not void there. If it is, it does not show
+            // whether the failed message has arrived.
             match (in_spot(first), in_spot(second)) {
                 (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
+                (Ok(void), Ok(_)) if void.void => Ok(Step {
+                    spot: talk.spot.clone(),
+                    ..void
+                }),
                 (Err(_), Ok(other)) => Ok(other),
                 (taken, _) => taken,
             }
@@ -601,17 +606,15 @@ impl Talk {
     ) -> (bool, bool) {
         let opened = !self.said.iter().any(|said| !said.cancels);
         self.echo = step.echo;
-        if let Spot::Undelivered(_) = &step.spot {
-            self.spot = step.spot;
-            let late =
-                self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
-            return (opened, late);
-        }
         let late =
             self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
         if step.void {
             self.spot = step.spot;
             return (opened, true);
+        }
+        if let Spot::Undelivered(_) = &step.spot {
+            self.spot = step.spot;
+            return (opened, late);
         }
         let cancels =
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
