@@ -792,9 +792,9 @@ impl Conversation<'_> {
         {
             step = talk::to(Spot::Elsewhere);
         }
-        if let Some(at) = known {
-            self.guards(&[(self.talks[at].0, &step)], words, false)?;
-        }
+        // Also for a member of a pattern that has not answered before.
+        let peer = known.map_or(words.from, |at| self.talks[at].0);
+        self.guards(&[(peer, &step)], words, false)?;
         let at = known.unwrap_or_else(|| {
             self.talks.push((words.from, talk));
             self.talks.len() - 1
