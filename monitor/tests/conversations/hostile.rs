@@ -545,7 +545,7 @@ fn no_message_exceeds_a_share_of_any_size() {
             let bytes = stage.monitor.bytes();
             assert!(bytes <= share, "{to}: {bytes} > {share}");
         }
-        // What adds no agent needs no space.
+        // A message that adds no agent needs no space.
         if stage.monitor.len() == 1 && accepted[0] > 0 {
             let header = |words, from, to| {
                 let header = say_in("own", words).sender(long(from));
