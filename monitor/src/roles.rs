@@ -66,25 +66,20 @@ impl Monitor {
         let Some(projection) = projection.filter(|_| self.agent.is_some()) else {
             return false;
         };
-        let mut run = LocalRun::new(projection.locals(), u32::MAX);
-        let message = Observed {
-            act: observed.act,
-            own: observed.own,
-            peers: u32::MAX,
-        };
-        run.take(projection.locals(), message).is_ok() && !run.waits()
+        begun_roles(projection, observed) != 0
     }
 
     /// A violation is none if the state is uncertain: the conversation may have begun before the monitor, a
-    /// message waits for its turn, two agents may have one role, or there is another conversation with this
-    /// identifier. An agent that guesses an identifier can cause the last three.
+    /// message waits for its turn, the role of the monitored agent or that of another one is uncertain, or
+    /// there is another conversation with this identifier. An agent that guesses an identifier can cause all
+    /// but the first.
     pub(crate) fn recheck_local(&self, id: &str, at: u32, denied: Denied) -> Denied {
         let uncertain = |at: u32| {
             let slot = self.table.slot(at);
             let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
             rare.is_some_and(|rare| {
                 let waits = || rare.local.as_ref().is_some_and(LocalRun::waits);
-                rare.may_continue || rare.contested || waits()
+                rare.may_continue || rare.contested || rare.doubtful_roles != 0 || waits()
             })
         };
         match denied {
@@ -180,8 +175,10 @@ impl Monitor {
             return fault(Kind::NotOpened, state);
         };
         let locals = projection.locals();
+        let own_roles = run.roles();
         match run.take(locals, message) {
             Ok((_, peer)) => {
+                let (kept_roles, is_certain) = (run.roles(), run.is_certain());
                 let local = run.state(locals);
                 let state = local.map_or(state, |local| local.global_in(machine));
                 if let Some(party) = conversation.parties.first_mut() {
@@ -203,6 +200,11 @@ impl Monitor {
                     let is_asked = rare.asked.iter().any(|asked| asked.role == role);
                     let claims = !observed.own && !began && !is_asked;
                     rare.claimed |= claims;
+                    if claims {
+                        // The sender of this message, or that of an earlier one, may be an outsider.
+                        let others = own_roles | begun_roles(projection, observed);
+                        rare.doubtful_roles |= others & !kept_roles;
+                    }
                     rare.doubtful |= claims && rare.undelivered;
                     conversation.release_asked(&mut self.names, |asked| asked == role);
                 }
@@ -212,8 +214,10 @@ impl Monitor {
                 let complete = local.is_some_and(|local| local.is_final());
                 let bound_after = conversation.bound.len();
                 let rare = conversation.rare();
-                rare.undelivered = false;
+                rare.undelivered &= !is_certain;
                 if observed.own {
+                    // The agent knows its role.
+                    rare.doubtful_roles &= projection.senders_of(observed.act);
                     rare.last_sent = Some(last_sent(false, bound_after));
                 } else if rare.local.as_ref().is_none_or(|run| !run.has_last()) {
                     rare.last_sent = None;
@@ -251,7 +255,7 @@ impl Monitor {
                 Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
             // Another agent may have claimed the role of the sender.
-            Err(_) if peers == 0 && !observed.own && conversation.rare().claimed => {
+            Err(_) if !takes_part && conversation.rare().claimed => {
                 conversation.rare().contested = true;
                 Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
@@ -262,6 +266,20 @@ impl Monitor {
             Err(NotLocal::Unexpected) if peers == 0 => fault(Kind::WrongReceiver, state),
             Err(NotLocal::Unexpected) => fault(Kind::Unexpected, state),
         }
+    }
+}
+
+/// Returns the roles of the monitored agent of which this is the first message of the protocol.
+fn begun_roles(projection: &Projection, observed: &ObservedMessage<'_>) -> u32 {
+    let mut run = LocalRun::new(projection.locals(), u32::MAX);
+    let message = Observed {
+        act: observed.act,
+        own: observed.own,
+        peers: u32::MAX,
+    };
+    match run.take(projection.locals(), message) {
+        Ok(_) if !run.waits() => run.roles(),
+        _ => 0,
     }
 }
 

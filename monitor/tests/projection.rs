@@ -585,6 +585,48 @@ fn an_outsider_ends_no_conversation_of_roles() {
     station.right(&["confirm sta>med", "inform dro>sta", "inform sta>med"]);
 }
 
+#[test]
+fn an_outsider_decides_no_role_of_an_agent() {
+    // The agents ben and cid get the same first message.
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
+        <state id="4"><transition performative="agree" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let stage = |agent| stage_with(machine(text), agent);
+    let unknown = Verdict::Unchecked(Unchecked::UnknownHistory);
+    // The inform of the outsider would show that cid has the role b.
+    for order in [
+        ["inform mallory>cid", "request ann>cid"],
+        ["request ann>cid", "inform mallory>cid"],
+    ] {
+        let mut cid = stage("cid");
+        cid.right(&order);
+        assert_eq!(cid.check("inform cid>ben"), unknown, "{order:?}");
+    }
+    // An agent that sends the message of a role has it.
+    for order in [
+        ["inform cid>ben", "request ann>ben"],
+        ["request ann>ben", "inform cid>ben"],
+    ] {
+        let mut ben = stage("ben");
+        ben.right(&order);
+        ben.right(&["agree ben>ann"]);
+        assert_eq!(ben.wrong("agree ben>ann"), Kind::Ended, "{order:?}");
+    }
+    let mut cid = stage("cid");
+    cid.right(&["request ann>cid"]);
+    assert_eq!(cid.wrong("confirm cid>ben"), Kind::Unexpected);
+    // The second request to ben may be the first one again, or that to the role c.
+    let mut ann = stage("ann");
+    ann.right(&["request ann>ben"]);
+    ann.lost("request ann>ben");
+    ann.right(&["request ann>ben", "agree mallory>ann"]);
+    assert_eq!(ann.check("request ann>cid"), unknown);
+    assert_eq!(ann.check("agree ben>ann"), unknown);
+}
+
 /// Random runs of the roles with slow routes, undelivered messages, restarts and an intruder: no monitor
 /// refuses a message.
 #[test]
@@ -596,14 +638,23 @@ fn no_message_of_a_projected_protocol_is_refused() {
     };
     let runs = number("FIPA_WALK_SEEDS").unwrap_or(2_000);
     // Two messages of the last role may overtake one of the first.
-    let relay = r#"<scxml initial="1">
-        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
-        <state id="2"><transition performative="query-if" from="a" to="c" target="3"/></state>
-        <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
-        <state id="4"><transition performative="confirm" from="c" to="b" target="5"/></state>
-        <state id="5"><transition performative="agree" from="b" to="a" target="6"/></state>
-        <state id="6" final="yes"/></scxml>"#;
-    for (text, few) in [(DOCKING, 8), (relay, 16)] {
+    let relay = |second| {
+        format!(
+            r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="{second}" from="a" to="c" target="3"/></state>
+            <state id="3"><transition performative="inform" from="c" to="b" target="4"/></state>
+            <state id="4"><transition performative="confirm" from="c" to="b" target="5"/></state>
+            <state id="5"><transition performative="agree" from="b" to="a" target="6"/></state>
+            <state id="6" final="yes"/></scxml>"#
+        )
+    };
+    for (text, few) in [
+        (DOCKING, 8),
+        (&relay("query-if"), 16),
+        // The first message does not show the role.
+        (&relay("request"), 16),
+    ] {
         let (said, lost, unchecked) = walk(&machine(text), runs);
         assert!(said > runs * 4 && lost > runs / 8 && unchecked > runs / few);
     }

@@ -190,6 +190,18 @@ impl LocalRun {
         parts.all(|part| part.role == first).then_some(first)
     }
 
+    /// The roles that the agent may have.
+    pub(crate) fn roles(&self) -> u32 {
+        self.parts
+            .iter()
+            .fold(0, |mask, part| mask | (1 << part.role))
+    }
+
+    /// Whether the role and the state of the agent are certain.
+    pub(crate) fn is_certain(&self) -> bool {
+        self.parts.len() <= 1
+    }
+
     /// Whether a message waits for its turn.
     pub(crate) fn waits(&self) -> bool {
         self.parts.iter().any(|part| !part.early.is_empty())

@@ -195,6 +195,16 @@ impl Projection {
         &self.locals
     }
 
+    /// The roles that send this performative in some state.
+    pub(crate) fn senders_of(&self, act: Act<'_>) -> u32 {
+        let sends = |local: &&Local| {
+            let mut steps = local.states().iter().flat_map(LocalState::steps);
+            steps.any(|step| step.label.from == local.role && step.label.act.is(act))
+        };
+        let senders = self.locals.iter().filter(sends);
+        senders.fold(0, |mask, local| mask | (1 << local.role))
+    }
+
     /// Runs all roles against each other, with queues of bounded length between them, and returns the
     /// deadlocks and unexpected messages that it finds.
     ///
