@@ -74,7 +74,7 @@ impl Change<'_> {
         };
         self.opened |= made.target.is_new();
         if let Some(party) = conversation.parties.get_mut(index) {
-            self.opened |= party.acts == [0; 2];
+            self.opened |= party.acts == [0; 2] && !made.reported;
             self.move_party(party, made);
             if party.deadline != 0 {
                 self.deadlines.push(Deadline {
@@ -102,6 +102,10 @@ impl Change<'_> {
                 (next_state.state, next_state.resume, next_state.echo);
             self.state = self.state.or(Some(party.state));
             (self.late, self.void) = (true, true);
+            return;
+        }
+        if made.reported && party.state != FAILED && party.take_back_last(side) {
+            self.state = self.state.or(Some(party.state));
             return;
         }
         if made.reported || next_state.state == FAILED {

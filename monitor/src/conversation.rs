@@ -307,8 +307,36 @@ impl Party {
             }
             return false;
         };
+        self.revert(step, values);
+        true
+    }
+
+    /// Whether the last message may be of this side: it sent the last one, or the last one that crossed no
+    /// cancel.
+    pub(crate) fn may_have_last(&self, side: Side) -> bool {
+        self.last == side || self.last_step.is_some_and(|step| step.side == side)
+    }
+
+    /// An upper bound of the bytes that [`take_back_last`](Self::take_back_last) allocates.
+    pub(crate) const GROWTH_BY_REPORT: usize = size_of::<Worlds>() + 3 * size_of::<Details>();
+
+    /// Takes the last message of a side back, because a message transport service has reported that it was
+    /// not delivered. Returns whether it is the last one of the party.
+    pub(crate) fn take_back_last(&mut self, side: Side) -> bool {
+        let Some(step) = self.last_step.take_if(|step| step.side == side) else {
+            return false;
+        };
+        let details = self.details.as_deref().filter(|_| step.has_values);
+        let values = details.map_or_else(StepValues::default, |details| details.step);
+        self.revert(step, values);
+        true
+    }
+
+    /// Restores the values before the last message. If it may have arrived, the next message shows whether
+    /// it has.
+    fn revert(&mut self, step: LastStep, values: StepValues) {
         let arrived = self.clone();
-        let index = side_index(side);
+        let index = side_index(step.side);
         (self.state, self.resume, self.before) = (step.state, step.resume, step.before);
         (self.last, self.canceling_side, self.echo) = (step.last, step.canceling_side, step.echo);
         self.deadline = values.deadline;
@@ -332,7 +360,6 @@ impl Party {
             (self.state, self.resume, self.before) = (FAILED, arrived.state, missing.state);
             self.details().worlds = Some(Box::new(Worlds { missing, arrived }));
         }
-        true
     }
 
     /// Whether no message was sent yet.

@@ -243,37 +243,33 @@ impl Judge<'_> {
     /// Handles the report of a message transport service: a message of the receiver was not delivered to
     /// the agent `lost`. Until it is sent again, the protocol has ended with it.
     fn reported_failure(&self, lost: &str, moves: &mut Vec<Move>) {
-        let lost_party = self.party(lost).map(|(at, _)| at);
+        let lost_party = self.party(lost);
         let leads = self.gets_replies(lost);
         for receiver in self.observed.receivers {
             let initiator = self.names.is(self.conversation.initiator, receiver);
             let designated = self.conversation.is_designated(self.names, receiver);
-            let concerns = |(at, party): &(usize, &Party)| {
-                let side = if !initiator && self.names.is(party.peer, receiver) {
-                    Side::Other
-                } else if initiator || designated {
-                    Side::Initiator
-                } else {
-                    return false;
-                };
-                let reached = match side {
-                    Side::Initiator => lost_party == Some(*at),
-                    Side::Other => leads,
-                };
-                let asked = party.asked[side_index(side)];
+            let is_own = |party: &Party| !initiator && self.names.is(party.peer, receiver);
+            let own = self.party(receiver).filter(|_| leads);
+            let own = own.filter(|(_, party)| is_own(party));
+            let own = own.map(|(at, party)| (at, party, Side::Other));
+            let led = lost_party.filter(|(_, party)| (initiator || designated) && !is_own(party));
+            let led = led.map(|(at, party)| (at, party, Side::Initiator));
+            let may_be_lost = |(_, party, side): &(usize, &Party, Side)| {
+                let asked = party.asked[side_index(*side)];
                 let answers = self.observed.in_reply_to == 0
                     || asked == 0
                     || self.observed.in_reply_to == asked;
-                reached && party.last == side && answers
+                party.may_have_last(*side) && answers
             };
-            let mut concerned = self
-                .conversation
-                .parties
-                .iter()
-                .enumerate()
-                .filter(concerns);
-            if let (Some((at, party)), None) = (concerned.next(), concerned.next()) {
-                moves.push(failed(at, party));
+            let mut concerned = own.into_iter().chain(led).filter(may_be_lost);
+            let (Some((at, party, side)), None) = (concerned.next(), concerned.next()) else {
+                continue;
+            };
+            let made = failed(at, party, side);
+            // Several agents may speak for the initiator.
+            let is_shared = lost_party.is_some_and(|(lost, _)| lost == at);
+            if !is_shared || !moves.iter().any(|other| other.target == made.target) {
+                moves.push(made);
             }
         }
     }
@@ -328,8 +324,12 @@ impl Judge<'_> {
             if stranger {
                 return Err(Fault::plain(Kind::Stranger));
             }
-            if self.roles_of(lost) != 0 {
-                moves.push(failed(0, party));
+            if self.roles_of(lost) != 0
+                && let Some(receiver) = self.observed.receivers.first()
+            {
+                let leads = conversation.speaks_for_initiator(self.names, receiver);
+                let side = if leads { Side::Initiator } else { Side::Other };
+                moves.push(failed(0, party, side));
             }
             return Ok(());
         }
@@ -490,8 +490,8 @@ pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
     all & !bound.fold(0, |mask, bound| mask | (1 << bound.role))
 }
 
-/// Returns the move of a party with an undelivered last message.
-pub(crate) fn failed(at: usize, party: &Party) -> Move {
+/// Returns the move of a party of which a message of this side was not delivered.
+pub(crate) fn failed(at: usize, party: &Party, side: Side) -> Move {
     let failed = |resume| NextState {
         resume,
         ..NextState::to(FAILED)
@@ -510,7 +510,7 @@ pub(crate) fn failed(at: usize, party: &Party) -> Move {
     };
     Move {
         target: MoveTarget::Party(at),
-        side: party.last,
+        side,
         next_state,
         reported: true,
     }

@@ -1050,7 +1050,8 @@ impl Monitor {
         let grown = conversation.parties.len() + added;
         let moves = self.moves.as_slice();
         let bindings = NewBindings::by(machine, conversation, &self.names, observed, moves, header);
-        let adds = added > 0 || !header.reply_to_names().is_empty();
+        let adds =
+            added > 0 || !header.reply_to_names().is_empty() || observed.undelivered_to.is_some();
         let growth = if adds || machine.scope == Scope::Conversation {
             let moves = (moves, &bindings, copied.is_some());
             growth_by(machine, conversation, observed, moves, header)
@@ -1443,7 +1444,7 @@ impl NewBindings {
 }
 
 /// Returns an upper bound of the bytes that a message adds to a conversation: with new participants, roles
-/// or agents in `reply-to`, or as the first of several copies.
+/// or agents in `reply-to`, as the first of several copies, or as the report of undelivered messages.
 fn growth_by(
     machine: &Machine,
     conversation: &Conversation,
@@ -1455,34 +1456,36 @@ fn growth_by(
     let sender = Names::cost(observed.sender.len());
     let reply_to = header.reply_to_names();
     let designated = reply_to.iter().map(name).sum::<usize>();
-    match machine.scope {
-        Scope::Participant => {
-            let new = moves.iter().filter_map(|made| match made.target {
-                MoveTarget::Receiver(number) => observed.receivers.get(number).map(name),
-                MoveTarget::Sender => Some(sender),
-                MoveTarget::Party(_) | MoveTarget::Unnamed => None,
-            });
-            let growth = conversation.growth(new.clone().count(), 0, reply_to.len());
-            growth + new.sum::<usize>() + designated
+    let reported = moves.iter().filter(|made| made.reported).count() * Party::GROWTH_BY_REPORT;
+    reported
+        + match machine.scope {
+            Scope::Participant => {
+                let new = moves.iter().filter_map(|made| match made.target {
+                    MoveTarget::Receiver(number) => observed.receivers.get(number).map(name),
+                    MoveTarget::Sender => Some(sender),
+                    MoveTarget::Party(_) | MoveTarget::Unnamed => None,
+                });
+                let growth = conversation.growth(new.clone().count(), 0, reply_to.len());
+                growth + new.sum::<usize>() + designated
+            }
+            Scope::Conversation => {
+                let receivers = match bindings.receivers {
+                    0 => &[],
+                    _ => observed.receivers,
+                };
+                // The agents in `reply-to` have a name each, and one for each binding.
+                let held = bindings.delegates.checked_div(reply_to.len());
+                let copies = match is_copied {
+                    true => Copied::MAX * size_of::<Copied>() + size_of::<u64>(),
+                    false => 0,
+                };
+                conversation.growth(0, bindings.count(), reply_to.len())
+                    + bindings.sender * sender
+                    + receivers.iter().map(name).sum::<usize>()
+                    + held.unwrap_or(0).max(1) * designated
+                    + copies
+            }
         }
-        Scope::Conversation => {
-            let receivers = match bindings.receivers {
-                0 => &[],
-                _ => observed.receivers,
-            };
-            // The agents in `reply-to` have a name each, and one for each binding.
-            let held = bindings.delegates.checked_div(reply_to.len());
-            let copies = match is_copied {
-                true => Copied::MAX * size_of::<Copied>() + size_of::<u64>(),
-                false => 0,
-            };
-            conversation.growth(0, bindings.count(), reply_to.len())
-                + bindings.sender * sender
-                + receivers.iter().map(name).sum::<usize>()
-                + held.unwrap_or(0).max(1) * designated
-                + copies
-        }
-    }
 }
 
 /// If the message is another copy of the last one to several receivers: gives its receiver the role of the
@@ -1616,7 +1619,12 @@ fn keep_alternatives(
             .into_iter()
             .chain(step.map(|step| (party, step.target)))
     });
-    rare.alternatives = kept.collect();
+    let reported = moves.iter().filter(|made| made.reported);
+    let reported = reported.filter_map(|made| match made.target {
+        MoveTarget::Party(at) => Some(any_state_of(at)),
+        MoveTarget::Unnamed | MoveTarget::Receiver(_) | MoveTarget::Sender => None,
+    });
+    rare.alternatives = kept.chain(reported).collect();
     rare.alternatives.sort_unstable();
     rare.alternatives.dedup();
     let first = &machine.initial().steps;
@@ -1663,15 +1671,19 @@ fn take_back(
     let party = conversation.parties.get_mut(at);
     let taken = party.is_some_and(|party| party.take_back(side, act, reply_with));
     let rare = conversation.rare.as_deref_mut();
-    if let Some(rare) = rare.filter(|rare| taken && rare.may_continue) {
-        // The state before the first known message is unknown, and a message that has ruled out
-        // states has no effect.
-        let unknown = (u32::try_from(at).unwrap_or(NONE), FAILED);
-        if !rare.alternatives.contains(&unknown) {
-            rare.alternatives.push(unknown);
-        }
+    if let Some(rare) = rare.filter(|rare| taken && rare.may_continue)
+        && !rare.alternatives.contains(&any_state_of(at))
+    {
+        rare.alternatives.push(any_state_of(at));
     }
     taken
+}
+
+/// The entry of [`Rare::alternatives`](crate::conversation::Rare::alternatives) of a party after an
+/// undelivered message: the state before the first known message is unknown, and a message that has ruled
+/// out states has no effect.
+fn any_state_of(party: usize) -> (u32, u16) {
+    (u32::try_from(party).unwrap_or(NONE), FAILED)
 }
 
 #[cfg(test)]
@@ -1793,9 +1805,11 @@ mod tests {
             ),
         ] {
             let mut monitor = Monitor::observer(Arc::clone(&library));
-            for act in acts {
+            let sent = |act| header(act, protocol).sender("ann").receivers(all());
+            let lost = header(Performative::Failure, protocol).sender("mts");
+            let lost = lost.receivers(all()).undelivered_to("ann");
+            for message in acts.map(sent).into_iter().chain([lost]) {
                 let before = COMPARISONS.get();
-                let message = header(act, protocol).sender("ann").receivers(all());
                 let verdict = monitor.check(&message, now);
                 assert!(verdict.is_accepted(), "{verdict:?}");
                 let made = COMPARISONS.get() - before;

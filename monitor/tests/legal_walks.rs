@@ -357,10 +357,24 @@ impl<'l> World<'l> {
         self.judge(Some(from), &header, what);
         if lost {
             self.counts[2] += 1;
-            let now = self.now;
-            self.monitors[from].undelivered(&header, AGENTS[receivers[0]], now);
-            self.log
-                .push(format!("lost: in {:?}", self.talks[number].id));
+            let (now, receiver) = (self.now, AGENTS[receivers[0]]);
+            // The own service knows it at once, and another one sends a letter.
+            let is_reported = self.rng.bool();
+            self.log.push(format!(
+                "lost: {is_reported} in {:?}",
+                self.talks[number].id
+            ));
+            if is_reported {
+                let report = Header::new(Performative::Failure)
+                    .sender("host-mts")
+                    .receivers([AGENTS[from]])
+                    .protocol(self.talks[number].machine.name().to_owned())
+                    .conversation_id(self.talks[number].id.clone())
+                    .undelivered_to(receiver);
+                self.monitors[from].check(&report, now);
+            } else {
+                self.monitors[from].undelivered(&header, receiver, now);
+            }
             return;
         }
         if !by_initiator {

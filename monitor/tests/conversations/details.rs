@@ -205,7 +205,10 @@ fn an_answer_that_crossed_an_undelivered_cancel_is_accepted() {
     stage.right(request("cancel ann>ben"));
     // This may be the result or the answer to the cancel.
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
-    stage.right(request("failure ams>ben").undelivered_to("ann"));
+    let lost = request("failure ams>ben").undelivered_to("ann");
+    assert_eq!(stage.right(lost), "cancelling");
+    // The result and the answer to the cancel.
+    assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
     assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
 }

@@ -81,6 +81,36 @@ fn a_conversation_at_its_share_of_bytes_continues_if_it_does_not_grow() {
 }
 
 #[test]
+fn a_report_of_many_undelivered_messages_does_not_exceed_the_share_of_a_peer() {
+    let (mut refused, mut taken) = (0, 0);
+    for share in (2_000..40_000).step_by(500) {
+        let mut limits = Limits::default();
+        limits.bytes = share * 8;
+        let mut stage = Stage::new(Monitor::observer(library_once()).with_limits(limits));
+        let all = || (0..20).map(|number| format!("arm {number}"));
+        if !stage
+            .check(&say("cfp ann>ben").receivers(all()))
+            .is_accepted()
+        {
+            continue;
+        }
+        for sender in all() {
+            stage.right(say("propose ben>ann").sender(sender));
+        }
+        let before = stage.monitor.bytes();
+        let lost = say("failure mts>ben")
+            .receivers(all())
+            .undelivered_to("ann");
+        match stage.check(&lost).is_accepted() {
+            true => taken += usize::from(stage.monitor.bytes() > before),
+            false => refused += 1,
+        }
+        assert!(stage.monitor.bytes() <= share, "{share}");
+    }
+    assert!(refused > 0 && taken > 0, "{refused} and {taken}");
+}
+
+#[test]
 fn a_conversation_cannot_grow_beyond_the_share_of_a_peer() {
     let text = r#"<scxml initial="1">
         <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>

@@ -254,9 +254,7 @@ fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
             let lost = dutch("failure mts>ann").undelivered_to("ben");
             assert_eq!(stage.right(lost), "undelivered");
             if !is_repeated {
-                // A bid that names the call may also have crossed a closing that arrived.
-                let state = answered.map_or("bidding", |_| "undelivered");
-                assert_eq!(stage.right(bid().reply_with("bid")), state);
+                assert_eq!(stage.right(bid().reply_with("bid")), "bidding");
             }
             assert_eq!(stage.right(closing()), "closed");
             // The bid crosses the second closing.
@@ -264,6 +262,70 @@ fn a_bid_that_crosses_an_undelivered_closing_is_a_bid() {
                 assert_eq!(stage.right(bid().reply_with("bid")), "closed");
             }
         }
+    }
+}
+
+#[test]
+fn a_reported_message_has_arrived_or_not() {
+    let dutch = |text| say_in("fipa-auction-dutch", text);
+    for name in [None, Some("ann")] {
+        let begun = || {
+            let mut stage = Stage::new(match name {
+                None => Monitor::observer(library()),
+                Some(name) => Monitor::agent(library(), name),
+            });
+            stage.right(dutch("inform ann>ben").reply_with("opening"));
+            stage.right(dutch("cfp ann>ben").reply_with("price"));
+            stage.right(dutch("inform ann>ben").reply_with("closing"));
+            let lost = dutch("failure mts>ann").undelivered_to("ben");
+            assert_eq!(stage.right(lost.in_reply_to("closing")), "undelivered");
+            stage
+        };
+        // The bid that answers the call is one, so it can be accepted.
+        let mut stage = begun();
+        let bid = dutch("propose ben>ann").in_reply_to("price");
+        assert_eq!(stage.right(bid.reply_with("bid")), "bidding");
+        stage.right(dutch("accept-proposal ann>ben").in_reply_to("bid"));
+        // A bid that answers no call of the auctioneer is wrong.
+        let mut stage = begun();
+        let bid = dutch("propose ben>ann").in_reply_to("other");
+        assert_eq!(stage.wrong(bid).kind, Kind::WrongReply);
+    }
+    // Another answer replaces one that was not delivered.
+    for lost in ["agree ben>ann", "not-understood ben>ann"] {
+        for mut stage in monitors("ben") {
+            stage.right(request("request ann>ben").reply_with("q"));
+            stage.right(request(lost).in_reply_to("q"));
+            stage.right(request("failure mts>ben").undelivered_to("ann"));
+            stage.right(request("refuse ben>ann").in_reply_to("q"));
+        }
+    }
+    // Several agents that speak for the initiator get the report.
+    for mut stage in monitors("ann") {
+        stage.right(request("request ann>ben").reply_to(["dan"]));
+        stage.right(request("agree ben>ann"));
+        stage.right(request("not-understood ann>ben"));
+        let lost = request("failure mts>ann,dan").undelivered_to("ben");
+        assert_eq!(stage.right(lost), "agreed");
+        stage.right(request("not-understood ann>ben"));
+    }
+    // A report begins no conversation.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    for (words, to) in [("failure mts>ann", "ben"), ("failure mts>ben", "ann")] {
+        let lost = request(words).undelivered_to(to);
+        let Verdict::Accepted(accepted) = stage.check(&lost) else {
+            panic!("it belongs to the conversation");
+        };
+        assert!(!accepted.opened);
+    }
+    // A message that crosses a cancel can be the undelivered one.
+    for mut stage in monitors("ben") {
+        stage.right(request("request ann>ben"));
+        stage.right(request("cancel ann>ben"));
+        stage.right(request("agree ben>ann"));
+        stage.right(request("failure mts>ben").undelivered_to("ann"));
+        stage.right(request("agree ben>ann"));
     }
 }
 
@@ -533,7 +595,13 @@ fn a_message_that_changes_no_state_shows_none() {
     let own = |words| say_in("own", words);
     let head = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">"#;
     let library = library_with("own", &format!("{head}{AUCTION}"));
-    let all: [&dyn Fn(&mut Stage); 4] = [
+    let all: [&dyn Fn(&mut Stage); 5] = [
+        // A call that was not delivered.
+        &|stage| {
+            stage.right(own("cfp ann>ben"));
+            let lost = own("failure mts>ann").undelivered_to("ben");
+            assert_eq!(stage.right(lost), "undelivered");
+        },
         // A void answer.
         &|stage| {
             stage.right(own("inform ann>ben").reply_with("2"));
@@ -543,7 +611,7 @@ fn a_message_that_changes_no_state_shows_none() {
         &|stage| {
             stage.right(own("cancel ann>ben"));
             let lost = own("failure mts>ann").undelivered_to("ben");
-            assert_eq!(stage.right(lost), "2");
+            assert_eq!(stage.right(lost), "undelivered");
         },
         // A cancel that failed.
         &|stage| {

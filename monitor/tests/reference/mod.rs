@@ -3,7 +3,7 @@
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
-use fipa_monitor::{Cancel, Library, Machine, Scope};
+use fipa_monitor::{Cancel, Library, Machine, Scope, Transition};
 
 mod talk;
 
@@ -50,6 +50,7 @@ pub(crate) struct Reference<'l> {
     refused: VecDeque<(String, &'static str, &'static str)>,
 }
 
+#[derive(Clone)]
 struct Conversation<'l> {
     machine: &'l Machine,
     initiator: &'static str,
@@ -185,7 +186,7 @@ impl<'l> Reference<'l> {
         if begins(machine, words.act) {
             let mut conversation = Conversation::new(machine, words.from, self.agent);
             if self.removed.contains(&words.id) {
-                conversation.may_continue = !later_targets(machine, words.act).is_empty();
+                conversation.may_continue = may_repeat(machine, words.act);
             }
             evict_alike(alike, &mut self.removed, words, self.agent);
             return match conversation.check(words, now) {
@@ -284,10 +285,11 @@ fn embedded<'m>(machine: &'m Machine, id: &str) -> Vec<&'m fipa_monitor::Subprot
     all
 }
 
-/// The states to which a message like the first one leads later.
-fn later_targets(machine: &Machine, act: &str) -> Vec<String> {
+/// The transition of a first message, and the later ones of messages like it.
+fn first_and_later<'m>(machine: &'m Machine, act: &str) -> (&'m Transition, Vec<&'m Transition>) {
     let first = options(machine, machine.initial().id());
-    let first = first.iter().find(|step| matches(step.performative(), act));
+    let mut first = first.into_iter();
+    let first = first.find(|step| matches(step.performative(), act));
     let first = first.expect("it begins the protocol");
     let overlap = |one: &str, other: &str| {
         let mut roles = machine.roles().iter();
@@ -296,10 +298,23 @@ fn later_targets(machine: &Machine, act: &str) -> Vec<String> {
     let states = machine.states().iter();
     let later = states.filter(|state| state.id() != machine.initial().id());
     let steps = later.flat_map(|state| state.transitions());
-    let mut targets: Vec<String> = steps
-        .filter(|step| matches(step.performative(), act) && overlap(step.from(), first.from()))
-        .map(|step| machine.target(step).to_owned())
-        .filter(|target| target != machine.target(first))
+    let alike = steps
+        .filter(|step| matches(step.performative(), act) && overlap(step.from(), first.from()));
+    (first, alike.collect())
+}
+
+/// Whether a message like the first one may come later.
+fn may_repeat(machine: &Machine, act: &str) -> bool {
+    !first_and_later(machine, act).1.is_empty()
+}
+
+/// The states to which a message like the first one leads later.
+fn later_targets(machine: &Machine, act: &str) -> Vec<String> {
+    let (first, later) = first_and_later(machine, act);
+    let targets = later.iter().map(|step| machine.target(step));
+    let mut targets: Vec<String> = targets
+        .filter(|target| *target != machine.target(first))
+        .map(str::to_owned)
         .collect();
     targets.sort();
     targets.dedup();
@@ -653,6 +668,9 @@ impl<'l> Conversation<'l> {
     }
 }
 
+/// Among the states that a talk may be in: each of them.
+const ANY_STATE: &str = "*";
+
 fn place(talks: &[(&'static str, Talk)], name: &str) -> Option<usize> {
     talks.iter().position(|(peer, _)| *peer == name)
 }
@@ -662,7 +680,7 @@ impl Conversation<'_> {
         for (_, talk) in &mut self.talks {
             talk.expire(self.machine, now);
         }
-        let before = self.lengths();
+        let before = self.clone();
         let verdict = match self.machine.scope() {
             Scope::Participant => self.check_per_participant(words, now),
             _ => self.check_per_conversation(words, now),
@@ -687,12 +705,19 @@ impl Conversation<'_> {
             .collect()
     }
 
-    fn keep_alternatives(&mut self, words: &Words, before: &HashMap<&'static str, usize>) {
+    fn keep_alternatives(&mut self, words: &Words, before: &Self) {
         let machine = self.machine;
-        let after = self.lengths();
+        // The state before a failed message is unknown.
+        let talks = self.talks.iter().filter(|(peer, talk)| {
+            let before = place(&before.talks, peer).map_or(0, |at| before.talks[at].1.failures);
+            talk.failures > before
+        });
+        let failed: Vec<&str> = talks.map(|(peer, _)| *peer).collect();
+        let (before, after) = (before.lengths(), self.lengths());
         let known = std::mem::take(&mut self.alternatives).into_iter();
         let kept = known.filter_map(|(peer, id)| {
-            if before.get(peer) == after.get(peer) {
+            let is_kept = id == ANY_STATE || failed.contains(&peer);
+            if is_kept || before.get(peer) == after.get(peer) {
                 return Some((peer, id));
             }
             let all = options(machine, &id);
@@ -702,6 +727,8 @@ impl Conversation<'_> {
             Some((peer, machine.target(step).to_owned()))
         });
         self.alternatives = kept.collect();
+        let failed = failed.iter().map(|peer| (*peer, ANY_STATE.to_owned()));
+        self.alternatives.extend(failed);
         if begins(machine, words.act) {
             let new = after.keys().filter(|peer| !before.contains_key(*peer));
             for peer in new {
@@ -951,9 +978,9 @@ impl Conversation<'_> {
         let (mut first, mut failed) = (None, Vec::new());
         let before: Vec<(&str, Talk)> = self.talks.clone();
         for name in &words.to {
-            let concerned: Vec<usize> = (0..before.len())
-                .filter(|at| {
-                    let (peer, talk) = &before[*at];
+            let concerned: Vec<(usize, bool)> = (0..before.len())
+                .filter_map(|at| {
+                    let (peer, talk) = &before[at];
                     let side = if *name == self.initiator {
                         true
                     } else if peer == name {
@@ -961,21 +988,21 @@ impl Conversation<'_> {
                     } else if self.designated.contains(name) {
                         true
                     } else {
-                        return false;
+                        return None;
                     };
                     let asked = talk.last_of(side).and_then(|said| said.reply_with.clone());
                     let answers = words.in_reply_to.is_none()
                         || asked.is_none()
                         || asked == words.in_reply_to;
-                    let reached = if side { lost_place == Some(*at) } else { leads };
-                    reached && talk.last_by_initiator() == side && answers
+                    let reached = if side { lost_place == Some(at) } else { leads };
+                    (reached && talk.may_have_last(side) && answers).then_some((at, side))
                 })
                 .collect();
-            if let [only] = concerned[..] {
+            if let [(only, side)] = concerned[..] {
                 // A receiver that is named twice gets the message once.
                 let talk = &mut self.talks[only].1;
                 if !failed.contains(&only) {
-                    talk.fail();
+                    talk.fail(side);
                     failed.push(only);
                 }
                 first = first.or(Some(talk.name()));
@@ -1021,7 +1048,10 @@ impl Conversation<'_> {
                 return Err("stranger");
             }
             if !held(lost).is_empty() {
-                self.talks[0].1.fail();
+                let receiver = words.to[0];
+                let has_part = self.roles.iter().any(|(_, agent)| *agent == receiver);
+                let goes_on = self.designated.contains(&receiver) && !has_part;
+                self.talks[0].1.fail(receiver == self.initiator || goes_on);
             }
             return Ok(self.verdict(Some(0), false, false));
         }

@@ -28,6 +28,12 @@ pub(super) struct Talk {
     pub(super) due: Option<u64>,
     /// Whether a failure that may have crossed a cancel was taken for the answer to it.
     pub(super) echo: bool,
+    /// The talk before its last message, until that one fails.
+    earlier: Option<Box<Talk>>,
+    /// After a failure: the talk if the message has not arrived, and if it has.
+    worlds: Option<Box<[Talk; 2]>>,
+    /// Number of reported failures.
+    pub(super) failures: usize,
 }
 
 #[derive(Debug, Clone)]
@@ -56,6 +62,8 @@ pub(super) struct Step {
     pub(super) echo: bool,
     /// Answers a cancel, and is no step of the protocol itself.
     pub(super) answers_cancel: bool,
+    /// The number of the talk in [`Talk::worlds`] that the message fits.
+    world: Option<usize>,
 }
 
 pub(super) fn to(spot: Spot) -> Step {
@@ -68,6 +76,7 @@ pub(super) fn to(spot: Spot) -> Step {
         before: None,
         echo: false,
         answers_cancel: false,
+        world: None,
     }
 }
 
@@ -123,6 +132,9 @@ impl Talk {
             said: Vec::new(),
             due: None,
             echo: false,
+            earlier: None,
+            worlds: None,
+            failures: 0,
         }
     }
 
@@ -207,6 +219,9 @@ impl Talk {
             }],
             due: None,
             echo: false,
+            earlier: None,
+            worlds: None,
+            failures: 0,
         }
     }
 
@@ -318,17 +333,27 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     ..step
                 })
             };
+            let in_world = |world: usize| {
+                let talks = talk.worlds.as_deref().expect("there are two");
+                let step = judge(machine, &talks[world], view)?;
+                Ok(Step {
+                    world: Some(world),
+                    ..step
+                })
+            };
             let over = matches!(&**before, Spot::At(id) if is_over(machine, id));
             let (first, second) = match act == "cancel" && over {
-                true => (&talk.previous, &**before),
-                false => (&**before, &talk.previous),
+                _ if talk.worlds.is_some() => (in_world(0), in_world(1)),
+                true => (in_spot(&talk.previous), in_spot(before)),
+                false => (in_spot(before), in_spot(&talk.previous)),
             };
             // A void message counts in the other state, if it is not void there. If it is, it does not show
             // whether the failed message has arrived.
-            match (in_spot(first), in_spot(second)) {
+            match (first, second) {
                 (Ok(void), Ok(other)) if void.void && !other.void => Ok(other),
                 (Ok(void), Ok(_)) if void.void => Ok(Step {
                     spot: talk.spot.clone(),
+                    world: None,
                     ..void
                 }),
                 (Err(_), Ok(other)) => Ok(other),
@@ -425,6 +450,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     guard: (None, false),
                     before: None,
                     echo: false,
+                    world: None,
                     answers_cancel: false,
                 },
                 // During a cancel, a failure counts as a crossing message too.
@@ -585,7 +611,37 @@ pub(super) fn comes_later(
 }
 
 impl Talk {
-    pub(super) fn fail(&mut self) {
+    /// Whether the last message may be of this side: it sent the last one, or the last one that crossed no
+    /// cancel.
+    pub(super) fn may_have_last(&self, by_initiator: bool) -> bool {
+        self.last_by_initiator() == by_initiator || self.takes_back(by_initiator)
+    }
+
+    fn takes_back(&self, by_initiator: bool) -> bool {
+        let earlier = self.earlier.as_deref();
+        let last = earlier.and_then(|earlier| self.said.get(earlier.said.len()));
+        last.is_some_and(|last| last.by_initiator == by_initiator)
+    }
+
+    /// The last message of a side was not delivered.
+    pub(super) fn fail(&mut self, by_initiator: bool) {
+        self.failures += 1;
+        if !matches!(self.spot, Spot::Undelivered(_))
+            && self.takes_back(by_initiator)
+            && let Some(missing) = self.earlier.take()
+        {
+            let (missing, arrived) = (*missing, self.clone());
+            *self = Self {
+                failures: self.failures,
+                ..missing.clone()
+            };
+            // Nothing follows the other messages, if they have arrived.
+            if !matches!(arrived.spot, Spot::NotUnderstood(_) | Spot::Cancelled(_)) {
+                self.spot = Spot::Undelivered(Box::new(arrived.spot.clone()));
+                self.worlds = Some(Box::new([missing, arrived]));
+            }
+            return;
+        }
         self.spot = match self.spot.clone() {
             spot @ (Spot::At(_) | Spot::Elsewhere) => Spot::Undelivered(Box::new(spot)),
             // The cancel was not delivered.
@@ -605,6 +661,15 @@ impl Talk {
         now: u64,
     ) -> (bool, bool) {
         let opened = !self.said.iter().any(|said| !said.cancels);
+        if let Some((world, talks)) = step
+            .world
+            .zip(self.worlds.take_if(|_| step.world.is_some()))
+        {
+            *self = Self {
+                failures: self.failures,
+                ..talks[world].clone()
+            };
+        }
         self.echo = step.echo;
         let late =
             self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
@@ -618,6 +683,11 @@ impl Talk {
         }
         let cancels =
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
+        let earlier = Self {
+            earlier: None,
+            ..self.clone()
+        };
+        self.earlier = Some(Box::new(earlier));
         self.previous = step.before.clone().unwrap_or_else(|| self.spot.clone());
         self.said.push(SentMessage {
             by_initiator,
