@@ -6,64 +6,20 @@
 #![expect(clippy::unwrap_used, reason = "a bench that cannot go on has failed")]
 #![expect(clippy::print_stdout, reason = "figures")]
 
+mod conversations;
+
 use std::collections::HashMap;
 use std::hint::black_box;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
-use fipa_acl::{AgentId, Message, Performative};
+use fipa_acl::{Message, Performative};
 use fipa_monitor::{Header, Library, Limits, Monitor};
 
+use self::conversations::{id, message, now, with_open};
+
 const OPEN: usize = 100_000;
-
-fn now() -> SystemTime {
-    SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000)
-}
-
-fn id(number: usize) -> String {
-    format!("9f0a1c2e-5b7d-4e21-8c3f-{number:012}")
-}
-
-fn message(act: Performative, from: &str, to: &str, protocol: &str, id: String) -> Message {
-    Message::builder(act)
-        .sender(AgentId::new(from).unwrap())
-        .receiver(AgentId::new(to).unwrap())
-        .protocol(protocol)
-        .conversation_id(id)
-        .build()
-        .unwrap()
-}
-
-/// A monitor with open subscriptions.
-fn with_open(count: usize) -> (Monitor, Vec<Message>) {
-    let mut limits = Limits::default();
-    limits.conversations = 2_000_000;
-    limits.bytes = usize::MAX;
-    let library = Arc::new(Library::standard());
-    let mut monitor = Monitor::observer(library).with_limits(limits);
-    let mut informs = Vec::new();
-    for number in 0..count {
-        let (ann, ben) = (
-            format!("rover_{}", number % 50),
-            format!("arm_{}", number % 70),
-        );
-        let protocol = "fipa-subscribe";
-        let ask = message(Performative::Subscribe, &ann, &ben, protocol, id(number));
-        let agree = message(Performative::Agree, &ben, &ann, protocol, id(number));
-        for said in [&ask, &agree] {
-            assert!(monitor.check(&Header::from(said), now()).is_accepted());
-        }
-        informs.push(message(
-            Performative::Inform,
-            &ben,
-            &ann,
-            protocol,
-            id(number),
-        ));
-    }
-    (monitor, informs)
-}
 
 /// Measures the time for `count` messages that have just been received, of conversations far apart in
 /// memory.

@@ -1119,9 +1119,9 @@ impl Monitor {
             ..passed
         };
         let is_charged = slot.is_charged();
-        // A conversation that is not complete is not over.
-        let is_touched = slot.parent != NONE || !passed.complete && slot.touch(List::Open, now_ms);
-        if !is_touched {
+        // An embedded conversation is in no list, and one that is not complete is not over.
+        let is_main = slot.parent == NONE;
+        if is_main && (passed.complete || !slot.touch(List::Open, now_ms)) {
             self.touch(at, now_ms);
         }
         if !is_charged {

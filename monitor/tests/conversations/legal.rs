@@ -837,6 +837,12 @@ fn a_wrong_reply_names_the_expected_and_the_received_value() {
     let wrong = stage.wrong(say("propose cid>ann").in_reply_to("b"));
     let reply = wrong.reply.as_ref().unwrap();
     assert_eq!((&*reply.expected, &*reply.received), ("c", "b"));
+    // The members of a pattern have one value until they answer.
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>arm_.*").reply_with("call"));
+    let wrong = stage.wrong(say("propose arm_1>ann").in_reply_to("other"));
+    let reply = wrong.reply.as_ref().unwrap();
+    assert_eq!((&*reply.expected, &*reply.received), ("call", "other"));
     // So it is for each side, and for the agents that continue in its place.
     for (words, expected) in [
         ("inform ben>ann", "accept"),
