@@ -528,7 +528,7 @@ pub(crate) struct Rare {
     /// Whether the state is uncertain, because an agent that may have claimed its role wrongly has ended the
     /// conversation, or because another agent may have that role.
     pub(crate) contested: bool,
-    /// Roles that the monitored agent may have, although it has none of them if no sender is an outsider.
+    /// Roles that the monitored agent may have, because the message that excludes them may be of an outsider.
     pub(crate) doubtful_roles: u32,
     /// Whether the last message of the monitored agent was reported as undelivered.
     pub(crate) undelivered: bool,

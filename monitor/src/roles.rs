@@ -185,28 +185,11 @@ impl Monitor {
                     party.state = state;
                 }
                 if let Some(role) = peer.filter(|role| free & (1 << role) != 0) {
-                    let agents = match observed.own {
-                        true => observed.receivers,
-                        false => &[observed.sender.into()][..],
-                    };
-                    for name in agents {
-                        let agent = conversation.acquire(&mut self.names, name);
-                        conversation.bound.push(RoleBinding { role, agent });
-                    }
-                    let began = self.names.is(conversation.initiator, observed.sender);
-                    let rare = conversation.rare();
-                    // The monitored agent has asked the sender to take the role: `peers` has no role of
-                    // which it has asked only others.
-                    let is_asked = rare.asked.iter().any(|asked| asked.role == role);
-                    let claims = !observed.own && !began && !is_asked;
-                    rare.claimed |= claims;
-                    if claims {
+                    let doubtful = || {
                         // The sender of this message, or that of an earlier one, may be an outsider.
-                        let others = own_roles | begun_roles(projection, observed);
-                        rare.doubtful_roles |= others & !kept_roles;
-                    }
-                    rare.doubtful |= claims && rare.undelivered;
-                    conversation.release_asked(&mut self.names, |asked| asked == role);
+                        (own_roles | begun_roles(projection, observed)) & !kept_roles
+                    };
+                    bind(conversation, &mut self.names, observed, role, doubtful);
                 }
                 if observed.own {
                     conversation.release_asked(&mut self.names, |_| true);
@@ -267,6 +250,36 @@ impl Monitor {
             Err(NotLocal::Unexpected) => fault(Kind::Unexpected, state),
         }
     }
+}
+
+/// Gives a free role to the other side of a message. A sender that the monitored agent knows only from this
+/// message claims the role, and `doubtful` are the roles of the monitored agent that the message excludes.
+fn bind(
+    conversation: &mut Conversation,
+    names: &mut Names,
+    observed: &ObservedMessage<'_>,
+    role: u8,
+    doubtful: impl FnOnce() -> u32,
+) {
+    let agents = match observed.own {
+        true => observed.receivers,
+        false => &[observed.sender.into()][..],
+    };
+    for name in agents {
+        let agent = conversation.acquire(names, name);
+        conversation.bound.push(RoleBinding { role, agent });
+    }
+    let began = names.is(conversation.initiator, observed.sender);
+    let rare = conversation.rare();
+    // The monitored agent has asked the sender to take the role: the sender has no role of which it has
+    // asked only others.
+    let is_asked = rare.asked.iter().any(|asked| asked.role == role);
+    if !observed.own && !began && !is_asked {
+        rare.claimed = true;
+        rare.doubtful |= rare.undelivered;
+        rare.doubtful_roles |= doubtful();
+    }
+    conversation.release_asked(names, |asked| asked == role);
 }
 
 /// Returns the roles of the monitored agent of which this is the first message of the protocol.
