@@ -618,6 +618,31 @@ fn an_outsider_decides_no_role_of_an_agent() {
     let mut cid = stage("cid");
     cid.right(&["request ann>cid"]);
     assert_eq!(cid.wrong("confirm cid>ben"), Kind::Unexpected);
+    // Both roles send an inform, so it does not show which one cid has.
+    let both = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="request" from="a" to="c" target="3"/></state>
+        <state id="3"><transition performative="propose" from="c" to="b" target="4"/></state>
+        <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
+        <state id="5"><transition performative="confirm" from="a" to="c" target="6"/></state>
+        <state id="6"><transition performative="inform" from="c" to="a" target="7"/></state>
+        <state id="7"><transition performative="disconfirm" from="c" to="a" target="8"/></state>
+        <state id="8" final="yes"/></scxml>"#;
+    let mut cid = stage_with(machine(both), "cid");
+    cid.right(&["request ann>cid", "propose mallory>cid", "inform cid>ann"]);
+    assert_eq!(cid.check("disconfirm cid>ann"), unknown);
+    // A message that comes too early for another role leaves the role certain.
+    let early = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="query-ref" from="a" to="d" target="3"/></state>
+        <state id="3"><transition performative="query-if" from="a" to="c" target="4"/></state>
+        <state id="4"><transition performative="inform" from="c" to="d" target="5"/></state>
+        <state id="5"><transition performative="inform" from="c" to="b" target="6"/></state>
+        <state id="6"><transition performative="agree" from="b" to="a" target="7"/></state>
+        <state id="7" final="yes"/></scxml>"#;
+    let mut ben = stage_with(machine(early), "ben");
+    ben.right(&["request ann>ben", "inform cid>ben"]);
+    assert_eq!(ben.wrong("propose ben>ann"), Kind::Unexpected);
     // The second request to ben may be the first one again, or that to the role c.
     let mut ann = stage("ann");
     ann.right(&["request ann>ben"]);

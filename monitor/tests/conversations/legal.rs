@@ -596,11 +596,14 @@ fn a_message_that_changes_no_state_shows_none() {
     let head = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">"#;
     let library = library_with("own", &format!("{head}{AUCTION}"));
     let all: [&dyn Fn(&mut Stage); 5] = [
-        // A call that was not delivered.
+        // A call that was not delivered, and calls to both participants after it.
         &|stage| {
+            stage.right(own("inform ann>cid"));
             stage.right(own("cfp ann>ben"));
             let lost = own("failure mts>ann").undelivered_to("ben");
             assert_eq!(stage.right(lost), "undelivered");
+            stage.right(own("cfp ann>ben"));
+            stage.right(own("cfp ann>cid"));
         },
         // A void answer.
         &|stage| {
