@@ -182,14 +182,14 @@ async fn serve(
     subscribers: &std::sync::Weak<Subscribers>,
 ) -> Result<(), DialogueError> {
     let mut dialogue = Dialogue::join(core, first)?;
-    dialogue
-        .answer(first, Performative::Agree, "", None)
-        .await?;
     let (sender, mut notifications) = mpsc::channel(MAX_WAITING);
     let Some(registered) = subscribers.upgrade() else {
-        dialogue.take_speaker().abandon(first, ENDED);
-        return Ok(());
+        return dialogue
+            .answer(first, Performative::Refuse, ENDED, None)
+            .await;
     };
+    // Registered before the `agree`: the subscriber gets each notification that is published after it has
+    // received the `agree`.
     let number = {
         let mut state = registered.0.lock();
         state.next += 1;
@@ -202,14 +202,18 @@ async fn serve(
         number
     };
     drop(registered);
-    let served = notify(&mut dialogue, first, &mut notifications).await;
+    let agreed = dialogue.answer(first, Performative::Agree, "", None).await;
+    let served = match agreed {
+        Ok(()) => notify(&mut dialogue, first, &mut notifications).await,
+        Err(error) => Err(error),
+    };
     if let Some(subscribers) = subscribers.upgrade() {
         subscribers.0.lock().all.remove(&number);
     }
     served
 }
 
-/// The content of the `failure` at the end of a publisher.
+/// The content of the `failure`, or of the `refuse`, at the end of a publisher.
 const ENDED: &str = "the publisher has ended";
 
 async fn notify(
