@@ -14,7 +14,7 @@ use std::hint::black_box;
 use fipa_acl::{Message, Performative};
 use fipa_monitor::{Header, Monitor};
 
-use self::conversations::{id, message, now, with_open};
+use self::conversations::{answer, now, with_open};
 
 /// Messages of a path, each of another conversation.
 const MESSAGES: usize = 1_000;
@@ -26,11 +26,11 @@ const PATHS: &[Path] = &[
         measured(|| check(monitor, informs, true));
     }),
     ("monitor/opening/1000", |monitor, _| {
-        let opening = numbered(Performative::Request, "fipa-request", MESSAGES);
+        let opening = numbered(&Performative::Request, "fipa-request", MESSAGES);
         measured(|| check(monitor, &opening, true));
     }),
     ("monitor/violation/1000", |monitor, _| {
-        let wrong = numbered(Performative::Propose, "fipa-subscribe", 0);
+        let wrong = numbered(&Performative::Propose, "fipa-subscribe", 0);
         measured(|| check(monitor, &wrong, false));
     }),
 ];
@@ -51,20 +51,10 @@ fn main() {
 }
 
 /// Messages of conversations from this number on.
-fn numbered(act: Performative, protocol: &str, first: usize) -> Vec<Message> {
+fn numbered(act: &Performative, protocol: &str, first: usize) -> Vec<Message> {
     let numbers = first..first + MESSAGES;
-    let from_to = |number| {
-        (
-            format!("arm_{}", number % 70),
-            format!("rover_{}", number % 50),
-        )
-    };
-    numbers
-        .map(|number| {
-            let (from, to) = from_to(number);
-            message(act.clone(), &from, &to, protocol, id(number))
-        })
-        .collect()
+    let messages = numbers.map(|number| answer(act.clone(), protocol, number));
+    messages.collect()
 }
 
 fn check(monitor: &mut Monitor, messages: &[Message], is_accepted: bool) {

@@ -17,7 +17,7 @@ use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use fipa_acl::{Message, Performative};
 use fipa_monitor::{Header, Library, Limits, Monitor};
 
-use self::conversations::{id, message, now, with_open};
+use self::conversations::{answer, id, message, now, with_open};
 
 const OPEN: usize = 100_000;
 
@@ -64,21 +64,8 @@ fn verdicts(c: &mut Criterion) {
             })
         });
     });
-    let wrong: Vec<Message> = (0..OPEN)
-        .map(|number| {
-            let (ann, ben) = (
-                format!("rover_{}", number % 50),
-                format!("arm_{}", number % 70),
-            );
-            message(
-                Performative::Propose,
-                &ben,
-                &ann,
-                "fipa-subscribe",
-                id(number),
-            )
-        })
-        .collect();
+    let propose = |number| answer(Performative::Propose, "fipa-subscribe", number);
+    let wrong: Vec<Message> = (0..OPEN).map(propose).collect();
     group.bench_function("violation", |b| {
         b.iter_custom(|count| {
             on_letters(&wrong, count, |message| {

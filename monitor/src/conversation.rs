@@ -271,6 +271,13 @@ impl Party {
         };
     }
 
+    /// Values of the last message.
+    fn step_values(&self) -> StepValues {
+        let has_values = self.last_step.is_some_and(|step| step.has_values);
+        let details = self.details.as_deref().filter(|_| has_values);
+        details.map_or_else(StepValues::default, |details| details.step)
+    }
+
     /// Decides that a message which was reported as failed has arrived, or has not.
     pub(crate) fn settle(&mut self, world: World) {
         let details = self.details.as_deref_mut();
@@ -288,14 +295,12 @@ impl Party {
     /// Takes a message back, because it was not delivered, or because that is uncertain. Returns whether
     /// the message is the last one.
     pub(crate) fn take_back(&mut self, side: Side, act: u8, reply_with: u64) -> bool {
-        let has_values = self.last_step.is_some_and(|step| step.has_values);
-        let details = self.details.as_deref().filter(|_| has_values);
-        let values = details.map_or_else(StepValues::default, |details| details.step);
+        let values = self.step_values();
         let is_it = |step: &LastStep| {
             step.side == side && step.act == act && values.reply_with == reply_with
         };
         let cancels = act == act_number(CANCEL);
-        let Some(step) = self.last_step.take_if(|step| is_it(step)) else {
+        let Some(step) = self.last_step.filter(is_it) else {
             // A message of the other side may have crossed the cancel, or was taken for its answer.
             if cancels
                 && (self.state == CANCELLING || self.state == CANCELLED && self.echo)
@@ -307,7 +312,7 @@ impl Party {
             }
             return false;
         };
-        self.revert(step, values);
+        self.revert(step);
         true
     }
 
@@ -323,18 +328,18 @@ impl Party {
     /// Takes the last message of a side back, because a message transport service has reported that it was
     /// not delivered. Returns whether it is the last one of the party.
     pub(crate) fn take_back_last(&mut self, side: Side) -> bool {
-        let Some(step) = self.last_step.take_if(|step| step.side == side) else {
-            return false;
-        };
-        let details = self.details.as_deref().filter(|_| step.has_values);
-        let values = details.map_or_else(StepValues::default, |details| details.step);
-        self.revert(step, values);
-        true
+        let step = self.last_step.filter(|step| step.side == side);
+        if let Some(step) = step {
+            self.revert(step);
+        }
+        step.is_some()
     }
 
     /// Restores the values before the last message. If it may have arrived, the next message shows whether
     /// it has.
-    fn revert(&mut self, step: LastStep, values: StepValues) {
+    fn revert(&mut self, step: LastStep) {
+        let values = self.step_values();
+        self.last_step = None;
         let arrived = self.clone();
         let index = side_index(step.side);
         (self.state, self.resume, self.before) = (step.state, step.resume, step.before);

@@ -1457,35 +1457,35 @@ fn growth_by(
     let reply_to = header.reply_to_names();
     let designated = reply_to.iter().map(name).sum::<usize>();
     let reported = moves.iter().filter(|made| made.reported).count() * Party::GROWTH_BY_REPORT;
-    reported
-        + match machine.scope {
-            Scope::Participant => {
-                let new = moves.iter().filter_map(|made| match made.target {
-                    MoveTarget::Receiver(number) => observed.receivers.get(number).map(name),
-                    MoveTarget::Sender => Some(sender),
-                    MoveTarget::Party(_) | MoveTarget::Unnamed => None,
-                });
-                let growth = conversation.growth(new.clone().count(), 0, reply_to.len());
-                growth + new.sum::<usize>() + designated
-            }
-            Scope::Conversation => {
-                let receivers = match bindings.receivers {
-                    0 => &[],
-                    _ => observed.receivers,
-                };
-                // The agents in `reply-to` have a name each, and one for each binding.
-                let held = bindings.delegates.checked_div(reply_to.len());
-                let copies = match is_copied {
-                    true => Copied::MAX * size_of::<Copied>() + size_of::<u64>(),
-                    false => 0,
-                };
-                conversation.growth(0, bindings.count(), reply_to.len())
-                    + bindings.sender * sender
-                    + receivers.iter().map(name).sum::<usize>()
-                    + held.unwrap_or(0).max(1) * designated
-                    + copies
-            }
+    let growth = match machine.scope {
+        Scope::Participant => {
+            let new = moves.iter().filter_map(|made| match made.target {
+                MoveTarget::Receiver(number) => observed.receivers.get(number).map(name),
+                MoveTarget::Sender => Some(sender),
+                MoveTarget::Party(_) | MoveTarget::Unnamed => None,
+            });
+            let growth = conversation.growth(new.clone().count(), 0, reply_to.len());
+            growth + new.sum::<usize>() + designated
         }
+        Scope::Conversation => {
+            let receivers = match bindings.receivers {
+                0 => &[],
+                _ => observed.receivers,
+            };
+            // The agents in `reply-to` have a name each, and one for each binding.
+            let held = bindings.delegates.checked_div(reply_to.len());
+            let copies = match is_copied {
+                true => Copied::MAX * size_of::<Copied>() + size_of::<u64>(),
+                false => 0,
+            };
+            conversation.growth(0, bindings.count(), reply_to.len())
+                + bindings.sender * sender
+                + receivers.iter().map(name).sum::<usize>()
+                + held.unwrap_or(0).max(1) * designated
+                + copies
+        }
+    };
+    growth + reported
 }
 
 /// If the message is another copy of the last one to several receivers: gives its receiver the role of the

@@ -25,13 +25,7 @@ impl Monitor {
         (header, observed): (&Header<'_>, &ObservedMessage<'_>),
         now: Now,
     ) -> Result<Passed, Denied> {
-        let mut run = LocalRun::new(projection.locals(), u32::MAX);
-        let message = Observed {
-            act: observed.act,
-            own: observed.own,
-            peers: u32::MAX,
-        };
-        if run.take(projection.locals(), message).is_err() {
+        if begun(projection, observed).is_none() {
             let certain = observed.own && self.is_certain(id);
             return Err(if certain || !machine.may_follow(observed.act) {
                 Denied::NotOpened(index)
@@ -282,18 +276,23 @@ fn bind(
     conversation.release_asked(names, |asked| asked == role);
 }
 
-/// Returns the roles of the monitored agent of which this is the first message of the protocol.
-fn begun_roles(projection: &Projection, observed: &ObservedMessage<'_>) -> u32 {
+/// Returns a conversation after this message, if the message can be the first one that the monitored agent
+/// sees.
+fn begun(projection: &Projection, observed: &ObservedMessage<'_>) -> Option<LocalRun> {
     let mut run = LocalRun::new(projection.locals(), u32::MAX);
     let message = Observed {
         act: observed.act,
         own: observed.own,
         peers: u32::MAX,
     };
-    match run.take(projection.locals(), message) {
-        Ok(_) if !run.waits() => run.roles(),
-        _ => 0,
-    }
+    run.take(projection.locals(), message).ok()?;
+    Some(run)
+}
+
+/// Returns the roles of the monitored agent of which this is the first message of the protocol.
+fn begun_roles(projection: &Projection, observed: &ObservedMessage<'_>) -> u32 {
+    let run = begun(projection, observed).filter(|run| !run.waits());
+    run.map_or(0, |run| run.roles())
 }
 
 /// Takes a message of the monitored agent back, if it is its last one in the conversation, and if no

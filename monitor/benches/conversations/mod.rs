@@ -30,6 +30,20 @@ pub(crate) fn message(
         .unwrap()
 }
 
+/// The rover and the arm of a conversation.
+fn agents(number: usize) -> [String; 2] {
+    [
+        format!("rover_{}", number % 50),
+        format!("arm_{}", number % 70),
+    ]
+}
+
+/// A message of the arm of a conversation to its rover.
+pub(crate) fn answer(act: Performative, protocol: &str, number: usize) -> Message {
+    let [rover, arm] = agents(number);
+    message(act, &arm, &rover, protocol, id(number))
+}
+
 /// A monitor with open subscriptions, and a further message of each.
 pub(crate) fn with_open(count: usize) -> (Monitor, Vec<Message>) {
     let mut limits = Limits::default();
@@ -39,23 +53,14 @@ pub(crate) fn with_open(count: usize) -> (Monitor, Vec<Message>) {
     let mut monitor = Monitor::observer(library).with_limits(limits);
     let mut informs = Vec::new();
     for number in 0..count {
-        let (ann, ben) = (
-            format!("rover_{}", number % 50),
-            format!("arm_{}", number % 70),
-        );
+        let [rover, arm] = agents(number);
         let protocol = "fipa-subscribe";
-        let ask = message(Performative::Subscribe, &ann, &ben, protocol, id(number));
-        let agree = message(Performative::Agree, &ben, &ann, protocol, id(number));
+        let ask = message(Performative::Subscribe, &rover, &arm, protocol, id(number));
+        let agree = answer(Performative::Agree, protocol, number);
         for said in [&ask, &agree] {
             assert!(monitor.check(&Header::from(said), now()).is_accepted());
         }
-        informs.push(message(
-            Performative::Inform,
-            &ben,
-            &ann,
-            protocol,
-            id(number),
-        ));
+        informs.push(answer(Performative::Inform, protocol, number));
     }
     (monitor, informs)
 }
