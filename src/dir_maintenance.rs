@@ -90,6 +90,9 @@ impl DirMaintenance {
                 }
                 continue;
             };
+            // A service that closes aborts this task before it removes the files itself. The abort takes
+            // effect here.
+            tokio::task::yield_now().await;
             if problem.is_some() {
                 sleep(RETRY_AFTER).await;
             } else {

@@ -7,7 +7,8 @@ use std::time::Instant;
 
 use fipa_acl::ErrorChain;
 use fipa_sds::{
-    ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, Registration, Role,
+    ContactDirectory, Directory, Entry, HostDirectory, HostError, MergedDirectory, Reach,
+    Registration, Role,
 };
 use fipa_transport::{Incarnation, Location};
 
@@ -71,8 +72,12 @@ impl Publisher {
         let published = self
             .host
             .publish_remote(through_here.collect(), self.known.lost_agents());
-        if let Err(error) = published {
-            tracing::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
+        match published {
+            // A gateway that closes publishes nothing.
+            Ok(()) | Err(HostError::Closed) => {}
+            Err(error) => {
+                tracing::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
+            }
         }
     }
 }
