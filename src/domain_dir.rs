@@ -2,8 +2,8 @@
 //!
 //! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `/tmp/fipa-<uid>/<domain>`, which is the same for a
 //! login shell and a service of the same user. Both levels belong to the user and have mode 0700.
-//! The last process that leaves removes them, but never `$FIPA_RUNTIME_DIR` itself, which belongs to
-//! its owner.
+//! The last process that leaves removes the lower level. The upper level stays: `$FIPA_RUNTIME_DIR`
+//! belongs to its owner, and in `/tmp` another user could take the name (see `user_dir`).
 //!
 //! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which
 //! systemd-tmpfiles respects, and renews the timestamps once a day for other cleaners.
@@ -20,10 +20,12 @@ use std::time::{Duration, Instant, SystemTime};
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
-/// The environment variable with the directory of all domains, instead of `/tmp/fipa-<uid>`.
+use crate::user_dir::UserDir;
+
+/// The environment variable with the directory of all domains, instead of that in `/tmp`.
 pub(crate) const VARIABLE: &str = "FIPA_RUNTIME_DIR";
 
-/// Maximum number of attempts to create a directory that another process removes as it leaves.
+/// Maximum number of attempts to join a directory that another process removes as it leaves.
 pub(crate) const RETRIES: u32 = 20;
 
 /// Time to wait for a cleaner that has locked a directory. It holds the lock while it examines the
@@ -49,8 +51,8 @@ const MAX_HOST: usize = 128;
 #[derive(Debug, Clone)]
 pub(crate) struct DomainDir {
     base: PathBuf,
-    /// Whether the owner named the base (`$FIPA_RUNTIME_DIR`), so that it is never removed.
-    is_named: bool,
+    /// The other user that holds the name `/tmp/fipa-<uid>`, if the base has another name.
+    name_held_by: Option<u32>,
     domain: String,
     /// The locks; set when the process has joined.
     locks: Option<Arc<DirLocks>>,
@@ -92,38 +94,50 @@ pub enum DomainDirError {
 impl DomainDir {
     /// Creates the directory of a domain, and checks that it is private.
     pub(crate) fn prepare(domain: &str) -> Result<Self, DomainDirError> {
-        let dir = Self::of(domain);
-        let create = || make_private(&dir.base).and_then(|()| make_private(&dir.path()));
-        let mut result = create();
-        for _ in 0..RETRIES {
-            match &result {
-                // The last process that left removed the upper level in between.
-                Err(DomainDirError::Io { source, .. })
-                    if source.kind() == io::ErrorKind::NotFound =>
-                {
-                    result = create();
-                }
-                _ => break,
-            }
+        let mut dir = Self::of(domain);
+        if make_private(&dir.base).is_err() {
+            // Another user may have taken the name in between.
+            dir = Self::of(domain);
+            make_private(&dir.base)?;
         }
-        result.map(|()| dir)
+        make_private(&dir.path())?;
+        if let Some(user) = dir.name_held_by {
+            tracing::warn!(
+                "{} holds the name of the directory in which the domains of this user are, so they are \
+                 in {}; to reserve the name at boot, see fipa doctor",
+                user_name(user),
+                dir.base.display()
+            );
+        }
+        Ok(dir)
     }
 
     /// Returns the directory of a domain without creating or examining it.
     pub(crate) fn of(domain: &str) -> Self {
         let named = std::env::var_os(VARIABLE).filter(|value| !value.is_empty());
-        let is_named = named.is_some();
-        let base = match named {
+        let (base, name_held_by) = match named {
             // A relative path would name another directory in each working directory.
-            Some(base) => std::path::absolute(&base).unwrap_or_else(|_| PathBuf::from(base)),
-            None => PathBuf::from(format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw())),
+            Some(base) => {
+                let base = std::path::absolute(&base).unwrap_or_else(|_| PathBuf::from(base));
+                (base, None)
+            }
+            None => {
+                let user = rustix::process::geteuid().as_raw();
+                let found = UserDir::find(Path::new("/tmp"), user);
+                (found.path, found.name_held_by)
+            }
         };
         Self {
             base,
-            is_named,
+            name_held_by,
             domain: domain.to_owned(),
             locks: None,
         }
+    }
+
+    /// Returns the other user that holds the name `/tmp/fipa-<uid>`, if the directory has another name.
+    pub(crate) fn name_held_by(&self) -> Option<u32> {
+        self.name_held_by
     }
 
     /// Locks both levels, so that systemd-tmpfiles skips them. Must be called after this process has
@@ -235,7 +249,7 @@ impl DomainDir {
     )]
     pub(crate) fn prefix(&self) -> String {
         format!(
-            "fipa_{}_{:08x}_",
+            "fipa_{}_{:08x}",
             self.domain,
             fnv(self.path().as_os_str().as_encoded_bytes())
         )
@@ -270,8 +284,7 @@ impl DomainDir {
         names.all(|entry| entry.is_ok_and(|entry| entry.file_name() == HOST))
     }
 
-    /// Removes the empty directories. Those that other processes use are not empty and stay, as does a
-    /// directory that the owner named.
+    /// Removes the empty directories of the domain. Those that other processes use are not empty and stay.
     pub(crate) fn leave(&self) {
         // Fails if the directory is not empty or does not exist, and then nothing is to be done.
         let remove = |path: PathBuf| drop(fs::remove_dir(path));
@@ -282,9 +295,6 @@ impl DomainDir {
             let _ = fs::remove_file(self.path().join(HOST));
         }
         remove(self.path());
-        if !self.is_named {
-            remove(self.base.clone());
-        }
     }
 }
 
@@ -473,13 +483,13 @@ mod tests {
     fn prefixes_differ_by_domain_and_base() {
         let dir = |base: &str, domain: &str| DomainDir {
             base: base.into(),
-            is_named: false,
+            name_held_by: None,
             domain: domain.into(),
             locks: None,
         };
         let all = [dir("/a", "x"), dir("/a", "y"), dir("/b", "x")].map(|p| p.prefix());
         assert!(all[0] != all[1] && all[0] != all[2] && all[1] != all[2]);
-        assert!(dir("/a", &"d".repeat(32)).prefix().len() <= 64);
+        assert!(dir("/a", &"d".repeat(32)).prefix().len() <= 47);
     }
 
     /// Creates a domain directory in a temporary directory.
@@ -487,7 +497,7 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let dir = DomainDir {
             base: home.path().join("base"),
-            is_named: false,
+            name_held_by: None,
             domain: "domain".to_owned(),
             locks: None,
         };
@@ -520,19 +530,9 @@ mod tests {
         assert_eq!(dir.host_id().unwrap(), host);
         fs::remove_dir(dir.base.join("another")).unwrap();
         dir.leave();
-        assert!(!dir.base.exists());
-    }
-
-    #[test]
-    fn a_directory_that_the_owner_named_is_not_removed() {
-        let (_home, dir) = created();
-        let named = DomainDir {
-            is_named: true,
-            ..dir
-        };
-        named.leave();
-        assert!(named.base.exists());
-        assert!(!named.path().exists());
+        assert!(!dir.path().exists());
+        // In /tmp, another user could take the name.
+        assert!(dir.base.exists());
     }
 
     #[test]

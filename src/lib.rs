@@ -162,6 +162,7 @@ mod presence;
 pub mod protocol;
 pub mod routes;
 mod service;
+mod user_dir;
 pub mod watch;
 
 pub use agent::{Agent, Loan, Unread};

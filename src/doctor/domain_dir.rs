@@ -1,10 +1,12 @@
 //! Checks the directory of the domain.
 
+use std::path::Path;
+
 use fipa_acl::ErrorChain;
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::domain_dir::DomainDir;
+use crate::domain_dir::{DomainDir, user_name};
 
 const AREA: Area = Area("domain");
 
@@ -12,11 +14,15 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     checks.push(directory(&DomainDir::of(&config.domain)));
 }
 
+const CHECK: &str = "directory of the domain";
+
 fn directory(dir: &DomainDir) -> Check {
-    const CHECK: &str = "directory of the domain";
     let path = dir.path();
     match dir.exists() {
-        Ok(true) => AREA.fine(CHECK, format!("{} is private", path.display())),
+        Ok(true) => match dir.name_held_by() {
+            None => AREA.fine(CHECK, format!("{} is private", path.display())),
+            Some(user) => name_held(&path, user),
+        },
         Ok(false) => {
             let found = format!(
                 "{} does not exist yet; the first process creates it",
@@ -31,4 +37,22 @@ fn directory(dir: &DomainDir) -> Check {
             "follow the remedy above; until then no process can join the domain",
         ),
     }
+}
+
+/// Reports another user that holds the name of the directory in `/tmp`.
+fn name_held(path: &Path, user: u32) -> Check {
+    let own = rustix::process::geteuid().as_raw();
+    AREA.problem(
+        CHECK,
+        Verdict::Doubtful,
+        format!(
+            "{} is private; the domains of this user are not in /tmp/fipa-{own}, because {} holds that name",
+            path.display(),
+            user_name(user)
+        ),
+        format!(
+            "reserve the name at boot: write the line `d /tmp/fipa-{own} 0700 {own}` into a file in \
+             /etc/tmpfiles.d, and restart the host"
+        ),
+    )
 }

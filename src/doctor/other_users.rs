@@ -11,6 +11,7 @@ use rustix::process::geteuid;
 use super::{Area, Check, Verdict};
 use crate::Config;
 use crate::domain_dir::user_name;
+use crate::user_dir::user_in;
 
 const AREA: Area = Area("domain");
 const CHECK: &str = "domains of other users";
@@ -39,7 +40,7 @@ fn others(shared_memory: &Path, temporary: &Path, user: u32) -> Others {
         }
     });
     each(temporary, |name, metadata| {
-        let owner = name.strip_prefix("fipa-").and_then(|id| id.parse().ok());
+        let owner = user_in(name);
         if metadata.is_dir() && owner == Some(metadata.uid()) && owner != Some(user) {
             found.entry(metadata.uid()).or_default();
         }

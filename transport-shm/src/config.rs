@@ -16,7 +16,9 @@ pub struct ShmConfig {
     /// this user and be closed to other users.
     pub root: PathBuf,
     /// Prefix of the names of all shared memory files of this domain: 1 to
-    /// [`ShmConfig::MAX_PREFIX`] ASCII letters, digits, `-` and `_`.
+    /// [`ShmConfig::MAX_PREFIX`] ASCII letters, digits, `-` and `_`. Random digits follow it, which
+    /// the first process of the domain draws, so that no other user can create a file with such a name
+    /// beforehand.
     pub prefix: String,
     /// Incarnation of this process's message transport service. Must be known.
     pub incarnation: Incarnation,
@@ -48,7 +50,7 @@ pub struct ShmConfig {
 
 impl ShmConfig {
     /// Maximum length of the prefix in bytes.
-    pub const MAX_PREFIX: usize = 64;
+    pub const MAX_PREFIX: usize = 47;
 
     /// Returns the defaults: letters of 64 MiB, 256 MiB for the domain, 64 processes.
     #[must_use]
@@ -83,8 +85,8 @@ impl ShmConfig {
     /// to [`Self::EXPIRED_CONNECTIONS`] covers connections that iceoryx2 fails to release.
     pub(crate) const MAX_LENDERS: usize = 32;
 
-    /// Checks the configuration and returns the one for iceoryx2.
-    pub(crate) fn iceoryx(&self) -> Result<Config, ShmError> {
+    /// Checks the configuration and returns the directory as a path of iceoryx2.
+    pub(crate) fn check(&self) -> Result<Path, ShmError> {
         let wrong = |what: String| ShmError::Configuration(what);
         let prefix_is_fine = (1..=Self::MAX_PREFIX).contains(&self.prefix.len())
             && self
@@ -116,19 +118,23 @@ impl ShmConfig {
             }
         }
         let text = self.root.to_str().filter(|_| self.root.is_absolute());
-        let root = text
-            .and_then(|text| Path::new(text.as_bytes()).ok())
+        text.and_then(|text| Path::new(text.as_bytes()).ok())
             .filter(|path| path.len() <= 160)
             .ok_or_else(|| {
                 wrong(format!(
                     "the directory {:?} is not an absolute path of at most 160 ASCII characters",
                     self.root
                 ))
-            })?;
+            })
+    }
+
+    /// Checks the configuration and returns the one for iceoryx2, whose files have this prefix.
+    pub(crate) fn iceoryx(&self, prefix: &str) -> Result<Config, ShmError> {
         let mut config = Config::default();
-        config.global.set_root_path(&root);
-        config.global.prefix = FileName::new(format!("{}_", self.prefix).as_bytes())
-            .map_err(|_| wrong(format!("the prefix {:?} is not a file name", self.prefix)))?;
+        config.global.set_root_path(&self.check()?);
+        config.global.prefix = FileName::new(format!("{prefix}_").as_bytes()).map_err(|_| {
+            ShmError::Configuration(format!("the prefix {prefix:?} is not a file name"))
+        })?;
         // Dead processes are cleaned up after their letters have been taken: see `domain_files`.
         config.global.node.cleanup_dead_nodes_on_creation = false;
         config.global.node.cleanup_dead_nodes_on_destruction = false;

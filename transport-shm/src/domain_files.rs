@@ -17,13 +17,14 @@ use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use iceoryx2::service::Service;
 use parking_lot::Mutex;
-use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, fstat, open};
+use rustix::fs::{FlockOperation, Mode, OFlags, Stat, fchmod, fstat, lstat, open};
 use rustix::io::Errno;
 
 use crate::fork::Owner;
 use crate::layout::Svc;
-use crate::memory::{SHM, lock};
+use crate::memory::{SHM, is_owned, lock};
 use crate::presence::{PeerProcess, ProcessPaths, wait_for_polls};
+use crate::secret::{self, Secret};
 use crate::{ShmConfig, ShmError};
 
 /// The result of [`cleanup_dead`].
@@ -49,7 +50,7 @@ pub struct Cleaned {
 /// Returns an error if the configuration is invalid, the lock is held for too long, or files cannot
 /// be listed.
 pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
-    let domain = DomainFiles::new(config)?;
+    let domain = DomainFiles::of(config)?;
     if !config.root.exists() {
         return Ok(Cleaned::default());
     }
@@ -69,21 +70,33 @@ pub(crate) struct DomainFiles {
     closing: AtomicBool,
     /// Whether the last wait for the lock timed out.
     lock_timed_out: AtomicBool,
+    /// The secret in the names of the files. `None` if no process had joined the domain.
+    secret: Option<Secret>,
     ice: Config,
     paths: ProcessPaths,
     config: ShmConfig,
 }
 
 impl DomainFiles {
-    pub(crate) fn new(config: &ShmConfig) -> Result<Self, ShmError> {
+    /// Returns the files of a domain, which may have no process. For tools.
+    pub(crate) fn of(config: &ShmConfig) -> Result<Self, ShmError> {
+        Self::new(config, secret_of(config)?)
+    }
+
+    fn new(config: &ShmConfig, secret: Option<Secret>) -> Result<Self, ShmError> {
+        let prefix = match &secret {
+            Some(secret) => format!("{}_{}", config.prefix, secret.as_str()),
+            None => config.prefix.clone(),
+        };
         Ok(Self {
             member: false,
             owner: Owner::this(),
             cleaning: Mutex::default(),
             closing: AtomicBool::new(false),
             lock_timed_out: AtomicBool::new(false),
-            ice: config.iceoryx()?,
-            paths: ProcessPaths::new(&config.root, &config.prefix),
+            secret,
+            ice: config.iceoryx(&prefix)?,
+            paths: ProcessPaths::new(&config.root, &prefix),
             config: config.clone(),
         })
     }
@@ -112,24 +125,37 @@ impl DomainFiles {
         &self.paths
     }
 
-    /// Creates the directories, checks that they are private, and takes the lock as
-    /// [`lock`](Self::lock) does. Retries if another process removes them at the same time.
-    pub(crate) fn enter(&self) -> Result<OwnedFd, ShmError> {
+    /// Creates the directories and the secret, checks that the directories are private, and takes the
+    /// lock as [`lock`](Self::lock) does. Retries if another process removes them at the same time.
+    pub(crate) fn enter(config: &ShmConfig) -> Result<(Self, OwnedFd), ShmError> {
+        config.check()?;
         let mut tries = 0;
         loop {
             tries += 1;
-            match self.try_enter() {
+            match Self::try_enter(config) {
                 Err(error) if error.is_missing_file() && tries < MAX_ENTER_ATTEMPTS => {}
                 entered => return entered,
             }
         }
     }
 
-    fn try_enter(&self) -> Result<OwnedFd, ShmError> {
-        make_private(&self.config.root)?;
-        let lock = self.lock()?;
-        make_private(self.paths.directory())?;
-        Ok(lock)
+    fn try_enter(config: &ShmConfig) -> Result<(Self, OwnedFd), ShmError> {
+        let root = &config.root;
+        make_private(root)?;
+        let lock = lock_root(root, FlockOperation::NonBlockingLockExclusive, || {
+            LOCK_TIMEOUT
+        })?;
+        let failed = |e| file_error("cannot create", &secret::path(root), e);
+        let secret = match secret_of(config)? {
+            Some(secret) => secret,
+            None => Secret::draw().map_err(failed)?,
+        };
+        if Secret::read(root).map_err(failed)?.is_none() {
+            secret.store(root).map_err(failed)?;
+        }
+        let domain = Self::new(config, Some(secret))?;
+        make_private(domain.paths.directory())?;
+        Ok((domain, lock))
     }
 
     /// Keeps other processes from starting and cleaning up until the result is dropped. The lock is
@@ -176,18 +202,14 @@ impl DomainFiles {
         how: FlockOperation,
         timeout: impl Fn() -> Duration,
     ) -> Result<OwnedFd, ShmError> {
-        let root = &self.config.root;
         let lock_timed_out = self.lock_timed_out.load(Ordering::Relaxed);
-        let locked = lock(root, how, || match lock_timed_out {
+        let locked = lock_root(&self.config.root, how, || match lock_timed_out {
             true => Duration::ZERO,
             false => timeout(),
         });
-        let busy = matches!(locked, Err(Errno::WOULDBLOCK));
+        let busy = matches!(locked, Err(ShmError::Busy { .. }));
         self.lock_timed_out.store(busy, Ordering::Relaxed);
-        locked.map_err(|e| match busy {
-            true => ShmError::Busy { path: root.clone() },
-            false => file_error("cannot lock", root, e),
-        })
+        locked
     }
 
     /// Removes the access of other users to files that iceoryx2 0.10 leaves open to them. The
@@ -197,6 +219,10 @@ impl DomainFiles {
             let name = file.file_name();
             let name = name.to_string_lossy();
             if !name.starts_with(&self.prefix()) || !name.ends_with(".global_mgmt") {
+                continue;
+            }
+            // The prefix is visible now, and a file of another user is none of this domain.
+            if !file.metadata().is_ok_and(|metadata| is_owned(&metadata)) {
                 continue;
             }
             let path = file.path();
@@ -291,7 +317,7 @@ impl DomainFiles {
         for one in self.all()? {
             if self.paths.is_alive(one) {
                 cleaned.alive += 1;
-            } else {
+            } else if self.is_current(&lock) {
                 self.paths.remove(one);
                 cleaned.removed += 1;
             }
@@ -299,13 +325,13 @@ impl DomainFiles {
         let nodes = self.nodes()?;
         let is_dead = |node: &NodeState<Svc>| matches!(node, NodeState::Dead(_));
         if cleaned.alive == 0 && nodes.iter().all(is_dead) {
-            self.remove_all();
+            self.remove_all(&lock);
             return Ok(cleaned);
         }
-        self.remove_empty_files(&nodes);
-        self.remove_partial_nodes(&nodes);
-        self.remove_untagged_services();
-        self.remove_orphaned_connections();
+        self.remove_empty_files(&nodes, &lock);
+        self.remove_partial_nodes(&nodes, &lock);
+        self.remove_untagged_services(&lock);
+        self.remove_orphaned_connections(&lock);
         // The rest runs without the lock, because a starting process must not wait for it: iceoryx2
         // waits long for structures that a dead process left unfinished.
         drop(lock);
@@ -330,19 +356,19 @@ impl DomainFiles {
         if !nameless.is_empty() {
             // These processes were killed while they created or removed a node, or they create one
             // now. Under the lock no process creates a node, so the check is repeated there.
-            let _lock = self.lock()?;
+            let lock = self.lock()?;
             for node in self.nodes()? {
                 if let NodeState::Dead(dead) = node
                     && dead.details().is_none()
                     && nameless.contains(dead.id())
                 {
-                    self.remove_node(&dead.id().value().to_string());
+                    self.remove_node(&dead.id().value().to_string(), &lock);
                 }
             }
         }
         if dead > 0 {
             let lock = self.lock()?;
-            self.remove_orphaned_connections();
+            self.remove_orphaned_connections(&lock);
             drop(lock);
             // A process releases its side of connections with dead ones only when it polls its
             // mailbox.
@@ -368,7 +394,7 @@ impl DomainFiles {
     /// Removes empty files of processes that were killed between creating a file and extending it.
     /// iceoryx2 0.10 waits without limit for such a file to grow. The caller must hold the lock,
     /// under which no other process creates connections or services.
-    fn remove_empty_files(&self, nodes: &[NodeState<Svc>]) {
+    fn remove_empty_files(&self, nodes: &[NodeState<Svc>], lock: &OwnedFd) {
         let prefix = self.prefix();
         let mut ports = Vec::new();
         for node in nodes {
@@ -387,7 +413,7 @@ impl DomainFiles {
                 .iter()
                 .any(|end| name.ends_with(end))
                 || ports.iter().any(|port| name.contains(port));
-            if name.starts_with(&prefix) && nobody_makes_it && is_empty() {
+            if name.starts_with(&prefix) && nobody_makes_it && is_empty() && self.is_current(lock) {
                 // A failed removal is retried by the next cleanup.
                 let _ = std::fs::remove_file(file.path());
             }
@@ -397,7 +423,7 @@ impl DomainFiles {
     /// Removes the nodes whose process was killed while it created or removed them: iceoryx2 takes
     /// them for nodes that are being created, or for invalid ones. The caller must hold the lock,
     /// under which no process creates a node. A process that removes its node tolerates the help.
-    fn remove_partial_nodes(&self, nodes: &[NodeState<Svc>]) {
+    fn remove_partial_nodes(&self, nodes: &[NodeState<Svc>], lock: &OwnedFd) {
         let whole: HashSet<String> = nodes
             .iter()
             .filter_map(|node| match node {
@@ -415,7 +441,7 @@ impl DomainFiles {
             let id = name.strip_prefix(&prefix).unwrap_or(&name);
             let id = id.split('.').next().unwrap_or_default();
             if !id.is_empty() && id.bytes().all(|b| b.is_ascii_digit()) && !whole.contains(id) {
-                self.remove_node(id);
+                self.remove_node(id, lock);
             }
         }
     }
@@ -427,7 +453,7 @@ impl DomainFiles {
     /// iceoryx2 0.10 also leaves one if the process that removes the last node from a service is
     /// killed before it locks the service: a later process finds no node to remove, and so does not
     /// consider itself the last one.
-    fn remove_untagged_services(&self) {
+    fn remove_untagged_services(&self, lock: &OwnedFd) {
         // Without the complete list of used services, unused ones cannot be told apart.
         let Ok(used) = self.tagged(".service_tag") else {
             return;
@@ -459,8 +485,10 @@ impl DomainFiles {
             id.is_some_and(|id| ids.contains(&id))
         });
         for file in shared.map(|file| file.path()).chain(untagged.into_values()) {
-            // A failed removal is retried by the next cleanup.
-            let _ = std::fs::remove_file(file);
+            if self.is_current(lock) {
+                // A failed removal is retried by the next cleanup.
+                let _ = std::fs::remove_file(file);
+            }
         }
     }
 
@@ -471,7 +499,7 @@ impl DomainFiles {
     ///
     /// A living process that still has such a connection open keeps its memory and does not need
     /// the file.
-    fn remove_orphaned_connections(&self) {
+    fn remove_orphaned_connections(&self, lock: &OwnedFd) {
         // Without the complete list of ports, missing ones cannot be told apart.
         let Ok(ports) = self.tagged(".port_tag") else {
             return;
@@ -488,6 +516,7 @@ impl DomainFiles {
             };
             if let (Some(receiver), Some(sender)) = (ends.next(), ends.next())
                 && [sender, receiver].iter().any(|port| !ports.contains(*port))
+                && self.is_current(lock)
             {
                 // A failed removal is retried by the next cleanup.
                 let _ = std::fs::remove_file(file.path());
@@ -532,6 +561,7 @@ impl DomainFiles {
             self.paths.doorbell(process),
             self.paths.status_page(process),
             self.services().join(service),
+            secret::path(&self.config.root),
         ]
     }
 
@@ -540,7 +570,10 @@ impl DomainFiles {
     }
 
     /// Removes the files of a node.
-    fn remove_node(&self, id: &str) {
+    fn remove_node(&self, id: &str, lock: &OwnedFd) {
+        if !self.is_current(lock) {
+            return;
+        }
         let nodes = self.config.root.join("nodes");
         let name = format!("{}{id}.", self.prefix());
         remove_files(&nodes, &name);
@@ -548,11 +581,15 @@ impl DomainFiles {
         let _ = std::fs::remove_dir(nodes.join(id));
     }
 
-    /// Removes all files with the domain's prefix. The caller holds the lock, and no process of the
-    /// domain runs. Also removes what iceoryx2 leaves for the next process, and structures that it
-    /// cannot interpret after a process was killed.
-    fn remove_all(&self) {
-        let prefix = self.prefix();
+    /// Removes all files with the domain's prefix, whatever secret follows it: processes may have been
+    /// killed after another program had removed the secret. The caller holds the lock, and no process
+    /// of the domain runs. Also removes what iceoryx2 leaves for the next process, and structures that
+    /// it cannot interpret after a process was killed.
+    fn remove_all(&self, lock: &OwnedFd) {
+        if !self.is_current(lock) {
+            return;
+        }
+        let prefix = format!("{}_", self.config.prefix);
         remove_files(Path::new(SHM), &prefix);
         for directory in ["nodes", "services", "processes"] {
             let directory = self.config.root.join(directory);
@@ -564,6 +601,19 @@ impl DomainFiles {
             remove_files(&directory, &prefix);
             let _ = std::fs::remove_dir(&directory);
         }
+        secret::remove(&self.config.root);
+    }
+
+    /// Whether the lock is that of the directory. If another program has removed the directory, other
+    /// processes may have created it again, and the lock of the removed one says nothing about their
+    /// files. Checked before each removal.
+    fn is_current(&self, lock: &OwnedFd) -> bool {
+        let is_same = |(held, found): (Stat, Stat)| {
+            (held.st_dev, held.st_ino) == (found.st_dev, found.st_ino)
+        };
+        let found = fstat(lock).and_then(|held| Ok((held, lstat(&self.config.root)?)));
+        found.is_ok_and(is_same)
+            && Secret::read(&self.config.root).is_ok_and(|secret| secret == self.secret)
     }
 
     fn prefix(&self) -> String {
@@ -617,6 +667,50 @@ impl Drop for DomainFiles {
             let _ = self.ring_all();
         }
     }
+}
+
+/// Returns the secret of a domain. If another program has removed the link, running processes of the
+/// domain have the secret in the names of their files.
+fn secret_of(config: &ShmConfig) -> Result<Option<Secret>, ShmError> {
+    let stored = Secret::read(&config.root)
+        .map_err(|e| file_error("cannot read", &secret::path(&config.root), e))?;
+    if stored.is_some() {
+        return Ok(stored);
+    }
+    let mut examined = Vec::new();
+    for file in files_in(Path::new(SHM)) {
+        let name = file.file_name();
+        let Some(secret) = Secret::in_name(&config.prefix, &name.to_string_lossy()) else {
+            continue;
+        };
+        if examined.contains(&secret) || !file.metadata().is_ok_and(|it| is_owned(&it)) {
+            continue;
+        }
+        let domain = DomainFiles::new(config, Some(secret.clone()))?;
+        if domain
+            .all()?
+            .into_iter()
+            .any(|one| domain.paths.is_alive(one))
+        {
+            return Ok(Some(secret));
+        }
+        examined.push(secret);
+    }
+    Ok(None)
+}
+
+/// Takes the lock of a domain, which is on the directory itself.
+fn lock_root(
+    root: &Path,
+    how: FlockOperation,
+    timeout: impl Fn() -> Duration,
+) -> Result<OwnedFd, ShmError> {
+    lock(root, how, timeout).map_err(|e| match e {
+        Errno::WOULDBLOCK => ShmError::Busy {
+            path: root.to_owned(),
+        },
+        _ => file_error("cannot lock", root, e),
+    })
 }
 
 fn make_private(directory: &Path) -> Result<(), ShmError> {

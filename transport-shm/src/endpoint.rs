@@ -82,10 +82,9 @@ impl Endpoint {
         generation: u64,
         runtime: Handle,
     ) -> Result<Arc<Self>, ShmError> {
-        let domain = DomainFiles::new(&config)?;
         let budget = Arc::new(Budget::new(&config));
         // Under the lock, so that no other process takes unfinished files for those of a dead one.
-        let lock = domain.enter()?;
+        let (domain, lock) = DomainFiles::enter(&config)?;
         let domain = Arc::new(domain.for_endpoint());
         let opened = Self::open_locked(config, generation, runtime, budget, Arc::clone(&domain));
         // Before `domain` is dropped: after a failure, its last owner takes the lock to clean up.

@@ -32,7 +32,7 @@ pub struct Inspection {
 /// # Errors
 /// Returns an error if the configuration is invalid or `/dev/shm` cannot be read.
 pub fn inspect(config: &ShmConfig) -> Result<Inspection, ShmError> {
-    let domain = DomainFiles::new(config)?;
+    let domain = DomainFiles::of(config)?;
     let shm = rustix::fs::statvfs(SHM)
         .map_err(|e| file_error("cannot read the size of", Path::new(SHM), e))?;
     let (alive, dead) = domain.count()?;

@@ -66,6 +66,7 @@ mod pool;
 mod presence;
 #[cfg(feature = "raw")]
 pub mod raw;
+mod secret;
 mod segment;
 mod static_file;
 mod storage;

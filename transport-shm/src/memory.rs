@@ -198,7 +198,8 @@ pub(crate) fn lock(
     }
 }
 
-fn is_owned(found: &Metadata) -> bool {
+/// Whether a file belongs to this user.
+pub(crate) fn is_owned(found: &Metadata) -> bool {
     found.uid() == rustix::process::geteuid().as_raw()
 }
 

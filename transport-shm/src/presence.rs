@@ -31,7 +31,7 @@ use tokio::io::unix::AsyncFd;
 use crate::answer_words::{AnswerWords, LentWords, WordPlace};
 use crate::domain_files::files_in;
 use crate::fork::Owner;
-use crate::memory::{Mapping, PAGE, SHM, open_owned};
+use crate::memory::{Mapping, PAGE, SHM, is_owned, open_owned};
 use crate::segment;
 use crate::wakeup::{RingState, StatusWords};
 
@@ -107,7 +107,8 @@ impl ProcessPaths {
                 Err(e) => return Err(e),
             };
             for file in files {
-                let name = file?.file_name();
+                let file = file?;
+                let name = file.file_name();
                 let incarnation: Option<Incarnation> = name
                     .to_str()
                     .and_then(|name| name.strip_prefix(&self.prefix))
@@ -116,7 +117,9 @@ impl ProcessPaths {
                         matches!(*kind, "live" | "bell" | "page") || kind.ends_with(CONTENT)
                     })
                     .and_then(|(digits, _)| digits.parse().ok());
-                found.extend(incarnation);
+                // Any user may create files with such names.
+                let is_own = || file.metadata().is_ok_and(|metadata| is_owned(&metadata));
+                found.extend(incarnation.filter(|_| is_own()));
             }
         }
         found.sort_unstable();

@@ -78,7 +78,7 @@ impl RawNode {
     /// Returns an error if the configuration is invalid or iceoryx2 cannot create the node.
     pub fn open(config: &ShmConfig) -> Result<Self, ShmError> {
         let node = NodeBuilder::new()
-            .config(&config.iceoryx()?)
+            .config(&config.iceoryx(&config.prefix)?)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Svc>()
             .map_err(|error| ShmError::Iceoryx {

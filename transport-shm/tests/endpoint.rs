@@ -449,6 +449,33 @@ fn a_closed_transport_misses_no_files() {
     assert!(one.is_there() && !one.rejoin().unwrap());
 }
 
+/// Every user may create files in `/dev/shm`, also with the names that the domain had before.
+#[test]
+fn names_that_another_program_has_created_beforehand_are_not_needed() {
+    let domain = TestDomain::new();
+    let (one, _sink) = domain.listening();
+    let in_shm = |file: &String| file.starts_with("/dev/shm");
+    let names: Vec<String> = domain.files().into_iter().filter(in_shm).collect();
+    assert!(!names.is_empty());
+    one.close();
+    domain.until_removed();
+    // No process can open or remove directories as files, whatever its rights.
+    for name in &names {
+        std::fs::create_dir(name).unwrap();
+    }
+    let (two, two_sink) = domain.listening();
+    let (three, three_sink) = domain.listening();
+    send_until_accepted((&two, &two_sink), &three);
+    // The content would keep the last files.
+    three_sink.arrived.lock().unwrap().clear();
+    two.close();
+    three.close();
+    for name in &names {
+        std::fs::remove_dir(name).unwrap();
+    }
+    domain.until_removed();
+}
+
 #[test]
 fn a_domain_whose_files_were_removed_is_joined_again() {
     let domain = TestDomain::new();

@@ -1,0 +1,214 @@
+//! The directory of all domains of a user below `/tmp`.
+//!
+//! It is `/tmp/fipa-<uid>`. Every user may create files in `/tmp`, so another user may hold that name.
+//! Then it is `/tmp/fipa-<uid>.<16 hexadecimal digits>`: any process of the user finds it by its name and
+//! owner. Only root can remove the directory of another user from `/tmp`, and no process of a domain
+//! removes it, so a user that has it keeps it until the host starts again.
+
+use std::fs::{self, DirBuilder, Metadata};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use rustix::fs::{FlockOperation, Mode, OFlags};
+
+/// Maximum number of entries of `/tmp` that are examined.
+const MAX_ENTRIES: usize = 100_000;
+
+/// Length of the end of another name, in hexadecimal digits.
+const DIGITS: usize = 16;
+
+/// Time to wait for another process that chooses the directory. Another user may hold the lock, too.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// The directory of all domains of a user.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct UserDir {
+    /// The directory, which may not exist unless another user holds its first name.
+    pub(crate) path: PathBuf,
+    /// The other user that holds the name `fipa-<uid>`.
+    pub(crate) name_held_by: Option<u32>,
+}
+
+impl UserDir {
+    /// Finds the directory. Creates it only if another user holds the name `fipa-<uid>`. If that fails,
+    /// the result is the directory of the other user, which cannot be used.
+    pub(crate) fn find(temporary: &Path, user: u32) -> Self {
+        let first = temporary.join(format!("fipa-{user}"));
+        let found = fs::symlink_metadata(&first);
+        let name_held_by = match &found {
+            Ok(found) if found.uid() == user => return Self::free(first),
+            Ok(found) => Some(found.uid()),
+            Err(_) => None,
+        };
+        let other = match (other(temporary, user), name_held_by) {
+            (Some(other), _) => other,
+            (None, None) => return Self::free(first),
+            (None, Some(_)) => match create_other(temporary, user) {
+                Ok(other) => other,
+                Err(error) => {
+                    tracing::error!(
+                        %error,
+                        "cannot create a directory for the domains of this user in {}",
+                        temporary.display()
+                    );
+                    first
+                }
+            },
+        };
+        Self {
+            path: other,
+            name_held_by,
+        }
+    }
+
+    fn free(path: PathBuf) -> Self {
+        Self {
+            path,
+            name_held_by: None,
+        }
+    }
+}
+
+/// Returns the user in the name of a directory of domains.
+pub(crate) fn user_in(name: &str) -> Option<u32> {
+    let rest = name.strip_prefix("fipa-")?;
+    let user = match rest.split_once('.') {
+        None => rest,
+        Some((user, digits)) => {
+            let is_number = digits.bytes().all(|digit| digit.is_ascii_hexdigit());
+            (digits.len() == DIGITS && is_number).then_some(user)?
+        }
+    };
+    user.parse().ok()
+}
+
+/// Returns the directory with another name. Of several, which processes have created at the same time, all
+/// choose the first in the order of names.
+fn other(temporary: &Path, user: u32) -> Option<PathBuf> {
+    let entries = fs::read_dir(temporary).ok()?.take(MAX_ENTRIES).flatten();
+    let named = entries.filter(|entry| {
+        let name = entry.file_name();
+        name.to_str()
+            .is_some_and(|name| user_in(name) == Some(user) && name.contains('.'))
+    });
+    let is_private =
+        |found: &Metadata| found.is_dir() && found.uid() == user && found.mode() & 0o077 == 0;
+    let own = named.filter(|entry| entry.metadata().is_ok_and(|found| is_private(&found)));
+    own.map(|entry| entry.path()).min()
+}
+
+fn create_other(temporary: &Path, user: u32) -> io::Result<PathBuf> {
+    // Two processes that start at the same time create one directory. Without the lock, they may use
+    // different ones until the next start.
+    let _lock = lock(temporary);
+    if let Some(other) = other(temporary, user) {
+        return Ok(other);
+    }
+    let digits = getrandom::u64().map_err(io::Error::other)?;
+    let path = temporary.join(format!("fipa-{user}.{digits:0DIGITS$x}"));
+    DirBuilder::new().mode(0o700).create(&path)?;
+    Ok(other(temporary, user).unwrap_or(path))
+}
+
+/// Locks a directory until the result is dropped. `None` after the timeout.
+fn lock(directory: &Path) -> Option<rustix::fd::OwnedFd> {
+    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+    let opened = rustix::fs::open(directory, flags, Mode::empty()).ok()?;
+    let began = Instant::now();
+    loop {
+        match rustix::fs::flock(&opened, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Some(opened),
+            Err(_) if began.elapsed() < LOCK_TIMEOUT => {
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            Err(_) => return None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+
+    fn this_user() -> u32 {
+        rustix::process::geteuid().as_raw()
+    }
+
+    /// Creates a name of another user: for a user that this process is not, each file is one.
+    fn hold(temporary: &Path, user: u32) {
+        fs::create_dir(temporary.join(format!("fipa-{user}"))).unwrap();
+    }
+
+    #[test]
+    fn the_name_is_that_of_the_user_unless_another_user_holds_it() {
+        let temporary = tempfile::tempdir().unwrap();
+        let temporary = temporary.path();
+        let user = this_user();
+        let own = temporary.join(format!("fipa-{user}"));
+        assert_eq!(UserDir::find(temporary, user), UserDir::free(own.clone()));
+        hold(temporary, user);
+        assert_eq!(UserDir::find(temporary, user), UserDir::free(own));
+        // To any other user, this user is another one.
+        let another = user.wrapping_add(1);
+        hold(temporary, another);
+        let found = UserDir::find(temporary, another);
+        assert_eq!(found.name_held_by, Some(user));
+        let name = found.path.file_name().unwrap().to_str().unwrap();
+        assert_eq!(user_in(name), Some(another));
+        assert!(found.path.is_dir());
+    }
+
+    #[test]
+    fn a_directory_with_another_name_is_found_again() {
+        let temporary = tempfile::tempdir().unwrap();
+        let temporary = temporary.path();
+        let user = this_user();
+        let (first, second) = ("0000000000000001", "00000000000000ff");
+        let named = |digits: &str| temporary.join(format!("fipa-{user}.{digits}"));
+        for path in [named(second), named(first)] {
+            DirBuilder::new().mode(0o700).create(path).unwrap();
+        }
+        // Also after the other user has removed its own.
+        assert_eq!(UserDir::find(temporary, user).path, named(first));
+        // What other users could enter, or have created, is not used.
+        fs::set_permissions(named(first), fs::Permissions::from_mode(0o755)).unwrap();
+        assert_eq!(UserDir::find(temporary, user).path, named(second));
+        fs::remove_dir(named(second)).unwrap();
+        symlink("/", named(second)).unwrap();
+        let own = temporary.join(format!("fipa-{user}"));
+        assert_eq!(UserDir::find(temporary, user).path, own);
+    }
+
+    #[test]
+    fn processes_that_start_at_the_same_time_choose_one_directory() {
+        let temporary = tempfile::tempdir().unwrap();
+        let directory = temporary.path().to_owned();
+        // As for a user whose name another user holds.
+        let user = this_user();
+        let create = || {
+            let directory = directory.clone();
+            std::thread::spawn(move || create_other(&directory, user).unwrap())
+        };
+        let threads: Vec<_> = std::iter::repeat_with(create).take(16).collect();
+        let mut chosen = threads.into_iter().map(|it| it.join().unwrap());
+        let first = chosen.next().unwrap();
+        assert!(chosen.all(|path| path == first));
+    }
+
+    #[test]
+    fn the_user_is_read_from_the_name() {
+        for (name, user) in [
+            ("fipa-1000", Some(1000)),
+            ("fipa-0.0123456789abcdef", Some(0)),
+            ("fipa-0.0123456789abcde", None),
+            ("fipa-0.0123456789abcdex", None),
+            ("fipa-demo-17", None),
+            ("other-1000", None),
+        ] {
+            assert_eq!(user_in(name), user, "{name}");
+        }
+    }
+}
