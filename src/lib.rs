@@ -189,6 +189,8 @@ pub use fipa_sds::{
     Change, DeregisterError, Entry, EntryError, HostError, Matcher, Members, MembersError,
     NameError, Pattern, PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
+#[doc(hidden)]
+pub use fipa_transport::log_limit;
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, IncarnationError, Kind, ListenError, Location,
     LocationError, Outcome, Signature, TransportError, TransportErrorKind,
