@@ -161,6 +161,7 @@ mod presence;
 #[cfg(feature = "protocols")]
 pub mod protocol;
 pub mod routes;
+mod sender_tasks;
 mod service;
 pub mod watch;
 
@@ -198,3 +199,4 @@ pub use fipa_transport::{
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};
 pub use incoming::Incoming;
+pub use sender_tasks::SenderTasks;
