@@ -43,10 +43,7 @@ pub(crate) enum Refusal {
     #[error("no rule allows it (access.allow)")]
     NotAllowed,
     #[error("its sender exceeds the limit of letters per second (access.rate)")]
-    TooMany {
-        /// Whether to log the refusal: true at most once per second and sender.
-        told: bool,
-    },
+    TooMany,
 }
 
 /// The error of a rule that cannot be parsed.
@@ -101,11 +98,7 @@ struct Rule {
 
 /// The rate of one sender.
 #[derive(Debug)]
-struct Sender {
-    bucket: TokenBucket,
-    /// Time of the last refusal that was logged.
-    told: Option<Instant>,
-}
+struct Sender(TokenBucket);
 
 impl Access {
     /// Parses these entries, each a sender and its receivers. `rate` is the maximum number of
@@ -183,10 +176,10 @@ impl Senders {
         self.sizes.remove(&(size - 1, source));
         self.sizes.insert((size, source));
         self.len += 1;
-        known.senders.entry(sender).or_insert_with(|| Sender {
-            bucket: TokenBucket::new(rate, now),
-            told: None,
-        })
+        known
+            .senders
+            .entry(sender)
+            .or_insert_with(|| Sender(TokenBucket::new(rate, now)))
     }
 
     /// Removes the senders without a letter in the last second, at most once per second. The bucket
@@ -219,7 +212,7 @@ impl Senders {
     /// Removes the senders without a letter in the last second.
     fn sweep(&mut self, now: Instant) {
         self.sources.retain(|_, known| {
-            let is_recent = |it: &Sender| !is_over(it.bucket.asked(), now);
+            let is_recent = |it: &Sender| !is_over(it.0.asked(), now);
             known.senders.retain(|_, it| is_recent(it));
             let SourceSenders { senders, order } = known;
             order.retain(|sender| senders.contains_key(sender));
@@ -236,14 +229,10 @@ impl Senders {
 impl Sender {
     /// Takes a token for one letter.
     fn take(&mut self, rate: f64, now: Instant) -> Result<(), Refusal> {
-        if self.bucket.take(1.0, rate, now) {
-            return Ok(());
+        match self.0.take(1.0, rate, now) {
+            true => Ok(()),
+            false => Err(Refusal::TooMany),
         }
-        let told = self.told.is_none_or(|before| is_over(before, now));
-        if told {
-            self.told = Some(now);
-        }
-        Err(Refusal::TooMany { told })
     }
 }
 
@@ -438,7 +427,7 @@ mod tests {
 
     const ROVER: Source = Source::Certificate([1; 32]);
     const CREX: Source = Source::Certificate([2; 32]);
-    const TOLD: Result<(), Refusal> = Err(Refusal::TooMany { told: true });
+    const TOO_MANY: Result<(), Refusal> = Err(Refusal::TooMany);
 
     #[test]
     fn invented_senders_displace_those_of_the_same_source_only() {
@@ -453,7 +442,7 @@ mod tests {
         }
         assert_eq!(access.senders.len, MAX_SENDERS);
         // The rate of the first sender is still stored, and other senders of its source may send.
-        assert_eq!(access.count(ROVER, "rover", now), TOLD);
+        assert_eq!(access.count(ROVER, "rover", now), TOO_MANY);
         assert_eq!(access.count(ROVER, "arm", now), Ok(()));
         // Many sources with one sender each evict the senders of a source with two or more.
         for number in 0..MAX_SENDERS as u64 {
@@ -473,21 +462,22 @@ mod tests {
         let mut access = access(&[], &[], 1);
         let now = Instant::now();
         assert_eq!(access.count(CREX, "rover", now), Ok(()));
-        assert_eq!(access.count(CREX, "rover", now), TOLD);
+        assert_eq!(access.count(CREX, "rover", now), TOO_MANY);
         assert_eq!(access.count(ROVER, "rover", now), Ok(()));
     }
 
     #[test]
-    fn who_sends_too_much_is_told_of_once_a_second_and_others_notice_nothing() {
+    fn a_sender_beyond_its_rate_is_refused_without_effect_on_others() {
         let mut access = access(&[], &[], 2);
         let begun = Instant::now();
         let at = |ms| begun + Duration::from_millis(ms);
         let said: Vec<_> = [0, 0, 0, 100, 600, 700, 1100, 1100]
             .map(|ms| access.count(ROVER, "rover", at(ms)))
             .into();
-        let refused = |told| Err(Refusal::TooMany { told });
-        let (first, more) = (refused(true), refused(false));
-        let all = [Ok(()), Ok(()), first, more, Ok(()), more, Ok(()), first];
+        let passes = Ok(());
+        let all = [
+            passes, passes, TOO_MANY, TOO_MANY, passes, TOO_MANY, passes, TOO_MANY,
+        ];
         assert_eq!(said, all);
         assert_eq!(access.count(ROVER, "crex", at(1100)), Ok(()));
     }

@@ -9,6 +9,7 @@ use std::time::Instant;
 use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_mts::{AccessGate, LetterParts, Link};
 use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
+use fipa_transport::log_limit;
 use parking_lot::Mutex;
 
 use crate::access::{Access, LetterFacts, Refusal};
@@ -201,11 +202,8 @@ impl AccessGate for RulesGate {
         }
         let judged = self.judge(now, receiver, letter, link);
         judged.map_err(|why| {
-            // A sender that exceeds its rate must not fill the log as well.
-            if !matches!(why, Refused::ByRule(Refusal::TooMany { told: false })) {
-                let sender = &*letter.sender;
-                tracing::warn!(target: AUDIT, sender, receiver, "letter refused: {why}");
-            }
+            let sender = &*letter.sender;
+            log_limit::warn!(target: AUDIT, of: link.source, sender, receiver, "letter refused: {why}");
             why.to_string()
         })
     }

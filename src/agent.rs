@@ -10,7 +10,7 @@ use fipa_acl::{
 };
 use fipa_mts::LetterDraft;
 use fipa_sds::{Cancellation, DeregisterError, RegisterError, Registration};
-use fipa_transport::{Incarnation, LoanedContent};
+use fipa_transport::{Incarnation, LoanedContent, log_limit};
 
 use crate::background;
 use crate::delivery::{Deliveries, deliveries};
@@ -401,7 +401,7 @@ impl Drop for RegistrationGuard {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(error = %ErrorChain(&error), agent = %self.core.endpoint.name, "cannot deregister an agent")
+                    log_limit::warn!(error = %ErrorChain(&error), agent = %self.core.endpoint.name, "cannot deregister an agent")
                 }
             }
         }

@@ -13,7 +13,7 @@ use fipa_monitor::{
 };
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Resolution, Role, resolve};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 
 use crate::config::{self, Check};
@@ -187,7 +187,7 @@ impl Checks {
         match violation {
             Some(violation) if monitored.enforce => Err(SendError::Violation(violation)),
             Some(violation) => {
-                tracing::warn!("sent a message that violates its protocol: {violation}");
+                log_limit::warn!("sent a message that violates its protocol: {violation}");
                 Ok(None)
             }
             None => Ok(Unsettled::new(monitored, message)),
@@ -210,8 +210,8 @@ impl Checks {
             return incoming;
         };
         if origin.is_legacy() && violation.kind.depends_on_policy() {
-            tracing::warn!(
-                "received a message of a legacy peer that is accepted although it breaks a rule: \
+            log_limit::warn!(
+                of: incoming.message().sender(), "received a message of a legacy peer that is accepted although it breaks a rule: \
                  {violation}"
             );
             return incoming;
@@ -226,7 +226,7 @@ impl Checks {
             // The answer ends the conversation in the monitor, if the sender takes part in one.
             let _ = monitored.check(&Header::from(&answer));
         }
-        tracing::warn!("received a message that violates its protocol: {violation}");
+        log_limit::warn!(of: incoming.message().sender(), "received a message that violates its protocol: {violation}");
         incoming.violates(violation);
         incoming
     }

@@ -3,6 +3,7 @@
 use fipa_acl::Message;
 use fipa_mts::core::Received;
 use fipa_sds::Directory;
+use fipa_transport::log_limit;
 
 use crate::config::{self, Check};
 use crate::error::{OpenError, SendError};
@@ -13,7 +14,7 @@ pub(crate) struct Rules;
 impl Rules {
     pub(crate) fn load(config: &config::Monitor) -> Result<Self, OpenError> {
         if config.check != Check::Off {
-            tracing::warn!(
+            log_limit::warn!(
                 "monitor.check has no effect: this program was built without the feature `protocols`"
             );
         }

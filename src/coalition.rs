@@ -6,7 +6,7 @@ use fipa_acl::ErrorChain;
 use fipa_sds::{
     DeregisterError, Directory, Members, MembersError, RegisterError, Registration, Role,
 };
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 
 use crate::domain::{Domain, warn_of_name};
 use crate::{AgentId, RegisterOptions};
@@ -194,7 +194,7 @@ impl Drop for Coalition {
                 // Closing the domain has already removed the name.
                 Ok(()) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(error = %ErrorChain(&error), coalition = self.name(), "cannot remove a coalition");
+                    log_limit::warn!(error = %ErrorChain(&error), coalition = self.name(), "cannot remove a coalition");
                 }
             }
         }

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use fipa_acl::Message;
 use fipa_sds::{Entry, Reach, Role};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
@@ -404,7 +404,7 @@ impl State {
         }
         if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {
             let dropped = self.others.pop_front();
-            tracing::warn!(
+            log_limit::warn!(
                 message = dropped.map(|it| it.message().to_string()),
                 "dropped a message: this agent serves protocols and reads no other messages; call \
                  Agent::receive to read them"

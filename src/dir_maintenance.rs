@@ -1,11 +1,13 @@
 //! Maintains a process's files in the directory of its domain: renews their timestamps, and joins
-//! the domain again if another program removes the directory, as cleaners of `/tmp` do.
+//! the domain again if another program removes the directory, as cleaners of `/tmp` do. Also logs the
+//! numbers of log lines that were omitted meanwhile.
 
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
 use fipa_sds::{HostDirectory, HostError};
+use fipa_transport::log_limit;
 use fipa_transport_net::{UnixError, UnixTransport};
 #[cfg(feature = "shm")]
 use fipa_transport_shm::{ShmError, ShmTransport};
@@ -69,6 +71,7 @@ impl DirMaintenance {
         // The last logged problem, so that each problem is logged once.
         let mut problem: Option<String> = None;
         loop {
+            log_limit::report_omitted();
             // Watched before the check, so that no removal is missed.
             let watched = self.watch();
             let Some(missing) = self.missing() else {
@@ -96,7 +99,7 @@ impl DirMaintenance {
             if problem.is_some() {
                 sleep(RETRY_AFTER).await;
             } else {
-                tracing::warn!(
+                log_limit::warn!(
                     missing,
                     "another program removed files in {}; joining the domain again (exempt the \
                      directory from cleaning, or set FIPA_RUNTIME_DIR to another one)",
@@ -109,12 +112,12 @@ impl DirMaintenance {
             match joined.await {
                 Ok(Ok(joined)) => {
                     self = joined;
-                    tracing::info!("joined the domain in {} again", self.dir.path().display());
+                    log_limit::info!("joined the domain in {} again", self.dir.path().display());
                 }
                 Ok(Err(error)) => {
                     let text = ErrorChain(&error).to_string();
                     if problem.as_ref() != Some(&text) {
-                        tracing::error!(error = text, "cannot join the domain again; retrying");
+                        log_limit::error!(error = text, "cannot join the domain again; retrying");
                     }
                     problem = Some(text);
                 }

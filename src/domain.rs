@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
 use fipa_sds::{Cancellation, Entry, Query, Watch};
+use fipa_transport::log_limit;
 use tokio::runtime::Handle;
 
 use crate::checks::Rules;
@@ -229,7 +230,7 @@ pub(crate) fn warn_of_name(id: &AgentId) {
         message.encode(Representation::String, dialect).err()
     };
     if let Some(error) = fails(Dialect::Standard).or_else(|| fails(Dialect::Jade)) {
-        tracing::warn!(
+        log_limit::warn!(
             "agents of legacy peers (string encoding, JADE) can neither receive letters from {:?} nor \
              address it ({error}); use a name without blanks and parentheses if there are such peers",
             id.name()

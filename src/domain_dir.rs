@@ -17,6 +17,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use fipa_transport::log_limit;
+
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
@@ -322,7 +324,7 @@ fn lock_shared(path: &Path) -> Result<OwnedFd, DomainDirError> {
             }
             // The lock is optional: the process joins again if the directory is removed.
             Err(error) => {
-                tracing::warn!(
+                log_limit::warn!(
                     %error,
                     "cannot lock {}, so cleaners of temporary files may remove it; exempt it from \
                      cleaning, or set FIPA_RUNTIME_DIR to another directory",

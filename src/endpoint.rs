@@ -11,7 +11,7 @@ use fipa_acl::{
 use fipa_mts::core::Received;
 use fipa_mts::{LetterDraft, Mts, PostError, letter_by};
 use fipa_sds::{DeregisterError, Directory};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 
 use crate::checks::{Checks, Origin};
@@ -183,8 +183,8 @@ impl Endpoint {
             Ok(incoming) => incoming,
             Err(refused) => {
                 let (error, received) = *refused;
-                tracing::warn!(
-                    agent = %self.name, error = %ErrorChain(&error),
+                log_limit::warn!(
+                    of: received.service, agent = %self.name, error = %ErrorChain(&error),
                     "ignored a received letter: its message cannot be decoded"
                 );
                 self.mts().handle_undecodable(&self.name, &received, &error);
@@ -218,7 +218,7 @@ impl Endpoint {
                 drop(sent);
                 Ok(answer)
             });
-        sent.inspect_err(|error| tracing::warn!(%error, "cannot answer a protocol violation"))
+        sent.inspect_err(|error| log_limit::warn!(%error, "cannot answer a protocol violation"))
             .ok()
     }
 

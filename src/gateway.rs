@@ -27,7 +27,9 @@ use fipa_sds::{
     Cancellation, ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
     Role as EntryRole, StaticDirectory,
 };
-use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind};
+use fipa_transport::{
+    Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
+};
 use fipa_transport_net::Refusals;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -195,7 +197,6 @@ impl Gateway {
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
             contacts,
-            notices: Mutex::default(),
             configuration: Arc::clone(&self.configuration),
             refusals,
             questions: Mutex::default(),
@@ -358,7 +359,7 @@ impl Gateway {
             // Closing blocks until the goodbye has been sent.
             let goodbye = tokio::task::spawn_blocking(move || network.close()).await;
             if let Err(error) = goodbye {
-                tracing::warn!(%error, "the directory of the network was not closed properly");
+                log_limit::warn!(%error, "the directory of the network was not closed properly");
             }
         }
         self.service.close().await;
@@ -420,7 +421,7 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
             .iter()
             .map(ToString::to_string)
             .collect();
-        tracing::info!(
+        log_limit::info!(
             locations = now.join(" "),
             "the locations of this gateway have changed"
         );
@@ -429,7 +430,7 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
             register(&registering, cancellation)
         });
         if let Some(Err(error)) = registered.await {
-            tracing::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
+            log_limit::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
         }
         service.mts.greet(neighbours.to_greet(Instant::now()));
     }
@@ -574,7 +575,7 @@ impl KnownPeers {
 impl Contacts for KnownPeers {
     fn heard(&self, name: &str, agent: Incarnation, location: Location) {
         if let Err(error) = self.record(Instant::now(), name, agent, location) {
-            tracing::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
+            log_limit::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
         }
     }
 

@@ -6,10 +6,10 @@ use bytes::Bytes;
 use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
 #[cfg(feature = "protocols")]
 use fipa_acl::{Performative, Text};
-use fipa_mts::core::Received;
-use fipa_transport::Kind;
 #[cfg(feature = "protocols")]
-use {fipa_monitor::Violation, fipa_transport::Incarnation};
+use fipa_monitor::Violation;
+use fipa_mts::core::Received;
+use fipa_transport::{Incarnation, Kind};
 
 /// A received message.
 #[derive(Debug, Clone)]
@@ -24,7 +24,6 @@ pub struct Incoming {
     violation: Option<Box<Violation>>,
     /// The registration of the sending agent, as far as the service that handed the letter over proves
     /// it; unknown for an agent of a legacy peer, and for letters of this process itself.
-    #[cfg(feature = "protocols")]
     pub(crate) sender: Incarnation,
     /// The agent that did not get a letter, if this is the proved report of a service about it: see
     /// [`crate::delivery_report`].
@@ -65,7 +64,6 @@ impl Incoming {
                 index,
                 message: OnceLock::new(),
             }),
-            #[cfg(feature = "protocols")]
             sender: received.sender,
             via: received.via,
             #[cfg(feature = "protocols")]
@@ -116,6 +114,11 @@ impl Incoming {
     #[must_use]
     pub fn content(&self) -> Option<Bytes> {
         self.parts.index.content(self.parts.letter.payload())
+    }
+
+    /// Returns the number of bytes of the letter.
+    pub(crate) fn bytes(&self) -> usize {
+        self.parts.letter.len()
     }
 
     /// Whether the message has this communicative act of the standard.

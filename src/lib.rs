@@ -161,6 +161,7 @@ mod presence;
 #[cfg(feature = "protocols")]
 pub mod protocol;
 pub mod routes;
+mod sender_tasks;
 mod service;
 mod user_dir;
 pub mod watch;
@@ -190,6 +191,8 @@ pub use fipa_sds::{
     Change, DeregisterError, Entry, EntryError, HostError, Matcher, Members, MembersError,
     NameError, Pattern, PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
+#[doc(hidden)]
+pub use fipa_transport::log_limit;
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, IncarnationError, Kind, ListenError, Location,
     LocationError, Outcome, Signature, TransportError, TransportErrorKind,
@@ -197,3 +200,4 @@ pub use fipa_transport::{
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};
 pub use incoming::Incoming;
+pub use sender_tasks::SenderTasks;

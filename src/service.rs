@@ -9,7 +9,7 @@ use fipa_acl::ErrorChain;
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Cancellation, Directory, Entry, HostDirectory, Pattern};
-use fipa_transport::{Incarnation, Kind, Location, Signature, Transport};
+use fipa_transport::{Incarnation, Kind, Location, Signature, Transport, log_limit};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -142,7 +142,7 @@ impl Service {
             return Err(OpenError::NoTransport(reasons(config, &refused)));
         }
         for (kind, error) in &refused {
-            tracing::warn!(%kind, error, "a transport cannot be used; continuing without it");
+            log_limit::warn!(%kind, error, "a transport cannot be used; continuing without it");
         }
         Ok(service)
     }
@@ -212,6 +212,7 @@ impl Service {
     /// Waits for letters in transit, at most [`CLOSING_PATIENCE`], and ends the service.
     pub(crate) async fn close(&self) {
         self.mts.close(CLOSING_PATIENCE).await;
+        log_limit::report_omitted();
         self.abort();
     }
 
@@ -221,7 +222,7 @@ impl Service {
         self.maintenance.abort();
         self.mts.abort();
         if let Err(error) = self.host.close() {
-            tracing::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
+            log_limit::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
         }
         self.dir.leave();
     }

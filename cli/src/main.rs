@@ -11,6 +11,7 @@
 //! * [`report`] prints errors and warnings; [`output`] prints results; [`input`] reads files and
 //!   standard input.
 
+mod answers;
 mod command;
 mod complete;
 mod input;

@@ -24,7 +24,7 @@ use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, Pattern, View};
 use fipa_transport::{
     Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
-    OwnerProcess, Transport, TransportError, TransportErrorKind,
+    OwnerProcess, Transport, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
@@ -847,7 +847,7 @@ impl State {
             if outcome.attempts().is_empty() {
                 tracing::trace!(%receiver, %outcome, "letter");
             } else {
-                tracing::info!(%receiver, %outcome, "letter");
+                log_limit::info!(of: &*receiver, %receiver, %outcome, "letter");
             }
             outcomes.known.push((receiver, outcome));
             outcomes.known.len() >= outcomes.expected

@@ -15,7 +15,7 @@ use fipa_sds::{
     Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, OwnDfEntry,
     Present,
 };
-use fipa_transport::{Incarnation, Location, TransportErrorKind};
+use fipa_transport::{Incarnation, Location, TransportErrorKind, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
@@ -88,7 +88,7 @@ impl Exchanging {
             Err(error) => {
                 // The text of a malformed letter may be part of the error.
                 let error = ErrorChain(&error).to_string();
-                tracing::info!(error = %escape(&error), "rejected an exchange letter of a gateway");
+                log_limit::info!(of: from, error = %escape(&error), "rejected an exchange letter of a gateway");
             }
         }
     }
@@ -404,7 +404,7 @@ impl Disputes {
         for (holder, other) in self.next(now, contested) {
             let (name, at, by) = (&other.name, &holder.mts.name, &other.mts.name);
             let (shown, by_shown) = (escape(at), escape(by));
-            tracing::warn!(%name, holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
+            log_limit::warn!(of: other.mts.incarnation, %name, holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
             let content = format!(
                 "the name {name:?} is registered at {at:?} and at {by:?}: this host reaches the agent \
                  at {at:?}; deregister one of them"
@@ -460,13 +460,13 @@ impl Contested {
         let Self { entry, holder, .. } = self;
         let (name, mts) = (&entry.name, escape(&holder.mts.name));
         let content = if self.is_announced {
-            tracing::warn!(%name, holder = %mts, "an agent of another host has the same name");
+            log_limit::warn!(of: holder.mts.incarnation, %name, holder = %mts, "an agent of another host has the same name");
             format!(
                 "the name {name:?} is also registered at {mts:?}: each other host reaches the agent \
                  that was announced to it first; deregister one of them"
             )
         } else {
-            tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
+            log_limit::warn!(of: holder.mts.incarnation, %name, holder = %mts, "an earlier registration on another host has the name");
             format!(
                 "the name {name:?} was registered earlier at {mts:?}: other hosts reach that agent, \
                  and this one on its own host only; deregister one of them"
@@ -518,7 +518,7 @@ impl Means {
             let letter = letter_for(message, SystemTime::now());
             letter
                 .inspect_err(
-                    |error| tracing::warn!(error = %ErrorChain(error), "cannot encode a letter"),
+                    |error| log_limit::warn!(error = %ErrorChain(error), "cannot encode a letter"),
                 )
                 .ok()
         })?;

@@ -4,8 +4,7 @@
 //! The ontology of a letter selects its handler. A request with an unknown ontology is answered
 //! with `not-understood`.
 
-use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -14,7 +13,7 @@ use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Contacts as _, letter_for};
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use fipa_transport_net::Refusals;
 use parking_lot::Mutex;
 
@@ -41,8 +40,6 @@ pub(crate) struct GatewayAgent {
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
     pub(super) contacts: Arc<KnownPeers>,
-    /// Time of the last logged notice of each gateway.
-    pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
     /// The connections that were refused because of keys.
@@ -58,7 +55,9 @@ impl GatewayAgent {
         while let Some(received) = mts.receive(own).await {
             match Message::decode(received.letter.payload()) {
                 Ok(message) => self.handle(&message, &received),
-                Err(error) => tracing::info!(%error, "cannot decode a letter to the gateway"),
+                Err(error) => {
+                    log_limit::info!(of: received.service, %error, "cannot decode a letter to the gateway")
+                }
             }
         }
     }
@@ -70,7 +69,8 @@ impl GatewayAgent {
         {
             // A gateway sends its own agents only, on its own connections.
             if received.service != sender {
-                tracing::info!(
+                log_limit::info!(
+                    of: received.service,
                     "ignored agents of a gateway: sent on a connection of another service"
                 );
                 return;
@@ -157,23 +157,15 @@ impl GatewayAgent {
         Ok(())
     }
 
-    /// Logs a notice about a name that another gateway sent to the operator of this one. At most
-    /// one notice per second and gateway is logged.
+    /// Logs a notice about a name that another gateway sent to the operator of this one.
     fn log_notice(&self, gateway: Incarnation, message: &Message) {
-        let now = Instant::now();
-        let mut notices = self.notices.lock();
-        notices.retain(|_, logged| now.saturating_duration_since(*logged) < Duration::from_secs(1));
         let all = self.neighbours.all();
-        let neighbour = all.iter().find(|it| it.entry.incarnation == gateway);
-        if let Some(neighbour) = neighbour
-            && let Entry::Vacant(place) = notices.entry(gateway)
-        {
-            place.insert(now);
+        if let Some(neighbour) = all.iter().find(|it| it.entry.incarnation == gateway) {
             let content = message.content().map(|content| &content[..]);
             let text = String::from_utf8_lossy(content.unwrap_or_default());
             let text: String = text.chars().take(MAX_NOTICE).collect();
             let (gateway, notice) = (escape(&neighbour.entry.name), escape(&text));
-            tracing::warn!(%gateway, %notice, "another gateway reports a problem with a name");
+            log_limit::warn!(of: neighbour.entry.incarnation, %gateway, %notice, "another gateway reports a problem with a name");
         }
     }
 
@@ -215,13 +207,13 @@ impl GatewayAgent {
         fill: impl FnOnce(fipa_acl::MessageBuilder) -> fipa_acl::MessageBuilder,
     ) {
         let Some(to) = self.view.by_incarnation(sender) else {
-            tracing::info!("dropping a reply: its requester is no longer registered");
+            log_limit::info!("dropping a reply: its requester is no longer registered");
             return;
         };
         let answer = message.reply(performative).sender(self.id.clone());
         match fill(answer).build() {
             Ok(answer) => self.send(&answer, &to),
-            Err(error) => tracing::warn!(%error, "cannot build a reply of the gateway"),
+            Err(error) => log_limit::warn!(%error, "cannot build a reply of the gateway"),
         }
     }
 
@@ -239,7 +231,7 @@ impl GatewayAgent {
                 drop(self.service.mts.send_to(submission, to));
             }
             Err(error) => {
-                tracing::warn!(error = %ErrorChain(&error), "cannot encode a letter of the gateway")
+                log_limit::warn!(error = %ErrorChain(&error), "cannot encode a letter of the gateway")
             }
         }
     }

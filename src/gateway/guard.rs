@@ -4,6 +4,7 @@
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::ErrorChain;
+use fipa_transport::log_limit;
 use fipa_transport_net::secure::{Credentials, Rules, Security};
 
 use crate::config;
@@ -17,7 +18,7 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 fn warn_about_expiry(credentials: &Credentials) {
     let now = SystemTime::now();
     if let Some(what) = Holding::at(now, &credentials.own).told() {
-        tracing::warn!(
+        log_limit::warn!(
             "the certificate of this host {what}; peers refuse a host without a valid certificate \
              (renew it with `fipa keys renew`)"
         );
@@ -25,7 +26,7 @@ fn warn_about_expiry(credentials: &Credentials) {
     for trusted in &credentials.trusted {
         if let Some(what) = Holding::at(now, trusted).told() {
             let peer = trusted.certified().mts();
-            tracing::warn!(
+            log_limit::warn!(
                 "the certificate of {peer} {what}; it has to be renewed on that host (`fipa keys renew` \
                  there)"
             );
@@ -85,7 +86,7 @@ impl Guard {
             self = match tokio::task::spawn_blocking(move || self.checked()).await {
                 Ok(guard) => guard,
                 Err(error) => {
-                    tracing::error!(%error, "key changes are ignored; restart the gateway");
+                    log_limit::error!(%error, "key changes are ignored; restart the gateway");
                     return;
                 }
             };
@@ -117,7 +118,7 @@ impl Guard {
             Ok(count) => {
                 let repaired = self.fault.take().is_some();
                 if changed || repaired {
-                    tracing::info!(trusted = count, "the keys were read again");
+                    log_limit::info!(trusted = count, "the keys were read again");
                 }
             }
             Err(error) => {
@@ -139,12 +140,12 @@ impl Guard {
             return;
         }
         match kept {
-            Ok(()) => tracing::error!(
+            Ok(()) => log_limit::error!(
                 trusted = count,
                 "cannot use the changed keys: {error}; until this is repaired, only peers whose \
                  certificates can be read are trusted (see `fipa keys list`)"
             ),
-            Err(kept) => tracing::error!(
+            Err(kept) => log_limit::error!(
                 "cannot use the changed keys: {error}; cannot restrict trust to the readable \
                  certificates: {}",
                 ErrorChain(&kept)

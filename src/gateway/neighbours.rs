@@ -16,7 +16,9 @@ use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
     Role, Source, Subscriber, View as DirectoryView, Watch,
 };
-use fipa_transport::{Incarnation, Introduction, Location, Mandate, Principal, TransportErrorKind};
+use fipa_transport::{
+    Incarnation, Introduction, Location, Mandate, Principal, TransportErrorKind, log_limit,
+};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
@@ -159,20 +161,20 @@ impl Neighbours {
         let before = state.present.get(&incarnation);
         if before.is_some_and(|before| before.principal != peer.hop.principal) {
             let (name, at) = (escape(&peer.name), &peer.hop.location);
-            tracing::info!(%name, %at, "ignored a connection with another certificate");
+            log_limit::info!(of: host(at), %name, %at, "ignored a connection with another certificate");
             return;
         }
         let neighbour = state.neighbour(peer, before);
         if let Err(error) = neighbour.entry.check() {
-            tracing::info!(error = %ErrorChain(&error), at = %peer.hop.location, "ignored a gateway with an invalid entry");
+            log_limit::info!(of: host(&peer.hop.location), error = %ErrorChain(&error), at = %peer.hop.location, "ignored a gateway with an invalid entry");
             return;
         }
         let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));
         let is_new = before.is_none();
         if is_new {
             let security = security(peer.hop.principal);
-            tracing::info!(
-                name = %peer.name,
+            log_limit::info!(
+                of: host(&peer.hop.location), name = %peer.name,
                 at = %peer.hop.location,
                 encrypted = security.encrypted,
                 certificate = security.certificate.as_deref(),
@@ -180,8 +182,8 @@ impl Neighbours {
             );
         }
         if is_new && state.is_namesake(&peer.name) {
-            tracing::warn!(
-                "the gateway at {} has the name of this gateway, {}: logs and lists do not tell the hosts \
+            log_limit::warn!(
+                of: host(&peer.hop.location), "the gateway at {} has the name of this gateway, {}: logs and lists do not tell the hosts \
                  apart; set mts.name on one of them",
                 peer.hop.location,
                 escape(&peer.name)
@@ -225,7 +227,7 @@ impl Neighbours {
         }
         self.generation.fetch_add(1, Ordering::Release);
         self.changed.notify_one();
-        tracing::info!(name = %peer.name, at = %peer.hop.location, "no longer connected");
+        log_limit::info!(of: host(&peer.hop.location), name = %peer.name, at = %peer.hop.location, "no longer connected");
     }
 
     /// Returns the gateways to greet from the current locations of this one, by name and location:
@@ -267,7 +269,7 @@ impl State {
             && *listed.name != *peer.name
         {
             let (name, says) = (&listed.name, &peer.name);
-            tracing::info!(%name, %says, "a static peer has another name than in discovery.static");
+            log_limit::info!(of: &**name, %name, %says, "a static peer has another name than in discovery.static");
         }
         let configured = listed.iter().flat_map(|listed| &listed.locations);
         let configured: Vec<Location> = configured

@@ -20,7 +20,7 @@ use fipa_sds::{
     DfEntry, Directory, Entry, Exchange, MergedDirectory, OwnDfEntry, Reach, RegisterError,
     Registration, Role,
 };
-use fipa_transport::{Incarnation, Location, Principal};
+use fipa_transport::{Incarnation, Location, Principal, log_limit};
 use tokio::task::{JoinHandle, JoinSet};
 
 use super::exchange::Exchanging;
@@ -215,7 +215,7 @@ impl PlatformAgents {
     fn send(&self, from: Incarnation, answer: &Answer) -> Option<Sending> {
         let letter = letter_for(&answer.message, SystemTime::now());
         let letter = letter
-            .inspect_err(|error| tracing::warn!(error = %ErrorChain(error), "cannot encode a letter of the gateway"))
+            .inspect_err(|error| log_limit::warn!(error = %ErrorChain(error), "cannot encode a letter of the gateway"))
             .ok()?;
         let mut submission = Submission {
             sender: from,
@@ -229,7 +229,7 @@ impl PlatformAgents {
             return Some(self.service.mts.send(submission));
         }
         let Some(to) = self.view.by_incarnation(registration) else {
-            tracing::info!("dropping a reply: its requester is no longer registered");
+            log_limit::info!("dropping a reply: its requester is no longer registered");
             return None;
         };
         Some(self.service.mts.send_to(submission, &to))
@@ -369,13 +369,13 @@ impl Task {
         let message = match Message::decode(received.letter.payload()) {
             Ok(message) => message,
             Err(error) => {
-                tracing::info!(error = %ErrorChain(&error), agent = %self.name, "cannot decode a letter to an agent of the gateway");
+                log_limit::info!(of: received.service, error = %ErrorChain(&error), agent = %self.name, "cannot decode a letter to an agent of the gateway");
                 let mts = &self.means.service.mts;
                 return mts.handle_undecodable(&self.name, received, &error);
             }
         };
         let Some(asker) = self.means.asker(&message, received) else {
-            tracing::info!(agent = %self.name, "cannot answer a letter: its sender is not registered");
+            log_limit::info!(of: received.service, agent = %self.name, "cannot answer a letter: its sender is not registered");
             return;
         };
         let now = Now {
@@ -453,7 +453,7 @@ impl Task {
         };
         let staying = self.means.send_df(local);
         for (agent, _) in staying.difference(&self.staying) {
-            tracing::warn!(
+            log_limit::warn!(
                 %agent,
                 "the services of an agent are not told to other hosts: at most {} descriptions of {} \
                  bytes and {} parts, and {} bytes together, travel; agents of other hosts find them \
@@ -499,7 +499,7 @@ impl Task {
     fn relocate(&mut self) {
         let means = &self.means;
         if let Err(error) = entry(means, self.kind, &self.name, self.incarnation) {
-            tracing::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot update an agent of the gateway");
+            log_limit::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot update an agent of the gateway");
         }
         if let Core::Ams(ams) = &mut self.core {
             ams.describe(means.description());
@@ -524,7 +524,7 @@ impl Task {
         let Some((id, incarnation)) = enter(&self.means, self.kind, &self.configured, true) else {
             return;
         };
-        tracing::info!(
+        log_limit::info!(
             before = %self.name, now = id.name(), holder = %escape(&holder.mts.name),
             "an agent of the gateway has a new name: an agent of another host has its name"
         );
@@ -535,7 +535,7 @@ impl Task {
         }
         self.send_answers();
         if let Err(error) = service.host.deregister(&self.name, self.incarnation) {
-            tracing::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot deregister an agent of the gateway");
+            log_limit::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot deregister an agent of the gateway");
         }
         drop(service.mts.deregister(self.incarnation));
         self.name = id.name().into();
@@ -567,7 +567,7 @@ fn enter(
         let id = match AgentId::new(&*name) {
             Ok(id) => id,
             Err(error) => {
-                tracing::warn!(error = %ErrorChain(&error), "cannot register an agent of the gateway");
+                log_limit::warn!(error = %ErrorChain(&error), "cannot register an agent of the gateway");
                 return None;
             }
         };
@@ -587,7 +587,7 @@ fn enter(
         }
     }
     if let Some(error) = last {
-        tracing::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
+        log_limit::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
     }
     None
 }

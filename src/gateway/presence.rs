@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, ErrorChain, Message, Performative};
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Role, Source};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 
 use super::gateway_agent::GatewayAgent;
 use crate::presence::{self, Answer, Asked, MAX_ASKED};
@@ -177,17 +177,17 @@ impl GatewayAgent {
                     self.answer_presence(message, received.sender, answer);
                 }
                 Ok(_) if received.remote => {
-                    tracing::info!("ignored a question about agents: not from a gateway");
+                    log_limit::info!(of: received.service, "ignored a question about agents: not from a gateway");
                 }
                 Ok(asked) => self.handle_local_question(message, received.sender, asked),
                 Err(error) => {
-                    tracing::info!(error = %ErrorChain(&error), "ignored a question about agents")
+                    log_limit::info!(of: received.service, error = %ErrorChain(&error), "ignored a question about agents")
                 }
             },
             Performative::Inform if is_gateway => match presence::read_answer(content) {
                 Ok(answer) => self.pass_on(received.sender, Some(&answer)),
                 Err(error) => {
-                    tracing::info!(error = %ErrorChain(&error), "ignored an answer about agents")
+                    log_limit::info!(of: received.service, error = %ErrorChain(&error), "ignored an answer about agents")
                 }
             },
             // The version of the other gateway has no such questions.
@@ -284,10 +284,10 @@ impl GatewayAgent {
             match question.map(|question| question.build()) {
                 Ok(Ok(question)) => self.send(&question, &entry),
                 Ok(Err(error)) => {
-                    tracing::warn!(error = %ErrorChain(&error), "cannot ask another gateway")
+                    log_limit::warn!(error = %ErrorChain(&error), "cannot ask another gateway")
                 }
                 Err(error) => {
-                    tracing::warn!(error = %ErrorChain(&error), "cannot ask another gateway")
+                    log_limit::warn!(error = %ErrorChain(&error), "cannot ask another gateway")
                 }
             }
         }

@@ -10,7 +10,7 @@ use fipa_sds::{
     ContactDirectory, Directory, Entry, HostDirectory, HostError, MergedDirectory, Reach,
     Registration, Role,
 };
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, log_limit};
 
 use super::Network;
 use crate::config::is_on_loopback;
@@ -76,7 +76,7 @@ impl Publisher {
             // A gateway that closes publishes nothing.
             Ok(()) | Err(HostError::Closed) => {}
             Err(error) => {
-                tracing::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
+                log_limit::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
             }
         }
     }
@@ -170,7 +170,7 @@ impl PublishTask {
         let mut heard = publisher.contacts.watch();
         let mut located = publisher.service.follow_locations();
         if publisher.network.is_some() && publisher.announced_locations().is_empty() {
-            tracing::info!(
+            log_limit::info!(
                 "this gateway has no location that other hosts can use, so it announces nothing by \
                  mDNS until it has one; see transport.tcp.listen and `ip address`"
             );
@@ -271,7 +271,7 @@ impl PublishTask {
                     }
                     let before = self.refused.insert(Arc::clone(name), entry.incarnation);
                     if before != Some(entry.incarnation) {
-                        tracing::warn!(%name, error = %ErrorChain(&error), "cannot announce an agent to other hosts");
+                        log_limit::warn!(%name, error = %ErrorChain(&error), "cannot announce an agent to other hosts");
                     }
                 }
             }

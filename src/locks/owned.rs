@@ -8,6 +8,7 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::{ErrorChain, Message};
 use fipa_locking::{Ending, Fence, Grant, Options, OwnerState, Resource};
 use fipa_sds::{Entry, RegisterError, Role};
+use fipa_transport::log_limit;
 
 use super::shell::{self, Shared};
 use super::state_file::StateFile;
@@ -307,7 +308,7 @@ fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Resul
         }
         // The owner is found by messages. Not every name of a resource is one of an agent.
         Err(error) => {
-            tracing::info!(
+            log_limit::info!(
                 error = %ErrorChain(&error), "a resource is not listed in the directory"
             );
             None

@@ -15,6 +15,7 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::{AgentId, ErrorChain, Message, Performative};
 use fipa_locking::{Fence, LockStatus, Millis, Peer, Resource};
 use fipa_mts::letter_for;
+use fipa_transport::log_limit;
 use serde::{Deserialize, Serialize};
 
 use super::shell::Shared;
@@ -285,7 +286,7 @@ pub(super) async fn query(
                     found.insert((status.resource.clone(), owner.clone()), status);
                 }
             }
-            Err(error) => tracing::info!(%error, "ignored an answer of an owner"),
+            Err(error) => log_limit::info!(%error, "ignored an answer of an owner"),
         }
     }
     Ok(found.into_values().collect())

@@ -15,7 +15,7 @@ use fipa_locking::{
 };
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Entry, Reach, Role, Watch};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
@@ -210,8 +210,8 @@ impl State {
                 self.holds(&resource, Holding::Refused(by.name().to_owned()));
             }
             Event::Contested { resource, by } => {
-                tracing::warn!(
-                    resource = %escape(resource.as_str()), by = %escape(by.name()),
+                log_limit::warn!(
+                    of: resource.as_str(), resource = %escape(resource.as_str()), by = %escape(by.name()),
                     "another agent claims a resource that this agent owns; each admits its own fences only"
                 );
                 let by = by.name().to_owned();
@@ -488,7 +488,7 @@ impl Task {
         self.greet_all();
         let ended = self.serve().await;
         if let Err(error) = ended {
-            tracing::error!(%error, "the locks of an agent have ended");
+            log_limit::error!(%error, "the locks of an agent have ended");
         }
         self.core.demultiplexer.end_serving(&self.messages);
         self.shared.close(&self.core);

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use fipa_locking::{Millis, OwnerState, OwnerStateError};
+use fipa_transport::log_limit;
 
 /// Environment variable with the state directory.
 const VARIABLE: &str = "FIPA_STATE_DIR";
@@ -124,7 +125,7 @@ impl StateFile {
             return;
         }
         if let Err(error) = write(&self.path, &self.state.closed()) {
-            tracing::warn!(
+            log_limit::warn!(
                 %error, path = %self.path.display(),
                 "cannot write the state of an owner; its next start waits for the longest lease"
             );

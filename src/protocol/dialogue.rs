@@ -11,7 +11,7 @@ use fipa_monitor::{
     Header, Library, Monitor, Policy, Unchecked, Verdict, Violation, ViolationKind,
 };
 use fipa_mts::letter_for;
-use fipa_transport::{FailureReason, Incarnation, Outcome};
+use fipa_transport::{FailureReason, Incarnation, Outcome, log_limit};
 
 use super::partners::PartnerEvent;
 use super::reachability::{Reachability, ReachabilitySender};
@@ -430,13 +430,13 @@ impl Dialogue {
                     match event {
                         PartnerEvent::Gone { agent } => return Err(DialogueError::Gone { agent }),
                         PartnerEvent::Unreachable { agent, since } => {
-                            tracing::warn!(agent = %escape(&agent), "the host of an agent is silent");
+                            log_limit::warn!(of: &*agent, agent = %escape(&agent), "the host of an agent is silent");
                             if silence == Silence::Ends {
                                 return Err(DialogueError::Unreachable { agent, since });
                             }
                         }
                         PartnerEvent::Returned { agent } => {
-                            tracing::info!(agent = %escape(&agent), "the host of an agent answers again");
+                            log_limit::info!(of: &*agent, agent = %escape(&agent), "the host of an agent answers again");
                         }
                     }
                 }

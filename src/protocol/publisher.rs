@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use fipa_acl::{ErrorChain, Message, Performative, escape};
-use fipa_transport::FailureReason;
+use fipa_transport::{FailureReason, log_limit};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
@@ -161,7 +161,7 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
                 false => serve(&core, &first, &subscribers).await,
             };
             if let Err(error) = served {
-                tracing::info!(subscriber = %escape(&name), error = %ErrorChain(&error), "a subscription has ended");
+                log_limit::info!(of: &*name, subscriber = %escape(&name), error = %ErrorChain(&error), "a subscription has ended");
             }
         });
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use fipa_acl::{ErrorChain, Message, escape};
+use fipa_transport::log_limit;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::task::{JoinError, JoinHandle};
@@ -172,7 +173,7 @@ where
         let task = match Task::join(queue.agent(), &first, Some(Arc::clone(&home))) {
             Ok(task) => task,
             Err(error) => {
-                tracing::warn!(error = %ErrorChain(&error), "cannot take part in a conversation");
+                log_limit::warn!(error = %ErrorChain(&error), "cannot take part in a conversation");
                 continue;
             }
         };
@@ -220,7 +221,7 @@ async fn finish<E: Display>(
         }
     };
     if let Some(error) = failed {
-        tracing::warn!(error = %escape(&error), "the handler of a conversation failed");
+        log_limit::warn!(error = %escape(&error), "the handler of a conversation failed");
     }
 }
 

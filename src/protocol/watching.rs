@@ -8,7 +8,7 @@ use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Directory, Entry, Reach, Role, Watch};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 
 use super::partners::{PartnerEvent, Partners};
 use crate::agent::{Agent, AgentCore};
@@ -197,7 +197,7 @@ impl PartnerWatch {
                 gateway,
             )),
             Err(error) => {
-                tracing::warn!(%error, "cannot ask the gateway about other agents")
+                log_limit::warn!(%error, "cannot ask the gateway about other agents")
             }
         }
     }
@@ -250,7 +250,7 @@ impl PartnerWatch {
             Performative::Inform => match presence::read_answer(content.unwrap_or_default()) {
                 Ok(answer) => self.partners.handle_answer(Instant::now(), &answer),
                 Err(error) => {
-                    tracing::info!(error = %ErrorChain(&error), "ignored an answer of the gateway")
+                    log_limit::info!(error = %ErrorChain(&error), "ignored an answer of the gateway")
                 }
             },
             // A gateway that does not support the question, or an undelivered question.

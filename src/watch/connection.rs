@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, SystemTime};
 
 use fipa_mts::watch::record::{self, Wish};
+use fipa_transport::log_limit;
 use parking_lot::Mutex;
 use rustix::io::Errno;
 use rustix::net::{SendFlags, send};
@@ -96,7 +97,7 @@ impl Connection {
                     error.kind(),
                     ErrorKind::BrokenPipe | ErrorKind::ConnectionReset
                 ) {
-                    tracing::warn!(%error, "cannot send to a watcher; closing the connection");
+                    log_limit::warn!(%error, "cannot send to a watcher; closing the connection");
                 }
                 outgoing.disconnected = true;
                 outgoing.queued.clear();

@@ -5,6 +5,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use fipa_mts::watch::record::{MAX_LEN, Wish};
 use fipa_mts::watch::{Record, RecordError, Source};
+use fipa_transport::log_limit;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -33,11 +34,11 @@ pub(super) async fn run(listener: UnixListener, wish: Wish, events: mpsc::Sender
                 number += 1;
                 processes.spawn(listen(process, Source(number), wish, events.clone()));
             }
-            Ok(_) => tracing::warn!(
+            Ok(_) => log_limit::warn!(
                 "refused a process: {MAX_PROCESSES} processes, the maximum, are watched already"
             ),
             Err(error) => {
-                tracing::warn!(%error, "cannot accept the connection of a process; retrying");
+                log_limit::warn!(%error, "cannot accept the connection of a process; retrying");
                 // The cause may persist, for example a lack of descriptors: avoids a busy loop.
                 tokio::time::sleep(Duration::from_millis(100)).await;
             }

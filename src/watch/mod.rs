@@ -24,7 +24,7 @@ use fipa_mts::watch::Joiner;
 use fipa_mts::watch::record::{MAX_CONTENT, Wish};
 pub use fipa_mts::watch::{Event, Fate, Passage, RecordError};
 use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
@@ -204,7 +204,7 @@ impl Drop for Watcher {
 
 fn leave(host: &HostDirectory, dir: &DomainDir) {
     if let Err(error) = host.close() {
-        tracing::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
+        log_limit::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
     }
     dir.leave();
 }

@@ -8,6 +8,7 @@ use fipa_mts::core::Notice;
 use fipa_mts::watch::record;
 use fipa_mts::{Mts, Tap};
 use fipa_sds::{HostDirectory, HostError, SocketId};
+use fipa_transport::log_limit;
 use parking_lot::Mutex;
 use rustix::net::sockopt::set_socket_send_buffer_size;
 use tokio::task::JoinSet;
@@ -89,7 +90,7 @@ impl Watchers {
                     let (watchers, host) = (Arc::clone(&self), Arc::clone(&host));
                     tasks.spawn(watchers.serve(host, service.clone(), *new));
                 } else {
-                    tracing::warn!(
+                    log_limit::warn!(
                         "ignoring a watcher: {MAX_WATCHERS} watchers, the maximum, are connected already"
                     );
                 }
@@ -113,7 +114,7 @@ impl Watchers {
             }
             tokio::time::sleep(PAUSE).await;
         }
-        tracing::warn!("a watcher did not accept the connection within 1 s; it gets no records");
+        log_limit::warn!("a watcher did not accept the connection within 1 s; it gets no records");
     }
 
     fn connect(
@@ -141,7 +142,7 @@ impl Watchers {
             service: service.clone(),
         };
         connected.change(|connections| connections.push(connection));
-        tracing::info!(mts = %name, "a watcher connected; it gets records of the letters");
+        log_limit::info!(mts = %name, "a watcher connected; it gets records of the letters");
         Ok(connected)
     }
 }

@@ -8,6 +8,7 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::time::Duration;
 
+use fipa_transport::log_limit;
 use rustix::io::Errno;
 use rustix::net::netlink::SocketAddrNetlink;
 use rustix::net::{AddressFamily, SocketFlags, SocketType, bind, socket_with, sockopt};
@@ -44,7 +45,7 @@ impl Changes {
     pub(crate) fn subscribe() -> Self {
         let socket = open().and_then(|socket| UnixDatagram::from_std(socket.into()));
         if let Err(error) = &socket {
-            tracing::warn!(
+            log_limit::warn!(
                 %error,
                 "cannot open a netlink socket; polling the interfaces every {POLL:?} instead \
                  (does RestrictAddressFamilies= lack AF_NETLINK?)"
@@ -68,7 +69,7 @@ impl Changes {
             drain(socket)
         };
         if let Err(error) = changed.await {
-            tracing::warn!(%error, "the netlink socket failed; polling the interfaces instead");
+            log_limit::warn!(%error, "the netlink socket failed; polling the interfaces instead");
             self.socket = None;
         }
     }

@@ -37,11 +37,6 @@ mod identity;
 mod interfaces;
 #[cfg(feature = "ip")]
 mod legacy;
-#[cfg_attr(
-    not(any(feature = "ip", test)),
-    expect(dead_code, reason = "only TCP resets connections")
-)]
-mod log_limit;
 #[cfg(feature = "quic")]
 mod quic;
 #[cfg_attr(

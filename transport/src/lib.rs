@@ -6,6 +6,7 @@
 //! * [`wire`] is the fixed layout of a parcel in mailboxes and network frames.
 //! * [`OwnerProcess`] tells a process from a forked child.
 //! * [`TokenBucket`] limits the rate of a peer or a sender.
+//! * [`log_limit`] limits the rate of log lines.
 //! * `conformance` (feature of that name) is the suite that every implementation passes.
 //!   [`Faulty`] wraps a transport and injects faults.
 //!
@@ -17,6 +18,7 @@ pub mod conformance;
 mod faulty;
 mod incarnation;
 mod location;
+pub mod log_limit;
 mod outcome;
 mod owner;
 mod parcel;

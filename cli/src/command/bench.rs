@@ -209,7 +209,10 @@ fn report(
     measured: Measured<'_>,
 ) -> Result<(), Failure> {
     for note in measured.notes {
-        tracing::info!("{note}");
+        #[expect(clippy::disallowed_macros, reason = "no other process causes notes")]
+        {
+            tracing::info!("{note}");
+        }
     }
     if let Some(file) = &arguments.svg {
         let drawn = (measured.svg)().and_then(|picture| {

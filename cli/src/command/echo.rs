@@ -1,13 +1,14 @@
 //! `fipa echo`: an agent that answers.
 
 use clap::Args;
-use fipa::{Agent, Config, ErrorChain, Incoming, Message, Performative};
+use fipa::{Agent, Config, ErrorChain, Incoming, Message, MessageBuilder, Performative};
 use fipa_acl::escape;
 
+use crate::answers::Answers;
 use crate::membership::{self, Receiver, Stop};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::{self, Failure};
+use crate::report::Failure;
 
 /// Run an agent that answers each message with an inform of the same content
 ///
@@ -60,6 +61,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
 
 async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
     let mut received = 0;
+    let mut answers = Answers::new(agent);
     while count.is_none_or(|count| received < count) {
         match agent.receive().await {
             // The library has logged the violation. An answer would continue a conversation that the
@@ -69,7 +71,8 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
                 received += 1;
                 output::text(&line(&incoming))?;
                 if requires_answer(incoming.message()) {
-                    answer(agent, &incoming).await;
+                    let answer = answer(agent, incoming.message());
+                    answers.send(&incoming, answer).await;
                 }
             }
             Err(error) => {
@@ -81,6 +84,7 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
             }
         }
     }
+    answers.finish().await;
     Ok(())
 }
 
@@ -102,9 +106,8 @@ fn requires_answer(message: &Message) -> bool {
     }
 }
 
-/// Answers a message. A failed answer does not end the agent.
-async fn answer(agent: &Agent, incoming: &Incoming) {
-    let message = incoming.message();
+/// Returns the answer to a message.
+fn answer(agent: &Agent, message: &Message) -> MessageBuilder {
     // `Agent::reply` would set reply-with, which requests an answer to the answer.
     let reply = message.reply(Performative::Inform);
     let mut reply = reply.sender(agent.id().clone());
@@ -114,16 +117,5 @@ async fn answer(agent: &Agent, incoming: &Incoming) {
     if let Some(encoding) = message.encoding() {
         reply = reply.encoding(encoding);
     }
-    let reply = match reply.build() {
-        Ok(reply) if reply.receivers().is_empty() => {
-            return report::warn("cannot answer: the message has no sender");
-        }
-        Ok(reply) => reply,
-        Err(error) => return report::warn(&format!("cannot answer: {error}")),
-    };
-    match agent.send(reply).await {
-        Ok(deliveries) if deliveries.all_succeeded() => {}
-        Ok(deliveries) => report::warn(&format!("the answer was not delivered: {deliveries}")),
-        Err(error) => report::warn(&format!("cannot answer: {}", ErrorChain(&error))),
-    }
+    reply
 }

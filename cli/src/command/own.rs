@@ -8,13 +8,16 @@ use fipa::locks::{
     AdmitError, Algorithm, Ending, Fence, LockError, LockOptions, OwnError, OwnOptions,
 };
 use fipa::locks::{Owned, OwnerEvent};
-use fipa::{Agent, AgentId, Config, ErrorChain, Message, Performative, RegisterOptions};
+use fipa::{
+    Agent, AgentId, Config, ErrorChain, Message, MessageBuilder, Performative, RegisterOptions,
+};
 use fipa_acl::escape;
 
+use crate::answers::Answers;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::{self, Failure};
+use crate::report::Failure;
 
 /// Own a resource: other agents can lock it, and commands of the holder are admitted
 ///
@@ -150,6 +153,7 @@ async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Fail
         escape(agent.name()),
         config.domain
     ))?;
+    let mut answers = Answers::new(agent);
     loop {
         tokio::select! {
             event = owned.next() => match event {
@@ -158,7 +162,11 @@ async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Fail
             },
             received = agent.receive() => match received {
                 Ok(incoming) if incoming.violation().is_some() => {}
-                Ok(incoming) => handle(agent, owned, incoming.message()).await?,
+                Ok(incoming) => {
+                    if let Some(answer) = handle(agent, owned, incoming.message())? {
+                        answers.send(&incoming, answer).await;
+                    }
+                }
                 Err(error) => {
                     return Err(Failure::failed(
                         ErrorChain(&error).to_string(),
@@ -198,10 +206,14 @@ fn line(event: &OwnerEvent) -> String {
     }
 }
 
-/// Admits or refuses a command. Other messages are ignored.
-async fn handle(agent: &Agent, owned: &Owned, message: &Message) -> Result<(), Failure> {
+/// Admits or refuses a command, and returns the answer. Other messages are ignored.
+fn handle(
+    agent: &Agent,
+    owned: &Owned,
+    message: &Message,
+) -> Result<Option<MessageBuilder>, Failure> {
     if *message.performative() != Performative::Request {
-        return Ok(());
+        return Ok(None);
     }
     let (act, text) = match owned.check(message) {
         Ok(fence) => (Performative::Agree, format!("admitted with {fence}")),
@@ -212,16 +224,7 @@ async fn handle(agent: &Agent, owned: &Owned, message: &Message) -> Result<(), F
     };
     output::text(&format!("{}: {message}\n", escape(&text)))?;
     let answer = message.reply(act).sender(agent.id().clone()).content(text);
-    match answer.build() {
-        Ok(answer) if answer.receivers().is_empty() => {}
-        Ok(answer) => match agent.send(answer).await {
-            Ok(deliveries) if deliveries.all_succeeded() => {}
-            Ok(deliveries) => report::warn(&format!("the answer was not delivered: {deliveries}")),
-            Err(error) => report::warn(&format!("cannot answer: {}", ErrorChain(&error))),
-        },
-        Err(error) => report::warn(&format!("cannot answer: {error}")),
-    }
-    Ok(())
+    Ok(Some(answer))
 }
 
 fn refusal(error: &AdmitError) -> String {

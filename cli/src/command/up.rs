@@ -2,7 +2,7 @@
 
 use clap::Args;
 use fipa::keys::{Certificate, Keys};
-use fipa::{Change, Config, Entry, Gateway, Reach};
+use fipa::{Change, Config, Entry, Gateway, Reach, log_limit};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
@@ -75,15 +75,15 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
                 let now = problems.borrow_and_update().clone();
                 if now != problem {
                     match &now {
-                        Some(text) => tracing::warn!("discovery of other hosts may fail: {text}"),
-                        None => tracing::info!("discovery of other hosts works again"),
+                        Some(text) => log_limit::warn!("discovery of other hosts may fail: {text}"),
+                        None => log_limit::info!("discovery of other hosts works again"),
                     }
                     problem = now;
                 }
             }
         }
     }
-    tracing::info!("stopping the gateway");
+    log_limit::info!("stopping the gateway");
     Stop::ending();
     gateway.close().await;
     Ok(())
@@ -97,7 +97,7 @@ fn reload(gateway: &mut Gateway, global: &Global) {
     });
     match reloaded {
         Ok(later) => {
-            tracing::info!("configuration reloaded");
+            log_limit::info!("configuration reloaded");
             if !later.is_empty() {
                 let later = later.join(", ");
                 report::warn(&format!(
@@ -193,7 +193,7 @@ fn log(change: &Change) {
         Change::Joined(entry) => log_entry("joined", entry),
         Change::Changed { after, .. } => log_entry("changed", after),
         Change::Left(entry) => log_entry("left", entry),
-        Change::Lagged => tracing::info!("some changes are not listed: too many at once"),
+        Change::Lagged => log_limit::info!("some changes are not listed: too many at once"),
     }
 }
 
@@ -202,10 +202,10 @@ fn log_entry(change: &str, entry: &Entry) {
         Reach::Local => "this host",
         Reach::Remote { .. } => "another host",
     };
-    tracing::info!(
-        name = %entry.name,
+    log_limit::info!(
+        of: &*entry.name, name = %entry.name,
         reach,
         mts = %entry.mts.name,
-        "{change}"
+        "an agent {change}"
     );
 }

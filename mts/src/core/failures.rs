@@ -6,11 +6,15 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Dialect, ErrorChain, Letter};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
-use fipa_transport::{FailureReason, Incarnation, Kind, LegacySource, Location, Signature, Stream};
+use fipa_transport::{
+    FailureReason, Incarnation, Kind, LegacySource, Location, Signature, Stream, log_limit,
+    quota_address,
+};
 
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, registration_of};
 use super::inbox::Received;
 use super::lane::Delivery;
+use super::limits::log_omitted;
 use super::{Core, News, Now, own_lane, work};
 use crate::failure::{Failed, Failure};
 
@@ -92,18 +96,15 @@ impl Core {
                 FailureTarget::LegacyPeer { from, .. } => Some(*from),
                 FailureTarget::Ours(_) | FailureTarget::Remote(_) => None,
             };
+            let address = from.map(|from| from.address);
             let failed = match &sender {
                 FailureTarget::LegacyPeer { failed, .. } | FailureTarget::Remote(failed) => {
-                    let address = from.map(|from| from.address);
                     let named = failed.sender.name();
                     if !self.failure_limit.allows(now.instant, address, named) {
                         continue;
                     }
                     // Failure messages are encoded only in proportion to the received bytes.
-                    if !self
-                        .failure_limit
-                        .covers(now.instant, address, letter.len())
-                    {
+                    if !self.failure_limit.covers(address, letter.len()) {
                         continue;
                     }
                     Some(Arc::clone(failed))
@@ -128,7 +129,7 @@ impl Core {
                 let letter = match report.written_for(name, Dialect::Standard, now.utc) {
                     Ok(letter) => letter,
                     Err(error) => {
-                        tracing::warn!(error = %ErrorChain(&*error), %receiver, "cannot encode a failure message");
+                        log_limit::warn!(error = %ErrorChain(&*error), %receiver, "cannot encode a failure message");
                         continue;
                     }
                 };
@@ -144,7 +145,7 @@ impl Core {
                     });
                     self.table.actions.push_back(Action::Deliverable { agent });
                 } else {
-                    self.failure_limit.leave_out(now.instant);
+                    log_omitted(address);
                 }
                 continue;
             }
@@ -155,7 +156,7 @@ impl Core {
                 None => from.and_then(|from| stated_entry(&failed.sender, from)),
             };
             let Some(entry) = known.or_else(|| stated.clone()) else {
-                tracing::info!(to = %failed.sender, %reason, "cannot send a failure message: its receiver is not known");
+                log_limit::info!(of: address.map(quota_address), to = %failed.sender, %reason, "cannot send a failure message: its receiver is not known");
                 continue;
             };
             if entry.role == Role::Gateway {
@@ -164,15 +165,12 @@ impl Core {
             let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
                 Ok(letter) => letter,
                 Err(error) => {
-                    tracing::warn!(error = %ErrorChain(&*error), receiver = %report.receiver, "cannot encode a failure message");
+                    log_limit::warn!(error = %ErrorChain(&*error), receiver = %report.receiver, "cannot encode a failure message");
                     continue;
                 }
             };
             work::steps(letter.len() / 512);
-            if !self
-                .failure_limit
-                .debit(now.instant, from.map(|from| from.address), letter.len())
-            {
+            if !self.failure_limit.debit(address, letter.len()) {
                 continue;
             }
             let stream = Stream {
@@ -181,7 +179,7 @@ impl Core {
             };
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
             if !self.has_room_for_stranger(id, letter.len()) {
-                self.failure_limit.leave_out(now.instant);
+                log_omitted(address);
                 continue;
             }
             let deadline = now.instant + FAILURE_DEADLINE;

@@ -10,7 +10,7 @@ use fipa_acl::{AclRepresentation, DecodeError, EncodeError, Letter, Message};
 use fipa_sds::{Entry, Reach, Resolution, Role, Source, View};
 use fipa_transport::{
     Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel,
-    Signature, Stream, Ticket, Verdict,
+    Signature, Stream, Ticket, Verdict, log_limit, quota_address,
 };
 
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
@@ -376,8 +376,8 @@ impl Core {
             && self.lanes.get(&id).is_some_and(|lane| lane.is_empty())
         {
             let wait = until.saturating_duration_since(now.instant);
-            tracing::info!(
-                receiver = %entry.name,
+            log_limit::info!(
+                of: &*entry.name, receiver = %entry.name,
                 wait_ms = u64::try_from(wait.as_millis()).unwrap_or(u64::MAX),
                 "letters wait until the legacy peer has found their sender by mDNS"
             );
@@ -569,7 +569,7 @@ impl Core {
             let (from, len) = (unframed.from.address, unframed.letter.len());
             self.failure_limit.credit(now.instant, from, len);
             if let Some(fault) = &unframed.fault {
-                tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
+                log_limit::info!(of: quota_address(from), %from, "refused a letter of a legacy peer: {fault}");
             } else if unframed.parts.is_none() {
                 unframed.parts = self.reader.parts(&unframed.letter);
             }
@@ -587,7 +587,7 @@ impl Core {
                     continue;
                 }
                 (Receiver::Unknown(name), None) => {
-                    tracing::info!(receiver = %name, from = %unframed.from.address, "cannot deliver an unframed letter: no agent of this host has the name");
+                    log_limit::info!(of: quota_address(unframed.from.address), receiver = %name, from = %unframed.from.address, "cannot deliver an unframed letter: no agent of this host has the name");
                     (FailureReason::NoSuchAgent, String::new())
                 }
             };

@@ -7,7 +7,7 @@
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
-use fipa_transport::TokenBucket;
+use fipa_transport::{TokenBucket, log_limit, quota_address};
 
 use crate::Map;
 
@@ -27,8 +27,6 @@ const CREDIT_MEMORY: Duration = Duration::from_secs(60);
 const MIN_CREDIT: u64 = 1024;
 /// Maximum credit of an address, in bytes.
 const MAX_CREDIT: u64 = 1 << 20;
-/// Interval of the log line about omitted failure messages.
-const LOG_EVERY: Duration = Duration::from_secs(1);
 
 /// The address from which a letter came, if known, and the name of its sender.
 type Sender = (Option<IpAddr>, String);
@@ -113,7 +111,7 @@ impl SenderLimit {
                 return false;
             }
         }
-        let address = from.map(host);
+        let address = from.map(quota_address);
         let sender = (address, sender.to_owned());
         // The narrowest first, because a refused request must not use up the wider rates. If the
         // widest refuses, nothing is stored.
@@ -151,16 +149,13 @@ struct ByteCredit {
     last: Instant,
 }
 
-/// Limits failure messages, and counts those that are omitted. Without I/O except for the log.
+/// Limits failure messages, and logs those that are omitted. Without I/O except for the log.
 #[derive(Debug)]
 pub(super) struct FailureLimit {
     limit: SenderLimit,
     /// Credit of legacy peers' addresses: failure messages about letters from one address never
     /// have more bytes than these letters are credited for.
     credits: Map<IpAddr, ByteCredit>,
-    left_out: u64,
-    /// Time of the next log line about omitted messages.
-    log_at: Option<Instant>,
 }
 
 impl Default for FailureLimit {
@@ -172,25 +167,23 @@ impl Default for FailureLimit {
                 Rate::of(IN_ALL),
             ),
             credits: Map::default(),
-            left_out: 0,
-            log_at: None,
         }
     }
 }
 
 impl FailureLimit {
-    /// Whether another failure message may be sent to this sender; otherwise counts it as omitted.
+    /// Whether another failure message may be sent to this sender; otherwise logs it as omitted.
     pub(super) fn allows(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
         let allowed = self.limit.take(now, from, sender);
         if !allowed {
-            self.leave_out(now);
+            log_omitted(from);
         }
         allowed
     }
 
     /// Credits the bytes of a letter from a legacy peer at this address, at least [`MIN_CREDIT`].
     pub(super) fn credit(&mut self, now: Instant, from: IpAddr, bytes: usize) {
-        let (from, bytes) = (host(from), (bytes as u64).max(MIN_CREDIT));
+        let (from, bytes) = (quota_address(from), (bytes as u64).max(MIN_CREDIT));
         if self.credits.len() >= MAX_CREDIT_ADDRESSES && !self.credits.contains_key(&from) {
             let is_recent =
                 |it: &ByteCredit| now.saturating_duration_since(it.last) < CREDIT_MEMORY;
@@ -209,28 +202,28 @@ impl FailureLimit {
         credit.last = now;
     }
 
-    /// Whether the credit of this address covers the bytes of the failed letter; otherwise counts
+    /// Whether the credit of this address covers the bytes of the failed letter; otherwise logs
     /// the message as omitted.
-    pub(super) fn covers(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+    pub(super) fn covers(&self, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
         let credit = self
             .credits
-            .get(&host(from))
+            .get(&quota_address(from))
             .map_or(0, |credit| credit.bytes);
         // Larger letters than the maximum credit need only that.
         let may = credit >= (bytes as u64).min(MAX_CREDIT);
         if !may {
-            self.leave_out(now);
+            log_omitted(Some(from));
         }
         may
     }
 
     /// Subtracts the bytes of a failure message from the credit of this address, if it covers them;
-    /// otherwise counts the message as omitted. Without an address there is no limit: the sender is
+    /// otherwise logs the message as omitted. Without an address there is no limit: the sender is
     /// an agent of another gateway.
-    pub(super) fn debit(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+    pub(super) fn debit(&mut self, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let credit = self.credits.get_mut(&host(from));
+        let credit = self.credits.get_mut(&quota_address(from));
         let left = credit
             .as_ref()
             .and_then(|it| it.bytes.checked_sub(bytes as u64));
@@ -240,46 +233,21 @@ impl FailureLimit {
                 true
             }
             _ => {
-                self.leave_out(now);
+                log_omitted(Some(from));
                 false
             }
         }
     }
-
-    /// Counts an omitted failure message.
-    pub(super) fn leave_out(&mut self, now: Instant) {
-        self.left_out = self.left_out.saturating_add(1);
-        self.log_at.get_or_insert(now + LOG_EVERY);
-    }
-
-    /// Time of the next call of [`handle_timeout`](Self::handle_timeout).
-    pub(super) fn due(&self) -> Option<Instant> {
-        self.log_at
-    }
-
-    /// Logs the number of omitted messages when it is due.
-    pub(super) fn handle_timeout(&mut self, now: Instant) {
-        if self.log_at.is_some_and(|at| at <= now) {
-            self.log_at = None;
-            let count = std::mem::take(&mut self.left_out);
-            tracing::warn!(
-                count,
-                "omitted failure messages beyond a limit: {PER_SENDER} per second to one sender, \
-                 {PER_ADDRESS} to one address, {IN_ALL} in total, the bytes received from one \
-                 address, or a full queue of the sender"
-            );
-        }
-    }
 }
 
-/// The address that represents a host: for IPv6 the /64 network, unless it is link-local.
-fn host(address: IpAddr) -> IpAddr {
-    match address {
-        IpAddr::V6(v6) if !v6.is_unicast_link_local() => {
-            IpAddr::V6((v6.to_bits() & !u128::from(u64::MAX)).into())
-        }
-        other => other,
-    }
+/// Logs an omitted failure message to a sender at this address.
+pub(super) fn log_omitted(from: Option<IpAddr>) {
+    log_limit::warn!(
+        of: from.map(quota_address),
+        "omitted a failure message beyond a limit: {PER_SENDER} per second to one sender, \
+         {PER_ADDRESS} to one address, {IN_ALL} in total, the bytes received from one address, \
+         or a full queue of the sender"
+    );
 }
 
 #[cfg(test)]
@@ -299,7 +267,6 @@ mod tests {
         assert_eq!(allowed.count(), 20);
         assert!(limit.allows(now, address(1), "quiet"));
         assert!(limit.allows(now, address(2), "loud"));
-        assert_eq!(limit.left_out, 980);
         // A second later everything is allowed again.
         assert!(limit.allows(now + Duration::from_secs(1), address(1), "loud"));
     }
@@ -340,32 +307,18 @@ mod tests {
         let (mut limit, now) = (FailureLimit::default(), Instant::now());
         let [one, other] = [1, 2].map(|last| address(last).unwrap());
         limit.credit(now, one, 1500);
-        assert!(limit.debit(now, Some(one), 1000));
-        assert!(!limit.debit(now, Some(one), 600));
-        assert!(!limit.debit(now, Some(other), 1));
-        assert_eq!(limit.left_out, 2);
+        assert!(limit.debit(Some(one), 1000));
+        assert!(!limit.debit(Some(one), 600));
+        assert!(!limit.debit(Some(other), 1));
         limit.credit(now, one, 200);
-        assert!(limit.debit(now, Some(one), 600), "200 count as 1024");
-        assert!(limit.debit(now, None, 600), "another gateway's agent");
+        assert!(limit.debit(Some(one), 600), "200 count as 1024");
+        assert!(limit.debit(None, 600), "another gateway's agent");
         for number in 0..2 * MAX_CREDIT_ADDRESSES as u32 {
             limit.credit(now, Ipv4Addr::from(number).into(), 1);
         }
         assert_eq!(limit.credits.len(), MAX_CREDIT_ADDRESSES);
         limit.credit(now + CREDIT_MEMORY, other, 9);
         assert_eq!(limit.credits.len(), 1);
-        assert!(limit.debit(now + CREDIT_MEMORY, Some(other), 9));
-    }
-
-    #[test]
-    fn omitted_messages_are_logged_once_a_second() {
-        let (mut limit, now) = (FailureLimit::default(), Instant::now());
-        assert_eq!(limit.due(), None);
-        limit.leave_out(now);
-        limit.leave_out(now + LOG_EVERY / 2);
-        assert_eq!(limit.due(), Some(now + LOG_EVERY));
-        limit.handle_timeout(now + LOG_EVERY / 2);
-        assert_eq!(limit.left_out, 2);
-        limit.handle_timeout(now + LOG_EVERY);
-        assert_eq!((limit.left_out, limit.due()), (0, None));
+        assert!(limit.debit(Some(other), 9));
     }
 }

@@ -1053,7 +1053,6 @@ impl Core {
             self.handle_late_note(now, late);
         }
         self.peers.handle_timeout(now.instant, &mut self.table);
-        self.failure_limit.handle_timeout(now.instant);
         self.send_failures(now);
         self.forget_idle_lanes(now);
     }
@@ -1185,8 +1184,7 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
-        let others = earlier(self.peers.due(), self.failure_limit.due());
-        let others = earlier(others, self.passes.due());
+        let others = earlier(self.peers.due(), self.passes.due());
         earlier(earlier(lanes, notes), earlier(others, self.waiting.due()))
     }
 

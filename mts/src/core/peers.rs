@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     AttemptId, Body, Conclusion, Incarnation, Location, Signature, Stream, TransportError,
-    TransportErrorKind,
+    TransportErrorKind, log_limit,
 };
 
 use super::attempts::{AttemptTable, Purpose, note_parcel};
@@ -294,7 +294,7 @@ impl StaticPeer {
             return;
         };
         if self.answers.is_none() {
-            tracing::info!(peer = %self.peer.name, at = %candidate.location, "the static peer answers");
+            log_limit::info!(of: &*self.peer.name, peer = %self.peer.name, at = %candidate.location, "the static peer answers");
         }
         candidate.state = State::AskAt(now + KEEP);
         self.answers = Some(candidate.location.clone());
@@ -313,7 +313,7 @@ impl StaticPeer {
             .take_if(|at| *at == candidate.location)
             .is_some();
         if parted || candidate.failures == 0 && self.answers.is_none() {
-            tracing::info!(peer = %self.peer.name, at = %candidate.location, %error, "the static peer does not answer");
+            log_limit::info!(of: &*self.peer.name, peer = %self.peer.name, at = %candidate.location, %error, "the static peer does not answer");
         }
         let pause = FIRST_PAUSE.saturating_mul(1 << candidate.failures.min(10));
         candidate.state = State::AskAt(now + pause.min(LONGEST_PAUSE));

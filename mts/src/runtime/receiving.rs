@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 use fipa_acl::Letter;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
-    LegacySource, LoanedContent, Location, Parcel, Sink, Verdict,
+    LegacySource, LoanedContent, Location, Parcel, Sink, Verdict, log_limit, quota_address,
 };
 use parking_lot::MutexGuard;
 
@@ -59,7 +59,7 @@ impl Sink for TransportSink {
                 }
             }
             Err(error) => {
-                tracing::warn!(%error, "dropping an unframed letter: its envelope is malformed");
+                log_limit::warn!(of: quota_address(from.address), %error, "dropping an unframed letter: its envelope is malformed");
                 return;
             }
         };

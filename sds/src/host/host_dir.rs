@@ -10,6 +10,7 @@ use std::os::unix::fs::{DirBuilderExt as _, FileExt as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use fipa_transport::log_limit;
 use parking_lot::{Mutex, MutexGuard};
 use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
@@ -495,7 +496,7 @@ struct Turn<'a>(&'a HostDir);
 impl Drop for Turn<'_> {
     fn drop(&mut self) {
         if let Err(error) = rustix::fs::flock(&self.0.dir, FlockOperation::Unlock) {
-            tracing::error!(%error, path = %self.0.path.display(), "cannot unlock the turn lock");
+            log_limit::error!(%error, path = %self.0.path.display(), "cannot unlock the turn lock");
         }
     }
 }
@@ -509,7 +510,7 @@ pub(super) struct Guard<'a> {
 impl Drop for Guard<'_> {
     fn drop(&mut self) {
         if let Err(error) = self.host_dir.domain.unlock() {
-            tracing::error!(%error, path = %self.host_dir.path.display(), "cannot unlock the directory");
+            log_limit::error!(%error, path = %self.host_dir.path.display(), "cannot unlock the directory");
         }
     }
 }

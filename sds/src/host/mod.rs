@@ -27,7 +27,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
-use fipa_transport::{Forked, Incarnation, OwnerProcess};
+use fipa_transport::{Forked, Incarnation, OwnerProcess, log_limit};
 use inotify::{WatchMask, Watches};
 use parking_lot::Mutex;
 use tokio::sync::watch;
@@ -342,7 +342,7 @@ impl Drop for HostDirectory {
             return;
         }
         if let Err(error) = self.close() {
-            tracing::error!(error = %ErrorChain(&error), "cannot remove this process's files from the host's directory");
+            log_limit::error!(error = %ErrorChain(&error), "cannot remove this process's files from the host's directory");
         }
     }
 }
@@ -352,7 +352,7 @@ impl Directory for HostDirectory {
 
     fn refresh(&self) {
         if let Err(error) = self.shared.refresh() {
-            tracing::error!(error = %ErrorChain(&error), "the view of the host's directory may be out of date");
+            log_limit::error!(error = %ErrorChain(&error), "the view of the host's directory may be out of date");
         }
     }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use arc_swap::ArcSwap;
 use fipa_acl::ErrorChain;
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
@@ -146,7 +146,7 @@ impl Shared {
         drop(others);
         for name in taken {
             if let Some(entry) = own.agents.remove(&name) {
-                tracing::error!(
+                log_limit::error!(
                     %name,
                     "another process registered the name while the directory was gone; this agent \
                      is no longer registered"
@@ -256,7 +256,7 @@ impl Shared {
         let read = self.read_file(id).unwrap_or_else(|error| {
             // Treated as empty; the process's next file may be valid.
             let path = self.host_dir().path().join(Name::Entries(id).to_string());
-            tracing::error!(path = %path.display(), error = %ErrorChain(&error), "entries file ignored");
+            log_limit::error!(path = %path.display(), error = %ErrorChain(&error), "entries file ignored");
             file::Read::default()
         });
         let process = others.processes.entry(id).or_default();

@@ -16,6 +16,7 @@ use std::task::Poll;
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
+use fipa_transport::log_limit;
 use futures_core::Stream as _;
 use inotify::{EventMask, EventStream, Inotify, WatchDescriptor, WatchMask, Watches};
 use tokio::time::Instant;
@@ -44,7 +45,7 @@ impl Watcher {
         let events = match Self::inotify(host_dir) {
             Ok((events, dir)) => Events::Inotify { events, dir },
             Err(error) => {
-                tracing::warn!(
+                log_limit::warn!(
                     error = %ErrorChain(&error),
                     "no inotify watch for {}: polling it every {} ms; raise \
                      fs.inotify.max_user_instances (sysctl)",
@@ -110,7 +111,7 @@ impl Watcher {
                     // A rejoin ends this watcher.
                     shared.report_disturbed();
                 } else {
-                    tracing::error!(error = %ErrorChain(&error), "the view of the host's directory may be out of date");
+                    log_limit::error!(error = %ErrorChain(&error), "the view of the host's directory may be out of date");
                 }
                 // The error may persist (for example `EMFILE`); the pause prevents a busy loop.
                 tokio::time::sleep(Duration::from_millis(100)).await;

@@ -7,6 +7,7 @@
 use std::io;
 use std::time::Instant;
 
+use fipa_transport::log_limit;
 use rustix::time::{
     Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create,
     timerfd_settime,
@@ -50,7 +51,7 @@ impl Alarm {
         match self.expires(due).await {
             Some(Ok(())) => return,
             Some(Err(error)) => {
-                tracing::warn!(%error, "a timer of the kernel failed; using one of the runtime");
+                log_limit::warn!(%error, "a timer of the kernel failed; using one of the runtime");
                 self.timer = None;
             }
             None => {}

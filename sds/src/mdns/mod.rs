@@ -32,7 +32,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use mdns_sd::{DaemonStatus, IfKind, Receiver, ServiceDaemon, ServiceInfo, TxtProperty};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast, watch};
@@ -260,7 +260,7 @@ impl MdnsDirectory {
             return;
         };
         if ended.recv_timeout(Duration::from_secs(5)).is_err() {
-            tracing::error!(
+            log_limit::error!(
                 "timed out after 5 s waiting for the mDNS library to send its goodbyes; other hosts keep the records until they expire"
             );
         }
@@ -736,7 +736,7 @@ impl Shared {
             tracing::debug!(%error, "multicast DNS, while it is closed");
             return;
         }
-        tracing::warn!(%error, "multicast DNS");
+        log_limit::warn!(%error, "multicast DNS");
         self.set_last_error(error);
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::ErrorChain;
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, log_limit};
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
 use super::alarm::Alarm;
@@ -250,7 +250,7 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
     }
     drop(own);
     let name = &withdrawn.name;
-    tracing::warn!(%name, holder = %theirs.mts.name, "withdrawing a registration: another gateway registered the name earlier");
+    log_limit::warn!(of: theirs.mts.incarnation, %name, holder = %theirs.mts.name, "withdrawing a registration: another gateway registered the name earlier");
     // The owner may have no receiver.
     let _ = shared.withdrawals.send(Withdrawal {
         withdrawn,

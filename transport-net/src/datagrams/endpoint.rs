@@ -10,7 +10,7 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Incarnation, ListenError, Location, Sink, TransportError, TransportErrorKind,
+    Incarnation, ListenError, Location, Sink, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::Mutex;
 use tokio::net::lookup_host;
@@ -171,7 +171,7 @@ impl<P: Protocol> Endpoint<P> {
             let moved = match state.listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
-                    tracing::warn!(kind = %P::KIND, %error, "cannot refresh the locations; keeping the previous ones");
+                    log_limit::warn!(kind = %P::KIND, %error, "cannot refresh the locations; keeping the previous ones");
                     return;
                 }
             };
@@ -193,7 +193,7 @@ impl<P: Protocol> Endpoint<P> {
         match (sink, told) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
-                tracing::warn!(kind = %P::KIND, %error, "cannot refresh the locations; keeping the previous ones");
+                log_limit::warn!(kind = %P::KIND, %error, "cannot refresh the locations; keeping the previous ones");
             }
             _ => {}
         }

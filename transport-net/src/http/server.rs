@@ -6,11 +6,10 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant as Now};
 
 use bytes::{BufMut, Bytes};
-use fipa_transport::{LegacySource, Signature};
+use fipa_transport::{LegacySource, Signature, log_limit, quota_address};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
@@ -24,7 +23,6 @@ use super::letter::{self, LetterError};
 use super::repeats::Arrived;
 use super::request::{RequestError, RequestHead, RequestReader, Status};
 use super::socket::Socket;
-use crate::log_limit::warn_limited;
 use crate::sockets::prepare;
 use crate::stream::budget::ReservedBytes;
 use crate::stream::config::Limits;
@@ -126,9 +124,11 @@ fn admit(endpoint: &Arc<HttpEndpoint>, stream: TcpStream, from: SocketAddr) {
     let each = config.max_connections_of(&quota_key);
     let all = config.limits.max_connections;
     let Some((slot, evicted)) = endpoint.connections.admit(from.ip(), each, all) else {
-        let before = tally.refused_crowd.fetch_add(1, Ordering::Relaxed);
-        let what = format_args!("{from}: HTTP connection closed: too many connections");
-        warn_limited(before, what);
+        count(&tally.refused_crowd);
+        log_limit::warn!(
+            of: quota_address(from.ip()),
+            "{from}: HTTP connection closed: too many connections"
+        );
         return;
     };
     if let Some(task) = evicted {
@@ -195,12 +195,9 @@ impl Serving {
             Refusal::NotItsAgent => &tally.refused_unproved,
             _ => &tally.refused_nonsense,
         };
-        let before = counter.fetch_add(1, Ordering::Relaxed);
+        count(counter);
         let from = self.from;
-        warn_limited(
-            before,
-            format_args!("{from}: HTTP request refused: {refusal}"),
-        );
+        log_limit::warn!(of: quota_address(from.ip()), "{from}: HTTP request refused: {refusal}");
         let refused = self.refuse(refusal.status());
         if let Ok(Err(error)) = timeout(LAST_ANSWER, refused).await {
             tracing::debug!(%from, "cannot answer a refused request: {error}");
@@ -226,12 +223,11 @@ impl Serving {
                 Some(self)
             }
             Err(what) => {
-                let tally = endpoint.stream.tally();
-                let before = tally.refused_unproved.fetch_add(1, Ordering::Relaxed);
+                count(&endpoint.stream.tally().refused_unproved);
                 let from = self.from;
-                warn_limited(
-                    before,
-                    format_args!("{from}: HTTPS connection refused: {what}"),
+                log_limit::warn!(
+                    of: quota_address(from.ip()),
+                    "{from}: HTTPS connection refused: {what}"
                 );
                 None
             }
@@ -408,7 +404,7 @@ impl Serving {
         self.first = false;
         // From here on to the end there is no wait, in which the task could be aborted.
         if self.endpoint.repeats.lock().is_repeat(Now::now(), arrived) {
-            tracing::info!(from = %self.from, "ignored a letter that its platform has repeated on another connection");
+            log_limit::info!(of: quota_address(self.from.ip()), from = %self.from, "ignored a letter that its platform has repeated on another connection");
             return Ok(());
         }
         count(&endpoint.tally().unframed_in);

@@ -2,15 +2,15 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use bytes::BytesMut;
+use fipa_transport::{log_limit, quota_address};
 use quinn::{Connection, ConnectionError, Incoming, RecvStream, SendStream};
 use tokio::time::timeout;
 
 use super::dial::ends;
 use super::sockets::{Sockets, loss_reason};
-use crate::log_limit::warn_limited;
+use crate::stream::counters::count;
 use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
 use crate::stream::link::LinkTask;
@@ -63,9 +63,8 @@ async fn receive(
     let (connection, send, receive, certificate) = match handshake_result {
         Ok(handshake_result) => handshake_result,
         Err(why) => {
-            let counter = &endpoint.tally().refused_unproved;
-            let before = counter.fetch_add(1, Ordering::Relaxed);
-            warn_limited(before, format_args!("{from}: connection refused: {why}"));
+            count(&endpoint.tally().refused_unproved);
+            log_limit::warn!(of: quota_address(from.ip()), "{from}: connection refused: {why}");
             return;
         }
     };

@@ -5,7 +5,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use fipa_transport::{Kind, Location, Sink};
+use fipa_transport::{Kind, Location, Sink, log_limit};
 use parking_lot::Mutex;
 use tokio::net::lookup_host;
 use tokio::task::JoinSet;
@@ -46,13 +46,13 @@ pub(crate) fn addresses(sink: &dyn Sink, to: &Location) -> Vec<String> {
 pub(crate) struct SilentPeers(Mutex<HashSet<String>>);
 
 impl SilentPeers {
-    /// Maximum number of addresses. Others announce addresses, so the number of warnings is bounded.
+    /// Maximum number of addresses, because other hosts announce them.
     const MAX: usize = 64;
 
     /// Logs that nothing answered at this location.
     fn failed(&self, to: &Location, what: &str) {
         if self.insert(to.address()) {
-            tracing::warn!("{to} is unreachable: {what}");
+            log_limit::warn!(of: to.address(), "{to} is unreachable: {what}");
         } else {
             tracing::debug!("{to} is still unreachable: {what}");
         }
@@ -67,7 +67,7 @@ impl SilentPeers {
     /// Forgets a location that answers: its next failure is logged again.
     fn answered(&self, to: &Location) {
         if self.0.lock().remove(to.address()) {
-            tracing::info!("{to} answers");
+            log_limit::info!(of: to.address(), "{to} answers");
         }
     }
 }

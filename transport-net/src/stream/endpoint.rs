@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Principal,
-    Sink, Ticket, TransportError, TransportErrorKind,
+    Sink, Ticket, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -46,7 +46,6 @@ use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 #[cfg(feature = "ip")]
 use crate::interfaces::Changes;
-use crate::log_limit::warn_limited;
 use crate::rate_limit::PeerRateLimit;
 #[cfg(feature = "ip")]
 use crate::rate_limit::PeerRateLimits;
@@ -442,7 +441,7 @@ impl Endpoint {
             let moved = match listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
-                    tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
+                    log_limit::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
                     return;
                 }
             };
@@ -469,7 +468,7 @@ impl Endpoint {
         match (sink, told) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
-                tracing::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
+                log_limit::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
             }
             _ => {}
         }
@@ -803,8 +802,8 @@ impl Endpoint {
 
     /// Logs and returns the refusal of a peer that claims to be another service.
     fn refuse(&self, from: Source, why: &'static str) -> ConnectionEnd {
-        let before = self.tally.refused_unproved.fetch_add(1, Ordering::Relaxed);
-        warn_limited(before, format_args!("{from}: connection refused: {why}"));
+        count(&self.tally.refused_unproved);
+        log_limit::warn!(of: from.home().whole(), "{from}: connection refused: {why}");
         ConnectionEnd::IdentityConflict(why)
     }
 
@@ -831,8 +830,9 @@ impl Endpoint {
     /// Logs the end of a connection and removes the connection from every table.
     pub(crate) fn left(&self, link: &Arc<Link>, end: &ConnectionEnd) {
         if end.is_misbehavior() {
-            let before = self.tally.refused_nonsense.fetch_add(1, Ordering::Relaxed);
-            warn_limited(before, format_args!("connection closed: {}", end.after()));
+            count(&self.tally.refused_nonsense);
+            let key = self.registry.lock().quota_keys.get(&link.number).cloned();
+            log_limit::warn!(of: key, "connection closed: {}", end.after());
         } else {
             tracing::debug!(link = link.number, "connection ended: {}", end.after());
         }
@@ -871,12 +871,9 @@ impl Endpoint {
 
     /// Logs a failure to accept a connection, and pauses.
     pub(crate) async fn accept_failed(&self, error: &io::Error) {
-        let before = self.tally.accept_failures.fetch_add(1, Ordering::Relaxed);
-        warn_limited(
-            before,
-            format_args!(
-                "cannot accept a connection: {error}; retrying (for `too many open files`, raise `ulimit -n`)"
-            ),
+        count(&self.tally.accept_failures);
+        log_limit::warn!(
+            "cannot accept a connection: {error}; retrying (for `too many open files`, raise `ulimit -n`)"
         );
         sleep(ACCEPT_RETRY_DELAY).await;
     }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, Arriving, AttemptId, Body, FailureReason, Introduction, Location, Parcel,
-    Sink, Ticket,
+    Sink, Ticket, log_limit,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -32,7 +32,6 @@ use super::proof::Proof;
 use super::source::{QuotaKey, Source};
 use super::wire::{ExtraStreams, Reading, Writing};
 use crate::end::ConnectionEnd;
-use crate::log_limit::warn_limited;
 use crate::rate_limit::PeerRateLimit;
 
 /// Maximum number of buffers handed to the kernel in one call.
@@ -710,9 +709,8 @@ impl LinkTask {
                     ));
                 };
                 if let Err(refused) = self.link.admits(&parcel) {
-                    let before = &self.endpoint.tally().refused_senders;
-                    let before = before.fetch_add(1, Ordering::Relaxed);
-                    warn_limited(before, format_args!("{from}: letter refused: {refused}"));
+                    count(&self.endpoint.tally().refused_senders);
+                    log_limit::warn!(of: from.home().whole(), "{from}: letter refused: {refused}");
                     self.link
                         .answer(id, &Answer::failed(FailureReason::Refused, &refused));
                     return Ok(());

@@ -3,11 +3,10 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
-use fipa_transport::LegacySource;
+use fipa_transport::{LegacySource, log_limit, quota_address};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
@@ -16,7 +15,6 @@ use tokio::time::{sleep, sleep_until, timeout};
 use super::accept_queue::{self, Full, QueueTurn, TURN};
 use super::endpoint::TcpEndpoint;
 use super::unframed::{self, UnframedError};
-use crate::log_limit::warn_limited;
 use crate::sockets::prepare;
 use crate::stream::counters::count;
 use crate::stream::endpoint::UnprovedSlot;
@@ -99,7 +97,7 @@ fn serve(
 
 fn reset(endpoint: &Arc<TcpEndpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
     if let Some(stream) = Arc::into_inner(stream) {
-        endpoint.legacy.reset(endpoint, stream, from, full);
+        super::legacy::reset(endpoint, stream, from, full);
     }
 }
 
@@ -204,9 +202,8 @@ async fn receive(
         }
         First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
-    let counter = &endpoint.tally().refused_nonsense;
-    let before = counter.fetch_add(1, Ordering::Relaxed);
-    warn_limited(before, format_args!("{from}: connection closed: {refused}"));
+    count(&endpoint.tally().refused_nonsense);
+    log_limit::warn!(of: quota_address(from.ip()), "{from}: connection closed: {refused}");
 }
 
 /// Waits for the first byte, which stays in the kernel's buffer. A connection without one loses its
@@ -382,12 +379,8 @@ async fn prove(
     if matches!(first, First::Byte(_)) {
         endpoint.refusals.add(from.ip(), &refused);
     }
-    let counter = &endpoint.tally().refused_unproved;
-    let before = counter.fetch_add(1, Ordering::Relaxed);
-    warn_limited(
-        before,
-        format_args!("{from}: connection refused: {refused}"),
-    );
+    count(&endpoint.tally().refused_unproved);
+    log_limit::warn!(of: quota_address(from.ip()), "{from}: connection refused: {refused}");
     None
 }
 

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Mandate,
-    Parcel, Ticket, TransportError, TransportErrorKind, quota_address,
+    Parcel, Ticket, TransportError, TransportErrorKind, log_limit, quota_address,
 };
 
 use super::config::UdpLimits;
@@ -31,7 +31,6 @@ use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
-use crate::log_limit::warn_limited;
 use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer};
 use crate::stream::budget::{ByteBudget, Meter};
 use crate::stream::source::{Home, QuotaKey};
@@ -445,9 +444,10 @@ impl Core {
             return;
         };
         if end.is_misbehavior() {
-            warn_limited(
-                self.counters.refused_nonsense,
-                format_args!("connection closed: {}", end.after()),
+            log_limit::warn!(
+                of: entry.connection.path().map(|path| quota_address(path.remote.ip())),
+                "connection closed: {}",
+                end.after()
             );
             self.counters.refused_nonsense += 1;
         } else {

@@ -4,7 +4,9 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use fipa_transport::{AttemptId, Conclusion, TransportError, TransportErrorKind};
+use fipa_transport::{
+    AttemptId, Conclusion, TransportError, TransportErrorKind, log_limit, quota_address,
+};
 
 use super::SYN;
 use super::config::UdtLimits;
@@ -18,7 +20,6 @@ use super::sender::Sender;
 use crate::datagrams::dialling::Greeting;
 use crate::datagrams::{Outbound, Path};
 use crate::end::ConnectionEnd;
-use crate::log_limit::warn_limited;
 
 /// The handshake of a connection that this side opens.
 pub(crate) type Dialling = crate::datagrams::dialling::Dialling<OwnHandshake>;
@@ -516,11 +517,9 @@ impl Connection {
         };
         let refused = std::mem::take(&mut receiver.refused);
         if refused > 0 {
-            warn_limited(
-                counters.refused_nonsense,
-                format_args!(
-                    "a letter of a legacy peer over UDT is incomplete or exceeds max_letter"
-                ),
+            log_limit::warn!(
+                of: self.path.map(|path| quota_address(path.remote.ip())),
+                "a letter of a legacy peer over UDT is incomplete or exceeds max_letter"
             );
             counters.refused_nonsense += refused;
         }

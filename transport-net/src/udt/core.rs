@@ -16,7 +16,8 @@ use std::time::Instant;
 use bytes::Bytes;
 use fipa_acl::Letter;
 use fipa_transport::{
-    Abandoned, AttemptId, Conclusion, Location, TransportError, TransportErrorKind, quota_address,
+    Abandoned, AttemptId, Conclusion, Location, TransportError, TransportErrorKind, log_limit,
+    quota_address,
 };
 
 use super::config::UdtLimits;
@@ -33,7 +34,6 @@ use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
-use crate::log_limit::warn_limited;
 use crate::rate_limit::{PeerRateLimits, is_one_peer};
 use crate::stream::budget::ByteBudget;
 use crate::stream::source::{Home, QuotaKey};
@@ -136,9 +136,8 @@ impl Core {
     }
 
     /// Notes that bytes which had arrived as a letter are none.
-    pub(crate) fn count_nonsense(&mut self) -> u64 {
+    pub(crate) fn count_nonsense(&mut self) {
         self.counters.refused_nonsense += 1;
-        self.counters.refused_nonsense - 1
     }
 
     /// Queues a letter for its translation. Returns whether the caller must start the task that
@@ -437,12 +436,10 @@ impl Core {
     fn greet(&mut self, now: Instant, path: Path, handshake: &Handshake) {
         let from = path.remote;
         if !(self.access)(from.ip()) {
-            warn_limited(
-                self.counters.refused_unproved,
-                format_args!(
-                    "{from}: UDT connection refused: the peer cannot prove its identity over UDT, and is not \
-                     listed in security.legacy_peers"
-                ),
+            log_limit::warn!(
+                of: quota_address(from.ip()),
+                "{from}: UDT connection refused: the peer cannot prove its identity over UDT, and is not \
+                 listed in security.legacy_peers"
             );
             self.counters.refused_unproved += 1;
             return;
@@ -588,9 +585,10 @@ impl Core {
             return;
         };
         if end.is_misbehavior() {
-            warn_limited(
-                self.counters.refused_nonsense,
-                format_args!("UDT connection closed: {}", end.after()),
+            log_limit::warn!(
+                of: entry.connection.path().map(|path| quota_address(path.remote.ip())),
+                "UDT connection closed: {}",
+                end.after()
             );
             self.counters.refused_nonsense += 1;
         } else {

@@ -6,13 +6,12 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use fipa_transport::{Kind, LegacySource, Sink, TransportError};
+use fipa_transport::{Kind, LegacySource, Sink, TransportError, log_limit, quota_address};
 
 use super::core::{Core, CoreEvent};
 use crate::datagrams::endpoint::Endpoint;
 use crate::datagrams::{Fragments, Path, Protocol, Transmit, WithProtocol};
 use crate::legacy::letter;
-use crate::log_limit::warn_limited;
 
 impl Protocol for Core {
     type Event = CoreEvent;
@@ -92,10 +91,10 @@ impl Protocol for Core {
                     sink.arrived_unframed(letter, Kind::Udt, source);
                 }
                 Err(error) => with(&mut |core| {
-                    let before = core.count_nonsense();
-                    warn_limited(
-                        before,
-                        format_args!("{from}: letter over UDT refused: {error}"),
+                    core.count_nonsense();
+                    log_limit::warn!(
+                        of: quota_address(from.ip()),
+                        "{from}: letter over UDT refused: {error}"
                     );
                 }),
             },

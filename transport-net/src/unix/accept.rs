@@ -1,14 +1,14 @@
 //! The listening side: accepts connections of this user.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use bytes::BytesMut;
+use fipa_transport::log_limit;
 use tokio::net::{UnixListener, UnixStream};
 
 use super::directory::peer;
 use crate::end::ConnectionEnd;
-use crate::log_limit::warn_limited;
+use crate::stream::counters::count;
 use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
 use crate::stream::link::LinkTask;
@@ -31,9 +31,8 @@ fn serve(endpoint: &Arc<Endpoint>, stream: UnixStream) {
     let from = match peer(&stream) {
         Ok(number) => Source::Process(number),
         Err(error) => {
-            let counter = &endpoint.tally().refused_unproved;
-            let before = counter.fetch_add(1, Ordering::Relaxed);
-            warn_limited(before, format_args!("connection refused: {error}"));
+            count(&endpoint.tally().refused_unproved);
+            log_limit::warn!("connection refused: {error}");
             return;
         }
     };

@@ -4,7 +4,7 @@
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
-use fipa_transport::{Hop, Kind, Location, Principal, quota_address};
+use fipa_transport::{Hop, Kind, Location, Principal, log_limit, quota_address};
 
 use super::super::connection::Connection;
 use super::super::packet::{self, NO_COOKIE};
@@ -13,7 +13,6 @@ use crate::address;
 use crate::datagrams::Path;
 use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
-use crate::log_limit::warn_limited;
 
 /// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.
@@ -88,12 +87,9 @@ impl Core {
                 return;
             }
             ClaimStatus::Taken { .. } => {
-                let before = self.counters.refused_unproved;
-                warn_limited(
-                    before,
-                    format_args!(
-                        "{from}: connection refused: it claims the incarnation of a connected service whose connection is alive"
-                    ),
+                log_limit::warn!(
+                    of: quota_address(from.ip()),
+                    "{from}: connection refused: it claims the incarnation of a connected service whose connection is alive"
                 );
                 self.counters.refused_unproved += 1;
                 self.reply(path, packet::refused(initiator));
