@@ -18,7 +18,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_transport::log_limit;
-
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
@@ -104,7 +103,7 @@ impl DomainDir {
         }
         make_private(&dir.path())?;
         if let Some(user) = dir.name_held_by {
-            tracing::warn!(
+            log_limit::warn!(
                 "{} holds the name of the directory in which the domains of this user are, so they are \
                  in {}; to reserve the name at boot, see fipa doctor",
                 user_name(user),

@@ -11,6 +11,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use fipa_transport::log_limit;
 use rustix::fs::{FlockOperation, Mode, OFlags};
 
 /// Maximum number of entries of `/tmp` that are examined.
@@ -48,7 +49,7 @@ impl UserDir {
             (None, Some(_)) => match create_other(temporary, user) {
                 Ok(other) => other,
                 Err(error) => {
-                    tracing::error!(
+                    log_limit::error!(
                         %error,
                         "cannot create a directory for the domains of this user in {}",
                         temporary.display()
