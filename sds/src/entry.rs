@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use fipa_transport::{Incarnation, Location};
 use serde::{Deserialize, Serialize};
 
-use crate::{Members, NameError, check_name};
+use crate::{Members, NameError, check_name, reserved_for};
 
 /// The known data of one registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -81,10 +81,18 @@ impl Entry {
         !self.locations.is_empty() && !self.locations.iter().any(supported)
     }
 
-    /// Checks the limits that every back end relies on.
+    /// Whether the entry is that of an agent of a platform without a gateway of this project, such as
+    /// JADE, by the configuration or a letter. It precedes no entry of the gateway that its name may
+    /// be [reserved](reserved_for) for, except by the configuration.
+    fn is_of_legacy_platform(&self) -> bool {
+        matches!(self.source, Source::Static | Source::Contact) && !self.mts.incarnation.is_known()
+    }
+
+    /// Checks what every back end relies on: the limits, and that a name that is [reserved for a
+    /// gateway](reserved_for) is claimed by a gateway of that name.
     ///
     /// # Errors
-    /// Returns the first limit that the entry exceeds.
+    /// Returns the first rule that the entry violates.
     pub fn check(&self) -> Result<(), EntryError> {
         check_name(&self.name)?;
         check_name(&self.mts.name).map_err(EntryError::MtsName)?;
@@ -93,7 +101,12 @@ impl Entry {
         if self.locations.len() > Self::MAX_LOCATIONS {
             return Err(EntryError::TooManyLocations(self.locations.len()));
         }
-        Ok(())
+        match reserved_for(&self.name) {
+            Some(gateway) if *self.mts.name != *gateway && !self.is_of_legacy_platform() => {
+                Err(EntryError::Reserved(gateway.to_owned()))
+            }
+            _ => Ok(()),
+        }
     }
 }
 
@@ -270,6 +283,12 @@ pub enum EntryError {
     /// The entry has more than [`Entry::MAX_LOCATIONS`] locations.
     #[error("{0} locations; at most {max} are allowed", max = Entry::MAX_LOCATIONS)]
     TooManyLocations(usize),
+    /// The name is [reserved](reserved_for) for another gateway.
+    #[error(
+        "the name is reserved for an agent of the gateway {0:?}; choose a name that does not begin with \
+         ams@ or df@"
+    )]
+    Reserved(String),
     /// A registration has no incarnation.
     #[error("a registration needs an incarnation (draw one with Incarnation::random)")]
     NoIncarnation,

@@ -130,6 +130,30 @@ fn agents_whose_names_are_patterns_are_left_out() {
 }
 
 #[test]
+fn the_names_of_platform_agents_count_from_the_gateway_of_that_name_only() {
+    for mandate in [Mandate::Unproved, certified(&[])] {
+        let mut bench = Bench::new(vec![present(1, mandate.clone()), present(2, mandate)]);
+        let names = [
+            "df@mts-1",
+            "ams@mts-1",
+            "df-000000ff@mts-1",
+            "df@mts-2",
+            "ams-000000ff@mts-2",
+            "arm@mts-2",
+        ];
+        bench.tell(1, &names, 5);
+        let directory = bench.exchange.directory();
+        let entries = directory.entries();
+        let known: Vec<&str> = entries.iter().map(|entry| &*entry.name).collect();
+        let own = ["ams@mts-1", "arm@mts-2", "df-000000ff@mts-1", "df@mts-1"];
+        assert_eq!(known, own);
+        bench.tell(2, &names, 4);
+        assert_eq!(bench.holder("df@mts-1"), Some(1));
+        assert_eq!(bench.holder("df@mts-2"), Some(2));
+    }
+}
+
+#[test]
 fn a_proved_claim_precedes_an_earlier_one_without_proof() {
     let mut bench = Bench::new(vec![
         present(1, Mandate::Unproved),

@@ -21,8 +21,8 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::Network;
+use super::names::{Contested, contested, own_agents};
 use super::neighbours::{Neighbour, Neighbours};
-use super::publisher::{Contested, own_agents};
 use crate::service::Service;
 
 /// Deadline for the delivery of a letter of the exchange. After a longer interruption of the link,
@@ -103,9 +103,9 @@ impl Exchanging {
         loop {
             let conflict_due = conflicts.due().is_some_and(|due| due <= Instant::now());
             if std::mem::take(&mut own_changed) || conflict_due {
-                let (own, contested) = own_agents(&means.service.host, &*known, means.has_keys);
+                let own = own_agents(&means.service.host);
                 self.core.lock().handle_own(Instant::now(), &own);
-                conflicts.report(&means, &contested);
+                conflicts.report(&means, &contested(&own, &*known, means.has_keys));
             }
             disputes.report(&means, Instant::now(), &self.directory.contested());
             if self.core.lock().has_own_df() {
@@ -457,21 +457,17 @@ impl Disputes {
 impl Contested {
     /// Logs the conflict and informs the agent of this host.
     fn report(&self, means: &Means) {
-        let Self { entry, holder, .. } = self;
-        let (name, mts) = (&entry.name, escape(&holder.mts.name));
-        let content = if self.is_announced {
-            tracing::warn!(%name, holder = %mts, "an agent of another host has the same name");
-            format!(
-                "the name {name:?} is also registered at {mts:?}: each other host reaches the agent \
-                 that was announced to it first; deregister one of them"
-            )
-        } else {
-            tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
-            format!(
-                "the name {name:?} was registered earlier at {mts:?}: other hosts reach that agent, \
-                 and this one on its own host only; deregister one of them"
-            )
-        };
+        let Self { entry, claim } = self;
+        let (name, mts) = (&entry.name, escape(&claim.mts.name));
+        tracing::warn!(%name, other = %mts, "an agent of another host has the same name");
+        if entry.is_platform_agent() {
+            // It gets a second name.
+            return;
+        }
+        let content = format!(
+            "the name {name:?} is also registered at {mts:?}: each other host reaches the agent \
+             that was announced to it first; deregister one of them"
+        );
         if let Ok(receiver) = AgentId::new(&**name) {
             let message = Message::builder(Performative::Failure)
                 .sender(means.id.clone())

@@ -545,6 +545,27 @@ mod tests {
     }
 
     #[test]
+    fn a_record_of_another_gateway_claims_no_name_of_a_platform_agent() {
+        let entry = example();
+        let own = Entry {
+            name: format!("df@{}", entry.mts.name).into(),
+            ..entry.clone()
+        };
+        assert_eq!(read("label", &encode(&own)), Ok(own));
+        for name in ["df@crex", "ams@crex", "ams-000000ff@crex"] {
+            let claim = Entry {
+                name: name.into(),
+                ..entry.clone()
+            };
+            let refused = RecordError::Entry(EntryError::Reserved("crex".to_owned()));
+            assert_eq!(read("label", &encode(&claim)), Err(refused.clone()));
+            // Records of legacy peers name no gateway.
+            let bare = read(name, &Vec::new());
+            assert_eq!(bare, Err(refused), "{name}");
+        }
+    }
+
+    #[test]
     fn labels_of_different_names_differ() {
         let long = "x".repeat(100);
         for (one, other) in [
