@@ -7,9 +7,11 @@ mod stranger;
 mod support;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use fipa::{
-    AgentId, Domain, Gateway, Kind, Message, Neighbour, Outcome, Performative, contact, routes,
+    AgentId, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative, contact,
+    routes,
 };
 use fipa_testbed::until_async;
 use stranger::Stranger;
@@ -161,8 +163,18 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
     near.close().await;
 }
 
+/// Returns the contested names in the report of the gateway, which `fipa doctor` shows.
+async fn contested_names(gateway: &Gateway, domain: &Domain) -> Vec<(String, String)> {
+    let asker = format!("asker of {}", gateway.name());
+    let asker = domain.register(&asker).await.unwrap();
+    let entry = domain.directory().lookup(gateway.name()).unwrap();
+    let report = routes::of_gateway(&asker, &entry, None, Duration::from_secs(60)).await;
+    let contested = report.unwrap().contested.into_iter();
+    contested.map(|it| (it.name, it.gateway)).collect()
+}
+
 #[tokio::test(flavor = "multi_thread")]
-async fn both_agents_with_one_name_are_told_and_a_third_host_reaches_one_of_them() {
+async fn both_agents_with_one_name_are_told_and_a_third_host_keeps_the_first() {
     let (far_config, third_config) = (config(&[]), config(&[]));
     let far = Gateway::open(&far_config).await.unwrap();
     let far_host = Domain::open(&far_config).await.unwrap();
@@ -185,37 +197,40 @@ async fn both_agents_with_one_name_are_told_and_a_third_host_reaches_one_of_them
         let known = host.directory().lookup("arm").unwrap();
         assert_eq!(known.incarnation, own.incarnation(), "its own");
     }
+    for (gateway, domain, other) in [(&far, &far_host, &near), (&near, &near_host, &far)] {
+        let report = contested_names(gateway, domain).await;
+        assert_eq!(report, [("arm".to_owned(), other.name().to_owned())]);
+    }
+    // A third host connects with the gateway of the later one first.
     let mut watcher = third_config.clone();
-    let peers = format!(
-        "discovery.static={{ \"near\" = [\"tcp://{}\"], \"far\" = [\"tcp://{}\"] }}",
-        address(&near),
-        address(&far)
-    );
-    watcher.discovery = config(&[&peers]).discovery;
-    let third = Gateway::open(&watcher).await.unwrap();
-    let leg = near_host.register("leg").await.unwrap();
-    let crane = far_host.register("crane").await.unwrap();
-    until_async("the agents of both hosts", || {
-        ["leg", "crane"]
-            .iter()
-            .all(|name| third.directory().known(name).is_some())
-    })
-    .await;
+    let near_at = address(&near);
+    watcher.discovery = config(&[&knowing("near", &[&near_at])]).discovery;
+    let mut third = Gateway::open(&watcher).await.unwrap();
     let known = |gateway: &Gateway| {
         let known = gateway.directory().known("arm");
         known.map(|known| known.incarnation)
     };
-    // After the agent leaves, the other one has the name.
-    let (leaving, staying) = match known(&third) == Some(one.incarnation()) {
-        true => (one, other),
-        false => (other, one),
-    };
-    drop(leaving);
-    until_async("the other has the name", || {
-        known(&third) == Some(staying.incarnation())
+    until_async("the agent of the near host", || known(&third).is_some()).await;
+    assert_eq!(known(&third), Some(other.incarnation()));
+    let crane = far_host.register("crane").await.unwrap();
+    let peers = format!(
+        "discovery.static={{ \"near\" = [\"tcp://{near_at}\"], \"far\" = [\"tcp://{}\"] }}",
+        address(&far)
+    );
+    watcher.discovery = config(&[&peers]).discovery;
+    assert_eq!(third.reload(&watcher).unwrap(), [""; 0]);
+    until_async("the agents of the far host", || {
+        third.directory().known("crane").is_some()
     })
     .await;
-    drop((leg, crane));
+    assert_eq!(known(&third), Some(other.incarnation()));
+    // After the agent leaves, the other one has the name.
+    drop(other);
+    until_async("the other has the name", || {
+        known(&third) == Some(one.incarnation())
+    })
+    .await;
+    drop(crane);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -44,20 +44,22 @@ impl Entry {
     /// Maximum length of the description, in bytes.
     pub const MAX_DESCRIPTION: usize = 1024;
 
-    /// Whether this entry keeps the name when `other` claims it too.
+    /// Whether this entry takes the name from `other`, which was known before.
     ///
-    /// Entries of this host precede entries from the network regardless of registration times: a
-    /// record on the network must not be able to cut a host's own traffic. A [contact](Source::Contact)
-    /// precedes no entry of a directory. Otherwise the earlier registration keeps the name, and the
-    /// lower incarnation breaks a tie, so that all hosts that have both entries decide alike.
+    /// Entries of this host precede entries from the network: a record on the network must not be able
+    /// to cut a host's own traffic. A [contact](Source::Contact) precedes no entry of a directory. Of
+    /// two entries of this host the earlier registration precedes. Of equal entries of other hosts, the
+    /// first known one keeps the name: their times are those of other clocks.
     #[must_use]
     pub fn precedes(&self, other: &Self) -> bool {
-        let rank = |entry: &Self| {
-            let remote = entry.reach != Reach::Local;
-            let contact = entry.source == Source::Contact;
-            (remote, contact, entry.registered, entry.incarnation)
-        };
-        rank(self) < rank(other)
+        self.rank() < other.rank()
+    }
+
+    pub(crate) fn rank(&self) -> impl Ord + use<> {
+        let remote = self.reach != Reach::Local;
+        let contact = self.source == Source::Contact;
+        let age = (!remote).then_some((self.registered, self.incarnation));
+        (remote, contact, age)
     }
 
     /// Type of the agent management system of a gateway (FIPA00023).

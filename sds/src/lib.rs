@@ -53,7 +53,7 @@ pub use exchange::{
 };
 pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
-pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, Withdrawal, probe};
+pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, probe};
 pub use memory::{MemoryDirectory, StaticDirectory};
 pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};

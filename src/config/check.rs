@@ -200,6 +200,14 @@ impl Findings {
                 "remove one of the two",
             );
         }
+        if security.loopback && config.transport.tcp.processes {
+            self.combined(
+                &["transport", "tcp", "processes"],
+                "is true, but security.loopback is true, too, and the ports of processes take letters from \
+                 loopback without keys",
+                "remove one of the two",
+            );
+        }
         if has_keys && config.mts.transports.contains(&Kind::Udp) {
             self.combined(
                 &["mts", "transports"],

@@ -23,6 +23,7 @@ use tokio::task::JoinSet;
 use super::Network;
 use super::names::{Contested, contested, own_agents};
 use super::neighbours::{Neighbour, Neighbours};
+use crate::routes::ContestedName;
 use crate::service::Service;
 
 /// Deadline for the delivery of a letter of the exchange. After a longer interruption of the link,
@@ -31,6 +32,9 @@ const DEADLINE: Duration = Duration::from_secs(5);
 /// Deadline for the delivery of goodbyes.
 const GOODBYE_DEADLINE: Duration = Duration::from_millis(500);
 
+/// Maximum number of contested names in the report of the gateway.
+const MAX_SHOWN: usize = 64;
+
 /// The ontology of messages about registrations (FIPA00023).
 pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
@@ -38,6 +42,8 @@ pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 pub(super) struct Exchanging {
     core: Mutex<Exchange>,
     directory: Arc<ExchangeDirectory>,
+    /// The agents of this host whose names agents of other hosts have.
+    contested: Mutex<Vec<ContestedName>>,
     /// Wakes the task after a letter has changed the state.
     wake: Notify,
 }
@@ -60,8 +66,15 @@ impl Exchanging {
         Self {
             directory: core.directory(),
             core: Mutex::new(core),
+            contested: Mutex::default(),
             wake: Notify::new(),
         }
+    }
+
+    /// Returns the agents of this host whose names agents of other hosts also have, at most
+    /// [`MAX_SHOWN`].
+    pub(super) fn contested(&self) -> Vec<ContestedName> {
+        self.contested.lock().clone()
     }
 
     /// Returns the directory of the agents that neighbors have sent.
@@ -105,9 +118,15 @@ impl Exchanging {
             if std::mem::take(&mut own_changed) || conflict_due {
                 let own = own_agents(&means.service.host);
                 self.core.lock().handle_own(Instant::now(), &own);
-                conflicts.report(&means, &contested(&own, &*known, means.has_keys));
+                let contested = contested(&own, &*known, means.has_keys);
+                let shown = contested.iter().take(MAX_SHOWN).map(ContestedName::from);
+                *self.contested.lock() = shown.collect();
+                conflicts.report(&means, &contested);
             }
-            disputes.report(&means, Instant::now(), &self.directory.contested());
+            let mut contested = self.directory.contested();
+            // The agents of gateways get second names.
+            contested.retain(|(_, other)| !other.is_platform_agent());
+            disputes.report(&means, Instant::now(), &contested);
             if self.core.lock().has_own_df() {
                 greetings.send(&means, Instant::now());
             }
@@ -362,8 +381,8 @@ impl NameConflicts {
     }
 }
 
-/// The names that agents of two other hosts claim, both with proof, and the reports about them to
-/// the gateways of the agents.
+/// The names that agents of two other hosts claim, both with proof or both without, and the reports
+/// about them to the gateways of the agents.
 #[derive(Default)]
 struct Disputes {
     /// By name and agent of the claimant that does not hold the name.

@@ -1,14 +1,14 @@
 //! Names that agents of this host and of other hosts have.
 //!
 //! No agent is renamed, and no claim of another host takes a name from this one: an agent of this host
-//! keeps its name on this host, and is announced to the others. Each of them reaches one of the agents
-//! by the name. The agents of the gateway get a second name, by which all others reach them.
+//! keeps its name on this host, and is announced to the others. Each of them reaches the agent that was
+//! announced to it first. The agents of the gateway get a second name, by which all others reach them.
 
 use std::sync::Arc;
 
 use fipa_sds::{Directory, Entry, HostDirectory, Reach, Role};
 
-use crate::routes::ASKER_TYPE;
+use crate::routes::{ASKER_TYPE, ContestedName};
 
 /// Returns the agents and coalitions of this host that are announced to other hosts. Agents that query
 /// this gateway are not announced.
@@ -37,6 +37,15 @@ pub(super) fn other_claim(
 pub(super) struct Contested {
     pub(super) entry: Arc<Entry>,
     pub(super) claim: Arc<Entry>,
+}
+
+impl From<&Contested> for ContestedName {
+    fn from(contested: &Contested) -> Self {
+        Self {
+            name: contested.entry.name.to_string(),
+            gateway: contested.claim.mts.name.to_string(),
+        }
+    }
 }
 
 /// Returns those of the agents of this host whose name an agent of another host also has.
