@@ -9,6 +9,7 @@ mod exchange;
 mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
+mod names;
 mod neighbours;
 mod platform_agents;
 mod presence;
@@ -25,7 +26,7 @@ use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
     Cancellation, ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
-    Role as EntryRole, StaticDirectory,
+    Role as EntryRole, StaticDirectory, reserved_for,
 };
 use fipa_transport::{
     Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
@@ -158,7 +159,6 @@ impl Gateway {
             known: Arc::clone(&known),
             contacts: Arc::clone(&contacts.directory),
             service: Arc::clone(&gateway.service),
-            has_keys: !config.security.keys.is_empty(),
             only_loopback: announces_on_loopback_only(config),
         });
         // From here on, the sender of a letter from another host is published on this host before
@@ -565,6 +565,12 @@ impl KnownPeers {
         agent: Incarnation,
         location: Location,
     ) -> Result<(), fipa_sds::EntryError> {
+        // An agent of a platform without a gateway, such as JADE, must not pass for one of a gateway.
+        if let Some(gateway) = reserved_for(name).filter(|_| !agent.is_known())
+            && self.neighbours.has_gateway(gateway)
+        {
+            return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()));
+        }
         if self.directory.heard(now, name, agent, location)? {
             self.heard.fetch_add(1, Ordering::AcqRel);
         }

@@ -127,12 +127,14 @@ impl Agent {
         let directory = self.domain().directory();
         directory.refresh();
         let entries = directory.entries();
-        let mut here = entries.iter().filter(|entry| {
+        let here = entries.iter().filter(|entry| {
             entry.reach == Reach::Local
                 && entry.is_platform_agent()
                 && entry.agent_type == agent_type
         });
-        AgentId::new(&*here.next()?.name).ok()
+        // The agent may have a second name for other hosts, which is longer.
+        let own = here.min_by_key(|entry| entry.name.len());
+        AgentId::new(&*own?.name).ok()
     }
 }
 

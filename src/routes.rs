@@ -51,10 +51,24 @@ pub struct Report {
     /// the latest, of at most 16 addresses.
     #[serde(default)]
     pub refused: Vec<RefusedConnection>,
+    /// The agents of the host whose names agents of other hosts also have, at most 64; empty unless the
+    /// service is a gateway.
+    #[serde(default)]
+    pub contested: Vec<ContestedName>,
     /// The configuration with which the service runs, as TOML text by key; empty unless the service is a
     /// gateway. See [`Config::values`](crate::Config::values).
     #[serde(default)]
     pub configuration: BTreeMap<String, String>,
+}
+
+/// A name that an agent of this host and an agent of another host have.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct ContestedName {
+    /// The name.
+    pub name: String,
+    /// The gateway of the other agent.
+    pub gateway: String,
 }
 
 /// A peer in `discovery.static` and its state.

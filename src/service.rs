@@ -189,6 +189,7 @@ impl Service {
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
             neighbours: Vec::new(),
             refused: Vec::new(),
+            contested: Vec::new(),
             configuration: BTreeMap::new(),
         }
     }

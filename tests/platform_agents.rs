@@ -2,6 +2,8 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+#[path = "support/stranger.rs"]
+mod stranger;
 mod support;
 
 use std::time::{Duration, SystemTime};
@@ -9,8 +11,11 @@ use std::time::{Duration, SystemTime};
 use fipa::platform::{
     AgentDescription, AmsDescription, Df, Exception, PlatformError, ServiceDescription, limits,
 };
-use fipa::{AgentId, Config, Domain, Gateway, Kind, Performative, Time, blocking};
+use fipa::{AgentId, Config, Domain, Gateway, Kind, Message, Performative, Reach, Time, blocking};
+use fipa_sds::{Directory as _, EXCHANGE_ONTOLOGY, MdnsConfig, MdnsDirectory, Mts, Registration};
 use fipa_testbed::until_async;
+use fipa_transport::Incarnation;
+use stranger::Stranger;
 
 /// Time limit of all waits, which a passing test does not reach.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -346,7 +351,6 @@ async fn of_two_agents_with_one_name_that_which_holds_it_is_found() {
     let (two, at_two) = host(&config(&[])).await;
     // These two hosts do not know each other; a third one knows both.
     let first = at_one.register("crane").await.unwrap();
-    support::next_millisecond().await;
     let second = at_two.register("crane").await.unwrap();
     for (agent, name) in [(&first, "lift-1"), (&second, "lift-2")] {
         let df = agent.df().unwrap();
@@ -366,18 +370,24 @@ async fn of_two_agents_with_one_name_that_which_holds_it_is_found() {
     let service = |found: &[AgentDescription]| found[0].services[0].name.clone().unwrap();
     until_async("both gateways", || third.neighbours().len() == 2).await;
     finds(&df, &["crane"]).await;
+    let holder = third.directory().known("crane").unwrap().incarnation;
+    let (leaving, staying, expected) = match holder == first.incarnation() {
+        true => (first, second, ["lift-1", "lift-2"]),
+        false => (second, first, ["lift-2", "lift-1"]),
+    };
     let mut notifications = df.subscribe(&lifting()).await.unwrap();
     let mut shown = service(&next(&mut notifications).await);
-    while shown != "lift-1" {
+    while shown != expected[0] {
         shown = service(&next(&mut notifications).await);
     }
     // The other agent gets the name.
-    drop(first);
+    drop(leaving);
     let mut changed = next(&mut notifications).await;
     if changed[0].services.is_empty() {
         changed = next(&mut notifications).await;
     }
-    assert_eq!(service(&changed), "lift-2");
+    assert_eq!(service(&changed), expected[1]);
+    drop(staying);
     for domain in [at_one, at_two, at_third] {
         domain.close().await;
     }
@@ -386,26 +396,68 @@ async fn of_two_agents_with_one_name_that_which_holds_it_is_found() {
     }
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
-    let same = format!("mts.name=robot-{}", std::process::id());
-    let [(near, at_home), (far, abroad)] = two_hosts(&[&same]).await;
-    assert_eq!(near.name(), far.name());
-    let listed = |domain: &Domain, prefix: &str| {
-        let entries = domain.directory().entries();
-        let all = entries.iter().filter(|it| it.name.starts_with(prefix));
-        all.map(|it| it.name.to_string()).collect::<Vec<_>>()
-    };
-    for prefix in ["ams@", "df@"] {
-        let plain = format!("{prefix}{}", near.name());
-        for domain in [&at_home, &abroad] {
-            until_async("two agents", || listed(domain, prefix).len() == 2).await;
-            let names = listed(domain, prefix);
-            assert_eq!(names[0], plain);
-            let digits = names[1].strip_prefix(&format!("{plain}-")).unwrap();
-            assert!(digits.len() == 4 && digits.chars().all(|c| c.is_ascii_hexdigit()));
+/// The prefixes of the names of a gateway's agents.
+const PREFIXES: [&str; 2] = ["ams", "df"];
+
+/// Returns the second names of the agents with this prefix that a domain knows, those of other hosts
+/// or its own.
+fn second_names(domain: &Domain, prefix: &str, gateway: &str, is_remote: bool) -> Vec<String> {
+    let entries = domain.directory().entries();
+    let wanted = entries.iter().filter(|entry| {
+        let digits = entry.name.strip_prefix(&format!("{prefix}-"));
+        let digits = digits.and_then(|rest| rest.strip_suffix(&format!("@{gateway}")));
+        digits.is_some_and(|it| it.len() == 8) && (entry.reach != Reach::Local) == is_remote
+    });
+    wanted.map(|it| it.name.to_string()).collect()
+}
+
+/// Checks that the agents of the gateway have their names, and that letters of its host reach them.
+async fn keeps_its_names(gateway: &Gateway, domain: &Domain, agent: &str) {
+    for prefix in PREFIXES {
+        let name = format!("{prefix}@{}", gateway.name());
+        for known in [
+            domain.directory().lookup(&name),
+            gateway.directory().lookup(&name),
+        ] {
+            let known = known.unwrap();
+            assert_eq!(known.reach, Reach::Local, "{name}");
+            assert_eq!(known.mts.incarnation, gateway.incarnation(), "{name}");
         }
     }
+    let agent = domain.register(agent).await.unwrap();
+    assert_eq!(
+        agent.df().unwrap().id().name(),
+        format!("df@{}", gateway.name())
+    );
+    // By the name, as a letter that is written by hand.
+    let df = agent.df_of(AgentId::new(format!("df@{}", gateway.name())).unwrap());
+    let own = df.register_service(ServiceDescription::new("a", "painting"));
+    assert_eq!(own.await.unwrap().lease_time, None, "it is of this host");
+    let ams = agent.ams_of(AgentId::new(format!("ams@{}", gateway.name())).unwrap());
+    assert_eq!(ams.description().await.unwrap().name, gateway.name());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn gateways_with_one_name_keep_it_and_reach_each_other_by_second_names() {
+    let same = format!("mts.name=robot-{}", support::mark());
+    let [(near, at_home), (far, abroad)] = two_hosts(&[&same]).await;
+    assert_eq!(near.name(), far.name());
+    for prefix in PREFIXES {
+        for domain in [&at_home, &abroad] {
+            until_async("the second name of the other host", || {
+                second_names(domain, prefix, near.name(), true).len() == 1
+                    && second_names(domain, prefix, near.name(), false).len() == 1
+            })
+            .await;
+        }
+        let [here, there] =
+            [&at_home, &abroad].map(|domain| second_names(domain, prefix, near.name(), false));
+        assert_ne!(here, there);
+        assert_eq!(second_names(&abroad, prefix, near.name(), true), here);
+        assert_eq!(second_names(&at_home, prefix, near.name(), true), there);
+    }
+    keeps_its_names(&near, &at_home, "painter").await;
+    keeps_its_names(&far, &abroad, "sprayer").await;
     // Each agent uses the directory facilitator of its own host.
     let rover = abroad.register("rover").await.unwrap();
     let df = rover.df().unwrap();
@@ -416,16 +468,170 @@ async fn of_two_gateways_with_one_name_the_later_names_its_agents_otherwise() {
     assert_eq!(df.search(&lifting()).await.unwrap().len(), 1);
     let other = at_home.register("other").await.unwrap();
     let facilitator = other.df().unwrap();
-    assert_ne!(facilitator.id(), df.id());
+    assert_eq!(facilitator.id(), df.id(), "the names are equal");
     // Only the description of its own host is one that an agent can change.
     let refused = facilitator.modify(lifting()).await;
     assert!(refused.is_err(), "{refused:?}");
     finds(&facilitator, &["rover"]).await;
+    // The other host's by the second name: requests, and notifications of a subscription.
+    let second = second_names(&at_home, "df", near.name(), true).remove(0);
+    let there = other.df_of(AgentId::new(second).unwrap());
+    assert_eq!(there.search(&lifting()).await.unwrap().len(), 1);
+    let mut notifications = there.subscribe(&lifting()).await.unwrap();
+    assert_eq!(next(&mut notifications).await.len(), 1);
+    let registered = there.register(lifting_as("b")).await.unwrap();
+    assert!(registered.lease_time.is_some());
+    let noticed = next(&mut notifications).await;
+    assert_eq!(names(noticed.iter().map(|it| &it.name)), ["other"]);
+    notifications.cancel(PATIENCE).await.unwrap();
+    let second = second_names(&at_home, "ams", near.name(), true).remove(0);
+    let there = other.ams_of(AgentId::new(second).unwrap());
+    let description = there.description().await.unwrap();
+    let addresses = description.services.iter().flat_map(|(_, all)| all);
+    let locations = far.locations();
+    let tcp = locations.iter().find(|it| it.kind() == Kind::Tcp).unwrap();
+    assert!(
+        addresses
+            .clone()
+            .any(|it| *it == format!("tcp://{}", tcp.address()))
+    );
     for domain in [at_home, abroad] {
         domain.close().await;
     }
     far.close().await;
     near.close().await;
+}
+
+/// Makes the stranger announce these agents, and waits until the gateway knows the agent `seen`.
+async fn announce(stranger: &mut Stranger, gateway: &Gateway, names: &[String], seen: &str) {
+    let agents = names.iter().map(|name| {
+        let id = Incarnation::random();
+        format!(r#"{{"name":"{name}","id":"{id}","registered":1}}"#)
+    });
+    let agents: Vec<String> = agents.collect();
+    let content = format!(
+        r#"{{"version":1,"tell":{{"full":{{"version":1,"first":true,"last":true,"agents":[{}]}}}}}}"#,
+        agents.join(",")
+    );
+    // The gateway ignores letters of a gateway that it does not know yet.
+    let known = async {
+        while gateway.directory().known(seen).is_none() {
+            let message = Message::builder(Performative::Inform).ontology(EXCHANGE_ONTOLOGY);
+            stranger.send(message.content(content.clone()));
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, known).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stranger_over_tcp_takes_no_name_of_a_gateways_agents() {
+    let (gateway, domain) = host(&config(&[])).await;
+    let own = gateway.name().to_owned();
+    // One that does not even claim to be that gateway.
+    let mut liar = Stranger::new("liar", &gateway);
+    let names = [
+        "decoy".to_owned(),
+        "df@liar".to_owned(),
+        format!("df@{own}"),
+        format!("ams@{own}"),
+        "df@nowhere".to_owned(),
+        "ams-00000000@nowhere".to_owned(),
+    ];
+    announce(&mut liar, &gateway, &names, "decoy").await;
+    let known = |name: &str| gateway.directory().known(name).is_some();
+    assert!(known("df@liar"), "its own");
+    assert!(!known("df@nowhere") && !known("ams-00000000@nowhere"));
+    keeps_its_names(&gateway, &domain, "painter").await;
+    // One that claims to have the same name.
+    let mut namesake = Stranger::new(&own, &gateway);
+    let names = [
+        "bait".to_owned(),
+        format!("df@{own}"),
+        format!("ams@{own}"),
+        own.clone(),
+    ];
+    announce(&mut namesake, &gateway, &names, "bait").await;
+    for prefix in PREFIXES {
+        until_async("a second name", || {
+            second_names(&domain, prefix, &own, false).len() == 1
+        })
+        .await;
+    }
+    keeps_its_names(&gateway, &domain, "sprayer").await;
+    let known = domain.directory().lookup(&own).unwrap();
+    assert_eq!(known.incarnation, gateway.incarnation());
+    domain.close().await;
+    gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_announcement_by_mdns_takes_no_name_of_a_gateways_agents() {
+    let config = config(&["discovery.mdns=true", "discovery.interfaces=lo"]);
+    let (gateway, domain) = host(&config).await;
+    let own = gateway.name().to_owned();
+    let namesake = MdnsDirectory::open(MdnsConfig {
+        interfaces: vec!["lo".to_owned()],
+        ..MdnsConfig::new(Mts::new(&*own, Incarnation::random()))
+    });
+    let namesake = namesake.unwrap();
+    let at: fipa::Location = "tcp://127.0.0.1:9".parse().unwrap();
+    for prefix in PREFIXES {
+        let registration = Registration {
+            registered: SystemTime::UNIX_EPOCH,
+            ..Registration::new(
+                format!("{prefix}@{own}"),
+                Incarnation::random(),
+                vec![at.clone()],
+            )
+        };
+        namesake.register(registration).unwrap();
+    }
+    for prefix in PREFIXES {
+        until_async("a second name", || {
+            second_names(&domain, prefix, &own, false).len() == 1
+        })
+        .await;
+    }
+    keeps_its_names(&gateway, &domain, "painter").await;
+    namesake.close();
+    domain.close().await;
+    gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_process_and_no_other_platform_takes_the_name_of_a_gateways_agent() {
+    let (gateway, domain) = host(&config(&["platform.df=false"])).await;
+    let own = gateway.name();
+    for name in [
+        format!("df@{own}"),
+        format!("df-00000000@{own}"),
+        "ams@elsewhere".to_owned(),
+    ] {
+        let refused = domain.register(&name).await;
+        let reason = refused.map(drop).unwrap_err();
+        let reason = fipa_acl::ErrorChain(&reason).to_string();
+        assert!(
+            reason.contains("reserved for an agent of the gateway"),
+            "{reason}"
+        );
+    }
+    let rover = domain.register("rover").await.unwrap();
+    let entry = domain.directory().lookup(own).unwrap();
+    for (name, is_reserved) in [(format!("df@{own}"), true), ("df@jade".to_owned(), false)] {
+        let id = AgentId::new(&*name).unwrap();
+        let id = id.with_address("tcp://127.0.0.1:9;fipa-services").unwrap();
+        let introduced = fipa::contact::introduce(&rover, &entry, &id, PATIENCE).await;
+        match introduced {
+            Ok(()) => assert!(!is_reserved, "{name}"),
+            Err(error) => {
+                let error = fipa_acl::ErrorChain(&error).to_string();
+                assert!(is_reserved && error.contains("reserved"), "{name}: {error}");
+            }
+        }
+    }
+    domain.close().await;
+    gateway.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

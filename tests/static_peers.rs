@@ -2,23 +2,19 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+#[path = "support/stranger.rs"]
+mod stranger;
 mod support;
 
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use fipa::{
     AgentId, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative, contact,
     routes,
 };
-use fipa_mts::letter_for;
 use fipa_testbed::until_async;
-use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
-    Transport as _, Verdict,
-};
-use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
-use parking_lot::Mutex;
+use stranger::Stranger;
 use support::config;
 use tokio::io::AsyncReadExt;
 
@@ -93,34 +89,6 @@ async fn the_gateway_answers_an_unknown_ontology_with_not_understood() {
     assert_eq!(answer.sender().unwrap().name(), gateway.name());
 }
 
-/// The messages that a gateway of another host gets.
-#[derive(Default)]
-struct Inbox(Mutex<Vec<Message>>);
-
-impl Inbox {
-    fn reply_to(&self, question: &str) -> Option<Message> {
-        let messages = self.0.lock();
-        let mut replies = messages.iter();
-        replies
-            .find(|it| it.in_reply_to() == Some(question))
-            .cloned()
-    }
-}
-
-impl Sink for Inbox {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
-        if let Body::Letter(letter) = arrival.parcel.body {
-            let message = Message::decode(letter.payload()).unwrap();
-            self.0.lock().push(message);
-        }
-        Verdict::Now(Answer::Accepted)
-    }
-
-    fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
-
-    fn concluded(&self, _: AttemptId, _: Conclusion) {}
-}
-
 /// Routes contain the incarnations of agents and gateways, and an introduced agent takes a name.
 #[tokio::test(flavor = "multi_thread")]
 async fn another_host_gets_no_routes_and_introduces_no_agents() {
@@ -128,50 +96,13 @@ async fn another_host_gets_no_routes_and_introduces_no_agents() {
     let gateway = Gateway::open(&config).await.unwrap();
     let domain = Domain::open(&config).await.unwrap();
     let arm = domain.register("arm").await.unwrap();
-    let incarnation = Incarnation::random();
-    let identity = Identity {
-        name: "stranger-mts".to_owned(),
-        incarnation,
-        domain: "elsewhere".to_owned(),
-        host: "elsewhere".to_owned(),
-    };
-    let tcp = TcpConfig::new(Vec::new(), identity);
-    let transport = TcpTransport::new(tcp, tokio::runtime::Handle::current());
-    let inbox = Arc::new(Inbox::default());
-    transport.listen(inbox.clone()).unwrap();
-    let mut locations = gateway.locations().into_iter();
-    let at = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
-    let at = at.with_incarnation(gateway.incarnation());
+    let mut stranger = Stranger::new("stranger-mts", &gateway);
     let stolen = br#"{"version":1,"name":"thief","addresses":["tcp://127.0.0.1:9;fipa-services"]}"#;
-    for (sequence, ontology, content) in [
-        (1, routes::ONTOLOGY, &b""[..]),
-        (2, contact::ONTOLOGY, stolen),
-    ] {
-        let request = Message::builder(Performative::Request)
-            .sender(AgentId::new("stranger-mts").unwrap())
-            .receiver(AgentId::new(gateway.name()).unwrap())
-            .ontology(ontology)
-            .reply_with(ontology)
-            .content(content)
-            .build()
-            .unwrap();
-        let parcel = Parcel {
-            receiver: gateway.name().into(),
-            stream: Stream {
-                sender: incarnation,
-                receiver: gateway.incarnation(),
-            },
-            sequence,
-            after: 0,
-            remaining: Duration::from_secs(30),
-            transfer: sequence,
-            body: Body::Letter(letter_for(&request, SystemTime::now()).unwrap()),
-        };
-        transport
-            .dispatch(AttemptId(sequence), &at, parcel)
-            .unwrap();
-        until_async("the answer", || inbox.reply_to(ontology).is_some()).await;
-        let answer = inbox.reply_to(ontology).unwrap();
+    for (ontology, content) in [(routes::ONTOLOGY, &b""[..]), (contact::ONTOLOGY, stolen)] {
+        let request = Message::builder(Performative::Request).ontology(ontology);
+        stranger.send(request.reply_with(ontology).content(content));
+        until_async("the answer", || stranger.reply_to(ontology).is_some()).await;
+        let answer = stranger.reply_to(ontology).unwrap();
         assert_eq!(*answer.performative(), Performative::Refuse, "{answer}");
         let content = answer.content().unwrap();
         let told = String::from_utf8(content.to_vec()).unwrap();
@@ -180,7 +111,6 @@ async fn another_host_gets_no_routes_and_introduces_no_agents() {
         assert!(!answer.to_string().contains(&secret), "{answer}");
     }
     assert!(gateway.directory().known("thief").is_none());
-    transport.close();
     domain.close().await;
     gateway.close().await;
 }
@@ -233,43 +163,74 @@ async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
     near.close().await;
 }
 
+/// Returns the contested names in the report of the gateway, which `fipa doctor` shows.
+async fn contested_names(gateway: &Gateway, domain: &Domain) -> Vec<(String, String)> {
+    let asker = format!("asker of {}", gateway.name());
+    let asker = domain.register(&asker).await.unwrap();
+    let entry = domain.directory().lookup(gateway.name()).unwrap();
+    let report = routes::of_gateway(&asker, &entry, None, Duration::from_secs(60)).await;
+    let contested = report.unwrap().contested.into_iter();
+    contested.map(|it| (it.name, it.gateway)).collect()
+}
+
 #[tokio::test(flavor = "multi_thread")]
-async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
+async fn both_agents_with_one_name_are_told_and_a_third_host_keeps_the_first() {
     let (far_config, third_config) = (config(&[]), config(&[]));
     let far = Gateway::open(&far_config).await.unwrap();
     let far_host = Domain::open(&far_config).await.unwrap();
-    let earlier = far_host.register("arm").await.unwrap();
+    let one = far_host.register("arm").await.unwrap();
     let near_config = config(&[]);
     let near_host = Domain::open(&near_config).await.unwrap();
     // Registered while neither gateway knows the other registration.
-    support::next_millisecond().await;
-    let later = near_host.register("arm").await.unwrap();
+    let other = near_host.register("arm").await.unwrap();
     let mut knows_both = near_config.clone();
     knows_both.discovery = config(&[&knowing("far", &[&address(&far)])]).discovery;
     let near = Gateway::open(&knows_both).await.unwrap();
-
-    let failure = later.receive().await.unwrap().into_message();
-    assert_eq!(*failure.performative(), Performative::Failure);
-    assert_eq!(failure.sender().unwrap().name(), near.name());
-    let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
-    assert!(content.contains("registered earlier"), "{content}");
-    // A third host does not see the later registration.
+    for (agent, gateway) in [(&one, &far), (&other, &near)] {
+        let failure = agent.receive().await.unwrap().into_message();
+        assert_eq!(*failure.performative(), Performative::Failure);
+        assert_eq!(failure.sender().unwrap().name(), gateway.name());
+        let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
+        assert!(content.contains("also registered"), "{content}");
+    }
+    for (host, own) in [(&far_host, &one), (&near_host, &other)] {
+        let known = host.directory().lookup("arm").unwrap();
+        assert_eq!(known.incarnation, own.incarnation(), "its own");
+    }
+    for (gateway, domain, other) in [(&far, &far_host, &near), (&near, &near_host, &far)] {
+        let report = contested_names(gateway, domain).await;
+        assert_eq!(report, [("arm".to_owned(), other.name().to_owned())]);
+    }
+    // A third host connects with the gateway of the later one first.
     let mut watcher = third_config.clone();
-    watcher.discovery = config(&[&knowing("near", &[&address(&near)])]).discovery;
-    let third = Gateway::open(&watcher).await.unwrap();
-    let here = near_host.register("only here").await.unwrap();
-    until_async("the third host has the directory", || {
-        third.directory().known("only here").is_some()
+    let near_at = address(&near);
+    watcher.discovery = config(&[&knowing("near", &[&near_at])]).discovery;
+    let mut third = Gateway::open(&watcher).await.unwrap();
+    let known = |gateway: &Gateway| {
+        let known = gateway.directory().known("arm");
+        known.map(|known| known.incarnation)
+    };
+    until_async("the agent of the near host", || known(&third).is_some()).await;
+    assert_eq!(known(&third), Some(other.incarnation()));
+    let crane = far_host.register("crane").await.unwrap();
+    let peers = format!(
+        "discovery.static={{ \"near\" = [\"tcp://{near_at}\"], \"far\" = [\"tcp://{}\"] }}",
+        address(&far)
+    );
+    watcher.discovery = config(&[&peers]).discovery;
+    assert_eq!(third.reload(&watcher).unwrap(), [""; 0]);
+    until_async("the agents of the far host", || {
+        third.directory().known("crane").is_some()
     })
     .await;
-    assert!(third.directory().known("arm").is_none());
-    // After the earlier agent leaves, the name is free.
-    drop(earlier);
-    until_async("the later has the name", || {
-        third.directory().known("arm").is_some()
+    assert_eq!(known(&third), Some(other.incarnation()));
+    // After the agent leaves, the other one has the name.
+    drop(other);
+    until_async("the other has the name", || {
+        known(&third) == Some(one.incarnation())
     })
     .await;
-    drop(here);
+    drop(crane);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -10,6 +10,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Stdio};
 
 use common::{Host, Running};
+use fipa_testbed::until;
 use serde_json::Value;
 
 /// The verdict and the finding of a check.
@@ -20,6 +21,52 @@ fn check<'a>(report: &'a Value, name: &str) -> (&'a str, &'a str) {
         check["verdict"].as_str().unwrap(),
         check["found"].as_str().unwrap(),
     )
+}
+
+/// The gateways of the agents `arm` of two hosts, which both show the conflict. A third host keeps the
+/// agent that it knew first, although the other one was registered before.
+#[test]
+fn a_name_of_two_hosts_stays_with_the_agent_that_is_known_and_both_doctors_show_it() {
+    let [far, near, third] = [Host::new(), Host::new(), Host::new()];
+    let up = |host: &Host, name: &str, peers: &[(&str, &str)]| {
+        let peers = peers
+            .iter()
+            .map(|(name, at)| format!("{name} = [\"tcp://{at}\"]"));
+        let peers: Vec<String> = peers.collect();
+        let peers = format!("discovery.static={{ {} }}", peers.join(", "));
+        let name = format!("mts.name={name}");
+        let gateway = host.start(&["--set", &name, "--set", &peers, "up", "--json"]);
+        let address = gateway.tcp_address();
+        (gateway, address)
+    };
+    let _arms = (far.echo("arm"), near.echo("arm"));
+    let (_near_gateway, near_at) = up(&near, "near", &[]);
+    let (_third_gateway, third_at) = up(&third, "third", &[("near", &near_at)]);
+    let known = |name: &str| {
+        let known = third.run(&["agents", "--json"]).done_json();
+        let mut agents = known["agents"].as_array().unwrap().iter();
+        let agent = agents.find(|agent| agent["name"] == name)?;
+        Some(agent["mts"]["name"].as_str().unwrap().to_owned())
+    };
+    until("the arm of the near host", || known("arm").is_some());
+    let _crane = far.echo("crane");
+    let peers = [("near", &*near_at), ("third", &*third_at)];
+    let (_far_gateway, _) = up(&far, "far", &peers);
+    until("the agents of the far host", || known("crane").is_some());
+    assert_eq!(known("arm").as_deref(), Some("near"));
+    for (host, other) in [(&near, "far"), (&far, "near")] {
+        until("the doctor shows the conflict", || {
+            let report = host.run(&["doctor", "--json"]).done_json();
+            let expected = format!("the agent arm is also registered at the gateway {other}:");
+            let checks = report["checks"].as_array().unwrap();
+            checks.iter().any(|check| {
+                let found = check["found"].as_str().unwrap();
+                check["verdict"] == "doubtful" && found.starts_with(&expected)
+            })
+        });
+        let own = host.run(&["agents", "arm", "--json"]).done_json();
+        assert_eq!(own["agents"][0]["reach"], "local", "{own}");
+    }
 }
 
 #[test]

@@ -72,11 +72,6 @@ impl Ams {
         }
     }
 
-    /// Changes the identifier of the agent, which has registered under another name.
-    pub fn rename(&mut self, id: AgentId) {
-        self.id = id;
-    }
-
     /// Changes the description of the platform.
     pub fn describe(&mut self, platform: ApDescription) {
         self.platform = platform;

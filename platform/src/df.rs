@@ -98,11 +98,6 @@ impl Df {
         }
     }
 
-    /// Changes the identifier of the agent, which has registered under another name.
-    pub fn rename(&mut self, id: AgentId) {
-        self.id = id;
-    }
-
     /// Handles a message to the agent.
     pub fn handle_message(&mut self, now: Now, asker: &Asker, message: &Message) {
         self.expire(now.at);

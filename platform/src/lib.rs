@@ -135,6 +135,9 @@ pub struct Asker {
     pub is_proved: bool,
     /// The dialect of SL that the agent writes and reads.
     pub dialect: Dialect,
+    /// The identifier by which it asked the agent of this crate, if that is not the agent's own but
+    /// another one of it. Answers have it as their sender.
+    pub asked: Option<AgentId>,
 }
 
 impl Asker {
@@ -152,7 +155,13 @@ impl Asker {
             platform,
             is_proved: true,
             dialect: Dialect::Standard,
+            asked: None,
         }
+    }
+
+    /// Returns the identifier of the agent of this crate in this conversation.
+    pub(crate) fn asked<'a>(&'a self, own: &'a AgentId) -> &'a AgentId {
+        self.asked.as_ref().unwrap_or(own)
     }
 }
 

@@ -47,7 +47,7 @@ impl<'m> Request<'m> {
         // The action is part of each further answer, so it has to be printable before it is executed.
         let done = Content::from(Wff::done(action.clone()));
         let done = print(asker.dialect, &done).map_err(|_| unrecognised_content())?;
-        if !agent.name().eq_ignore_ascii_case(own.name()) {
+        if !agent.name().eq_ignore_ascii_case(asker.asked(own).name()) {
             // This agent performs no actions of other agents.
             return Err(Rejection::of(action, Exception::Unauthorised));
         }
@@ -216,7 +216,7 @@ pub(crate) fn reply(
     performative: Performative,
 ) -> MessageBuilder {
     let mut answer = Message::builder(performative)
-        .sender(own.clone())
+        .sender(asker.asked(own).clone())
         .receiver(asker.id.clone())
         .language(message.language().unwrap_or(LANGUAGE))
         .ontology(message.ontology().unwrap_or(ONTOLOGY));

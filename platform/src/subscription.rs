@@ -85,7 +85,7 @@ impl Subscription {
             Ok([ContentExpression::Identifying(query)]) => query,
             _ => return Err(request::unrecognised_content()),
         };
-        let template = template(&query, own)?;
+        let template = template(&query, asker.asked(own))?;
         if parameters(message) > limits::SUBSCRIPTION_PARAMETERS {
             let words = "the parameters of the message are too long for a subscription";
             return Err(Exception::InternalError(words.to_owned()));

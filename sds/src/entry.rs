@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use fipa_transport::{Incarnation, Location};
 use serde::{Deserialize, Serialize};
 
-use crate::{Members, NameError, check_name};
+use crate::{Members, NameError, check_name, reserved_for};
 
 /// The known data of one registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -44,20 +44,22 @@ impl Entry {
     /// Maximum length of the description, in bytes.
     pub const MAX_DESCRIPTION: usize = 1024;
 
-    /// Whether this entry keeps the name when `other` claims it too.
+    /// Whether this entry takes the name from `other`, which was known before.
     ///
-    /// Entries of this host precede entries from the network regardless of registration times: a
-    /// record on the network must not be able to cut a host's own traffic. A [contact](Source::Contact)
-    /// precedes no entry of a directory. Otherwise the earlier registration keeps the name, and the
-    /// lower incarnation breaks a tie, so that all hosts that have both entries decide alike.
+    /// Entries of this host precede entries from the network: a record on the network must not be able
+    /// to cut a host's own traffic. A [contact](Source::Contact) precedes no entry of a directory. Of
+    /// two entries of this host the earlier registration precedes. Of equal entries of other hosts, the
+    /// first known one keeps the name: their times are those of other clocks.
     #[must_use]
     pub fn precedes(&self, other: &Self) -> bool {
-        let rank = |entry: &Self| {
-            let remote = entry.reach != Reach::Local;
-            let contact = entry.source == Source::Contact;
-            (remote, contact, entry.registered, entry.incarnation)
-        };
-        rank(self) < rank(other)
+        self.rank() < other.rank()
+    }
+
+    pub(crate) fn rank(&self) -> impl Ord + use<> {
+        let remote = self.reach != Reach::Local;
+        let contact = self.source == Source::Contact;
+        let age = (!remote).then_some((self.registered, self.incarnation));
+        (remote, contact, age)
     }
 
     /// Type of the agent management system of a gateway (FIPA00023).
@@ -81,10 +83,18 @@ impl Entry {
         !self.locations.is_empty() && !self.locations.iter().any(supported)
     }
 
-    /// Checks the limits that every back end relies on.
+    /// Whether the entry is that of an agent of a platform without a gateway of this project, such as
+    /// JADE, by the configuration or a letter. It precedes no entry of the gateway that its name may
+    /// be [reserved](reserved_for) for, except by the configuration.
+    fn is_of_legacy_platform(&self) -> bool {
+        matches!(self.source, Source::Static | Source::Contact) && !self.mts.incarnation.is_known()
+    }
+
+    /// Checks what every back end relies on: the limits, and that a name that is [reserved for a
+    /// gateway](reserved_for) is claimed by a gateway of that name.
     ///
     /// # Errors
-    /// Returns the first limit that the entry exceeds.
+    /// Returns the first rule that the entry violates.
     pub fn check(&self) -> Result<(), EntryError> {
         check_name(&self.name)?;
         check_name(&self.mts.name).map_err(EntryError::MtsName)?;
@@ -93,7 +103,12 @@ impl Entry {
         if self.locations.len() > Self::MAX_LOCATIONS {
             return Err(EntryError::TooManyLocations(self.locations.len()));
         }
-        Ok(())
+        match reserved_for(&self.name) {
+            Some(gateway) if *self.mts.name != *gateway && !self.is_of_legacy_platform() => {
+                Err(EntryError::Reserved(gateway.to_owned()))
+            }
+            _ => Ok(()),
+        }
     }
 }
 
@@ -270,6 +285,12 @@ pub enum EntryError {
     /// The entry has more than [`Entry::MAX_LOCATIONS`] locations.
     #[error("{0} locations; at most {max} are allowed", max = Entry::MAX_LOCATIONS)]
     TooManyLocations(usize),
+    /// The name is [reserved](reserved_for) for another gateway.
+    #[error(
+        "the name is reserved for an agent of the gateway {0:?}; choose a name that does not begin with \
+         ams@ or df@"
+    )]
+    Reserved(String),
     /// A registration has no incarnation.
     #[error("a registration needs an incarnation (draw one with Incarnation::random)")]
     NoIncarnation,

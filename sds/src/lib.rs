@@ -39,6 +39,7 @@ mod memory;
 mod merged;
 mod name;
 mod query;
+mod reserved;
 mod resolve;
 mod view;
 mod watch;
@@ -52,11 +53,12 @@ pub use exchange::{
 };
 pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
-pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, Withdrawal, probe};
+pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, probe};
 pub use memory::{MemoryDirectory, StaticDirectory};
 pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};
 pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
+pub use reserved::{reserved_for, second_name};
 pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
 pub use view::{Snapshot, View};
 pub use watch::{Change, Subscriber, Watch};

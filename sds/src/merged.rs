@@ -15,10 +15,11 @@ use crate::{
 /// Several directories merged into one view.
 ///
 /// When several directories know a name, the view shows the entry that [precedes](Entry::precedes)
-/// the others. Of equal entries (one registration learned twice) it shows that of the first
-/// directory in the list. If they name different message transport services because the agent's
-/// service was restarted, it shows that of a directory that [speaks](Directory::speaks_for) for its
-/// service. Registrations go to the first writable directory.
+/// the others. Of equal entries it shows that of a directory that [speaks](Directory::speaks_for) for
+/// the message transport service of its entry, else that of the first directory in the list: an agent
+/// of a connected gateway precedes one that is only announced. Of one registration at one service that
+/// was learned twice, it shows the entry of the first directory in the list. Registrations go to the
+/// first writable directory.
 ///
 /// A directory whose link proves a service has a [mandate](Directory::mandate) for it. A proved
 /// entry precedes all unproved entries of other hosts except those of the configuration. Entries of
@@ -316,12 +317,16 @@ impl NameClaim {
             true => speaks(self) && !speaks(before),
             false if self.outranks(before, back_ends) => true,
             false if before.outranks(self, back_ends) => false,
-            false => new.precedes(old),
+            false if new.precedes(old) => true,
+            false if old.precedes(new) => false,
+            // One registration, learned twice.
+            false if new.incarnation == old.incarnation && new.incarnation.is_known() => false,
+            false => speaks(self) && !speaks(before),
         }
     }
 
-    /// Whether this claim precedes `other` regardless of registration times: both are of other
-    /// hosts, and this one is proved or from the configuration.
+    /// Whether this claim precedes `other` although both are of other hosts: this one is from the
+    /// configuration, or else proved.
     fn outranks<V: View + ?Sized>(&self, other: &Self, back_ends: &[Arc<V>]) -> bool {
         if self.entry.reach == Reach::Local || other.entry.reach == Reach::Local {
             return false;
@@ -330,7 +335,7 @@ impl NameClaim {
         let is_proved = |claim: &Self| claim.is_proved(back_ends);
         match is_proved(self) {
             true => !is_proved(other) && !is_static(other),
-            false => is_static(self) && is_proved(other),
+            false => is_static(self) && !is_static(other),
         }
     }
 

@@ -51,8 +51,8 @@ macro_rules! reads_its_table {
 
 /// Entries by the origin that claims them (a process, a record). When several origins claim a name,
 /// the entry that [precedes](Entry::precedes) the others holds it, and the others take over when it
-/// leaves. Proved origins come before all others, in the order in which they claimed the name;
-/// their stated registration times do not count.
+/// leaves. Of equal entries the first claim holds the name. Proved origins come before all others, in
+/// the order in which they claimed the name.
 #[derive(Debug)]
 pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
@@ -66,7 +66,7 @@ pub(crate) struct Table<O> {
 struct Index<O> {
     /// No list is empty; the first entry of a list holds the name.
     claims: HashMap<Arc<str>, Vec<(O, Arc<Entry>)>>,
-    /// Names that more than one proved origin claims.
+    /// Names that more than one origin claims with the same proof.
     contested: BTreeSet<Arc<str>>,
     is_proved: fn(&O) -> bool,
     /// The entries that hold their names. Copied for a change, because a view has them.
@@ -129,17 +129,18 @@ impl<O: Clone + Eq + Hash> Table<O> {
         self.touch();
     }
 
-    /// Returns at most `most` pairs for names that more than one proved origin claims: the entry
-    /// that holds the name, and each other proved entry.
+    /// Returns at most `most` pairs for names that several origins claim: the entry that holds the
+    /// name, and each other entry. An entry without proof does not count beside a proved one.
     pub(crate) fn contested(&self, most: usize) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         let index = self.index.read();
         let names = index.contested.iter();
         let claims = names.filter_map(|name| index.claims.get(name)?.split_first());
-        let pairs = claims.flat_map(|((_, holder), others)| {
-            let proved = others
+        let pairs = claims.flat_map(|((of, holder), others)| {
+            let is_proved = index.is_proved;
+            let equal = others
                 .iter()
-                .filter(|(origin, _)| (index.is_proved)(origin));
-            proved.map(|(_, other)| (Arc::clone(holder), Arc::clone(other)))
+                .filter(move |(origin, _)| is_proved(origin) == is_proved(of));
+            equal.map(|(_, other)| (Arc::clone(holder), Arc::clone(other)))
         });
         pairs.take(most).collect()
     }
@@ -301,9 +302,7 @@ impl<O: Eq> Index<O> {
         let is_proved = self.is_proved;
         let mut claims = self.claims.remove(name).unwrap_or_default();
         let before = claims.iter().position(|(of, _)| *of == origin);
-        if let Some(before) = before {
-            claims.remove(before);
-        }
+        let before = before.map(|index| (index, claims.remove(index).1));
         let proved = |claims: &[(O, Arc<Entry>)]| {
             let mut origins = claims.iter().map(|(of, _)| of);
             origins
@@ -313,18 +312,24 @@ impl<O: Eq> Index<O> {
         let first_unproved = proved(&claims);
         if let Some(entry) = entry {
             let index = match is_proved(&origin) {
-                true => before.unwrap_or(first_unproved),
+                true => before.map_or(first_unproved, |(index, _)| index),
                 false => {
                     let mut unproved = claims.iter().skip(first_unproved);
                     let index = unproved.position(|(_, other)| {
                         entry.precedes(other) || is_same_registration(&entry, other)
                     });
-                    index.map_or(claims.len(), |index| first_unproved + index)
+                    let index = index.map(|index| first_unproved + index);
+                    // An update keeps its place.
+                    let place = before.filter(|(_, before)| before.rank() == entry.rank());
+                    let place = place.map(|(index, _)| index);
+                    let index = index.into_iter().chain(place).min();
+                    index.unwrap_or(claims.len())
                 }
             };
             claims.insert(index, (origin, entry));
         }
-        if proved(&claims) > 1 {
+        let first_unproved = proved(&claims);
+        if first_unproved > 1 || (first_unproved == 0 && claims.len() > 1) {
             self.contested.insert(name.clone());
         } else if !self.contested.is_empty() {
             self.contested.remove(name);
@@ -372,6 +377,37 @@ mod tests {
         table.update(updates);
         assert_ne!(table.generation(), generation);
         assert_eq!(table.view().named("arm"), Some(second));
+    }
+
+    #[test]
+    fn the_first_claim_of_other_hosts_holds_the_name_whatever_their_times_are() {
+        let table = Table::new();
+        let of = |incarnation: u64, millis: u64| {
+            let mut entry = entry(incarnation, incarnation, "10.99.0.51");
+            let own = Arc::make_mut(&mut entry);
+            own.registered += std::time::Duration::from_millis(millis);
+            own.reach = crate::Reach::Remote {
+                gateway: own.mts.incarnation,
+            };
+            entry
+        };
+        let holder = || table.known("arm").map(|it| it.incarnation.as_u64());
+        table.put("first", of(9, 5000));
+        table.put("second", of(8, 1));
+        assert_eq!(holder(), Some(9));
+        // Updates keep their places, also one with another registration.
+        table.put("first", of(9, 6000));
+        table.put("first", of(10, 7000));
+        table.put("second", of(8, 0));
+        assert_eq!(holder(), Some(10));
+        let contested = table.contested(8);
+        assert_eq!(contested.len(), 1);
+        assert_eq!(contested[0].1.incarnation.as_u64(), 8);
+        table.update([("first", "arm".into(), None)]);
+        assert_eq!((holder(), table.contested(8).len()), (Some(8), 0));
+        // An entry of this host takes the name at once.
+        table.put("here", entry(11, 11, "10.99.0.51"));
+        assert_eq!(holder(), Some(11));
     }
 
     #[test]

@@ -10,9 +10,7 @@
 mod common;
 
 use common::registration;
-use fipa_sds::{
-    Change, Directory, Entry, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source,
-};
+use fipa_sds::{Change, Directory, Entry, MdnsConfig, MdnsDirectory, Mts, Role, Source};
 use fipa_testbed::{Avahi, Network, until_some_async};
 use fipa_transport::{Incarnation, Location};
 
@@ -231,7 +229,7 @@ async fn records_with_little_in_them_are_read(directory: &MdnsDirectory, avahi: 
     gone(directory, "bare").await;
 }
 
-/// The earlier registration keeps the name.
+/// Records of one name have labels of their own.
 async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     // The own registration first: Avahi renames the peer.
     let ours = registration("lift");
@@ -249,30 +247,25 @@ async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     gone(directory, "lift #2").await;
     directory.deregister("lift", ours.incarnation).unwrap();
 
-    // The peer first: a directory that has its record refuses the name, and one without it
-    // withdraws its registration.
+    // The peer first: both keep the name, under labels of their own.
     let strings = ["TYPE=theirs", "TIMESTAMP=20200101-00:00:00:000000"];
     let _peer = avahi.publish("winch", SERVICE_TYPE, 0, &strings);
-    let holder = until_some_async("the peer", || directory.lookup("winch")).await;
-    match directory.register(registration("winch")) {
-        Err(RegisterError::AlreadyRegistered { holder: told }) => assert_eq!(told, holder),
-        other => panic!("{other:?}"),
-    }
+    until_some_async("the peer", || directory.lookup("winch")).await;
     let newcomer = open("newcomer");
-    let mut withdrawals = newcomer.withdrawals();
     newcomer.register(registration("winch")).unwrap();
-    let told = tokio::time::timeout(common::WATCHDOG, withdrawals.recv()).await;
-    let told = told.expect("the later registration is withdrawn").unwrap();
-    assert_eq!(told.holder.agent_type, "theirs");
-    until_some_async("the peer's is the only record", || {
+    until_some_async("both records", || {
         let lines = avahi.browse(SERVICE_TYPE);
         let resolved = lines.iter().filter(|line| line.starts_with('='));
         let winches: Vec<_> = resolved.filter(|line| line.contains("winch")).collect();
-        (winches.len() == 1 && winches[0].contains("theirs")).then_some(())
+        let is_own = |line: &&&String| line.contains("fipa-name=winch");
+        let own = winches.iter().filter(is_own).count();
+        (winches.len() == 2 && own == 1).then_some(())
     })
     .await;
     let seen = until_some_async("the newcomer sees the peer", || newcomer.lookup("winch")).await;
     assert_eq!(seen.agent_type, "theirs");
+    let seen = directory.lookup("winch").unwrap();
+    assert_eq!(seen.agent_type, "theirs", "the first one keeps the name");
 }
 
 async fn gone(directory: &MdnsDirectory, name: &str) {

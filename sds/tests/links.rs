@@ -9,15 +9,14 @@
 
 mod common;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use common::registration;
-use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts, Withdrawal};
+use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts};
 use fipa_testbed::{Host, Network, until};
 use fipa_transport::Incarnation;
 use tokio::runtime::Runtime;
-use tokio::sync::broadcast::Receiver;
 
 #[test]
 fn views_agree_after_every_healing() {
@@ -105,7 +104,6 @@ fn inside_views_agree_after_every_healing() {
 /// The directory of one host's gateway.
 struct Member {
     directory: MdnsDirectory,
-    withdrawals: Receiver<Withdrawal>,
     own: BTreeMap<String, Incarnation>,
     /// Its worker threads are in the host's namespace.
     _runtime: Runtime,
@@ -128,7 +126,6 @@ impl Member {
                 MdnsDirectory::open(config).unwrap()
             };
             Self {
-                withdrawals: directory.withdrawals(),
                 directory,
                 own: BTreeMap::new(),
                 _runtime: runtime,
@@ -138,52 +135,44 @@ impl Member {
 
     /// Registers an agent of that name, or deregisters it.
     fn change(&mut self, name: &str, here: bool) {
-        self.forget_withdrawn();
         if let Some(incarnation) = self.own.remove(name) {
-            // It may have been withdrawn in the meantime.
-            let _ = self.directory.deregister(name, incarnation);
+            self.directory.deregister(name, incarnation).unwrap();
         }
         if here {
             let agent = registration(name);
-            if self.directory.register(agent.clone()).is_ok() {
-                self.own.insert(name.to_owned(), agent.incarnation);
-            }
+            self.directory.register(agent.clone()).unwrap();
+            self.own.insert(name.to_owned(), agent.incarnation);
         }
     }
 
-    fn forget_withdrawn(&mut self) {
-        while let Ok(withdrawal) = self.withdrawals.try_recv() {
-            let withdrawn = withdrawal.withdrawn;
-            if self.own.get(&*withdrawn.name) == Some(&withdrawn.incarnation) {
-                self.own.remove(&*withdrawn.name);
-            }
-        }
-    }
-
-    /// The agents in this host's view.
-    fn view(&mut self) -> BTreeMap<String, Incarnation> {
-        self.forget_withdrawn();
+    /// The agents of other hosts in this host's view.
+    fn view(&self) -> BTreeMap<String, Incarnation> {
         let entries = self.directory.entries();
-        let mut view: BTreeMap<_, _> = entries
+        entries
             .iter()
             .map(|entry| (entry.name.to_string(), entry.incarnation))
-            .collect();
-        view.extend(self.own.clone());
-        view
+            .collect()
     }
 }
 
-/// Waits until all views have every registration, with each name once.
+/// Waits until each view has every name of the other hosts, each with one of their registrations.
 fn agree(members: &mut [Member]) {
-    let mut views = Vec::new();
     let started = Instant::now();
     loop {
-        views.clear();
-        views.extend(members.iter_mut().map(Member::view));
-        let registered = members.iter().flat_map(|member| member.own.clone());
-        let all: BTreeMap<String, Incarnation> = registered.collect();
-        let names: usize = members.iter().map(|member| member.own.len()).sum();
-        if names == all.len() && views.iter().all(|view| *view == all) {
+        let views: Vec<_> = members.iter().map(Member::view).collect();
+        let agrees = |(index, view): (usize, &BTreeMap<String, Incarnation>)| {
+            let others = members.iter().enumerate();
+            let others = others.filter(|(other, _)| *other != index);
+            let mut names: BTreeMap<&String, BTreeSet<Incarnation>> = BTreeMap::new();
+            for (name, incarnation) in others.flat_map(|(_, member)| &member.own) {
+                names.entry(name).or_default().insert(*incarnation);
+            }
+            names.len() == view.len()
+                && names
+                    .iter()
+                    .all(|(name, all)| view.get(*name).is_some_and(|it| all.contains(it)))
+        };
+        if views.iter().enumerate().all(agrees) {
             return;
         }
         assert!(

@@ -11,7 +11,9 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use common::mdns::{free_port, open};
 use common::{conforms, next, registration};
-use fipa_sds::{Change, Directory, MdnsDirectory, Members, Reach, RegisterError, Role, Source};
+use fipa_sds::{
+    Change, Directory, MdnsDirectory, Members, Reach, RegisterError, Registration, Role, Source,
+};
 use fipa_testbed::{ChildGuard, PacketRepeater, until_some_async};
 use fipa_transport::{Incarnation, Location};
 
@@ -41,10 +43,6 @@ async fn entries_are_marked_and_ones_own_are_not_read_back() {
     assert_eq!(one.entries().to_vec(), [leg]);
     assert_eq!(two.entries().to_vec(), [arm]);
     assert_eq!((one.status().announced, one.status().known), (1, 1));
-    assert!(matches!(
-        two.register(registration("arm")),
-        Err(RegisterError::AlreadyRegistered { .. })
-    ));
 }
 
 #[tokio::test]
@@ -62,13 +60,12 @@ async fn closing_says_goodbye() {
     ));
 }
 
-/// Two directories register one name before they can know of each other; `first` is the one that is
-/// received first.
+/// Two directories register one name before they can know of each other; `first` and `second` are the
+/// times of their hosts. Both agents stay announced, and none takes the name from the other.
 async fn conflict(first: u64, second: u64) {
     let port = free_port();
     let (one, two) = (open(port, "one"), open(port, "two"));
     let witness = open(port, "witness");
-    let mut withdrawn = (one.withdrawals(), two.withdrawals());
     let agent = |millis| {
         let mut agent = registration("arm");
         agent.registered = UNIX_EPOCH + Duration::from_millis(millis);
@@ -77,34 +74,55 @@ async fn conflict(first: u64, second: u64) {
     let (agent_one, agent_two) = (agent(first), agent(second));
     one.register(agent_one.clone()).unwrap();
     two.register(agent_two.clone()).unwrap();
-
-    let (loser, winner, receiver) = if first < second {
-        (agent_two, agent_one, &mut withdrawn.1)
-    } else {
-        (agent_one, agent_two, &mut withdrawn.0)
-    };
-    let told = tokio::time::timeout(common::WATCHDOG, receiver.recv());
-    let told = told.await.expect("the withdrawal is reported").unwrap();
-    assert_eq!(told.withdrawn.incarnation, loser.incarnation);
-    assert_eq!(told.holder.incarnation, winner.incarnation);
-    until_some_async("one record is left, and it is the earlier's", || {
-        let entries = witness.entries();
-        let holder = entries.first()?;
-        (witness.status().known == 1 && holder.incarnation == winner.incarnation).then_some(())
+    let known = |directory: &MdnsDirectory| Some(directory.known("arm")?.incarnation);
+    until_some_async("each other's agent, and both records", || {
+        let known = (known(&one)?, known(&two)?);
+        let each = known == (agent_two.incarnation, agent_one.incarnation);
+        (each && witness.status().known == 2).then_some(())
     })
     .await;
-    assert_eq!(&*witness.entries()[0].name, "arm");
-    assert_eq!(one.status().announced + two.status().announced, 1);
+    assert_eq!((one.status().announced, two.status().announced), (1, 1));
+    let holder = known(&witness).unwrap();
+    let (directory, leaving, staying) = match holder == agent_one.incarnation {
+        true => (&one, &agent_one, &agent_two),
+        false => (&two, &agent_two, &agent_one),
+    };
+    directory.deregister("arm", leaving.incarnation).unwrap();
+    until_some_async("the other one has the name", || {
+        (known(&witness)? == staying.incarnation).then_some(())
+    })
+    .await;
 }
 
 #[tokio::test]
-async fn the_later_of_two_registrations_is_withdrawn() {
+async fn of_two_agents_of_one_name_both_are_announced() {
     conflict(1000, 2000).await;
 }
 
 #[tokio::test]
-async fn the_later_of_two_registrations_is_withdrawn_though_it_was_received_first() {
+async fn of_two_agents_of_one_name_both_are_announced_in_the_other_order() {
     conflict(2000, 1000).await;
+}
+
+#[tokio::test]
+async fn an_agent_that_is_announced_keeps_its_name_whatever_time_another_one_states() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    let witness = open(port, "witness");
+    let first = one.register(registration("arm")).unwrap();
+    until_some_async("the first", || witness.known("arm").zip(two.known("arm"))).await;
+    let later = Registration {
+        registered: UNIX_EPOCH,
+        ..registration("arm")
+    };
+    let later = two.register(later).unwrap();
+    until_some_async("both", || {
+        let known = one.known("arm")?;
+        (known.incarnation == later.incarnation && witness.status().known == 2).then_some(())
+    })
+    .await;
+    let held = witness.known("arm").unwrap();
+    assert_eq!(held.incarnation, first.incarnation);
 }
 
 #[tokio::test]

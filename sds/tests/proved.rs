@@ -8,7 +8,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_sds::{
-    Change, ContactDirectory, Directory, Exchange, MergedDirectory, Mts, Present, StaticDirectory,
+    Change, ContactDirectory, Directory, Entry, Exchange, ExchangeDirectory, MergedDirectory, Mts,
+    Present, StaticDirectory, Subscriber,
 };
 use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
@@ -130,6 +131,30 @@ fn agents_whose_names_are_patterns_are_left_out() {
 }
 
 #[test]
+fn the_names_of_platform_agents_count_from_the_gateway_of_that_name_only() {
+    for mandate in [Mandate::Unproved, certified(&[])] {
+        let mut bench = Bench::new(vec![present(1, mandate.clone()), present(2, mandate)]);
+        let names = [
+            "df@mts-1",
+            "ams@mts-1",
+            "df-000000ff@mts-1",
+            "df@mts-2",
+            "ams-000000ff@mts-2",
+            "arm@mts-2",
+        ];
+        bench.tell(1, &names, 5);
+        let directory = bench.exchange.directory();
+        let entries = directory.entries();
+        let known: Vec<&str> = entries.iter().map(|entry| &*entry.name).collect();
+        let own = ["ams@mts-1", "arm@mts-2", "df-000000ff@mts-1", "df@mts-1"];
+        assert_eq!(known, own);
+        bench.tell(2, &names, 4);
+        assert_eq!(bench.holder("df@mts-1"), Some(1));
+        assert_eq!(bench.holder("df@mts-2"), Some(2));
+    }
+}
+
+#[test]
 fn a_proved_claim_precedes_an_earlier_one_without_proof() {
     let mut bench = Bench::new(vec![
         present(1, Mandate::Unproved),
@@ -208,13 +233,72 @@ fn proved_agents_of_a_disconnected_gateway_are_kept() {
 }
 
 #[test]
-fn without_proof_the_earlier_registration_has_the_name() {
+fn without_proof_the_first_claim_has_the_name_too() {
     let unproved = [1, 2].map(|gateway| present(gateway, Mandate::Unproved));
     let mut bench = Bench::new(unproved.to_vec());
     bench.tell(1, &["rover"], 50);
     bench.tell(2, &["rover"], 1);
+    assert_eq!(bench.holder("rover"), Some(1));
+    let contested = bench.exchange.directory().contested();
+    let gateways = contested.iter().map(|(holder, other)| {
+        let of = |entry: &Entry| entry.mts.incarnation.as_u64();
+        (of(holder), of(other))
+    });
+    assert_eq!(gateways.collect::<Vec<_>>(), [(1, 2)]);
+    bench.tell(1, &[], 50);
     assert_eq!(bench.holder("rover"), Some(2));
-    assert!(bench.exchange.directory().contested().is_empty());
+}
+
+/// A directory of announcements, without connections to the gateways.
+struct Announced(Arc<ExchangeDirectory>);
+
+impl Directory for Announced {
+    fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        self.0.known(name)
+    }
+
+    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.0.known_incarnation(incarnation)
+    }
+
+    fn entries(&self) -> Arc<[Arc<Entry>]> {
+        self.0.entries()
+    }
+
+    fn generation(&self) -> u64 {
+        self.0.generation()
+    }
+
+    fn subscribe(&self, subscriber: &Subscriber) {
+        self.0.subscribe(subscriber);
+    }
+}
+
+#[test]
+fn an_agent_of_a_connected_gateway_precedes_one_that_is_only_announced() {
+    let bench = |gateway| Bench::new(vec![present(gateway, Mandate::Unproved)]);
+    let (mut announced, mut connected) = (bench(1), bench(2));
+    announced.tell(1, &["rover", "arm"], 1);
+    connected.tell(2, &["rover", "arm"], 50);
+    let legacy = StaticDirectory::new([("arm", vec!["tcp://10.0.0.9:1;jade".parse().unwrap()])]);
+    let merged = MergedDirectory::new(vec![
+        Arc::new(Announced(announced.exchange.directory())),
+        connected.exchange.directory(),
+        Arc::new(legacy.unwrap()),
+    ]);
+    let gateway = |entry: Option<Arc<Entry>>| entry.map(|it| it.mts.incarnation.as_u64());
+    assert_eq!(gateway(merged.known("rover")), Some(2));
+    assert_eq!(gateway(merged.view().named("rover")), Some(2));
+    // The configuration of the owner precedes both.
+    assert_eq!(gateway(merged.known("arm")), Some(0));
+    let entries = merged.entries();
+    let of_entries: Vec<_> = entries
+        .iter()
+        .map(|it| gateway(Some(Arc::clone(it))))
+        .collect();
+    assert_eq!(of_entries, [Some(0), Some(2)]);
+    connected.tell(2, &[], 50);
+    assert_eq!(gateway(merged.known("rover")), Some(1));
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use fipa_sds::{Pattern, check_name};
+use fipa_sds::{Pattern, check_name, reserved_for};
 use fipa_transport::wire::MAX_REMAINING;
 use fipa_transport::{Kind, Location};
 
@@ -129,7 +129,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.access(&config.access);
     found.heartbeat(config.monitor.heartbeat);
     found.protocols(&config.monitor.protocols);
-    found.platform(&config.platform);
+    found.platform(&config.platform, &config.mts.name);
     found.monitor(&config.monitor);
     found.0
 }
@@ -197,6 +197,14 @@ impl Findings {
             self.combined(
                 &["security", "insecure"],
                 "is true, but security.keys is set, and with keys every connection is encrypted",
+                "remove one of the two",
+            );
+        }
+        if security.loopback && config.transport.tcp.processes {
+            self.combined(
+                &["transport", "tcp", "processes"],
+                "is true, but security.loopback is true, too, and the ports of processes take letters from \
+                 loopback without keys",
                 "remove one of the two",
             );
         }
@@ -281,15 +289,22 @@ impl Findings {
         }
     }
 
-    fn platform(&mut self, platform: &Platform) {
+    fn platform(&mut self, platform: &Platform, gateway: &str) {
         for (key, agent) in [("ams", &platform.ams), ("df", &platform.df)] {
-            if let PlatformAgent::Named(name) = agent
-                && check_name(name).is_err()
-            {
+            let PlatformAgent::Named(name) = agent else {
+                continue;
+            };
+            if check_name(name).is_err() {
                 self.add(
                     &["platform", key],
                     format_args!("cannot be {name:?}, which is no name of an agent"),
                     "use true, false, or a name without any of * + ? [ ( { | ^ $ \\",
+                );
+            } else if reserved_for(name).is_some_and(|other| other != gateway) {
+                self.add(
+                    &["platform", key],
+                    format_args!("cannot be {name:?}, which is reserved for another gateway"),
+                    "use true, or a name that does not begin with ams@ or df@",
                 );
             }
         }

@@ -530,6 +530,11 @@ fn a_gateway_listens_on_the_network_only_with_keys_or_with_insecure() {
         let line = format!("discovery.static={{ \"echo@jade\" = [\"{static_peer}\"] }}");
         assert_eq!(mistakes(&[&line]), "");
     }
+    let loopback = ["security.loopback=true", "transport.tcp.processes=true"];
+    assert!(mistakes(&[keys, loopback[0], loopback[1]]).contains("`transport.tcp.processes`"));
+    for one in loopback {
+        assert_eq!(mistakes(&[keys, one]), "");
+    }
     assert_eq!(mistakes(&[open, "security.insecure=true"]), "");
     assert_eq!(mistakes(&[open, "security.keys=/etc/fipa/keys"]), "");
     assert_eq!(

@@ -6,7 +6,7 @@ use fipa_transport::Signature;
 
 use super::peers;
 use super::{Area, Check, Verdict};
-use crate::routes::{Connected, RefusedConnection, Report, StaticPeer};
+use crate::routes::{Connected, ContestedName, RefusedConnection, Report, StaticPeer};
 use crate::{Config, Kind};
 
 const AREA: Area = Area("gateway");
@@ -14,6 +14,7 @@ const CONFIGURATION: &str = "configuration of the running gateway";
 const CONNECTIONS: &str = "connections with other gateways";
 const PEERS: &str = "static peers";
 const REFUSED: &str = "refused connections";
+const NAMES: &str = "names of agents";
 const PORTS: &str = "ports of known gateways";
 
 /// Maximum number of values that are shown.
@@ -39,6 +40,7 @@ pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &m
     checks.push(configuration(config, report));
     checks.extend(report.neighbours.iter().map(connection));
     checks.extend(report.peers.iter().filter_map(static_peer));
+    checks.extend(report.contested.iter().map(contested));
     let recent = report.refused.iter().filter(|it| it.seconds <= RECENT);
     checks.extend(recent.map(refused));
     peers::connect_all(PORTS, unconnected(config, report).into_iter(), checks);
@@ -102,6 +104,21 @@ fn static_peer(peer: &StaticPeer) -> Option<Check> {
         found,
         "do what the reason says; the gateway asks its static peers again every few seconds",
     ))
+}
+
+/// Reports an agent of this host whose name an agent of another host also has.
+fn contested(contested: &ContestedName) -> Check {
+    let ContestedName { name, gateway } = contested;
+    AREA.problem(
+        NAMES,
+        Verdict::Doubtful,
+        format!(
+            "the agent {name} is also registered at the gateway {gateway}: each other host reaches the one \
+             that was announced to it first"
+        ),
+        "deregister one of the two agents, or give it another name; if it is an agent of the gateway \
+         (ams@, df@), set mts.name on one of the hosts",
+    )
 }
 
 /// Reports a connection that the gateway has refused because of keys.
@@ -172,6 +189,24 @@ mod tests {
         let expected = "sherpa runs with other values: mts.queue = 7 (here: 256); security.loopback = true \
                         (here: false)";
         assert_eq!(differs.found, expected);
+    }
+
+    #[test]
+    fn names_that_agents_of_two_hosts_have_are_listed() {
+        let config = Config::for_host("sherpa");
+        let mut report = report(&config);
+        report.contested.push(ContestedName {
+            name: "arm".to_owned(),
+            gateway: "crex".to_owned(),
+        });
+        let mut checks = Vec::new();
+        examine(&config, Ok(&report), &mut checks);
+        let listed = checks.iter().find(|check| check.verdict != Verdict::Fine);
+        let found = &listed.unwrap().found;
+        assert!(
+            found.starts_with("the agent arm is also registered at the gateway crex:"),
+            "{found}"
+        );
     }
 
     #[test]

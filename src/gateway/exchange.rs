@@ -21,8 +21,9 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::Network;
+use super::names::{Contested, contested, own_agents};
 use super::neighbours::{Neighbour, Neighbours};
-use super::publisher::{Contested, own_agents};
+use crate::routes::ContestedName;
 use crate::service::Service;
 
 /// Deadline for the delivery of a letter of the exchange. After a longer interruption of the link,
@@ -31,6 +32,9 @@ const DEADLINE: Duration = Duration::from_secs(5);
 /// Deadline for the delivery of goodbyes.
 const GOODBYE_DEADLINE: Duration = Duration::from_millis(500);
 
+/// Maximum number of contested names in the report of the gateway.
+const MAX_SHOWN: usize = 64;
+
 /// The ontology of messages about registrations (FIPA00023).
 pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
@@ -38,6 +42,8 @@ pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 pub(super) struct Exchanging {
     core: Mutex<Exchange>,
     directory: Arc<ExchangeDirectory>,
+    /// The agents of this host whose names agents of other hosts have.
+    contested: Mutex<Vec<ContestedName>>,
     /// Wakes the task after a letter has changed the state.
     wake: Notify,
 }
@@ -60,8 +66,15 @@ impl Exchanging {
         Self {
             directory: core.directory(),
             core: Mutex::new(core),
+            contested: Mutex::default(),
             wake: Notify::new(),
         }
+    }
+
+    /// Returns the agents of this host whose names agents of other hosts also have, at most
+    /// [`MAX_SHOWN`].
+    pub(super) fn contested(&self) -> Vec<ContestedName> {
+        self.contested.lock().clone()
     }
 
     /// Returns the directory of the agents that neighbors have sent.
@@ -103,11 +116,17 @@ impl Exchanging {
         loop {
             let conflict_due = conflicts.due().is_some_and(|due| due <= Instant::now());
             if std::mem::take(&mut own_changed) || conflict_due {
-                let (own, contested) = own_agents(&means.service.host, &*known, means.has_keys);
+                let own = own_agents(&means.service.host);
                 self.core.lock().handle_own(Instant::now(), &own);
+                let contested = contested(&own, &*known, means.has_keys);
+                let shown = contested.iter().take(MAX_SHOWN).map(ContestedName::from);
+                *self.contested.lock() = shown.collect();
                 conflicts.report(&means, &contested);
             }
-            disputes.report(&means, Instant::now(), &self.directory.contested());
+            let mut contested = self.directory.contested();
+            // The agents of gateways get second names.
+            contested.retain(|(_, other)| !other.is_platform_agent());
+            disputes.report(&means, Instant::now(), &contested);
             if self.core.lock().has_own_df() {
                 greetings.send(&means, Instant::now());
             }
@@ -362,8 +381,8 @@ impl NameConflicts {
     }
 }
 
-/// The names that agents of two other hosts claim, both with proof, and the reports about them to
-/// the gateways of the agents.
+/// The names that agents of two other hosts claim, both with proof or both without, and the reports
+/// about them to the gateways of the agents.
 #[derive(Default)]
 struct Disputes {
     /// By name and agent of the claimant that does not hold the name.
@@ -457,21 +476,17 @@ impl Disputes {
 impl Contested {
     /// Logs the conflict and informs the agent of this host.
     fn report(&self, means: &Means) {
-        let Self { entry, holder, .. } = self;
-        let (name, mts) = (&entry.name, escape(&holder.mts.name));
-        let content = if self.is_announced {
-            log_limit::warn!(of: holder.mts.incarnation, %name, holder = %mts, "an agent of another host has the same name");
-            format!(
-                "the name {name:?} is also registered at {mts:?}: each other host reaches the agent \
-                 that was announced to it first; deregister one of them"
-            )
-        } else {
-            log_limit::warn!(of: holder.mts.incarnation, %name, holder = %mts, "an earlier registration on another host has the name");
-            format!(
-                "the name {name:?} was registered earlier at {mts:?}: other hosts reach that agent, \
-                 and this one on its own host only; deregister one of them"
-            )
-        };
+        let Self { entry, claim } = self;
+        let (name, mts) = (&entry.name, escape(&claim.mts.name));
+        tracing::warn!(%name, other = %mts, "an agent of another host has the same name");
+        if entry.is_platform_agent() {
+            // It gets a second name.
+            return;
+        }
+        let content = format!(
+            "the name {name:?} is also registered at {mts:?}: each other host reaches the agent \
+             that was announced to it first; deregister one of them"
+        );
         if let Ok(receiver) = AgentId::new(&**name) {
             let message = Message::builder(Performative::Failure)
                 .sender(means.id.clone())

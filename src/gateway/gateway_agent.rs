@@ -192,6 +192,7 @@ impl GatewayAgent {
         let report = routes::Report {
             neighbours: neighbours.map(Into::into).collect(),
             refused: self.refusals.latest().into_iter().map(Into::into).collect(),
+            contested: self.exchange.contested(),
             configuration: self.configuration.lock().clone(),
             ..self.service.report(&entries)
         };

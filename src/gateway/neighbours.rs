@@ -39,8 +39,10 @@ struct State {
     peers: Vec<Peer>,
     /// Locations at which an attempt failed, and the cause.
     doubted: HashMap<Location, TransportErrorKind>,
-    /// The name of this gateway, until a neighbor with the same name was reported.
+    /// The name of this gateway.
     own_name: Option<Arc<str>>,
+    /// Whether a neighbor with the same name was reported.
+    has_namesake: bool,
     /// Neighbors whose last connection has ended, with the time of the end, the latest last.
     parted: VecDeque<(Instant, Arc<Entry>)>,
 }
@@ -118,6 +120,13 @@ impl Neighbours {
     /// Sets the peers that the configuration names, with their locations.
     pub(crate) fn name_peers(&self, peers: Vec<Peer>) {
         self.state.lock().peers = peers;
+    }
+
+    /// Whether this gateway or a neighbor has the name.
+    pub(super) fn has_gateway(&self, name: &str) -> bool {
+        let state = self.state.lock();
+        let mut neighbours = state.present.values();
+        state.own_name.as_deref() == Some(name) || neighbours.any(|it| *it.entry.name == *name)
     }
 
     /// Returns all neighbors, in no particular order.
@@ -254,7 +263,8 @@ impl Neighbours {
 impl State {
     /// Whether a neighbor has the name of this gateway, and is the first one.
     fn is_namesake(&mut self, name: &str) -> bool {
-        self.own_name.take_if(|own| **own == *name).is_some()
+        let is_same = self.own_name.as_deref() == Some(name);
+        is_same && !std::mem::replace(&mut self.has_namesake, true)
     }
 
     /// Returns the neighbor with this new connection, based on its state before.

@@ -18,21 +18,21 @@ use fipa_platform::{
 };
 use fipa_sds::{
     DfEntry, Directory, Entry, Exchange, MergedDirectory, OwnDfEntry, Reach, RegisterError,
-    Registration, Role,
+    Registration, Role, second_name,
 };
 use fipa_transport::{Incarnation, Location, Principal, log_limit};
 use tokio::task::{JoinHandle, JoinSet};
 
 use super::exchange::Exchanging;
+use super::names::other_claim;
 use super::neighbours::Neighbours;
-use super::publisher::other_holder;
 use crate::config;
 use crate::service::Service;
 
 /// Deadline for the delivery of an answer.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 
-/// Time for which an agent of another host must have the name before this one changes its own. The
+/// Time for which an agent of another host must have the name before this one gets a second name. The
 /// updates of a directory may arrive in the wrong order.
 const CONTESTED: Duration = Duration::from_secs(1);
 
@@ -40,9 +40,6 @@ const CONTESTED: Duration = Duration::from_secs(1);
 const _: () = assert!(Exchange::MAX_DF_ENTRY == limits::REMOTE_BYTES);
 const _: () = assert!(Exchange::MAX_TOTAL_DF_ENTRIES == limits::REMOTE_DESCRIPTIONS);
 const _: () = assert!(Exchange::MAX_DF_LEASE.as_secs() == limits::LEASE.as_secs());
-
-/// Maximum number of names that are tried.
-const TRIES: usize = 8;
 
 /// The parts of the gateway that the platform agents use.
 #[derive(Clone)]
@@ -264,15 +261,34 @@ enum Core {
     Df(Df),
 }
 
+/// A registration of one of the agents, with a queue of its own.
+struct Registered {
+    id: AgentId,
+    incarnation: Incarnation,
+}
+
+impl Registered {
+    fn name(&self) -> &str {
+        self.id.name()
+    }
+}
+
+/// The registration by which other hosts reach the agent when they know another agent by its name.
+enum SecondName {
+    /// There was no need for one.
+    None,
+    Registered(Registered),
+    /// The directory of this host refused it.
+    Refused,
+}
+
 /// One of the agents, while the gateway runs.
 struct Task {
     means: PlatformAgents,
     kind: Kind,
     core: Core,
-    /// The name of the configuration.
-    configured: String,
-    name: Arc<str>,
-    incarnation: Incarnation,
+    own: Registered,
+    second: SecondName,
     /// Since when an agent of another host has the name.
     contested: Option<Instant>,
     /// The notifications under way.
@@ -287,8 +303,8 @@ struct Task {
 impl Task {
     /// Registers the agent in the directory of this host.
     fn register(means: PlatformAgents, kind: Kind, configured: String) -> Option<Self> {
-        let (id, incarnation) = enter(&means, kind, &configured, false)?;
-        let name: Arc<str> = id.name().into();
+        let own = enter(&means, kind, configured.into())?;
+        let id = own.id.clone();
         let core = match kind {
             Kind::Ams => Core::Ams(Ams::new(id, means.description())),
             Kind::Df => Core::Df(Df::new(id)),
@@ -297,9 +313,8 @@ impl Task {
             means,
             kind,
             core,
-            configured,
-            name,
-            incarnation,
+            own,
+            second: SecondName::None,
             contested: None,
             sent: JoinSet::new(),
             staying: HashSet::new(),
@@ -322,11 +337,19 @@ impl Task {
             let due = [self.poll_timeout(), contested, self.remote_due];
             let due = due.into_iter().flatten().min();
             let due = due.map(tokio::time::Instant::from_std);
+            let second = self.second().map(|second| second.incarnation);
             tokio::select! {
-                received = service.mts.receive(self.incarnation) => match received {
-                    Some(received) => self.handle(&received),
+                received = service.mts.receive(self.own.incarnation) => match received {
+                    Some(received) => self.handle(&received, None),
                     None => return,
                 },
+                received = service.mts.receive(second.unwrap_or_default()), if second.is_some() => {
+                    let Some(received) = received else {
+                        return;
+                    };
+                    let asked = self.second().map(|second| second.id.clone());
+                    self.handle(&received, asked);
+                }
                 change = here.next() => {
                     if change.is_none() {
                         return;
@@ -365,19 +388,25 @@ impl Task {
         }
     }
 
-    fn handle(&mut self, received: &Received) {
+    /// Handles a letter to the agent. `asked` is its second name, if the letter came to that.
+    fn handle(&mut self, received: &Received, asked: Option<AgentId>) {
+        let name = asked.as_ref().map_or(self.own.name(), AgentId::name);
         let message = match Message::decode(received.letter.payload()) {
             Ok(message) => message,
             Err(error) => {
-                log_limit::info!(of: received.service, error = %ErrorChain(&error), agent = %self.name, "cannot decode a letter to an agent of the gateway");
+                tracing::info!(error = %ErrorChain(&error), agent = name, "cannot decode a letter to an agent of the gateway");
                 let mts = &self.means.service.mts;
-                return mts.handle_undecodable(&self.name, received, &error);
+                return mts.handle_undecodable(&name.into(), received, &error);
             }
         };
-        let Some(asker) = self.means.asker(&message, received) else {
-            log_limit::info!(of: received.service, agent = %self.name, "cannot answer a letter: its sender is not registered");
+        let Some(mut asker) = self.means.asker(&message, received) else {
+            tracing::info!(
+                agent = name,
+                "cannot answer a letter: its sender is not registered"
+            );
             return;
         };
+        asker.asked = asked;
         let now = Now {
             at: Instant::now(),
             wall: SystemTime::now(),
@@ -462,7 +491,7 @@ impl Task {
                 Exchange::MAX_DF_ENTRY,
                 limits::REMOTE_PARTS,
                 Exchange::MAX_DF_BYTES,
-                self.name
+                self.own.name()
             );
         }
         self.staying = staying;
@@ -477,7 +506,7 @@ impl Task {
             let Some(answer) = answer else {
                 return;
             };
-            let sending = self.means.send(self.incarnation, &answer);
+            let sending = self.means.send(self.sender(&answer), &answer);
             let Some(id) = answer.notification else {
                 // The outcome is not awaited: a requester that gets no answer asks again.
                 continue;
@@ -498,21 +527,28 @@ impl Task {
     /// Updates the addresses of the agent after a change of the locations of the gateway.
     fn relocate(&mut self) {
         let means = &self.means;
-        if let Err(error) = entry(means, self.kind, &self.name, self.incarnation) {
-            log_limit::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot update an agent of the gateway");
+        for one in [Some(&self.own), self.second()].into_iter().flatten() {
+            if let Err(error) = entry(means, self.kind, one.name().into(), one.incarnation) {
+                tracing::warn!(error = %ErrorChain(&error), agent = one.name(), "cannot update an agent of the gateway");
+            }
         }
         if let Core::Ams(ams) = &mut self.core {
             ams.describe(means.description());
         }
     }
 
-    /// Changes the name when an agent of another host has had it for [`CONTESTED`].
+    /// Registers a second name when an agent of another host has had the name of this one for
+    /// [`CONTESTED`]. The second name stays, because agents of other hosts use it from then on.
     fn check_name(&mut self) {
-        let own = self.means.service.host.known(&self.name);
-        let own = own.filter(|own| own.incarnation == self.incarnation);
-        let holder =
-            own.and_then(|own| other_holder(&own, &*self.means.known, self.means.has_keys));
-        let Some(holder) = holder else {
+        if !matches!(self.second, SecondName::None) {
+            self.contested = None;
+            return;
+        }
+        let means = &self.means;
+        let own = means.service.host.known(self.own.name());
+        let own = own.filter(|own| own.incarnation == self.own.incarnation);
+        let claim = own.and_then(|own| other_claim(&own, &*means.known, means.has_keys));
+        let Some(claim) = claim else {
             self.contested = None;
             return;
         };
@@ -520,90 +556,66 @@ impl Task {
         if since.elapsed() < CONTESTED {
             return;
         }
-        self.contested = None;
-        let Some((id, incarnation)) = enter(&self.means, self.kind, &self.configured, true) else {
-            return;
+        let name = second_name(self.own.name(), means.service.own.incarnation);
+        self.second = match enter(means, self.kind, Arc::clone(&name)) {
+            Some(second) => {
+                tracing::info!(
+                    agent = self.own.name(), second = %name, other = %escape(&claim.mts.name),
+                    "an agent of the gateway has a second name for other hosts: an agent of another host \
+                     has its name"
+                );
+                SecondName::Registered(second)
+            }
+            None => SecondName::Refused,
         };
-        log_limit::info!(
-            before = %self.name, now = id.name(), holder = %escape(&holder.mts.name),
-            "an agent of the gateway has a new name: an agent of another host has its name"
-        );
-        let service = Arc::clone(&self.means.service);
-        // Answers to letters that arrived under the former name have that name.
-        while let Some(received) = service.mts.try_receive(self.incarnation) {
-            self.handle(&received);
+    }
+
+    fn second(&self) -> Option<&Registered> {
+        match &self.second {
+            SecondName::Registered(second) => Some(second),
+            SecondName::None | SecondName::Refused => None,
         }
-        self.send_answers();
-        if let Err(error) = service.host.deregister(&self.name, self.incarnation) {
-            log_limit::warn!(error = %ErrorChain(&error), agent = %self.name, "cannot deregister an agent of the gateway");
-        }
-        drop(service.mts.deregister(self.incarnation));
-        self.name = id.name().into();
-        self.incarnation = incarnation;
-        match &mut self.core {
-            Core::Ams(ams) => ams.rename(id),
-            Core::Df(df) => df.rename(id),
-        }
+    }
+
+    /// Returns the registration that sends an answer: that which was asked.
+    fn sender(&self, answer: &Answer) -> Incarnation {
+        let second = self.second().filter(|second| {
+            let sender = answer.message.sender();
+            sender.is_some_and(|sender| sender.name() == second.name())
+        });
+        second.unwrap_or(&self.own).incarnation
     }
 }
 
-/// Registers an agent under its name, or, if the name is taken, under the name with `-` and four
-/// hexadecimal digits.
-fn enter(
-    means: &PlatformAgents,
-    kind: Kind,
-    configured: &str,
-    is_taken: bool,
-) -> Option<(AgentId, Incarnation)> {
-    let mut with_digits = is_taken;
-    let mut last = None;
-    for _ in 0..TRIES {
-        let incarnation = Incarnation::random();
-        let name: Arc<str> = match with_digits {
-            true => format!("{configured}-{:04x}", incarnation.as_u64() & 0xffff).into(),
-            false => configured.into(),
-        };
-        with_digits = true;
-        let id = match AgentId::new(&*name) {
-            Ok(id) => id,
-            Err(error) => {
-                log_limit::warn!(error = %ErrorChain(&error), "cannot register an agent of the gateway");
-                return None;
-            }
-        };
-        // The queue must exist before the name is visible, because letters can arrive from then on.
-        let mts = &means.service.mts;
-        mts.register(Arc::clone(&name), incarnation);
-        match entry(means, kind, &name, incarnation) {
-            Ok(_) => return Some((id, incarnation)),
-            Err(error) => {
-                drop(mts.deregister(incarnation));
-                let is_taken = matches!(error, RegisterError::AlreadyRegistered { .. });
-                last = Some(error);
-                if !is_taken {
-                    break;
-                }
-            }
-        }
+/// Registers an agent under a name of its own.
+fn enter(means: &PlatformAgents, kind: Kind, name: Arc<str>) -> Option<Registered> {
+    let incarnation = Incarnation::random();
+    let id = AgentId::new(&*name)
+        .inspect_err(|error| tracing::warn!(error = %ErrorChain(error), "cannot register an agent of the gateway"))
+        .ok()?;
+    // The queue must exist before the name is visible, because letters can arrive from then on.
+    let mts = &means.service.mts;
+    mts.register(Arc::clone(&name), incarnation);
+    if let Err(error) = entry(means, kind, name, incarnation) {
+        drop(mts.deregister(incarnation));
+        tracing::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
+        return None;
     }
-    if let Some(error) = last {
-        log_limit::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
-    }
-    None
+    Some(Registered { id, incarnation })
 }
 
 /// Registers or updates the directory entry of an agent.
 fn entry(
     means: &PlatformAgents,
     kind: Kind,
-    name: &Arc<str>,
+    name: Arc<str>,
     incarnation: Incarnation,
 ) -> Result<Arc<Entry>, RegisterError> {
     let known = means.service.host.known_incarnation(incarnation);
     let registration = Registration {
         agent_type: kind.agent_type().to_owned(),
         description: kind.description().to_owned(),
-        ..Registration::new(Arc::clone(name), incarnation, means.service.locations())
+        ..Registration::new(name, incarnation, means.service.locations())
     };
     means.service.host.register(Registration {
         // The age of the registration decides about the name.

@@ -7,14 +7,14 @@ use std::time::Instant;
 
 use fipa_acl::ErrorChain;
 use fipa_sds::{
-    ContactDirectory, Directory, Entry, HostDirectory, HostError, MergedDirectory, Reach,
-    Registration, Role,
+    ContactDirectory, Directory, Entry, HostDirectory, HostError, MergedDirectory, Registration,
+    Role,
 };
 use fipa_transport::{Incarnation, Location, log_limit};
 
 use super::Network;
+use super::names::own_agents;
 use crate::config::is_on_loopback;
-use crate::routes::ASKER_TYPE;
 use crate::service::Service;
 
 /// Publishes the agents of other hosts to the processes of this host, as reachable through this
@@ -29,8 +29,6 @@ pub(super) struct Publisher {
     pub(super) contacts: Arc<ContactDirectory>,
     /// The service that accepts letters for the published and announced agents.
     pub(super) service: Arc<Service>,
-    /// Whether `security.keys` is set.
-    pub(super) has_keys: bool,
     /// Whether announcements stay on this host.
     pub(super) only_loopback: bool,
 }
@@ -80,64 +78,6 @@ impl Publisher {
             }
         }
     }
-}
-
-/// Returns the agents and coalitions of this host that are announced to other hosts, and those
-/// whose name an agent of another host also has, each with that agent.
-///
-/// Without keys, the earlier registration holds the name on all hosts. With keys, the registration
-/// times of other hosts have no effect: all agents of this host are announced, and a claim that no
-/// link proves is ignored. Agents that query this gateway are not announced.
-pub(super) fn own_agents(
-    host: &HostDirectory,
-    known: &dyn Directory,
-    has_keys: bool,
-) -> (Vec<Arc<Entry>>, Vec<Contested>) {
-    let (mut own, mut contested) = (Vec::new(), Vec::new());
-    let entries = host.entries();
-    let agents = entries
-        .iter()
-        .filter(|entry| entry.reach == Reach::Local && entry.role != Role::Gateway)
-        .filter(|entry| *entry.agent_type != *ASKER_TYPE);
-    for entry in agents {
-        let holder = other_holder(entry, known, has_keys);
-        if holder.is_none() || has_keys {
-            own.push(Arc::clone(entry));
-        }
-        if let Some(holder) = holder {
-            contested.push(Contested {
-                entry: Arc::clone(entry),
-                holder,
-                is_announced: has_keys,
-            });
-        }
-    }
-    (own, contested)
-}
-
-/// Returns the agent of another host that has the name of this agent of this host, with a better or a
-/// proved claim: see [`own_agents`].
-pub(super) fn other_holder(
-    entry: &Entry,
-    known: &dyn Directory,
-    has_keys: bool,
-) -> Option<Arc<Entry>> {
-    let age = |entry: &Entry| (entry.registered, entry.incarnation);
-    let holder = known.known(&entry.name)?;
-    let has_name = holder.incarnation != entry.incarnation
-        && match has_keys {
-            true => known.mandate(holder.mts.incarnation).is_proved(),
-            false => age(&holder) < age(entry),
-        };
-    has_name.then_some(holder)
-}
-
-/// An agent of this host whose name an agent of another host also has.
-pub(super) struct Contested {
-    pub(super) entry: Arc<Entry>,
-    pub(super) holder: Arc<Entry>,
-    /// Whether the agent of this host is announced to other hosts nevertheless.
-    pub(super) is_announced: bool,
 }
 
 /// The task that keeps announcements and published entries up to date.
@@ -208,11 +148,7 @@ impl PublishTask {
 
     /// Announces the agents that joined on this host, and withdraws those that left.
     fn announce(&mut self, network: &dyn Directory) {
-        let (agents, _) = own_agents(
-            &self.publisher.host,
-            &*self.publisher.known,
-            self.publisher.has_keys,
-        );
+        let agents = own_agents(&self.publisher.host);
         let mine: HashMap<&Arc<str>, &Arc<Entry>> =
             agents.iter().map(|entry| (&entry.name, entry)).collect();
         // An entry with an unchanged incarnation is updated in place, without being withdrawn.
@@ -276,57 +212,5 @@ impl PublishTask {
                 }
             }
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use fipa_sds::{Exchange, HostConfig, Mts, Present};
-    use fipa_transport::{Mandate, Principal};
-
-    use super::*;
-
-    /// Returns the number of announced and of contested agents of a host with the agent `rover`,
-    /// while a neighbor with this mandate has an agent `rover` that was registered long before.
-    fn announced(mandate: Mandate, has_keys: bool) -> (usize, usize) {
-        let place = tempfile::tempdir().unwrap();
-        let host = HostDirectory::open(HostConfig {
-            brief: false,
-            dir: place.path().join("domain"),
-            mts: Mts::new("mts", Incarnation::from_u64(1)),
-            gateway: true,
-        });
-        let host = host.unwrap();
-        let at = "shm://0000000000000001#0000000000000001".parse().unwrap();
-        let rover = Registration::new("rover", Incarnation::from_u64(2), vec![at]);
-        host.register(rover).unwrap();
-        let gateway = Incarnation::from_u64(7);
-        let mut exchange = Exchange::new(0);
-        let present = Present {
-            mts: Mts::new("crex-mts", gateway),
-            locations: vec!["tcp://192.0.2.1:7788#0000000000000007".parse().unwrap()],
-            mandate,
-            principal: Principal::Certificate([7; 32]),
-        };
-        exchange.handle_neighbours(Instant::now(), &[present]);
-        let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,
-            "agents":[{"name":"rover","id":"0000000000000008","registered":1}]}}}"#;
-        let taken = exchange.handle_letter(Instant::now(), gateway, told);
-        taken.unwrap();
-        let known = MergedDirectory::new(vec![exchange.directory()]);
-        let (own, contested) = own_agents(&host, &known, has_keys);
-        assert!(contested.iter().all(|it| it.is_announced == has_keys));
-        (own.len(), contested.len())
-    }
-
-    #[tokio::test]
-    async fn with_keys_no_claimed_time_keeps_agents_of_this_host_from_others() {
-        let certified = |agents: &[&str]| {
-            Mandate::Certified(agents.iter().map(|agent| (*agent).to_owned()).collect())
-        };
-        assert_eq!(announced(Mandate::Unproved, false), (0, 1));
-        assert_eq!(announced(Mandate::Unproved, true), (1, 0));
-        assert_eq!(announced(certified(&[]), true), (1, 1), "told");
-        assert_eq!(announced(certified(&["crex"]), true), (1, 0));
     }
 }

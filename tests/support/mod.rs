@@ -4,7 +4,6 @@
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::{Duration, SystemTime};
 
 use fipa::config::Sources;
 use fipa::{Agent, AgentId, Config, Domain, Message, Performative};
@@ -41,16 +40,6 @@ pub(crate) fn config(set: &[&str]) -> Config {
 pub(crate) async fn two(config: &Config) -> (Domain, Domain) {
     let member = || async { Domain::open(config).await.unwrap() };
     (member().await, member().await)
-}
-
-/// Waits until the clock shows another millisecond. Of two registrations with one name, the earlier one has it,
-/// and directories carry the times of registrations in this unit.
-pub(crate) async fn next_millisecond() {
-    let millis = || SystemTime::UNIX_EPOCH.elapsed().unwrap().as_millis();
-    let before = millis();
-    while millis() == before {
-        tokio::time::sleep(Duration::from_millis(1)).await;
-    }
 }
 
 /// Builds an `inform` with this content.

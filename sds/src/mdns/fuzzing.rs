@@ -29,7 +29,7 @@ pub struct Listener {
 /// Builds the packets that announce this entry.
 #[must_use]
 pub fn announced(entry: &Entry) -> Vec<Vec<u8>> {
-    let label = record::label(&entry.name, 0);
+    let label = record::label(&entry.name, 0, entry.mts.incarnation);
     let says = record::encode(entry);
     packet::announcement(&label, "fipa-2.local", &says)
         .into_iter()
@@ -116,7 +116,7 @@ impl Listener {
 /// Asserts that a decoded entry is equal after encoding and decoding it again.
 fn survives(entry: &Entry, at: SystemTime) {
     let says = record::encode(entry);
-    let label = record::label(&entry.name, 0);
+    let label = record::label(&entry.name, 0, entry.mts.incarnation);
     match record::decode(&label, &says, at) {
         Ok(again) => assert_eq!(&again, entry),
         Err(error) => panic!("{entry:?} cannot be decoded again: {error}"),

@@ -5,10 +5,9 @@
 //! `record` defines the format. Failed or blocked multicast is never fatal; it is reported in the
 //! [status](MdnsDirectory::status).
 //!
-//! A name belongs to the earlier registration. The directory with the later registration withdraws
-//! it and [reports](MdnsDirectory::withdrawals) that; agents are never renamed. The instance label
-//! of a record has no meaning between gateways: a label in use by another name is replaced by a
-//! different one.
+//! Agents of several gateways may have one name: all are announced, and a directory shows that which
+//! was announced to it first. The instance label of a record has no meaning between gateways: a label
+//! in use by another record is replaced by a different one.
 
 mod alarm;
 mod beacon;
@@ -35,7 +34,7 @@ use std::time::{Duration, Instant};
 use fipa_transport::{Incarnation, log_limit};
 use mdns_sd::{DaemonStatus, IfKind, Receiver, ServiceDaemon, ServiceInfo, TxtProperty};
 use parking_lot::Mutex;
-use tokio::sync::{Notify, broadcast, watch};
+use tokio::sync::{Notify, watch};
 
 use self::beacon::Digest;
 use self::coalition_sync::{CoalitionSync, Updates};
@@ -94,15 +93,6 @@ pub struct MdnsDirectory {
     task: tokio::task::JoinHandle<()>,
 }
 
-/// A registration that was withdrawn because another agent registered the name earlier.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Withdrawal {
-    /// The withdrawn registration.
-    pub withdrawn: Arc<Entry>,
-    /// The entry that holds the name.
-    pub holder: Arc<Entry>,
-}
-
 /// Status of [`MdnsDirectory`].
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct MdnsStatus {
@@ -155,7 +145,6 @@ impl MdnsDirectory {
             // The addresses of a host that starts may not be usable yet.
             interfaces_changed: AtomicBool::new(true),
             own: Mutex::default(),
-            withdrawals: broadcast::channel(64).0,
             status: Mutex::default(),
             last_error: watch::Sender::new(failed),
             postponed: Notify::new(),
@@ -165,13 +154,6 @@ impl MdnsDirectory {
         }
         let task = runtime.spawn(task::run(Arc::clone(&shared)));
         Ok(Self { shared, task })
-    }
-
-    /// Returns a receiver of every later withdrawal. With more than 64 unread withdrawals, the
-    /// oldest are lost.
-    #[must_use]
-    pub fn withdrawals(&self) -> broadcast::Receiver<Withdrawal> {
-        self.shared.withdrawals.subscribe()
     }
 
     /// Returns the current status.
@@ -331,7 +313,6 @@ struct Shared {
     /// Whether to check the interfaces at once.
     interfaces_changed: AtomicBool,
     own: Mutex<OwnAgents>,
-    withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
     last_error: watch::Sender<Option<String>>,
     /// Wakes the task for work that is due later or now.
@@ -434,8 +415,7 @@ impl Shared {
             return Err(RegisterError::Closed);
         }
         let announced = own.agents.get(&entry.name);
-        let ours = announced.map(|announced| Arc::clone(&announced.entry));
-        if let Some(holder) = ours.or_else(|| self.table.known(&entry.name))
+        if let Some(holder) = announced.map(|announced| Arc::clone(&announced.entry))
             && holder.incarnation != entry.incarnation
         {
             return Err(RegisterError::AlreadyRegistered { holder });
@@ -461,7 +441,7 @@ impl Shared {
         mut attempt: u32,
     ) -> Result<(), mdns_sd::Error> {
         let fullname = loop {
-            let fullname = fullname(&record::label(&entry.name, attempt));
+            let fullname = fullname(&self.label(&entry.name, attempt));
             let mut others = own.agents.iter().filter(|(name, _)| **name != entry.name);
             let free = others.all(|(_, other)| other.fullname != fullname);
             if free && !own.spoilt.contains(&fullname) {
@@ -514,8 +494,12 @@ impl Shared {
         Ok(())
     }
 
+    fn label(&self, name: &str, attempt: u32) -> String {
+        record::label(name, attempt, self.config.mts.incarnation)
+    }
+
     fn register_with_daemon(&self, announced: &Announcement) -> Result<(), mdns_sd::Error> {
-        let label = record::label(&announced.entry.name, announced.attempt);
+        let label = self.label(&announced.entry.name, announced.attempt);
         let host = announced.host_name();
         let properties = record::encode(&announced.entry);
         let properties: Vec<TxtProperty> = properties.into_iter().map(TxtProperty::from).collect();
@@ -533,7 +517,7 @@ impl Shared {
         let due = own.relocations.take_due(now);
         let packets = due.iter().filter_map(|name| {
             let announced = own.agents.get(name)?;
-            let label = record::label(name, announced.attempt);
+            let label = self.label(name, announced.attempt);
             let properties = record::encode(&announced.entry);
             let packet = packet::announcement(&label, &announced.host_name(), &properties)?;
             Some((label, packet))

@@ -131,14 +131,19 @@ pub(super) fn decode(
 ///
 /// The label is the name with `?` for `.` if a legacy peer can convert it back, otherwise a prefix
 /// of the name and a hash of it. `attempt` changes the hash: labels that differ only in case are
-/// equal on the network, so another name may already use the first label.
-pub(super) fn label(name: &str, attempt: u32) -> String {
+/// equal on the network, so another name may already use the first label, or another gateway the same
+/// name. Further labels are those of the gateway alone.
+pub(super) fn label(name: &str, attempt: u32, gateway: Incarnation) -> String {
     let plain = name.replace('.', "?");
     let faithful = plain.len() <= MAX_LABEL && !name.contains(['?', '\\']);
     if faithful && attempt == 0 {
         return plain;
     }
-    let hash = format!("~{:016x}", fnv1a(name, attempt));
+    let of = match attempt {
+        0 => 0,
+        _ => gateway.as_u64(),
+    };
+    let hash = format!("~{:016x}", fnv1a(name, attempt, of));
     let beginning = plain.replace('\\', "_");
     let beginning = &beginning[..beginning.floor_char_boundary(MAX_LABEL - hash.len())];
     format!("{beginning}{hash}")
@@ -360,8 +365,12 @@ fn cut(text: &str) -> &str {
 }
 
 /// FNV-1a: all hosts must compute the same value; it need not be unpredictable.
-fn fnv1a(name: &str, attempt: u32) -> u64 {
-    let bytes = name.bytes().chain(attempt.to_be_bytes());
+fn fnv1a(name: &str, attempt: u32, gateway: u64) -> u64 {
+    let numbers = attempt
+        .to_be_bytes()
+        .into_iter()
+        .chain(gateway.to_be_bytes());
+    let bytes = name.bytes().chain(numbers);
     bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
     })
@@ -390,6 +399,8 @@ mod tests {
             .map(|(key, value)| ((*key).to_owned(), value.to_vec()))
             .collect()
     }
+
+    const GATEWAY: Incarnation = Incarnation::from_u64(0xab);
 
     fn example() -> Entry {
         let gateway = Incarnation::from_u64(0xab);
@@ -427,7 +438,7 @@ mod tests {
                 "TIMESTAMP=20261120-11:00:00:123000",
             ]
         );
-        assert_eq!(label(&example().name, 0), "arm?left@crex");
+        assert_eq!(label(&example().name, 0, GATEWAY), "arm?left@crex");
     }
 
     #[test]
@@ -545,6 +556,27 @@ mod tests {
     }
 
     #[test]
+    fn a_record_of_another_gateway_claims_no_name_of_a_platform_agent() {
+        let entry = example();
+        let own = Entry {
+            name: format!("df@{}", entry.mts.name).into(),
+            ..entry.clone()
+        };
+        assert_eq!(read("label", &encode(&own)), Ok(own));
+        for name in ["df@crex", "ams@crex", "ams-000000ff@crex"] {
+            let claim = Entry {
+                name: name.into(),
+                ..entry.clone()
+            };
+            let refused = RecordError::Entry(EntryError::Reserved("crex".to_owned()));
+            assert_eq!(read("label", &encode(&claim)), Err(refused.clone()));
+            // Records of legacy peers name no gateway.
+            let bare = read(name, &Vec::new());
+            assert_eq!(bare, Err(refused), "{name}");
+        }
+    }
+
+    #[test]
     fn labels_of_different_names_differ() {
         let long = "x".repeat(100);
         for (one, other) in [
@@ -553,10 +585,13 @@ mod tests {
             (&*long, &*"x".repeat(101)),
             (&*long, &*"x".repeat(46)),
         ] {
-            assert_ne!(label(one, 0), label(other, 0));
+            assert_ne!(label(one, 0, GATEWAY), label(other, 0, GATEWAY));
         }
-        assert_ne!(label("arm", 1), label("arm", 2));
-        assert!(label("arm", 1).starts_with("arm~"));
+        assert_ne!(label("arm", 1, GATEWAY), label("arm", 2, GATEWAY));
+        assert!(label("arm", 1, GATEWAY).starts_with("arm~"));
+        let other = Incarnation::from_u64(8);
+        assert_eq!(label("arm", 0, GATEWAY), label("arm", 0, other));
+        assert_ne!(label("arm", 1, GATEWAY), label("arm", 1, other));
     }
 
     #[test]
@@ -690,7 +725,7 @@ mod tests {
 
         #[test]
         fn labels_are_valid_and_reversible(name in any_name(), attempt in 0..3_u32) {
-            let label = label(&name, attempt);
+            let label = label(&name, attempt, GATEWAY);
             prop_assert!(!label.is_empty() && label.len() <= MAX_LABEL);
             prop_assert!(!label.contains(['.', '\\']));
             let turned_back = label.replace('?', ".") == name;

@@ -13,7 +13,7 @@ use super::browse::{ParsedPacket, label_of};
 use super::listener::Listener;
 use super::record::{self, Properties};
 use super::restart::{self, CacheCheck, Pauses};
-use super::{MAX_SPOILT, Shared, Withdrawal};
+use super::{MAX_SPOILT, OwnAgents, Shared};
 use crate::Entry;
 
 /// Delay before the stop command is repeated to a busy library.
@@ -164,7 +164,7 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Optio
         own_found(shared, fullname, &entry, Digest::of(properties));
     } else {
         shared.put(fullname, Some(Arc::clone(&entry)));
-        contested(shared, &entry);
+        give_way(shared, fullname, &entry);
     }
     Some(entry.mts.incarnation)
 }
@@ -206,10 +206,8 @@ fn is_renamed(fullname: &str, original: &str) -> bool {
         .is_some()
 }
 
-/// Handles a conflict over the label of an own record, for which the library chose another label.
-/// The conflicting record may be of the same name or of another one. Announces the record under the
-/// next label; if the names are equal, both gateways detect that, and the later registration is
-/// withdrawn.
+/// Handles a conflict over the label of an own record. The conflicting record may be of the same name
+/// or of another one. Announces the record under the next label.
 fn renamed(shared: &Shared, original: &str) {
     let original = original.to_lowercase();
     let mut own = shared.own.lock();
@@ -233,29 +231,18 @@ fn renamed(shared: &Shared, original: &str) {
     }
 }
 
-/// If this gateway announces the same name with a later registration, withdraws it.
-fn contested(shared: &Shared, theirs: &Arc<Entry>) {
-    let mut own = shared.own.lock();
-    let Some(ours) = own.agents.get(&theirs.name) else {
-        return;
-    };
-    let age = |entry: &Entry| (entry.registered, entry.incarnation);
-    if age(&ours.entry) < age(theirs) {
+/// Takes another label for an own record if another gateway announces this one by the same label. Of
+/// two gateways the one with the greater incarnation does so. Two records of one label would replace
+/// each other in the caches of other hosts.
+fn give_way(shared: &Shared, fullname: &str, theirs: &Entry) {
+    if theirs.mts.incarnation > shared.config.mts.incarnation {
         return;
     }
-    let withdrawn = Arc::clone(&ours.entry);
-    if let Err(error) = shared.withdraw(&mut own, &withdrawn.name) {
-        let name = &withdrawn.name;
-        shared.failed(format!("cannot withdraw {name:?}: {error}"));
+    let original = fullname.to_lowercase();
+    let is_own = |own: &OwnAgents| own.agents.values().any(|one| *one.fullname == *original);
+    if is_own(&shared.own.lock()) {
+        renamed(shared, &original);
     }
-    drop(own);
-    let name = &withdrawn.name;
-    log_limit::warn!(of: theirs.mts.incarnation, %name, holder = %theirs.mts.name, "withdrawing a registration: another gateway registered the name earlier");
-    // The owner may have no receiver.
-    let _ = shared.withdrawals.send(Withdrawal {
-        withdrawn,
-        holder: Arc::clone(theirs),
-    });
 }
 
 #[cfg(test)]

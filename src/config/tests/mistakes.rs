@@ -291,6 +291,11 @@ fn mistakes_are_reported_with_line_and_key() {
              use true, false, or a name without any of * + ? [ ( { | ^ $ \\",
         ),
         (
+            "[mts]\nname = \"rover\"\n[platform]\nams = \"ams@rover\"\ndf = \"df@crex\"\n",
+            "fipa.toml:5: `platform.df` cannot be \"df@crex\", which is reserved for another gateway; \
+             use true, or a name that does not begin with ams@ or df@",
+        ),
+        (
             "[discovery.static]\necho = [\"http://:7778/acc\"]\n",
             "fipa.toml:2: `discovery.static.echo` lists http://:7778/acc, which has no host or a wrong \
              port; write for example http://10.0.0.7:7778/acc",
