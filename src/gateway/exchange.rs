@@ -478,7 +478,7 @@ impl Contested {
     fn report(&self, means: &Means) {
         let Self { entry, claim } = self;
         let (name, mts) = (&entry.name, escape(&claim.mts.name));
-        tracing::warn!(%name, other = %mts, "an agent of another host has the same name");
+        log_limit::warn!(%name, other = %mts, "an agent of another host has the same name");
         if entry.is_platform_agent() {
             // It gets a second name.
             return;

@@ -394,13 +394,13 @@ impl Task {
         let message = match Message::decode(received.letter.payload()) {
             Ok(message) => message,
             Err(error) => {
-                tracing::info!(error = %ErrorChain(&error), agent = name, "cannot decode a letter to an agent of the gateway");
+                log_limit::info!(error = %ErrorChain(&error), agent = name, "cannot decode a letter to an agent of the gateway");
                 let mts = &self.means.service.mts;
                 return mts.handle_undecodable(&name.into(), received, &error);
             }
         };
         let Some(mut asker) = self.means.asker(&message, received) else {
-            tracing::info!(
+            log_limit::info!(
                 agent = name,
                 "cannot answer a letter: its sender is not registered"
             );
@@ -529,7 +529,7 @@ impl Task {
         let means = &self.means;
         for one in [Some(&self.own), self.second()].into_iter().flatten() {
             if let Err(error) = entry(means, self.kind, one.name().into(), one.incarnation) {
-                tracing::warn!(error = %ErrorChain(&error), agent = one.name(), "cannot update an agent of the gateway");
+                log_limit::warn!(error = %ErrorChain(&error), agent = one.name(), "cannot update an agent of the gateway");
             }
         }
         if let Core::Ams(ams) = &mut self.core {
@@ -559,7 +559,7 @@ impl Task {
         let name = second_name(self.own.name(), means.service.own.incarnation);
         self.second = match enter(means, self.kind, Arc::clone(&name)) {
             Some(second) => {
-                tracing::info!(
+                log_limit::info!(
                     agent = self.own.name(), second = %name, other = %escape(&claim.mts.name),
                     "an agent of the gateway has a second name for other hosts: an agent of another host \
                      has its name"
@@ -591,14 +591,14 @@ impl Task {
 fn enter(means: &PlatformAgents, kind: Kind, name: Arc<str>) -> Option<Registered> {
     let incarnation = Incarnation::random();
     let id = AgentId::new(&*name)
-        .inspect_err(|error| tracing::warn!(error = %ErrorChain(error), "cannot register an agent of the gateway"))
+        .inspect_err(|error| log_limit::warn!(error = %ErrorChain(error), "cannot register an agent of the gateway"))
         .ok()?;
     // The queue must exist before the name is visible, because letters can arrive from then on.
     let mts = &means.service.mts;
     mts.register(Arc::clone(&name), incarnation);
     if let Err(error) = entry(means, kind, name, incarnation) {
         drop(mts.deregister(incarnation));
-        tracing::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
+        log_limit::warn!(error = %ErrorChain(&error), "cannot register the {} of the gateway", kind.description());
         return None;
     }
     Some(Registered { id, incarnation })

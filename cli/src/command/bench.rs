@@ -1,5 +1,6 @@
 //! `fipa bench`: the shell of the crate `fipa-bench`, which measures.
 
+use fipa::log_limit;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -211,7 +212,7 @@ fn report(
     for note in measured.notes {
         #[expect(clippy::disallowed_macros, reason = "no other process causes notes")]
         {
-            tracing::info!("{note}");
+            log_limit::info!("{note}");
         }
     }
     if let Some(file) = &arguments.svg {
