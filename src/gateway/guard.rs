@@ -134,7 +134,8 @@ impl Guard {
     fn keep_confirmed(&self, error: &str) {
         let (confirmed, _) = self.keys.confirmed();
         let count = confirmed.len();
-        let kept = self.security.trust_only(confirmed);
+        let revoked = self.keys.readable_revoked();
+        let kept = self.security.trust_only(confirmed, revoked);
         if self.fault.as_deref() == Some(error) {
             return;
         }
