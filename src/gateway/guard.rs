@@ -77,11 +77,13 @@ impl Guard {
         self.security.clone()
     }
 
-    /// Checks the keys at regular intervals, for as long as the future is polled.
-    pub(super) async fn run(mut self) {
+    /// Checks the keys at regular intervals, for as long as the future is polled. Calls `changed` after each
+    /// change of the trusted certificates.
+    pub(super) async fn run(mut self, changed: Box<dyn Fn(&Security) + Send>) {
         let mut interval = tokio::time::interval(CHECK_INTERVAL);
         loop {
             interval.tick().await;
+            let revision = self.security.revision();
             self = match tokio::task::spawn_blocking(move || self.checked()).await {
                 Ok(guard) => guard,
                 Err(error) => {
@@ -89,6 +91,9 @@ impl Guard {
                     return;
                 }
             };
+            if self.security.revision() != revision {
+                changed(&self.security);
+            }
         }
     }
 

@@ -29,7 +29,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 use rustls::client::Resumption;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::version::TLS13;
@@ -73,6 +73,8 @@ pub struct CredentialsError(#[from] rustls::Error);
 #[derive(Clone)]
 pub struct Security {
     now: Arc<RwLock<Arc<Prepared>>>,
+    /// Held during a replacement.
+    replacing: Arc<Mutex<()>>,
     /// Counts replacements.
     replaced: watch::Sender<u64>,
     rules: Rules,
@@ -105,6 +107,7 @@ impl Security {
     pub fn new(credentials: Credentials, rules: Rules) -> Result<Self, CredentialsError> {
         Ok(Self {
             now: Arc::new(RwLock::new(Arc::new(Prepared::new(credentials)?))),
+            replacing: Arc::default(),
             replaced: watch::Sender::new(0),
             rules,
         })
@@ -121,12 +124,7 @@ impl Security {
             trusted,
             revoked,
         } = credentials;
-        let mut now = self.now.write();
-        let known = now.known.with_certificates(trusted, revoked);
-        *now = Arc::new(Prepared::with(own, key, known)?);
-        drop(now);
-        self.replaced.send_modify(|count| *count += 1);
-        Ok(())
+        self.change(|now| Prepared::with(own, key, now.known.with_certificates(trusted, revoked)))
     }
 
     /// Replaces the trusted peers, and keeps the key and certificate. These certificates are revoked in
@@ -139,16 +137,10 @@ impl Security {
         trusted: Vec<Certificate>,
         mut revoked: Vec<Fingerprint>,
     ) -> Result<(), CredentialsError> {
-        let (own, key) = {
-            let now = self.now.read();
+        self.change(|now| {
             revoked.extend(now.known.revoked());
-            (now.own.clone(), now.key.clone_key())
-        };
-        self.replace(Credentials {
-            own,
-            key,
-            trusted,
-            revoked,
+            let known = now.known.with_certificates(trusted, revoked);
+            Prepared::with(now.own.clone(), now.key.clone_key(), known)
         })
     }
 
@@ -158,10 +150,22 @@ impl Security {
     /// When the credentials cannot be used with them; the previous ones stay in use.
     #[cfg(feature = "http")]
     pub fn set_authorities(&self, authorities: Authorities) -> Result<(), CredentialsError> {
-        let mut now = self.now.write();
-        let known = now.known.with_authorities(authorities);
-        *now = Arc::new(Prepared::with(now.own.clone(), now.key.clone_key(), known)?);
-        drop(now);
+        self.change(|now| {
+            let known = now.known.with_authorities(authorities);
+            Prepared::with(now.own.clone(), now.key.clone_key(), known)
+        })
+    }
+
+    /// Replaces the credentials by changed ones. They are prepared without the lock that connections take.
+    fn change(
+        &self,
+        change: impl FnOnce(&Prepared) -> Result<Prepared, CredentialsError>,
+    ) -> Result<(), CredentialsError> {
+        let _replacing = self.replacing.lock();
+        let before = Arc::clone(&self.now.read());
+        let after = Arc::new(change(&before)?);
+        *self.now.write() = after;
+        // Connections are judged by the new credentials from here on.
         self.replaced.send_modify(|count| *count += 1);
         Ok(())
     }
