@@ -75,13 +75,9 @@ async fn a_revoked_host_ends_with_its_agents_its_services_and_the_letters_for_it
     // It takes no letter out of its queue.
     let arm = theirs.register(&format!("arm-{mark}")).await.unwrap();
     let crane = theirs.register(&format!("crane-{mark}")).await.unwrap();
-    let lifting = ServiceDescription::of_type("lifting");
-    crane
-        .df()
-        .unwrap()
-        .register_service(lifting.clone())
-        .await
-        .unwrap();
+    let facilitator = crane.df().unwrap();
+    let lift = ServiceDescription::new("lift-1", "lifting");
+    facilitator.register_service(lift).await.unwrap();
     let [rover, asker] = ["rover", "asker"].map(|name| format!("{name}-{mark}"));
     let rover = ours.register(&rover).await.unwrap();
     let asker = ours.register(&asker).await.unwrap();
@@ -89,7 +85,7 @@ async fn a_revoked_host_ends_with_its_agents_its_services_and_the_letters_for_it
     knows(&ours, &arm).await;
     let df = rover.df().unwrap();
     let lifting = AgentDescription {
-        services: vec![lifting],
+        services: vec![ServiceDescription::of_type("lifting")],
         ..AgentDescription::default()
     };
     while df.search(&lifting).await.unwrap().is_empty() {}
