@@ -172,11 +172,16 @@ impl Gateway {
             Arc::clone(&gateway.neighbours),
         );
         gateway.tasks.push(tokio::spawn(follow));
+        #[cfg(feature = "secure")]
+        let contacted = Arc::clone(&contacts.directory);
         gateway.open_for_letters(config, known, contacts, refusals)?;
         #[cfg(feature = "secure")]
-        gateway
-            .tasks
-            .extend(guard.map(|guard| tokio::spawn(guard.run())));
+        gateway.tasks.extend(guard.map(|guard| {
+            let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));
+            tokio::spawn(guard.run(Box::new(move |security| {
+                withdraw(security, &service.mts, &exchange, &contacted);
+            })))
+        }));
         Ok(gateway)
     }
 
@@ -393,6 +398,20 @@ impl Drop for Gateway {
     fn drop(&mut self) {
         self.abort();
     }
+}
+
+/// Applies a change of the trusted certificates to everything that hosts without trust have here. Their
+/// connections end by themselves. The letters end first, because the entries tell where they were to go.
+#[cfg(feature = "secure")]
+fn withdraw(
+    security: &fipa_transport_net::secure::Security,
+    mts: &fipa_mts::Mts,
+    exchange: &Exchanging,
+    contacts: &ContactDirectory,
+) {
+    let withdrawn = mts.handle_trust(|certificate| security.trusts((*certificate).into()));
+    exchange.withdraw(&withdrawn);
+    contacts.withdraw(&withdrawn.iter().map(|(gateway, _)| *gateway).collect());
 }
 
 /// Registers the gateway with its current locations.

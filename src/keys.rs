@@ -23,6 +23,8 @@ use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+#[cfg(feature = "http")]
+use fipa_transport_net::secure::Authorities;
 pub use fipa_transport_net::secure::{
     Certificate, CertificateError, Certified, CredentialsError, Fingerprint,
 };
@@ -56,7 +58,7 @@ pub struct Keys {
 
 /// The change times of the files at one time, which show a change without reading the files.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Stamp([Option<(i64, i64, u64)>; 3]);
+pub(crate) struct Stamp([Option<(i64, i64, u64)>; 4]);
 
 impl Stamp {
     /// Whether a file was changed so recently that another change may get the same time.
@@ -313,6 +315,12 @@ impl Keys {
         }
     }
 
+    /// Returns the revoked certificates that can be read.
+    pub(crate) fn readable_revoked(&self) -> Vec<Fingerprint> {
+        let (revoked, _) = self.all("revoked");
+        revoked.iter().map(Certificate::fingerprint).collect()
+    }
+
     /// Revokes trusted certificates permanently: all certificates of the service with this name or, if
     /// there are none, the one whose fingerprint starts with this text of at least 8 characters.
     /// Other certificates that cannot be read do not prevent it.
@@ -419,7 +427,13 @@ impl Keys {
         let key = PrivateKeyDer::from_pem_slice(&read(&file)?);
         let key = key.map_err(|error| contents(&file, &error))?;
         let trusted = self.trusted()?;
-        Ok(Credentials { own, key, trusted })
+        let revoked = self.revoked()?;
+        Ok(Credentials {
+            own,
+            key,
+            trusted,
+            revoked: revoked.iter().map(Certificate::fingerprint).collect(),
+        })
     }
 
     /// Returns the change times of the files, to detect changes.
@@ -427,6 +441,7 @@ impl Keys {
         let parts = [
             self.own_file(),
             self.dir.join("trusted"),
+            self.dir.join("revoked"),
             self.dir.join("own.key"),
         ];
         Stamp(parts.map(|path| {
@@ -586,13 +601,13 @@ fn to_pem(certificate: &Certificate) -> String {
 /// # Errors
 /// If the file cannot be read, or contains something else.
 #[cfg(feature = "http")]
-pub(crate) fn authorities(file: &Path) -> Result<fipa_transport_net::Authorities, KeysError> {
+pub(crate) fn authorities(file: &Path) -> Result<Authorities, KeysError> {
     if file.as_os_str().is_empty() {
-        return Ok(fipa_transport_net::Authorities::default());
+        return Ok(Authorities::default());
     }
     let text = read(file)?;
     let certificates: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&text).collect();
     let certificates = certificates.map_err(|error| contents(file, &error))?;
-    let authorities = fipa_transport_net::Authorities::new(certificates);
+    let authorities = Authorities::new(certificates);
     authorities.map_err(|error| contents(file, &error))
 }

@@ -508,13 +508,15 @@ fn https(
     let settings = &config.transport.https;
     let authorities = crate::keys::authorities(settings.authorities.as_ref());
     let authorities = authorities.map_err(|error| ErrorChain(&error).to_string())?;
+    let set = security.set_authorities(authorities);
+    set.map_err(|error| ErrorChain(&error).to_string())?;
     let config = HttpConfig {
         listen: settings.listen.clone(),
         identity: identity(config, role, dir, incarnation)?,
         limits: stream_limits(config),
         security: Some(security.clone()),
     };
-    let transport = HttpTransport::over_tls(config, security.clone(), authorities, handle.clone());
+    let transport = HttpTransport::over_tls(config, security.clone(), handle.clone());
     Ok(Arc::new(transport))
 }
 

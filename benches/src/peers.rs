@@ -4,7 +4,6 @@
 //! of the host. An agent of a second JADE platform asks the same echo agent in turn, so other load
 //! of the machine affects both alike. `comparison/jade` has the two agents.
 
-use fipa_transport::log_limit;
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 
@@ -199,7 +198,7 @@ impl<'a> Side<'a> {
                 self.found.trips.push(micros);
             }
             _ => {
-                log_limit::warn!(%deliveries, "a request had no reply");
+                tracing::warn!(%deliveries, "a request had no reply");
                 self.found.lost += 1;
             }
         }

@@ -1,6 +1,5 @@
 //! The processes of a measurement: start, orders, end and cleanup.
 
-use fipa_transport::log_limit;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
@@ -335,13 +334,13 @@ fn remove_leftovers() {
     }
     for file in left(Path::new(SHARED_MEMORY_DIR), SHARED_MEMORY) {
         if let Err(error) = std::fs::remove_file(&file) {
-            log_limit::warn!(%error, file = %file.display(), "could not be removed");
+            tracing::warn!(%error, file = %file.display(), "could not be removed");
         }
     }
 }
 
 fn remove(place: &Path) {
     if let Err(error) = std::fs::remove_dir_all(place) {
-        log_limit::warn!(%error, directory = %place.display(), "could not be removed");
+        tracing::warn!(%error, directory = %place.display(), "could not be removed");
     }
 }

@@ -24,7 +24,7 @@ use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, Pattern, View};
 use fipa_transport::{
     Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
-    OwnerProcess, Transport, TransportError, TransportErrorKind, log_limit,
+    OwnerProcess, Transport, TransportError, TransportErrorKind, log_limit, Principal,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
@@ -455,6 +455,19 @@ impl Mts {
         let now = state.clocks.now();
         state.core.reorder(now, order, routes);
         self.shared.carry_out(state);
+    }
+
+    /// Ends the letters for agents of services whose certificate is no longer trusted, and returns these
+    /// services; see [`Core::handle_trust`].
+    pub fn handle_trust(
+        &self,
+        is_trusted: impl Fn(&[u8; 32]) -> bool,
+    ) -> Vec<(Incarnation, Principal)> {
+        let mut state = self.shared.lock();
+        let now = state.clocks.now();
+        let withdrawn = state.core.handle_trust(now, is_trusted);
+        self.shared.carry_out(state);
+        withdrawn
     }
 
     /// Returns the kinds of the open transports.

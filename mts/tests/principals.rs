@@ -15,7 +15,8 @@ use fipa_sds::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
+    Kind, Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, TransportError,
+    TransportErrorKind, Verdict,
 };
 
 use self::common::letter;
@@ -707,4 +708,127 @@ fn lanes_of_invented_senders_are_dropped_with_their_letters() {
     }
     let lanes = lanes(&mut bench);
     assert!(lanes < 8_000, "{lanes} lanes");
+}
+
+/// The position of a letter for `rover` when the trust in its gateway is withdrawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Position {
+    Waiting,
+    UnderWay { arrives: bool },
+    InCustody,
+}
+
+/// Returns the bench with a letter of the process of `arm` for `rover` in this position.
+fn with_letter_for_rover(position: Position) -> (Bench, Option<AttemptId>) {
+    let mut bench = Bench::new();
+    let taken = bench.letter(process_at("shm://arms"), (ARM, ROVER), 1);
+    assert_eq!(taken, Verdict::Later);
+    let (attempt, location, _) = dispatched(&mut bench).expect("the letter is passed on");
+    assert_eq!(location.incarnation(), HONEST);
+    let conclusion = match position {
+        Position::Waiting => Conclusion::NotSent(unreachable()),
+        Position::InCustody => Conclusion::Answered(Answer::Custody),
+        Position::UnderWay { .. } => return (bench, Some(attempt)),
+    };
+    bench.core.handle_conclusion(bench.now, attempt, conclusion);
+    (bench, None)
+}
+
+fn unreachable() -> TransportError {
+    TransportError::new(TransportErrorKind::Unreachable, "")
+}
+
+/// Withdraws the trust in the certificate of this service alone.
+fn withdraw(bench: &mut Bench, service: Incarnation) -> Vec<Incarnation> {
+    let Principal::Certificate(withdrawn) = link(service, service).principal else {
+        panic!("no certificate");
+    };
+    let now = bench.now;
+    let services = bench.core.handle_trust(now, |it| *it != withdrawn);
+    services.into_iter().map(|(service, _)| service).collect()
+}
+
+/// Returns the end of a letter that was handed over, and its details: an answer, or a report after custody.
+fn ended(bench: &mut Bench) -> Option<(FailureReason, String)> {
+    std::iter::from_fn(|| bench.core.poll_action()).find_map(|action| match action {
+        Action::Answer {
+            answer: Answer::Failed { reason, detail },
+            ..
+        } => Some((reason, detail)),
+        Action::Dispatch { parcel, .. } => match parcel.body {
+            Body::Report(Report::Settled(Outcome::Failed { reason, attempts })) => {
+                Some((reason, format!("{attempts:?}")))
+            }
+            _ => None,
+        },
+        _ => None,
+    })
+}
+
+/// Whether a letter is handed over.
+fn hands_over(bench: &mut Bench) -> bool {
+    std::iter::from_fn(|| bench.core.poll_action()).any(|action| {
+        matches!(action, Action::Dispatch { parcel, .. } if matches!(parcel.body, Body::Letter(_)))
+    })
+}
+
+#[test]
+fn letters_for_a_gateway_without_trust_end_as_refused_unless_it_may_have_taken_them() {
+    use FailureReason::{Refused, Unconfirmed};
+
+    for (position, expected) in [
+        (Position::Waiting, Refused),
+        (Position::UnderWay { arrives: false }, Refused),
+        (Position::UnderWay { arrives: true }, Unconfirmed),
+        (Position::InCustody, Unconfirmed),
+    ] {
+        let (mut bench, attempt) = with_letter_for_rover(position);
+        assert_eq!(withdraw(&mut bench, HONEST), [HONEST]);
+        if let Some(attempt) = attempt {
+            let abandoned = std::iter::from_fn(|| bench.core.poll_action())
+                .any(|action| matches!(action, Action::Abandon { .. }));
+            assert!(abandoned, "{position:?}");
+            let conclusion = match position {
+                Position::UnderWay { arrives: true } => Conclusion::Unconfirmed(unreachable()),
+                _ => Conclusion::NotSent(unreachable()),
+            };
+            bench.core.handle_conclusion(bench.now, attempt, conclusion);
+        }
+        let Some((reason, detail)) = ended(&mut bench) else {
+            panic!("{position:?}: the letter has no end");
+        };
+        assert_eq!(reason, expected, "{position:?}: {detail}");
+        assert!(
+            detail.contains("the trust in the certificate of"),
+            "{detail}"
+        );
+        // A later letter is not handed over either, while the directory still lists the receiver.
+        bench.letter(process_at("shm://arms"), (ARM, ROVER), 2);
+        assert!(!hands_over(&mut bench), "{position:?}");
+        // Until the gateway is trusted again.
+        assert!(withdraw(&mut bench, LIAR).contains(&LIAR));
+        bench.letter(process_at("shm://arms"), (ARM, ROVER), 3);
+        assert!(hands_over(&mut bench), "{position:?}");
+    }
+}
+
+#[test]
+fn withdrawn_trust_in_another_gateway_ends_no_letter() {
+    let (mut bench, _) = with_letter_for_rover(Position::InCustody);
+    withdraw(&mut bench, LIAR);
+    assert_eq!(ended(&mut bench), None);
+}
+
+#[test]
+fn letters_that_were_taken_from_a_gateway_before_it_lost_trust_are_delivered() {
+    let mut bench = Bench::new();
+    let taken = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
+    assert_eq!(taken, Verdict::Later);
+    let (attempt, _, _) = dispatched(&mut bench).expect("the letter is passed on");
+    let busy = Conclusion::Answered(Answer::Busy);
+    bench.core.handle_conclusion(bench.now, attempt, busy);
+    withdraw(&mut bench, HONEST);
+    assert_eq!(ended(&mut bench), None);
+    bench.arrives(process_at("shm://arms"), (ROVER, ARM), (0, Body::Credit));
+    assert!(hands_over(&mut bench), "the letter stays");
 }

@@ -3,6 +3,7 @@
 //! A letter may arrive before the announcement of its sender, and on some networks the announcement
 //! never arrives. This back end makes it possible to answer such a sender for a limited time.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -80,6 +81,17 @@ impl ContactDirectory {
         self.table.put((), Arc::clone(&entry));
         heard.push((entry, now));
         Ok(known.is_none_or(|(known, _)| known.incarnation != incarnation))
+    }
+
+    /// Drops the contacts at these gateways.
+    pub fn withdraw(&self, gateways: &HashSet<Incarnation>) {
+        self.heard.lock().retain(|(entry, _)| {
+            let stays = !gateways.contains(&entry.mts.incarnation);
+            if !stays {
+                self.table.release((), &entry.name, entry.incarnation);
+            }
+            stays
+        });
     }
 
     /// Drops contacts that `others`, the other back ends, know, and those that are older than

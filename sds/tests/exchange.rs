@@ -9,8 +9,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use fipa_sds::{
-    Change, Directory, Entry, Exchange, ExchangeError, Mts, OwnDfEntry, Present, Reach, Role,
-    Source,
+    Change, ContactDirectory, Directory, Entry, Exchange, ExchangeError, MergedDirectory, Mts,
+    OwnDfEntry, Present, Reach, Role, Source,
 };
 use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
@@ -548,6 +548,67 @@ fn agents_of_a_gateway_that_falls_silent_are_lost_for_a_minute() {
     world.gateways[1].exchange.handle_neighbours(now, &[]);
     world.run(Exchange::MEMORY * 2);
     assert!(directory.lost_agents().is_empty());
+}
+
+/// Also those that another directory has, while the connection has not ended yet.
+#[test]
+fn entries_of_a_gateway_without_trust_end_at_once() {
+    let mut world = World::new(2, 4);
+    let certificate = |number| Principal::Certificate([number; 32]);
+    world.proofs[0] = (Mandate::Certified([].into()), certificate(1), Vec::new());
+    world.join(0, "arm");
+    world.describe(0, "arm", "gripping", None);
+    world.connect();
+    world.run(Duration::from_millis(300));
+    let gateway = Incarnation::from_u64(1);
+    let contacts = Arc::new(ContactDirectory::new());
+    let heard = contacts.heard(
+        world.now,
+        "leg",
+        Incarnation::from_u64(7),
+        location(0).with_incarnation(gateway),
+    );
+    assert_eq!(heard, Ok(true));
+    let directory = world.gateways[1].exchange.directory();
+    let all = MergedDirectory::new(vec![
+        Arc::clone(&contacts) as _,
+        Arc::clone(&directory) as _,
+    ]);
+    let lists = |name: &str| all.lookup(name).is_some();
+    assert!(lists("arm") && lists("leg"));
+
+    let withdraw = |world: &mut World, number: Option<u8>| {
+        let gateways = number.map(|number| (gateway, certificate(number)));
+        world.gateways[1].exchange.handle_withdrawn(gateways);
+    };
+    withdraw(&mut world, Some(1));
+    assert!(!lists("arm") && !lists("leg"));
+    assert!(world.df_entries(1).is_empty());
+    world.connect();
+    world.run(Duration::from_secs(20));
+    assert!(!lists("arm") && !lists("leg"));
+    assert!(
+        directory.lost_agents().is_empty(),
+        "a lost agent may return"
+    );
+
+    // Trust that is restored.
+    withdraw(&mut world, None);
+    assert!(lists("leg"));
+    world.connect();
+    world.run(Duration::from_secs(20));
+    assert!(lists("arm"));
+    // The service of another certificate.
+    withdraw(&mut world, Some(2));
+    assert!(lists("arm") && lists("leg"));
+    withdraw(&mut world, Some(1));
+    world.proofs[0].1 = certificate(2);
+    world.connect();
+    world.run(Duration::from_secs(20));
+    assert!(lists("arm") && lists("leg"));
+
+    contacts.withdraw(&[gateway].into());
+    assert!(lists("arm") && !lists("leg"));
 }
 
 /// A gateway that is killed and restarted has another incarnation at the same location: the entries

@@ -16,6 +16,8 @@ use fipa_sds::{
     Present,
 };
 use fipa_transport::{Incarnation, Location, TransportErrorKind, log_limit};
+#[cfg(feature = "secure")]
+use fipa_transport::Principal;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
@@ -88,6 +90,14 @@ impl Exchanging {
         let others = self.core.lock().handle_own_df(Instant::now(), entries);
         self.wake.notify_one();
         others
+    }
+
+    /// Sets the gateways whose certificate is no longer trusted; see [`Exchange::handle_withdrawn`].
+    #[cfg(feature = "secure")]
+    pub(super) fn withdraw(&self, gateways: &[(Incarnation, Principal)]) {
+        let gateways = gateways.iter().copied();
+        self.core.lock().handle_withdrawn(gateways);
+        self.wake.notify_one();
     }
 
     /// Handles the content of a letter with [`EXCHANGE_ONTOLOGY`] from this gateway.

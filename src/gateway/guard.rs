@@ -78,11 +78,13 @@ impl Guard {
         self.security.clone()
     }
 
-    /// Checks the keys at regular intervals, for as long as the future is polled.
-    pub(super) async fn run(mut self) {
+    /// Checks the keys at regular intervals, for as long as the future is polled. Calls `changed` after each
+    /// change of the trusted certificates.
+    pub(super) async fn run(mut self, changed: Box<dyn Fn(&Security) + Send>) {
         let mut interval = tokio::time::interval(CHECK_INTERVAL);
         loop {
             interval.tick().await;
+            let revision = self.security.revision();
             self = match tokio::task::spawn_blocking(move || self.checked()).await {
                 Ok(guard) => guard,
                 Err(error) => {
@@ -90,6 +92,9 @@ impl Guard {
                     return;
                 }
             };
+            if self.security.revision() != revision {
+                changed(&self.security);
+            }
         }
     }
 
@@ -135,7 +140,8 @@ impl Guard {
     fn keep_confirmed(&self, error: &str) {
         let (confirmed, _) = self.keys.confirmed();
         let count = confirmed.len();
-        let kept = self.security.trust_only(confirmed);
+        let revoked = self.keys.readable_revoked();
+        let kept = self.security.trust_only(confirmed, revoked);
         if self.fault.as_deref() == Some(error) {
             return;
         }

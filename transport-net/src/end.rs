@@ -1,5 +1,8 @@
 //! The reasons for which a connection ends, and their consequences for parcels.
 
+#[cfg(feature = "ip")]
+use std::io;
+
 use fipa_transport::{Incarnation, Location, TransportError, TransportErrorKind};
 
 /// The reason for which a connection ends.
@@ -42,6 +45,18 @@ pub(crate) enum ConnectionEnd {
     IdentityConflict(&'static str),
     /// This endpoint closes.
     Closed,
+}
+
+/// Returns the error of a transport in an error of a socket: the reason for which a guarded stream has
+/// ended, or a broken connection.
+#[cfg(feature = "ip")]
+pub(crate) fn of_io(error: io::Error) -> TransportError {
+    let inner = error.get_ref().and_then(|inner| inner.downcast_ref());
+    let inner: Option<&TransportError> = inner;
+    match inner {
+        Some(ended) => ended.clone(),
+        None => TransportError::new(TransportErrorKind::Broken, error),
+    }
 }
 
 impl ConnectionEnd {

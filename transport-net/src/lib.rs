@@ -59,8 +59,6 @@ mod unix;
 
 #[cfg(feature = "ip")]
 pub use address::{AddressError, reachable_at};
-#[cfg(all(feature = "http", feature = "secure"))]
-pub use http::{Authorities, AuthoritiesError};
 #[cfg(feature = "http")]
 pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;

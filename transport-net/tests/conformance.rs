@@ -9,8 +9,9 @@ mod common;
 
 use std::net::UdpSocket;
 use std::sync::Arc;
+use std::time::Duration;
 
-use fipa_transport::conformance::Fixture;
+use fipa_transport::conformance::{Fixture, KeyedEndpoint};
 use fipa_transport::{Faulty, Kind, Location, Transport};
 use fipa_transport_net::{TcpTransport, UdpTransport, UnixTransport};
 use tokio::net::TcpSocket;
@@ -50,6 +51,10 @@ impl Fixture for Tcp {
     fn nowhere(&self) -> Location {
         let address = self.nowhere.local_addr().unwrap().to_string();
         Location::new(Kind::Tcp, &address).unwrap()
+    }
+
+    fn keyed_pair(&self, _: Duration) -> Option<[KeyedEndpoint; 2]> {
+        None
     }
 }
 
@@ -96,6 +101,10 @@ impl Fixture for Udp {
         let address = self.nowhere.local_addr().unwrap().to_string();
         Location::new(Kind::Udp, &address).unwrap()
     }
+
+    fn keyed_pair(&self, _: Duration) -> Option<[KeyedEndpoint; 2]> {
+        None
+    }
 }
 
 struct Unix {
@@ -121,6 +130,36 @@ impl Fixture for Unix {
     fn nowhere(&self) -> Location {
         Location::new(Kind::Unix, "0000000000000001").unwrap()
     }
+
+    fn keyed_pair(&self, _: Duration) -> Option<[KeyedEndpoint; 2]> {
+        None
+    }
+}
+
+/// Creates two endpoints for [`Fixture::keyed_pair`] with hosts of their own.
+#[cfg(feature = "secure")]
+fn keyed_pair(
+    valid_for: Duration,
+    endpoint: impl Fn(fipa_transport_net::secure::Security) -> Arc<dyn Transport>,
+) -> Option<[KeyedEndpoint; 2]> {
+    use std::time::SystemTime;
+
+    let now = SystemTime::now();
+    let day = Duration::from_secs(86_400);
+    let [one, other] = [valid_for, day]
+        .map(|time| common::certificates::Host::valid(common::NAME, &[], now - day, now + time));
+    Some([(&one, &other), (&other, &one)].map(|(host, peer)| {
+        let security = host.security(&[peer]);
+        let (shared, without) = (security.clone(), host.credentials(&[]));
+        let without = std::sync::Mutex::new(Some(without));
+        KeyedEndpoint {
+            transport: endpoint(security),
+            withdraw: Box::new(move || {
+                let without = without.lock().unwrap().take().unwrap();
+                shared.replace(without).unwrap();
+            }),
+        }
+    }))
 }
 
 mod unix {
@@ -137,10 +176,12 @@ mod tcp_ipv4 {
 #[cfg(feature = "secure")]
 mod tls {
     use std::sync::Arc;
+    use std::time::Duration;
 
-    use fipa_transport::conformance::Fixture;
+    use fipa_transport::conformance::{Fixture, KeyedEndpoint};
     use fipa_transport::{Location, Transport};
     use fipa_transport_net::TcpTransport;
+    use fipa_transport_net::secure::Security;
 
     use super::{Tcp, common};
 
@@ -156,19 +197,27 @@ mod tls {
                 host: common::certificates::Host::new(common::NAME, &[]),
             }
         }
-    }
 
-    impl Fixture for Tls {
-        fn endpoint(&self) -> Arc<dyn Transport> {
+        fn with(&self, security: Security) -> Arc<dyn Transport> {
             let mut config = common::config(&[self.tcp.address]);
-            config.security = Some(self.host.security(&[&self.host]));
+            config.security = Some(security);
             // The gateways of several domains of a host share one certificate.
             config.identity.domain = config.identity.incarnation.to_string();
             Arc::new(TcpTransport::new(config, self.tcp.runtime.handle().clone()))
         }
+    }
+
+    impl Fixture for Tls {
+        fn endpoint(&self) -> Arc<dyn Transport> {
+            self.with(self.host.security(&[&self.host]))
+        }
 
         fn nowhere(&self) -> Location {
             self.tcp.nowhere()
+        }
+
+        fn keyed_pair(&self, valid_for: Duration) -> Option<[KeyedEndpoint; 2]> {
+            super::keyed_pair(valid_for, |security| self.with(security))
         }
     }
 
@@ -180,10 +229,12 @@ mod tls {
 mod quic {
     use std::net::UdpSocket;
     use std::sync::Arc;
+    use std::time::Duration;
 
-    use fipa_transport::conformance::Fixture;
+    use fipa_transport::conformance::{Fixture, KeyedEndpoint};
     use fipa_transport::{Kind, Location, Transport};
     use fipa_transport_net::QuicTransport;
+    use fipa_transport_net::secure::Security;
 
     use super::common;
 
@@ -207,14 +258,21 @@ mod quic {
                 host: common::certificates::Host::new(common::NAME, &[]),
             }
         }
+
+        fn with(&self, security: Security) -> Arc<dyn Transport> {
+            let mut config = common::quic_config(&[self.address], security);
+            config.identity.domain = config.identity.incarnation.to_string();
+            Arc::new(QuicTransport::new(config, self.runtime.handle().clone()))
+        }
     }
 
     impl Fixture for Quic {
         fn endpoint(&self) -> Arc<dyn Transport> {
-            let security = self.host.security(&[&self.host]);
-            let mut config = common::quic_config(&[self.address], security);
-            config.identity.domain = config.identity.incarnation.to_string();
-            Arc::new(QuicTransport::new(config, self.runtime.handle().clone()))
+            self.with(self.host.security(&[&self.host]))
+        }
+
+        fn keyed_pair(&self, valid_for: Duration) -> Option<[KeyedEndpoint; 2]> {
+            super::keyed_pair(valid_for, |security| self.with(security))
         }
 
         fn nowhere(&self) -> Location {
@@ -234,6 +292,53 @@ mod quic_ipv4 {
 mod quic_ipv6 {
     use super::quic::Quic;
     fipa_transport::conformance_tests!(Quic::new("[::1]:0"));
+}
+
+/// Endpoints of `https` are legacy peers of each other.
+#[cfg(all(feature = "http", feature = "secure"))]
+mod https {
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use fipa_transport::conformance::{Fixture, KeyedEndpoint};
+    use fipa_transport::{Location, Transport};
+    use fipa_transport_net::secure::Security;
+    use fipa_transport_net::{HttpConfig, HttpTransport};
+
+    use super::{Tcp, common};
+
+    struct Https(Tcp);
+
+    impl Https {
+        fn with(&self, security: Security) -> Arc<dyn Transport> {
+            let tcp = common::config(&[self.0.address]);
+            let config = HttpConfig {
+                listen: tcp.listen,
+                identity: tcp.identity,
+                limits: tcp.limits,
+                security: Some(security.clone()),
+            };
+            let runtime = self.0.runtime.handle().clone();
+            Arc::new(HttpTransport::over_tls(config, security, runtime))
+        }
+    }
+
+    impl Fixture for Https {
+        fn endpoint(&self) -> Arc<dyn Transport> {
+            let host = common::certificates::Host::new(common::NAME, &[]);
+            self.with(host.security(&[]))
+        }
+
+        fn nowhere(&self) -> Location {
+            self.0.nowhere()
+        }
+
+        fn keyed_pair(&self, valid_for: Duration) -> Option<[KeyedEndpoint; 2]> {
+            super::keyed_pair(valid_for, |security| self.with(security))
+        }
+    }
+
+    fipa_transport::trust_conformance_tests!(Https(Tcp::new("127.0.0.1:0")));
 }
 
 mod tcp_ipv6 {

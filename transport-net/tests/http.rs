@@ -60,7 +60,7 @@ fn connect(to: &Platform) -> TcpStream {
 }
 
 /// Reads an answer, which has no body.
-fn answer(stream: &mut TcpStream) -> String {
+fn answer(stream: &mut impl Read) -> String {
     let mut text = Vec::new();
     while !text.ends_with(b"\r\n\r\n") {
         let mut byte = [0];
@@ -605,8 +605,11 @@ fn a_closed_endpoint_concludes_its_letters() {
 /// The same over TLS.
 #[cfg(feature = "secure")]
 mod tls {
-    use fipa_transport_net::Authorities;
-    use fipa_transport_net::secure::{Rules, Security};
+    #[cfg(feature = "quic")]
+    use std::sync::Arc;
+    use std::time::SystemTime;
+
+    use fipa_transport_net::secure::{Authorities, Rules, Security};
     use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 
     use super::*;
@@ -614,6 +617,7 @@ mod tls {
 
     /// Creates an endpoint of `https` with these credentials, also as those that except legacy peers.
     fn party(security: Security, authorities: Authorities) -> Platform {
+        security.set_authorities(authorities).unwrap();
         let tcp = config(&["127.0.0.1:0"]);
         let config = HttpConfig {
             listen: tcp.listen,
@@ -622,7 +626,7 @@ mod tls {
             security: Some(security.clone()),
         };
         Party::over(Recorder::default(), |runtime| {
-            HttpTransport::over_tls(config, security, authorities, runtime)
+            HttpTransport::over_tls(config, security, runtime)
         })
     }
 
@@ -761,26 +765,50 @@ mod tls {
         assert!(ours.sink.record.lock().unframed.is_empty());
     }
 
+    /// An authority of platforms.
+    struct Authority {
+        root: rcgen::Certificate,
+        issuer: Issuer<'static, KeyPair>,
+    }
+
+    impl Authority {
+        fn new() -> Self {
+            let key = KeyPair::generate().unwrap();
+            let mut params = CertificateParams::default();
+            params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+            let root = params.self_signed(&key).unwrap();
+            let issuer = Issuer::new(params, key);
+            Self { root, issuer }
+        }
+
+        fn listed(&self) -> Authorities {
+            Authorities::new(vec![self.root.der().clone()]).unwrap()
+        }
+
+        /// Creates a platform that has proved its name `localhost` until this time. Returns its location
+        /// with that name, too.
+        fn platform(&self, until: SystemTime) -> (Host, Platform, Location) {
+            let jade = Host::named("jade", "localhost", &self.issuer, until);
+            let theirs = party(
+                Security::new(jade.credentials(&[]), Rules::default()).unwrap(),
+                Authorities::default(),
+            );
+            let at = theirs.location().authority().to_owned();
+            let named = format!("https://{}/acc", at.replace("127.0.0.1", "localhost"));
+            (jade, theirs, named.parse().unwrap())
+        }
+    }
+
+    fn tomorrow() -> SystemTime {
+        SystemTime::now() + Duration::from_secs(86_400)
+    }
+
     #[test]
     fn an_authority_proves_the_name_of_a_platform() {
-        let key = KeyPair::generate().unwrap();
-        let mut params = CertificateParams::default();
-        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        let root = params.self_signed(&key).unwrap();
-        let authority = Issuer::new(params, key);
-        let authorities = || Authorities::new(vec![root.der().clone()]).unwrap();
-        let (crex, jade) = (
-            Host::new("crex", &[]),
-            Host::named("jade", "localhost", &authority),
-        );
-        let ours = party(crex.security(&[]), authorities());
-        let theirs = party(
-            Security::new(jade.credentials(&[]), Rules::default()).unwrap(),
-            Authorities::default(),
-        );
-        let at = theirs.location().authority().to_owned();
-        let named = format!("https://{}/acc", at.replace("127.0.0.1", "localhost"));
-        let named: Location = named.parse().unwrap();
+        let authority = Authority::new();
+        let crex = Host::new("crex", &[]);
+        let ours = party(crex.security(&[]), authority.listed());
+        let (_, theirs, named) = authority.platform(tomorrow());
         ours.send(0, &named, letter(0, "rover")).unwrap();
         assert_eq!(ours.conclusion(0), Conclusion::Handed);
         // The certificate proves the name only, and only where the authority is listed.
@@ -794,5 +822,91 @@ mod tls {
         );
         assert_eq!(theirs.sink.record.lock().unframed.len(), 1);
         assert!(Authorities::new(vec![vec![1, 2, 3].into()]).is_err());
+    }
+
+    /// The connection of the first letter stays open, and is not used for another one.
+    #[test]
+    fn a_platform_is_judged_again_when_credentials_or_authorities_change() {
+        let authority = Authority::new();
+        let crex = Host::new("crex", &[]);
+        let without_authority = |security: &Security, _: &Host| {
+            security.set_authorities(Authorities::default()).unwrap();
+        };
+        let revoked = |security: &Security, jade: &Host| {
+            let mut credentials = crex.credentials(&[]);
+            credentials.revoked.push(jade.certificate.fingerprint());
+            security.replace(credentials).unwrap();
+        };
+        let unrelated = |security: &Security, _: &Host| {
+            security.replace(crex.credentials(&[])).unwrap();
+        };
+        let changes: [(&dyn Fn(&Security, &Host), bool); 3] = [
+            (&without_authority, false),
+            (&revoked, false),
+            (&unrelated, true),
+        ];
+        for (change, is_trusted) in changes {
+            let security = crex.security(&[]);
+            let ours = party(security.clone(), authority.listed());
+            let (jade, theirs, named) = authority.platform(tomorrow());
+            ours.send(0, &named, letter(0, "rover")).unwrap();
+            assert_eq!(ours.conclusion(0), Conclusion::Handed);
+            change(&security, &jade);
+            ours.send(1, &named, letter(1, "rover")).unwrap();
+            match is_trusted {
+                true => assert_eq!(ours.conclusion(1), Conclusion::Handed),
+                false => assert_eq!(failure(ours.conclusion(1)).0, TransportErrorKind::Refused),
+            }
+            let taken = theirs.sink.record.lock().unframed.len();
+            assert_eq!(taken, 1 + usize::from(is_trusted));
+        }
+    }
+
+    #[test]
+    fn a_chain_ends_with_its_first_certificate_that_ends() {
+        let authority = Authority::new();
+        let crex = Host::new("crex", &[]);
+        let ours = party(crex.security(&[]), authority.listed());
+        // Time for a handshake under load.
+        let end = SystemTime::now() + Duration::from_secs(4);
+        let (_, theirs, named) = authority.platform(end);
+        let mut number = 0;
+        let last = loop {
+            ours.send(number, &named, letter(number, "rover")).unwrap();
+            match ours.conclusion(number) {
+                Conclusion::Handed => number += 1,
+                other => break other,
+            }
+            thread::sleep(Duration::from_millis(20));
+        };
+        assert!(number > 0 && SystemTime::now() >= end, "{last:?}");
+        ours.send(number + 1, &named, letter(number + 1, "rover"))
+            .unwrap();
+        let after = ours.conclusion(number + 1);
+        assert_eq!(failure(after).0, TransportErrorKind::Refused);
+        assert_eq!(theirs.sink.record.lock().unframed.len() as u64, number);
+    }
+
+    /// A client that keeps its connection open, as JADE does.
+    #[cfg(feature = "quic")]
+    #[test]
+    fn the_next_request_after_trust_was_withdrawn_is_refused_and_the_connection_closed() {
+        let (crex, jade) = (Host::new("crex", &[]), Host::new("jade", &[]));
+        let security = crex.security(&[&jade]);
+        let ours = party(security.clone(), Authorities::default());
+        const TLS13: common::intruder::Versions = &[&rustls::version::TLS13];
+        let config = Arc::new(common::intruder::client(Some(&jade), TLS13));
+        let session = rustls::ClientConnection::new(config, "localhost".try_into().unwrap());
+        let mut client = rustls::StreamOwned::new(session.unwrap(), connect(&ours));
+        client.write_all(STRING).unwrap();
+        assert_eq!(answer(&mut client), OK);
+        security.replace(crex.credentials(&[])).unwrap();
+        // The connection may be closed before the request has been read.
+        let _ = client.write_all(STRING);
+        let mut rest = Vec::new();
+        let _ = client.read_to_end(&mut rest);
+        let rest = String::from_utf8(rest).unwrap();
+        assert!(rest.starts_with("HTTP/1.1 403 "), "{rest}");
+        assert_eq!(ours.sink.record.lock().unframed.len(), 1);
     }
 }

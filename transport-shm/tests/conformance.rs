@@ -4,9 +4,10 @@ mod common;
 
 use std::any::Any;
 use std::sync::Arc;
+use std::time::Duration;
 
 use common::TestDomain;
-use fipa_transport::conformance::Fixture;
+use fipa_transport::conformance::{Fixture, KeyedEndpoint};
 use fipa_transport::{Incarnation, Location, Transport};
 
 struct Shm(TestDomain);
@@ -20,6 +21,10 @@ impl Fixture for Shm {
 
     fn nowhere(&self) -> Location {
         common::location_of(Incarnation::random())
+    }
+
+    fn keyed_pair(&self, _: Duration) -> Option<[KeyedEndpoint; 2]> {
+        None
     }
 
     fn obstacle(&self) -> Option<Box<dyn Any>> {

@@ -213,10 +213,12 @@ pub enum Mandate {
     /// The service has the key of a certificate that names these agents. A name that ends with `*`
     /// stands for all names that begin so. An empty list stands for every agent.
     Certified(Arc<[String]>),
+    /// The trust in the certificate of the service was withdrawn. The service speaks for no agent.
+    Withdrawn,
 }
 
 impl Mandate {
-    /// Whether the link proves the agents of the service.
+    /// Whether the link proves or has proved the agents of the service.
     #[must_use]
     pub fn is_proved(&self) -> bool {
         *self != Self::Unproved
@@ -231,6 +233,7 @@ impl Mandate {
                 let mut agents = agents.iter();
                 agents.len() == 0 || agents.any(|agent| is_meant(agent, name))
             }
+            Self::Withdrawn => false,
         }
     }
 }

@@ -4,8 +4,9 @@
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
-use fipa_transport::conformance::Fixture;
+use fipa_transport::conformance::{Fixture, KeyedEndpoint};
 use fipa_transport::{
     Abandoned, Answer, Arrival, AttemptId, Conclusion, Faulty, Hop, Incarnation, Kind, ListenError,
     Location, Parcel, Principal, Sink, Ticket, Transport, TransportError, TransportErrorKind,
@@ -197,6 +198,10 @@ impl Fixture for TableFixture {
             .parse()
             .expect("a location")
     }
+
+    fn keyed_pair(&self, _: Duration) -> Option<[KeyedEndpoint; 2]> {
+        None
+    }
 }
 
 #[derive(Default)]
@@ -209,6 +214,10 @@ impl Fixture for FaultyFixture {
 
     fn nowhere(&self) -> Location {
         self.0.nowhere()
+    }
+
+    fn keyed_pair(&self, _: Duration) -> Option<[KeyedEndpoint; 2]> {
+        None
     }
 }
 

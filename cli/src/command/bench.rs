@@ -1,6 +1,5 @@
 //! `fipa bench`: the shell of the crate `fipa-bench`, which measures.
 
-use fipa::log_limit;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -212,7 +211,7 @@ fn report(
     for note in measured.notes {
         #[expect(clippy::disallowed_macros, reason = "no other process causes notes")]
         {
-            log_limit::info!("{note}");
+            tracing::info!("{note}");
         }
     }
     if let Some(file) = &arguments.svg {

@@ -8,7 +8,8 @@ use fipa_acl::Letter;
 use fipa_sds::{Entry, View};
 use fipa_transport::{
     Answer, Attempt, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location,
-    Outcome, Parcel, Report, Signature, Stream, Ticket, TransportError, TransportErrorKind,
+    Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, TransportError,
+    TransportErrorKind,
 };
 use smallvec::SmallVec;
 
@@ -217,6 +218,8 @@ pub(crate) struct AttemptTable {
     /// Notes that have been sent and are repeated unless they are acknowledged.
     pub(crate) repeated: VecDeque<AttemptId>,
     pub(crate) departed: Departed,
+    /// Services whose certificate is no longer trusted.
+    pub(crate) withdrawn: Map<Incarnation, Principal>,
     /// Total bytes of the letters in all lanes.
     pub(crate) held: usize,
     /// At a gateway, the bytes of them for each receiver.
@@ -266,6 +269,7 @@ impl AttemptTable {
             undelivered: VecDeque::new(),
             repeated: VecDeque::new(),
             departed: Departed::default(),
+            withdrawn: Map::default(),
             held: 0,
             held_for: Map::default(),
             tallies: Tallies::default(),

@@ -58,7 +58,7 @@ use fipa_acl::Letter;
 use fipa_sds::{Entry, Pattern, Resolution, Role, View};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
-    Introduction, Kind, Location, Outcome, Parcel, Report, Stream, TransportError,
+    Introduction, Kind, Location, Outcome, Parcel, Principal, Report, Stream, TransportError,
     TransportErrorKind, Verdict,
 };
 
@@ -1103,9 +1103,38 @@ impl Core {
     pub fn handle_introduced(&mut self, now: Now, peer: &Introduction) {
         self.principals.introduced(peer, &*self.table.view);
         let service = peer.hop.location.incarnation();
+        // It has proved another certificate.
+        let withdrawn = self.table.withdrawn.get(&service).copied();
+        if withdrawn.is_some() && withdrawn != self.principals.of_service(service) {
+            self.table.withdrawn.remove(&service);
+        }
         if service.is_known() {
             self.handle_reachable(now, Some(service));
         }
+    }
+
+    /// Handles a change of the trusted certificates, which `is_trusted` knows by their fingerprints. Letters
+    /// for the agents of services whose certificate is no longer trusted end. Returns these services.
+    /// Letters of their agents that were taken before stay.
+    pub fn handle_trust(
+        &mut self,
+        now: Now,
+        is_trusted: impl Fn(&[u8; 32]) -> bool,
+    ) -> Vec<(Incarnation, Principal)> {
+        self.table.withdrawn = self.principals.untrusted(is_trusted);
+        if !self.table.withdrawn.is_empty() {
+            // Only the owner of this host withdraws trust.
+            for id in self.lanes_in_order() {
+                self.with_lane(now, id, |lane, table| {
+                    if !lane.is_empty() {
+                        lane.trust_changed(now.instant, table);
+                    }
+                });
+            }
+        }
+        self.send_failures(now);
+        let withdrawn = self.table.withdrawn.iter();
+        withdrawn.map(|(it, principal)| (*it, *principal)).collect()
     }
 
     /// Handles a change of this host's network, or a connection that this service has opened. Drops

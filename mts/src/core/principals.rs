@@ -126,6 +126,26 @@ impl Principals {
         }
     }
 
+    /// Returns the services that have proved a certificate which is not trusted.
+    pub(super) fn untrusted(
+        &self,
+        is_trusted: impl Fn(&[u8; 32]) -> bool,
+    ) -> Map<Incarnation, Principal> {
+        let services = self.services.iter().map(|(it, service)| (*it, service));
+        let untrusted = services.filter(|(_, service)| match &service.principal {
+            Principal::Certificate(certificate) => !is_trusted(certificate),
+            Principal::Host | Principal::Unproved => false,
+        });
+        untrusted
+            .map(|(it, service)| (it, service.principal))
+            .collect()
+    }
+
+    /// Returns the principal of this service.
+    pub(super) fn of_service(&self, service: Incarnation) -> Option<Principal> {
+        self.services.get(&service).map(|it| it.principal)
+    }
+
     fn make_room(&mut self) {
         let services = &mut self.services;
         if services.len() < MAX_SERVICES {

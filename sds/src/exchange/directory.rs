@@ -113,6 +113,19 @@ impl ExchangeDirectory {
         self.table.notify_reread();
     }
 
+    /// Withdraws these gateways, and restores those that were withdrawn and are not among them. The entries of
+    /// withdrawn gateways end, and those in other directories are hidden.
+    pub(super) fn withdraw(&self, gateways: &HashMap<Incarnation, Principal>) {
+        gateways.keys().for_each(|gateway| self.forget(*gateway));
+        self.mandates.rcu(|mandates| {
+            let mut mandates = HashMap::clone(mandates);
+            mandates.retain(|_, mandate| *mandate != Mandate::Withdrawn);
+            mandates.extend(gateways.keys().map(|it| (*it, Mandate::Withdrawn)));
+            mandates
+        });
+        self.table.notify_reread();
+    }
+
     fn origin(&self, gateway: Incarnation) -> Origin {
         Origin {
             gateway,

@@ -55,6 +55,8 @@ pub struct Exchange {
     /// for all entries later.
     early: VecDeque<Incarnation>,
     directory: Arc<ExchangeDirectory>,
+    /// Gateways whose certificate is no longer trusted.
+    withdrawn: HashMap<Incarnation, Principal>,
     /// The agents of neighbors that fell silent, the latest last.
     lost: VecDeque<LostGateway>,
     random: u64,
@@ -222,6 +224,7 @@ impl Exchange {
             neighbors: HashMap::new(),
             early: VecDeque::new(),
             directory: Arc::default(),
+            withdrawn: HashMap::new(),
             lost: VecDeque::new(),
             random: seed,
         }
@@ -282,8 +285,41 @@ impl Exchange {
         }
     }
 
+    /// Sets the gateways whose certificate is no longer trusted. Their entries end at once, also those that
+    /// other directories have. They are no neighbors before they prove another certificate.
+    pub fn handle_withdrawn(
+        &mut self,
+        gateways: impl IntoIterator<Item = (Incarnation, Principal)>,
+    ) {
+        let neighbors = &self.neighbors;
+        let gateways = gateways.into_iter().filter(|(gateway, principal)| {
+            let neighbor = neighbors.get(gateway);
+            neighbor.is_none_or(|neighbor| neighbor.principal == *principal)
+        });
+        let withdrawn = gateways.collect();
+        if self.withdrawn == withdrawn {
+            return;
+        }
+        self.withdrawn = withdrawn;
+        let withdrawn = self.withdrawn.clone();
+        self.neighbors
+            .retain(|gateway, _| !withdrawn.contains_key(gateway));
+        self.early
+            .retain(|gateway| !withdrawn.contains_key(gateway));
+        self.directory.withdraw(&withdrawn);
+        self.forget_lost(|lost| withdrawn.contains_key(&lost.mts.incarnation));
+    }
+
     /// Sets the gateways that are connected now.
     pub fn handle_neighbours(&mut self, now: Instant, present: &[Present]) {
+        // The connection is about to end.
+        let is_withdrawn =
+            |it: &Present| self.withdrawn.get(&it.mts.incarnation) == Some(&it.principal);
+        let present: Vec<&Present> = present.iter().filter(|it| !is_withdrawn(it)).collect();
+        self.withdrawn.retain(|gateway, _| {
+            let proves_another = present.iter().any(|it| it.mts.incarnation == *gateway);
+            !proves_another
+        });
         for neighbor in self.neighbors.values_mut() {
             let mts = neighbor.mts.incarnation;
             let here = present.iter().any(|it| it.mts.incarnation == mts);

@@ -24,6 +24,7 @@ use super::request;
 use super::response::{Response, ResponseReader};
 use super::socket::Socket;
 use super::url::{PATH, Url};
+use crate::end;
 use crate::legacy::dialect::translate;
 use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
 use crate::sockets::{self, prepare};
@@ -168,13 +169,9 @@ impl HttpSender {
     ) -> Result<Socket, TransportError> {
         let endpoint = &self.endpoint.stream;
         #[cfg(feature = "secure")]
-        if let Some(super::Tls {
-            security,
-            authorities,
-        }) = &self.endpoint.tls
-        {
+        if let Some(security) = &self.endpoint.tls {
             let patience = endpoint.limits().handshake_timeout;
-            let secured = super::tls::connect(security, authorities, stream, _url, patience).await;
+            let secured = super::tls::connect(security, stream, _url, patience).await;
             let stream = secured.map_err(|what| {
                 count(&endpoint.tally().dial_failures);
                 let detail = format!("{peer}: {what}");
@@ -224,9 +221,7 @@ impl Connection {
                     return Err(TransportError::new(TransportErrorKind::Broken, detail));
                 }
                 Ok(Ok(_)) => {}
-                Ok(Err(error)) => {
-                    return Err(TransportError::new(TransportErrorKind::Broken, error));
-                }
+                Ok(Err(error)) => return Err(end::of_io(error)),
                 Err(_) => {
                     let detail = "the platform did not answer in time (stall_timeout)";
                     return Err(TransportError::new(TransportErrorKind::TimedOut, detail));

@@ -47,8 +47,6 @@ use self::client::HttpSender;
 pub use self::config::HttpConfig;
 use self::connections::Connections;
 use self::repeats::Repeats;
-#[cfg(feature = "secure")]
-pub use self::tls::{Authorities, AuthoritiesError};
 use crate::end::ConnectionEnd;
 use crate::legacy::queues::LegacySenders;
 use crate::sockets;
@@ -91,17 +89,9 @@ struct HttpEndpoint {
     /// The key of digests and boundaries, which peers cannot predict.
     key: (u64, u64),
     boundaries: AtomicU64,
-    /// The proofs of `https`.
+    /// The credentials of `https`.
     #[cfg(feature = "secure")]
-    tls: Option<Tls>,
-}
-
-/// The credentials of `https`, and the authorities that prove platforms.
-#[cfg(feature = "secure")]
-#[derive(Debug)]
-struct Tls {
-    security: crate::secure::Security,
-    authorities: Authorities,
+    tls: Option<crate::secure::Security>,
 }
 
 impl HttpEndpoint {
@@ -145,8 +135,8 @@ impl HttpTransport {
     }
 
     /// Creates an endpoint for `https`, with the credentials of this host. A platform proves its identity
-    /// with a trusted certificate, or, when this endpoint dials it, with one of these authorities for the
-    /// host name in its address.
+    /// with a trusted certificate, or, when this endpoint dials it, with one of the
+    /// [authorities](crate::secure::Security::set_authorities) for the host name in its address.
     ///
     /// A platform that dials and has no trusted certificate is subject to the rules of the configuration for
     /// peers that prove nothing.
@@ -155,20 +145,15 @@ impl HttpTransport {
     pub fn over_tls(
         config: HttpConfig,
         security: crate::secure::Security,
-        authorities: Authorities,
         runtime: Handle,
     ) -> Self {
-        let tls = Tls {
-            security,
-            authorities,
-        };
-        Self::over(Kind::Https, config, Some(tls), runtime)
+        Self::over(Kind::Https, config, Some(security), runtime)
     }
 
     fn over(
         kind: Kind,
         config: HttpConfig,
-        #[cfg(feature = "secure")] tls: Option<Tls>,
+        #[cfg(feature = "secure")] tls: Option<crate::secure::Security>,
         runtime: Handle,
     ) -> Self {
         let HttpConfig {

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant as Now};
 
 use bytes::{BufMut, Bytes};
-use fipa_transport::{LegacySource, Signature, log_limit, quota_address};
+use fipa_transport::{LegacySource, Signature, log_limit, quota_address, TransportError, TransportErrorKind};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
@@ -23,10 +23,12 @@ use super::letter::{self, LetterError};
 use super::repeats::Arrived;
 use super::request::{RequestError, RequestHead, RequestReader, Status};
 use super::socket::Socket;
+use crate::end;
 use crate::sockets::prepare;
 use crate::stream::budget::ReservedBytes;
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
+use crate::stream::proof::Proof;
 use crate::stream::source::{Home, QuotaKey, Source};
 
 /// Number of bytes that are read at a time, except for bodies.
@@ -52,6 +54,9 @@ enum Refusal {
     #[cfg(feature = "secure")]
     #[error("the certificate of the platform does not name the sender of the letter")]
     NotItsAgent,
+    /// What the platform has proved no longer counts.
+    #[error(transparent)]
+    Withdrawn(TransportError),
     #[error("the head of the request arrived too slowly (handshake_timeout)")]
     SlowHead,
     #[error("the body arrived too slowly (stall_timeout)")]
@@ -70,8 +75,13 @@ enum End {
 
 impl From<io::Error> for End {
     fn from(error: io::Error) -> Self {
-        tracing::debug!("HTTP connection failed: {error}");
-        Self::Over
+        match end::of_io(error) {
+            error if error.fault == TransportErrorKind::Refused => Refusal::Withdrawn(error).into(),
+            error => {
+                tracing::debug!("HTTP connection failed: {error}");
+                Self::Over
+            }
+        }
     }
 }
 
@@ -101,6 +111,7 @@ impl Refusal {
             Self::Unproved => Status::Forbidden,
             #[cfg(feature = "secure")]
             Self::NotItsAgent => Status::Forbidden,
+            Self::Withdrawn(_) => Status::Forbidden,
             Self::SlowHead | Self::SlowBody => Status::Timeout,
             Self::NoRoom => Status::Unavailable,
         }
@@ -141,9 +152,7 @@ fn admit(endpoint: &Arc<HttpEndpoint>, stream: TcpStream, from: SocketAddr) {
         endpoint: endpoint.clone(),
         slot,
         stream: Socket::Plain(stream),
-        is_proved: false,
-        #[cfg(feature = "secure")]
-        mandate: None,
+        proof: Proof::default(),
         from,
         quota_key,
         reader: RequestReader::default(),
@@ -163,11 +172,8 @@ struct Serving {
     reader: RequestReader,
     /// Whether no letter has arrived yet.
     first: bool,
-    /// Whether the platform has proved its identity with a trusted certificate.
-    is_proved: bool,
-    /// The trusted certificate, if it names agents: its platform speaks for them only.
-    #[cfg(feature = "secure")]
-    mandate: Option<Arc<crate::secure::Certified>>,
+    /// What the platform has proved with a trusted certificate.
+    proof: Proof,
 }
 
 impl Serving {
@@ -193,6 +199,7 @@ impl Serving {
             Refusal::Unproved => &tally.refused_unproved,
             #[cfg(feature = "secure")]
             Refusal::NotItsAgent => &tally.refused_unproved,
+            Refusal::Withdrawn(_) => &tally.refused_unproved,
             _ => &tally.refused_nonsense,
         };
         count(counter);
@@ -208,18 +215,15 @@ impl Serving {
     #[cfg(feature = "secure")]
     async fn secured(mut self) -> Option<Self> {
         let endpoint = Arc::clone(&self.endpoint);
-        let security = &endpoint.tls.as_ref()?.security;
+        let security = endpoint.tls.as_ref()?;
         let patience = self.limits().handshake_timeout;
         let Socket::Plain(stream) = self.stream else {
             return None;
         };
         match super::tls::accept(security, stream, patience).await {
-            Ok((stream, certificate)) => {
+            Ok((stream, proof)) => {
                 self.stream = Socket::Tls(Box::new(stream));
-                self.is_proved = certificate.is_some();
-                self.mandate = certificate
-                    .map(|it| Arc::clone(it.certified()))
-                    .filter(|it| !it.agents().is_empty());
+                self.proof = proof;
                 Some(self)
             }
             Err(what) => {
@@ -236,6 +240,7 @@ impl Serving {
 
     /// Answers a refused request, and reads what the client still sends.
     async fn refuse(&mut self, status: Status) -> io::Result<()> {
+        self.stream.release();
         self.stream
             .write_all(status.answer(false).as_bytes())
             .await?;
@@ -253,7 +258,7 @@ impl Serving {
     /// Serves requests until the connection ends.
     async fn serve(&mut self) -> Result<(), End> {
         prepare(self.stream.tcp(), self.limits())?;
-        let is_admitted = self.is_proved
+        let is_admitted = self.proof.principal().is_some()
             || self
                 .endpoint
                 .stream
@@ -380,10 +385,11 @@ impl Serving {
     async fn take(&mut self, head: &RequestHead, body: Bytes) -> Result<(), End> {
         let endpoint = &self.endpoint.stream;
         let letter = letter::read(&body, &head.boundary)?;
+        // The request may have been read together with an earlier one.
+        let proof = self.proof.check();
+        proof.map_err(|end| Refusal::Withdrawn(end.after()))?;
         #[cfg(feature = "secure")]
-        if let Some(certified) = &self.mandate
-            && !letter.is_of(|name| certified.speaks_for(name))
-        {
+        if self.proof.restricts() && !letter.is_of(|name| self.proof.speaks_for(name)) {
             return Err(Refusal::NotItsAgent.into());
         }
         if let Some(rate_limit) = endpoint.rate_limit(Home::Address(self.from.ip()))

@@ -11,7 +11,7 @@ use tokio::net::TcpStream;
 pub(super) enum Socket {
     Plain(TcpStream),
     #[cfg(feature = "secure")]
-    Tls(Box<tokio_rustls::TlsStream<TcpStream>>),
+    Tls(Box<super::tls::Stream>),
 }
 
 impl Socket {
@@ -20,7 +20,16 @@ impl Socket {
         match self {
             Self::Plain(stream) => stream,
             #[cfg(feature = "secure")]
-            Self::Tls(stream) => stream.get_ref().0,
+            Self::Tls(stream) => stream.get_ref().get_ref().0,
+        }
+    }
+
+    /// Lets an answer pass that refuses what the peer sends, although the proof of the peer no longer counts.
+    pub(super) fn release(&mut self) {
+        match self {
+            Self::Plain(_) => {}
+            #[cfg(feature = "secure")]
+            Self::Tls(stream) => stream.release(),
         }
     }
 }

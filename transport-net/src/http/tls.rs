@@ -5,89 +5,58 @@
 //! dials may also prove nothing; then the rules for `http` apply to it.
 
 use std::net::IpAddr;
-use std::sync::Arc;
 use std::time::Duration;
 
-use rustls::client::WebPkiServerVerifier;
-use rustls::pki_types::{CertificateDer, ServerName};
-use rustls::{CertificateError, RootCertStore};
+use rustls::CertificateError;
+use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 
 use super::url::Url;
-use crate::secure::{Certificate, Security};
+use crate::secure::Security;
+use crate::secure::guarded::Guarded;
+use crate::stream::proof::Proof;
 
-/// The authorities whose certificates prove the host names of platforms (RFC 5280). Without any, only
-/// trusted certificates prove a platform.
-#[derive(Debug, Clone, Default)]
-pub struct Authorities(Option<Arc<WebPkiServerVerifier>>);
+/// A connection over TLS, which ends when what the platform has proved no longer counts.
+pub(super) type Stream = Guarded<TlsStream<TcpStream>>;
 
-/// The reason for which certificates of authorities cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum AuthoritiesError {
-    /// None of the certificates is one of an authority.
-    #[error("none of the {0} certificates is one of an authority")]
-    None(usize),
-    /// The certificates cannot be used together.
-    #[error("the certificates of authorities cannot be used: {0}")]
-    Unusable(String),
-}
-
-impl Authorities {
-    /// Creates the authorities with these certificates, in DER form. Certificates that are not of an authority
-    /// are ignored, as long as one is.
-    ///
-    /// # Errors
-    /// When none of the certificates is one of an authority.
-    pub fn new(certificates: Vec<CertificateDer<'static>>) -> Result<Self, AuthoritiesError> {
-        let count = certificates.len();
-        let mut roots = RootCertStore::empty();
-        let (added, _ignored) = roots.add_parsable_certificates(certificates);
-        if added == 0 {
-            return Err(AuthoritiesError::None(count));
-        }
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let verifier = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), provider);
-        let verifier = verifier
-            .build()
-            .map_err(|error| AuthoritiesError::Unusable(error.to_string()))?;
-        Ok(Self(Some(verifier)))
-    }
-}
-
-/// Performs the handshake with a platform that has connected. Returns its certificate if that is
-/// trusted.
+/// Performs the handshake with a platform that has connected. Returns what the platform has proved,
+/// too: nothing, unless its certificate is trusted.
 pub(super) async fn accept(
     security: &Security,
     stream: TcpStream,
     patience: Duration,
-) -> Result<(TlsStream<TcpStream>, Option<Certificate>), String> {
+) -> Result<(Stream, Proof), String> {
     let config = security
         .platform_server()
         .map_err(|error| error.to_string())?;
     let handshake = timeout(patience, TlsAcceptor::from(config).accept(stream)).await;
     let handshake = handshake.map_err(|_| overdue(patience))?;
     let stream = handshake.map_err(|error| error.to_string())?;
-    let certificate = security.proof(stream.get_ref().1.peer_certificates());
-    Ok((stream.into(), certificate))
+    let trust = security.trust_in_client(stream.get_ref().1.peer_certificates());
+    let proof = trust.map(Proof::from).unwrap_or_default();
+    Ok((Guarded::new(stream.into(), proof.clone()), proof))
 }
 
 /// Performs the handshake with the platform at this address, which must prove its identity.
 pub(super) async fn connect(
     security: &Security,
-    authorities: &Authorities,
     stream: TcpStream,
     url: &Url,
     patience: Duration,
-) -> Result<TlsStream<TcpStream>, String> {
-    let config = security.platform_client(authorities.0.clone());
+) -> Result<Stream, String> {
+    let config = security.platform_client();
     let config = config.map_err(|error| error.to_string())?;
     let name = server_name(url)?;
-    let handshake = timeout(patience, TlsConnector::from(config).connect(name, stream)).await;
+    let connector = TlsConnector::from(config);
+    let handshake = timeout(patience, connector.connect(name.clone(), stream)).await;
     let handshake = handshake.map_err(|_| overdue(patience))?;
-    Ok(handshake.map_err(|error| advice(&error))?.into())
+    let stream = handshake.map_err(|error| advice(&error))?;
+    let presented = stream.get_ref().1.peer_certificates();
+    let trust = security.trust_in_server(presented, &name);
+    let trust = trust.ok_or("its certificate is no longer trusted")?;
+    Ok(Guarded::new(stream.into(), trust.into()))
 }
 
 /// The name that the certificate of an authority must prove.

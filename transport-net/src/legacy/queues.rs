@@ -19,7 +19,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 use tokio::time::timeout;
 
-use crate::end::ConnectionEnd;
+use crate::end::{self, ConnectionEnd};
 use crate::stream::config::Limits;
 
 /// Maximum number of bytes per write; the stall timeout applies to each write.
@@ -108,9 +108,7 @@ impl Progress<'_> {
             *self.written.lock() = true;
             match timeout(patience, stream.write_all_buf(&mut step)).await {
                 Ok(Ok(())) => {}
-                Ok(Err(error)) => {
-                    return Err(TransportError::new(TransportErrorKind::Broken, error));
-                }
+                Ok(Err(error)) => return Err(end::of_io(error)),
                 Err(_) => {
                     let detail = "the peer stopped reading (stall_timeout)";
                     return Err(TransportError::new(TransportErrorKind::TimedOut, detail));

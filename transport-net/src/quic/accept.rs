@@ -14,7 +14,6 @@ use crate::stream::counters::count;
 use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
 use crate::stream::link::LinkTask;
-use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 
 /// Accepts connections until it is aborted.
@@ -51,8 +50,8 @@ async fn receive(
     let from = incoming.remote_address();
     let patience = endpoint.limits().handshake_timeout;
     let handshake_result = match timeout(patience, handshake(&sockets, incoming)).await {
-        Ok(Ok((connection, send, receive))) => match sockets.certificate(&connection) {
-            Some(certificate) => Ok((connection, send, receive, certificate)),
+        Ok(Ok((connection, send, receive))) => match sockets.proof(&connection) {
+            Some(proof) => Ok((connection, send, receive, proof)),
             None => Err("the peer's certificate is no longer trusted".to_owned()),
         },
         Ok(Err(error)) => Err(error.to_string()),
@@ -60,7 +59,7 @@ async fn receive(
             "handshake not complete within {patience:?} (handshake_timeout)"
         )),
     };
-    let (connection, send, receive, certificate) = match handshake_result {
+    let (connection, send, receive, proof) = match handshake_result {
         Ok(handshake_result) => handshake_result,
         Err(why) => {
             count(&endpoint.tally().refused_unproved);
@@ -72,7 +71,6 @@ async fn receive(
         return;
     };
     let max_letter = endpoint.limits().max_letter;
-    let proof = Proof::of(&sockets.security, certificate);
     let reader = FrameReader::new(max_letter, BytesMut::new());
     let ends = ends(&connection, send, receive, max_letter);
     drop(connection);

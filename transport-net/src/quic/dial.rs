@@ -16,7 +16,6 @@ use crate::stream::dialing::{addresses, reach};
 use crate::stream::endpoint::Endpoint;
 use crate::stream::frame::FrameReader;
 use crate::stream::link::{Link, LinkTask};
-use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire::{Reading, Writing};
 
@@ -38,13 +37,12 @@ pub(super) async fn dial(
         Ok(connected) => connected,
         Err(end) => return running.fail(end),
     };
-    let Some(certificate) = sockets.certificate(&connection) else {
+    let Some(proof) = sockets.proof(&connection) else {
         let what = "the peer's certificate is no longer trusted";
         return running.fail(ConnectionEnd::unreachable(&to, &what));
     };
     link.connected(Instant::now());
     let from = connection.remote_address();
-    let proof = Proof::of(&sockets.security, certificate);
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
     let ends = ends(&connection, send, receive, limits.max_letter);
     drop(connection);

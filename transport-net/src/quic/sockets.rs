@@ -17,13 +17,14 @@ use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use super::settings;
+use crate::secure::Security;
 use crate::secure::advice::{self, Finder};
-use crate::secure::{Certificate, Security};
+use crate::stream::proof::Proof;
 use crate::{Limits, address};
 
 #[derive(Debug)]
 pub(super) struct Sockets {
-    pub(super) security: Security,
+    security: Security,
     transport: Arc<TransportConfig>,
     /// For IPv4 and IPv6; opened on demand.
     dialling: Mutex<[Option<Endpoint>; 2]>,
@@ -83,11 +84,11 @@ impl Sockets {
             .map_err(io::Error::other)
     }
 
-    /// Returns the trusted certificate that a peer has presented.
-    pub(super) fn certificate(&self, connection: &quinn::Connection) -> Option<Certificate> {
+    /// Returns the proof of a peer. `None` if its certificate is not trusted.
+    pub(super) fn proof(&self, connection: &quinn::Connection) -> Option<Proof> {
         let presented = connection.peer_identity()?;
         let presented = presented.downcast::<Vec<CertificateDer<'static>>>().ok()?;
-        self.security.peer(Some(&presented))
+        self.security.trust(Some(&presented)).map(Proof::from)
     }
 
     /// Releases the sockets; connections that are closing keep them until they have ended.

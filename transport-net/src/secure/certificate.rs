@@ -53,8 +53,16 @@ impl Fingerprint {
         Self(fingerprint)
     }
 
-    pub(crate) fn into_bytes(self) -> [u8; SHA256_OUTPUT_LEN] {
+    /// Returns the bytes.
+    #[must_use]
+    pub fn into_bytes(self) -> [u8; SHA256_OUTPUT_LEN] {
         self.0
+    }
+}
+
+impl From<[u8; SHA256_OUTPUT_LEN]> for Fingerprint {
+    fn from(fingerprint: [u8; SHA256_OUTPUT_LEN]) -> Self {
+        Self(fingerprint)
     }
 }
 
@@ -174,9 +182,7 @@ impl Certificate {
 
     /// Returns the time from `now` until the certificate expires.
     pub(crate) fn left(&self, now: SystemTime) -> Duration {
-        let last = u64::try_from(self.until).unwrap_or(0);
-        let end = Duration::from_secs(last.saturating_add(1));
-        end.saturating_sub(now.duration_since(UNIX_EPOCH).unwrap_or_default())
+        left_until(self.until, now)
     }
 
     /// Returns whether the certificate is valid at this time.
@@ -188,6 +194,23 @@ impl Certificate {
             _ => Holds::Now,
         }
     }
+}
+
+/// Returns the time from `now` until this last second of a validity is over.
+pub(super) fn left_until(last: i64, now: SystemTime) -> Duration {
+    let last = u64::try_from(last).unwrap_or(0);
+    let end = Duration::from_secs(last.saturating_add(1));
+    end.saturating_sub(now.duration_since(UNIX_EPOCH).unwrap_or_default())
+}
+
+/// Returns the last second at which a certificate in DER form is valid. `None` if it cannot be parsed.
+#[cfg(feature = "http")]
+pub(super) fn last_second(der: &[u8]) -> Option<i64> {
+    if der.len() > MAX_LEN {
+        return None;
+    }
+    let (_, read) = X509Certificate::from_der(der).ok()?;
+    Some(read.validity().not_after.timestamp())
 }
 
 /// The validity of a certificate at some time.

@@ -2,27 +2,34 @@
 //!
 //! There is no certification authority. A peer is trusted because its owner gave its certificate to
 //! the owner of this host, who added it to the trusted ones; the certificate that a peer presents
-//! is compared with them. There are no chains to verify, and withdrawing trust is removing a
-//! certificate, which ends the connections that were opened with it.
+//! is compared with them. Withdrawing trust is removing a certificate, which ends the connections
+//! that were opened with it. Only a platform that is dialed over `https` may instead present a chain
+//! of certificates from a listed authority.
 //!
 //! * `certificate`: the contents of a certificate.
 //! * `advice`: remedies when a peer is not trusted.
 //! * `verify`: the verification of a presented certificate.
-//! * `platform`: the same for platforms that are reached over `https`.
+//! * `platform`: the same for platforms that are reached over `https`, and their authorities.
+//! * `trust`: the trust in the peer of a connection, for as long as the connection is open.
+//! * `guarded`: a byte stream that ends with it.
 //!
 //! Files and the handling of letters do not belong here.
 
 pub(crate) mod advice;
 mod certificate;
 #[cfg(feature = "http")]
+pub(crate) mod guarded;
+#[cfg(feature = "http")]
 mod platform;
+mod trust;
 mod verify;
 
 use std::fmt;
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::{Duration, SystemTime};
 
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 use rustls::client::Resumption;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::version::TLS13;
@@ -32,6 +39,10 @@ use tokio::sync::watch;
 pub use self::certificate::{
     Certificate, CertificateError, Certified, Fingerprint, alternative_names,
 };
+#[cfg(feature = "http")]
+pub use self::platform::{Authorities, AuthoritiesError};
+use self::trust::Evidence;
+pub(crate) use self::trust::Trust;
 use self::verify::Known;
 
 #[cfg(feature = "fuzzing")]
@@ -47,6 +58,8 @@ pub struct Credentials {
     pub key: PrivateKeyDer<'static>,
     /// The certificates of trusted peers.
     pub trusted: Vec<Certificate>,
+    /// Certificates that prove no peer, even if they are trusted or an authority has signed them.
+    pub revoked: Vec<Fingerprint>,
 }
 
 /// The reason for which credentials cannot be used.
@@ -60,6 +73,8 @@ pub struct CredentialsError(#[from] rustls::Error);
 #[derive(Clone)]
 pub struct Security {
     now: Arc<RwLock<Arc<Prepared>>>,
+    /// Held during a replacement.
+    replacing: Arc<Mutex<()>>,
     /// Counts replacements.
     replaced: watch::Sender<u64>,
     rules: Rules,
@@ -92,6 +107,7 @@ impl Security {
     pub fn new(credentials: Credentials, rules: Rules) -> Result<Self, CredentialsError> {
         Ok(Self {
             now: Arc::new(RwLock::new(Arc::new(Prepared::new(credentials)?))),
+            replacing: Arc::default(),
             replaced: watch::Sender::new(0),
             rules,
         })
@@ -102,22 +118,56 @@ impl Security {
     /// # Errors
     /// When the credentials cannot be used; the previous ones stay in use.
     pub fn replace(&self, credentials: Credentials) -> Result<(), CredentialsError> {
-        let prepared = Arc::new(Prepared::new(credentials)?);
-        *self.now.write() = prepared;
-        self.replaced.send_modify(|count| *count += 1);
-        Ok(())
+        let Credentials {
+            own,
+            key,
+            trusted,
+            revoked,
+        } = credentials;
+        self.change(|now| Prepared::with(own, key, now.known.with_certificates(trusted, revoked)))
     }
 
-    /// Replaces the trusted peers, and keeps the key and certificate.
+    /// Replaces the trusted peers, and keeps the key and certificate. These certificates are revoked in
+    /// addition to those that already are.
     ///
     /// # Errors
     /// When the credentials cannot be used; the previous ones stay in use.
-    pub fn trust_only(&self, trusted: Vec<Certificate>) -> Result<(), CredentialsError> {
-        let (own, key) = {
-            let now = self.now.read();
-            (now.own.clone(), now.key.clone_key())
-        };
-        self.replace(Credentials { own, key, trusted })
+    pub fn trust_only(
+        &self,
+        trusted: Vec<Certificate>,
+        mut revoked: Vec<Fingerprint>,
+    ) -> Result<(), CredentialsError> {
+        self.change(|now| {
+            revoked.extend(now.known.revoked());
+            let known = now.known.with_certificates(trusted, revoked);
+            Prepared::with(now.own.clone(), now.key.clone_key(), known)
+        })
+    }
+
+    /// Replaces the authorities that prove the host names of platforms over `https`.
+    ///
+    /// # Errors
+    /// When the credentials cannot be used with them; the previous ones stay in use.
+    #[cfg(feature = "http")]
+    pub fn set_authorities(&self, authorities: Authorities) -> Result<(), CredentialsError> {
+        self.change(|now| {
+            let known = now.known.with_authorities(authorities);
+            Prepared::with(now.own.clone(), now.key.clone_key(), known)
+        })
+    }
+
+    /// Replaces the credentials by changed ones. They are prepared without the lock that connections take.
+    fn change(
+        &self,
+        change: impl FnOnce(&Prepared) -> Result<Prepared, CredentialsError>,
+    ) -> Result<(), CredentialsError> {
+        let _replacing = self.replacing.lock();
+        let before = Arc::clone(&self.now.read());
+        let after = Arc::new(change(&before)?);
+        *self.now.write() = after;
+        // Connections are judged by the new credentials from here on.
+        self.replaced.send_modify(|count| *count += 1);
+        Ok(())
     }
 
     /// Whether a peer at this address must prove its identity.
@@ -130,8 +180,14 @@ impl Security {
         self.rules.legacy_peers.contains(&ip.to_canonical())
     }
 
+    /// Returns the number of replacements of the credentials so far.
+    #[must_use]
+    pub fn revision(&self) -> u64 {
+        *self.replaced.borrow()
+    }
+
     /// Returns a receiver that is notified when the credentials have been replaced.
-    pub(crate) fn changes(&self) -> watch::Receiver<u64> {
+    fn changes(&self) -> watch::Receiver<u64> {
         self.replaced.subscribe()
     }
 
@@ -163,15 +219,12 @@ impl Security {
     }
 
     /// Returns the configuration of TLS with a platform that is dialed. It proves its identity with a
-    /// trusted certificate, or with one of these authorities for its name.
+    /// trusted certificate, or with one of an authority for its name.
     #[cfg(feature = "http")]
-    pub(crate) fn platform_client(
-        &self,
-        authorities: Option<Arc<rustls::client::WebPkiServerVerifier>>,
-    ) -> Result<Arc<ClientConfig>, rustls::Error> {
+    pub(crate) fn platform_client(&self) -> Result<Arc<ClientConfig>, rustls::Error> {
         let now = self.now.read().clone();
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let verifier = platform::Server::new(now.known.clone(), authorities);
+        let verifier = platform::Server::new(now.known.clone());
         let mut client = ClientConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&TLS13])?
             .dangerous()
@@ -181,18 +234,67 @@ impl Security {
         Ok(Arc::new(client))
     }
 
-    /// Returns the trusted certificate that a platform has presented, if it is valid now.
-    #[cfg(feature = "http")]
-    pub(crate) fn proof(&self, presented: Option<&[CertificateDer<'_>]>) -> Option<Certificate> {
-        let certificate = self.peer(presented)?;
-        let now = rustls::pki_types::UnixTime::now();
-        (certificate.holds(now) == certificate::Holds::Now).then_some(certificate)
+    /// Returns the trust in a peer that has presented these certificates in a handshake. `None` if the
+    /// first one is not trusted.
+    pub(crate) fn trust(&self, presented: Option<&[CertificateDer<'_>]>) -> Option<Trust> {
+        // Read before the certificates: a later change is judged again.
+        let revision = self.revision();
+        let presented = presented?.first()?;
+        let certificate = self.now.read().known.find(presented).cloned()?;
+        Some(Trust::new(self, revision, Evidence::Listed(certificate)))
     }
 
-    /// Returns the trusted certificate that a peer has presented.
-    pub(crate) fn peer(&self, presented: Option<&[CertificateDer<'_>]>) -> Option<Certificate> {
-        let presented = presented?.first()?;
-        self.now.read().known.find(presented).cloned()
+    /// Returns the trust in a platform that has dialed. `None` if its certificate is not trusted, or not
+    /// valid now: the handshake requires neither.
+    #[cfg(feature = "http")]
+    pub(crate) fn trust_in_client(
+        &self,
+        presented: Option<&[CertificateDer<'_>]>,
+    ) -> Option<Trust> {
+        let trust = self.trust(presented)?;
+        let now = rustls::pki_types::UnixTime::now();
+        let holds = trust.certificate()?.holds(now);
+        (holds == certificate::Holds::Now).then_some(trust)
+    }
+
+    /// Returns the trust in a platform that was dialed under this name.
+    #[cfg(feature = "http")]
+    pub(crate) fn trust_in_server(
+        &self,
+        presented: Option<&[CertificateDer<'_>]>,
+        name: &rustls::pki_types::ServerName<'static>,
+    ) -> Option<Trust> {
+        if let Some(trust) = self.trust(presented) {
+            return Some(trust);
+        }
+        let revision = self.revision();
+        let chain = trust::Chain::new(presented?, name)?;
+        let evidence = Evidence::Chain(chain);
+        let is_trusted = self.still_trusts(&evidence, SystemTime::now());
+        is_trusted.then(|| Trust::new(self, revision, evidence))
+    }
+
+    /// Whether the credentials still trust a peer that has presented this. The end of a trusted certificate
+    /// does not count here, see [`left`](Self::left).
+    fn still_trusts(&self, evidence: &Evidence, now: SystemTime) -> bool {
+        let known = Arc::clone(&self.now.read().known);
+        match evidence {
+            Evidence::Listed(certificate) => known.trusts(certificate.fingerprint()),
+            #[cfg(feature = "http")]
+            Evidence::Chain(chain) => known.trusts_chain(chain, now),
+        }
+    }
+
+    /// Returns the time until what a peer has presented must be judged again; zero if it has expired.
+    fn left(&self, evidence: &Evidence, now: SystemTime) -> Duration {
+        match evidence {
+            Evidence::Listed(certificate) => certificate.left(now),
+            #[cfg(feature = "http")]
+            Evidence::Chain(chain) => match self.still_trusts(evidence, now) {
+                true => chain.next_end(now),
+                false => Duration::ZERO,
+            },
+        }
     }
 }
 
@@ -206,9 +308,23 @@ impl fmt::Debug for Security {
 
 impl Prepared {
     fn new(credentials: Credentials) -> Result<Self, CredentialsError> {
-        let Credentials { own, key, trusted } = credentials;
+        let Credentials {
+            own,
+            key,
+            trusted,
+            revoked,
+        } = credentials;
+        let known = Known::default().with_certificates(trusted, revoked);
+        Self::with(own, key, known)
+    }
+
+    fn with(
+        own: Certificate,
+        key: PrivateKeyDer<'static>,
+        known: Known,
+    ) -> Result<Self, CredentialsError> {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let known = Arc::new(Known::new(trusted, &provider));
+        let known = Arc::new(known);
         let chain = vec![own.der().clone()];
         let mut server = ServerConfig::builder_with_provider(provider.clone())
             .with_protocol_versions(&[&TLS13])?

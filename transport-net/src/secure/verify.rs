@@ -1,9 +1,13 @@
 //! Verification of presented certificates.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
+#[cfg(feature = "http")]
+use std::time::{SystemTime, UNIX_EPOCH};
 
+#[cfg(feature = "http")]
+use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
-use rustls::crypto::{CryptoProvider, WebPkiSupportedAlgorithms, verify_tls13_signature};
+use rustls::crypto::{WebPkiSupportedAlgorithms, verify_tls13_signature};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{
@@ -12,23 +16,95 @@ use rustls::{
 };
 
 use super::certificate::{Certificate, Fingerprint, Holds};
+#[cfg(feature = "http")]
+use super::platform::Authorities;
+#[cfg(feature = "http")]
+use super::trust::Chain;
 
-/// The certificates of trusted peers.
+/// The certificates that prove peers.
 #[derive(Debug)]
 pub(super) struct Known {
+    /// The certificates of trusted peers, without revoked ones.
     trusted: HashMap<Fingerprint, Certificate>,
+    revoked: HashSet<Fingerprint>,
+    #[cfg(feature = "http")]
+    authorities: Authorities,
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl Known {
-    pub(super) fn new(trusted: Vec<Certificate>, provider: &CryptoProvider) -> Self {
+impl Default for Known {
+    fn default() -> Self {
+        let provider = rustls::crypto::ring::default_provider();
         Self {
-            trusted: trusted
-                .into_iter()
-                .map(|certificate| (certificate.fingerprint(), certificate))
-                .collect(),
+            trusted: HashMap::new(),
+            revoked: HashSet::new(),
+            #[cfg(feature = "http")]
+            authorities: Authorities::default(),
             algorithms: provider.signature_verification_algorithms,
         }
+    }
+}
+
+impl Known {
+    /// Returns the same authorities with these certificates.
+    pub(super) fn with_certificates(
+        &self,
+        trusted: Vec<Certificate>,
+        revoked: Vec<Fingerprint>,
+    ) -> Self {
+        let revoked: HashSet<Fingerprint> = revoked.into_iter().collect();
+        let trusted = trusted.into_iter();
+        let trusted = trusted.map(|certificate| (certificate.fingerprint(), certificate));
+        Self {
+            trusted: trusted.filter(|(it, _)| !revoked.contains(it)).collect(),
+            revoked,
+            #[cfg(feature = "http")]
+            authorities: self.authorities.clone(),
+            algorithms: self.algorithms,
+        }
+    }
+
+    /// Returns the same certificates with these authorities.
+    #[cfg(feature = "http")]
+    pub(super) fn with_authorities(&self, authorities: Authorities) -> Self {
+        Self {
+            trusted: self.trusted.clone(),
+            revoked: self.revoked.clone(),
+            authorities,
+            algorithms: self.algorithms,
+        }
+    }
+
+    /// Returns the revoked certificates.
+    pub(super) fn revoked(&self) -> impl Iterator<Item = Fingerprint> {
+        self.revoked.iter().copied()
+    }
+
+    /// Returns the authorities of platforms, unless one of these certificates is revoked.
+    #[cfg(feature = "http")]
+    pub(super) fn authorities_for<'a>(
+        &self,
+        mut presented: impl Iterator<Item = &'a CertificateDer<'a>>,
+    ) -> Option<&WebPkiServerVerifier> {
+        let is_revoked = |it: &CertificateDer<'_>| self.revoked.contains(&Fingerprint::of(it));
+        match presented.any(is_revoked) {
+            true => None,
+            false => self.authorities.verifier(),
+        }
+    }
+
+    /// Whether the authorities prove the name of a platform with this chain at this time.
+    #[cfg(feature = "http")]
+    pub(super) fn trusts_chain(&self, chain: &Chain, now: SystemTime) -> bool {
+        let Some((own, others)) = chain.presented.split_first() else {
+            return false;
+        };
+        let Some(authorities) = self.authorities_for(chain.presented.iter()) else {
+            return false;
+        };
+        let now = UnixTime::since_unix_epoch(now.duration_since(UNIX_EPOCH).unwrap_or_default());
+        let verified = authorities.verify_server_cert(own, others, &chain.name, &[], now);
+        verified.is_ok()
     }
 
     pub(super) fn find(&self, presented: &CertificateDer<'_>) -> Option<&Certificate> {

@@ -188,6 +188,14 @@ impl Connection {
         self.proof = proof;
     }
 
+    /// Checks that what the peer has proved still counts.
+    ///
+    /// # Errors
+    /// The reason for which the connection ends.
+    pub(crate) fn check_proof(&self) -> Result<(), ConnectionEnd> {
+        self.proof.check()
+    }
+
     /// Checks that the peer may send this letter. A peer with a certificate may only send letters
     /// of its own agents, according to both the envelope and the message.
     ///

@@ -331,6 +331,10 @@ impl State {
         let Some(writer) = &self.writer else {
             return Flushed::All;
         };
+        if let Err(end) = self.connection.check_proof() {
+            self.ending.get_or_insert(end);
+            return Flushed::Broken;
+        }
         let mut burst = 0;
         while !self.connection.is_flushed() {
             if burst >= MAX_BURST {
@@ -607,6 +611,7 @@ impl LinkTask {
                 if let Some(end) = state.ending.clone() {
                     return Err(end);
                 }
+                state.connection.check_proof()?;
                 state.connection.handle_frame(frame, now)?;
                 events = [state.connection.poll_event(), state.connection.poll_event()];
             }

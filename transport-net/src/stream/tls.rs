@@ -18,8 +18,9 @@ use tokio::time::timeout;
 use tokio_rustls::{TlsAcceptor, TlsConnector};
 
 use super::frame::Space;
+use super::proof::Proof;
 use super::wire::{Reading, Writing};
-use crate::secure::{Certificate, Security, advice};
+use crate::secure::{Security, advice};
 
 /// First byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
 pub(crate) const FIRST_BYTE: u8 = 22;
@@ -38,8 +39,8 @@ const MAX_WAITING: usize = 1 << 16;
 /// A connection whose peer has proved its identity.
 pub(crate) struct Secured {
     pub(crate) ends: (Reading, Writing),
-    /// The certificate of the peer.
-    pub(crate) certificate: Certificate,
+    /// The proof of the peer.
+    pub(crate) proof: Proof,
 }
 
 /// Performs the handshake with a peer that begins TLS.
@@ -110,8 +111,8 @@ fn secured(
     stream: TcpStream,
     mut session: Connection,
 ) -> Result<Secured, String> {
-    let certificate = security.peer(session.peer_certificates());
-    let certificate = certificate.ok_or("the peer's certificate is no longer trusted")?;
+    let trust = security.trust(session.peer_certificates());
+    let trust = trust.ok_or("the peer's certificate is no longer trusted")?;
     session.set_buffer_limit(Some(MAX_WAITING));
     let (read, write) = stream.into_split();
     let session = Arc::new(Session(Mutex::new(session)));
@@ -122,7 +123,7 @@ fn secured(
     };
     Ok(Secured {
         ends: (Reading::Tls(read, incoming), Writing::Tls(write, session)),
-        certificate,
+        proof: trust.into(),
     })
 }
 

@@ -351,12 +351,17 @@ async fn prove(
             match tls::accept(security, Arc::into_inner(stream)?, patience).await {
                 Ok(secured) => {
                     let (link, sink) = endpoint.accepted()?;
-                    let proof = Proof::of(security, secured.certificate);
                     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
                     LinkTask::new(endpoint.stream.clone(), link, sink, None)
-                        .serve(secured.ends, proof, reader, Source::Address(from), || {
-                            drop(slot);
-                        })
+                        .serve(
+                            secured.ends,
+                            secured.proof,
+                            reader,
+                            Source::Address(from),
+                            || {
+                                drop(slot);
+                            },
+                        )
                         .await;
                     return None;
                 }

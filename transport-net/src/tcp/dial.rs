@@ -84,7 +84,7 @@ async fn prove(
         Some(security) if !config.takes_frames_of(peer.ip()) => {
             let patience = config.limits.handshake_timeout;
             let secured = tls::connect(security, stream, peer, patience).await?;
-            Ok((secured.ends, Proof::of(security, secured.certificate)))
+            Ok((secured.ends, secured.proof))
         }
         _ => Ok((wire::plain(stream), Proof::default())),
     }

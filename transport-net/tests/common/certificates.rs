@@ -39,13 +39,15 @@ impl Host {
         }
     }
 
-    /// Creates a host with a certificate of an authority for this host name.
+    /// Creates a host with a certificate of an authority for this host name, which ends at this time.
     pub(crate) fn named(
         name: &str,
         host: &str,
         authority: &rcgen::Issuer<'static, KeyPair>,
+        until: SystemTime,
     ) -> Self {
         let mut params = CertificateParams::new([host.to_owned()]).unwrap();
+        params.not_after = until.into();
         for uri in alternative_names(name, &[]) {
             params
                 .subject_alt_names
@@ -68,6 +70,7 @@ impl Host {
                 .iter()
                 .map(|host| host.certificate.clone())
                 .collect(),
+            revoked: Vec::new(),
         }
     }
 

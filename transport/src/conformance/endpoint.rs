@@ -15,7 +15,7 @@ use crate::{
 };
 
 /// Timeout after which the suite considers a transport broken.
-const TIMEOUT: Duration = Duration::from_secs(60);
+pub(super) const TIMEOUT: Duration = Duration::from_secs(60);
 
 type VerdictOf = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
 

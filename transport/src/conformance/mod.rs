@@ -12,14 +12,17 @@
 mod edge_cases;
 mod endpoint;
 mod letters;
+mod trust;
 
 use std::any::Any;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::{Location, Transport};
 
 pub use edge_cases::*;
 pub use letters::*;
+pub use trust::*;
 
 /// The transport under test.
 pub trait Fixture {
@@ -29,6 +32,12 @@ pub trait Fixture {
 
     /// A location of this transport without an endpoint.
     fn nowhere(&self) -> Location;
+
+    /// Creates two endpoints without calling `listen`, of different services whose certificates are
+    /// valid now and trusted by the other one. The certificate of the first endpoint ends after this
+    /// time. `None` if peers of this transport prove nothing. There is no default: a transport with
+    /// keys must follow the rules on trust.
+    fn keyed_pair(&self, valid_for: Duration) -> Option<[KeyedEndpoint; 2]>;
 
     /// Takes the locks that other processes of this host take while they change what the endpoints
     /// share, and holds them until the result is dropped, as a stopped process does. `None` if the
@@ -68,11 +77,24 @@ macro_rules! conformance_tests {
             a_sink_may_call_its_transport
             a_caller_may_hold_a_lock_that_its_sink_takes
         );
+        $crate::trust_conformance_tests!($fixture);
     };
     (@each $fixture:expr; $($rule:ident)*) => {
         $(#[test]
         fn $rule() {
             $crate::conformance::$rule(&$fixture);
         })*
+    };
+}
+
+/// Defines the tests of the rules on trust only, for transports to legacy peers. The argument is an
+/// expression for a new [`Fixture`].
+#[macro_export]
+macro_rules! trust_conformance_tests {
+    ($fixture:expr) => {
+        $crate::conformance_tests!(@each $fixture;
+            withdrawn_trust_ends_open_connections
+            the_end_of_a_certificate_ends_open_connections
+        );
     };
 }

@@ -10,7 +10,7 @@
 //!
 //! This module dispatches letters; [`answers`] handles answers and reports, [`clock`] timeouts,
 //! [`custody`] predecessors at custodians, [`delivery`] the state of one letter, [`tried`] the
-//! attempts that are reported for letters that were never dispatched.
+//! attempts that are reported for letters that were never dispatched, [`trust`] withdrawn certificates.
 //!
 //! [`rules`]: super::rules
 
@@ -19,6 +19,7 @@ mod clock;
 mod custody;
 mod delivery;
 mod tried;
+mod trust;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -402,6 +403,10 @@ impl Lane {
                 }
                 continue;
             };
+            if trust::is_withdrawn(&entry, table) {
+                self.refuse(now, index, &entry, table);
+                continue;
+            }
             if self.letters[index].progress.uncertain && !entry.incarnation.is_known() {
                 // An earlier gateway may have sent it, and a legacy peer would take a copy for a new
                 // letter.
