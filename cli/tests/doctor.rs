@@ -113,16 +113,18 @@ fn a_directory_that_others_may_enter_is_bad() {
 #[test]
 fn without_inotify_letters_are_delivered_and_the_doctor_names_the_sysctl() {
     let host = Host::new();
-    let without_inotify =
-        |command| unshared(command, &[], "echo 0 >/proc/sys/user/max_inotify_instances");
-    let Some(echo) = without_inotify(&host.command(&["echo", "parrot"])) else {
+    let without_inotify = |arguments: &[&str]| {
+        let limit = "echo 0 >/proc/sys/user/max_inotify_instances";
+        unshared(&host.command(arguments), &[], limit)
+    };
+    let Some(echo) = without_inotify(&["echo", "parrot"]) else {
         return;
     };
     let parrot = Running::new(echo);
     let letter = ["send", "--to", "parrot", "--content", "hello"];
     let sent = host.run(&letter).done();
     assert!(sent.contains("delivered"), "{sent}");
-    let doctor = without_inotify(&host.command(&["doctor", "--json"]));
+    let doctor = without_inotify(&["doctor", "--json"]);
     let report = doctor.unwrap().output().unwrap().stdout;
     let report: Value = serde_json::from_slice(&report).unwrap();
     let (verdict, found) = check(&report, "inotify instances");
