@@ -369,6 +369,19 @@ mod tests {
         }
     }
 
+    /// Letters with such a name are refused before, but a rule for all senders has no exception.
+    #[test]
+    fn a_rule_for_all_senders_includes_names_with_line_breaks() {
+        let access = access(&[(".*", &["brake"])], &[(".*", &[".*"])], 0);
+        for sender in ["rov\n_1", "\n", "rov\r\n_1", "rov\u{2028}_1"] {
+            let judged = access.judge(&facts(sender, "brake"));
+            assert_eq!(judged, Err(Refusal::Denied), "{sender:?}");
+        }
+        let receivers = ["brake".to_owned()];
+        let refused = fault(("(?-s).*", &receivers)).map(|error| error.to_string());
+        assert!(refused.is_some_and(|why| why.contains("turns off the flag `s`")));
+    }
+
     #[test]
     fn a_rule_can_be_about_some_performatives_and_protocols_only() {
         let only = ["arm performative=request,cancel protocol=fipa-request"];

@@ -1,5 +1,6 @@
 //! The membership of a process in a domain.
 
+use std::ffi::OsStr;
 use std::fmt;
 use std::sync::Arc;
 
@@ -115,8 +116,7 @@ impl Domain {
     /// Joins the domain on a thread for blocking calls.
     fn join(config: &Config, brief: bool, cancellation: &Cancellation) -> Result<Self, OpenError> {
         let rules = Rules::load(&config.monitor)?;
-        let host = gethostname::gethostname();
-        let name = format!("{}-{}", host.to_string_lossy(), std::process::id());
+        let name = process_name(&gethostname::gethostname(), std::process::id());
         let service = Service::start(
             config,
             Role {
@@ -219,6 +219,11 @@ impl Domain {
     }
 }
 
+/// Returns the name of the message transport service of a process on the host with this name.
+fn process_name(host: &OsStr, process: u32) -> String {
+    format!("{}-{process}", fipa_sds::to_name(&host.to_string_lossy()))
+}
+
 /// Logs a warning if the encodings of legacy peers, which write names as words, cannot express this
 /// name.
 pub(crate) fn warn_of_name(id: &AgentId) {
@@ -235,5 +240,23 @@ pub(crate) fn warn_of_name(id: &AgentId) {
              address it ({error}); use a name without blanks and parentheses if there are such peers",
             id.name()
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::ffi::OsStrExt as _;
+
+    use super::*;
+
+    #[test]
+    fn a_process_on_a_host_of_any_name_has_a_valid_name() {
+        let names: [&[u8]; 5] = [b"sherpa", b"(none)", br"([{*+?|^$\", b" a\xff ", b""];
+        for host in names {
+            let name = process_name(OsStr::from_bytes(host), 4711);
+            assert_eq!(fipa_sds::check_name(&name), Ok(()), "{name}");
+            assert!(name.ends_with("-4711"), "{name}");
+        }
+        assert_eq!(process_name(OsStr::new("sherpa"), 4711), "sherpa-4711");
     }
 }

@@ -9,13 +9,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa::{
-    Agent, AgentId, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome, Performative,
-    TransportErrorKind,
+    Agent, AgentId, Config, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome,
+    Performative, TransportErrorKind,
 };
 use fipa_mts::letter_for;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
-    Transport as _, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Location, Parcel,
+    Sink, Stream, Transport as _, Verdict,
 };
 use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 
@@ -161,22 +161,27 @@ impl Sink for StoredConclusion {
     }
 }
 
-/// Sends a forged letter to an agent of a process over TCP, with the name of the gateway and this
-/// incarnation. Returns the answer of that process.
-async fn hand_over(gateway: &Gateway, incarnation: Incarnation, to: &Entry) -> Conclusion {
+/// A service of another host with this name and incarnation, without keys.
+fn peer(name: &str, incarnation: Incarnation) -> TcpConfig {
     let identity = Identity {
-        name: gateway.name().to_owned(),
+        name: name.to_owned(),
         incarnation,
         domain: "any".to_owned(),
         host: "any".to_owned(),
     };
     let mut config = TcpConfig::new(Vec::new(), identity);
     config.processes = true;
-    let transport = TcpTransport::new(config, tokio::runtime::Handle::current());
+    config
+}
+
+/// Has this peer send a letter of this sender to an agent, over TCP to one of these locations. Returns the
+/// answer.
+async fn hand_over(peer: TcpConfig, sender: &str, to: &Entry, at: &[Location]) -> Conclusion {
+    let transport = TcpTransport::new(peer, tokio::runtime::Handle::current());
     let stored = Arc::new(StoredConclusion::default());
     transport.listen(stored.clone()).unwrap();
     let message = Message::builder(Performative::Request)
-        .sender(AgentId::new(gateway.name()).unwrap())
+        .sender(AgentId::new(sender).unwrap())
         .receiver(AgentId::new(&*to.name).unwrap())
         .build()
         .unwrap();
@@ -193,7 +198,7 @@ async fn hand_over(gateway: &Gateway, incarnation: Incarnation, to: &Entry) -> C
         transfer: 0,
         body: Body::Letter(letter_for(&message, SystemTime::now()).unwrap()),
     };
-    let at = to.locations.iter().find(|it| it.kind() == Kind::Tcp);
+    let at = at.iter().find(|it| it.kind() == Kind::Tcp);
     transport
         .dispatch(AttemptId(1), at.unwrap(), parcel)
         .unwrap();
@@ -205,6 +210,92 @@ async fn hand_over(gateway: &Gateway, incarnation: Incarnation, to: &Entry) -> C
         assert!(began.elapsed() < Duration::from_secs(60));
         tokio::time::sleep(Duration::from_millis(2)).await;
     }
+}
+
+/// Opens a membership whose process also listens on TCP, with these rules.
+fn listening(rules: &str) -> Config {
+    support::load([
+        &*format!("domain=acc-{}", support::mark()),
+        "discovery.mdns=false",
+        "transport.tcp.processes=true",
+        rules,
+    ])
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_with_a_line_break_in_the_name_of_its_sender_is_refused() {
+    for rules in [
+        "access.deny={ \".*\" = [\"arm\"] }",
+        "access.deny={ \"x.*\" = [\"arm\"] }",
+        // No rule at all.
+        "access.rate=0",
+    ] {
+        let strict = Domain::open(&listening(rules)).await.unwrap();
+        let arm = strict.register("arm").await.unwrap();
+        let entry = strict.directory().lookup("arm").unwrap();
+        let peer = peer("crex-mts", Incarnation::random());
+        let refused = hand_over(peer, "rov\n_1", &entry, &entry.locations).await;
+        let Conclusion::Answered(Answer::Failed { reason, detail }) = &refused else {
+            panic!("{rules}: {refused:?}")
+        };
+        assert_eq!(*reason, FailureReason::Refused);
+        assert!(
+            detail.contains(r#""rov\u{a}_1" has the character U+000A"#),
+            "{detail}"
+        );
+        assert!(arm.try_receive().unwrap().is_none());
+        drop(arm);
+        strict.close().await;
+    }
+}
+
+/// The certificate of the peer covers the sender.
+#[cfg(feature = "secure")]
+#[tokio::test(flavor = "multi_thread")]
+async fn a_certified_peer_evades_no_rule_by_a_line_break() {
+    use fipa::keys::{Keys, VALID};
+    use fipa_transport_net::secure::{Rules, Security};
+
+    let home = tempfile::tempdir().unwrap();
+    let [own, theirs] = ["own", "theirs"].map(|keys| Keys::at(home.path().join(keys)));
+    own.init("brake-mts", &[], VALID).unwrap();
+    theirs.init("x-mts", &["x*".to_owned()], VALID).unwrap();
+    for (keys, other) in [(&own, &theirs), (&theirs, &own)] {
+        keys.trust(&std::fs::read(other.own_file()).unwrap())
+            .unwrap();
+    }
+    let config = support::load([
+        format!("domain=acc-{}", support::mark()),
+        "mts.name=brake-mts".to_owned(),
+        "discovery.mdns=false".to_owned(),
+        format!("security.keys={}", own.dir().display()),
+        "security.loopback=true".to_owned(),
+        "access.deny={ \".*\" = [\"brake\"] }".to_owned(),
+    ]);
+    let gateway = Gateway::open(&config).await.unwrap();
+    let domain = Domain::open(&config).await.unwrap();
+    let brake = domain.register("brake").await.unwrap();
+    let entry = domain.directory().lookup("brake").unwrap();
+    for (sender, why) in [("x_1", "access.deny"), ("x\n_1", "U+000A")] {
+        let credentials = theirs.credentials_of("x-mts").unwrap();
+        let rules = Rules {
+            loopback: true,
+            ..Rules::default()
+        };
+        let mut peer = peer("x-mts", Incarnation::random());
+        peer.processes = false;
+        peer.security = Some(Security::new(credentials, rules).unwrap());
+        let refused = hand_over(peer, sender, &entry, &gateway.locations()).await;
+        let Conclusion::Answered(Answer::Failed { reason, detail }) = &refused else {
+            panic!("{sender:?}: {refused:?}")
+        };
+        assert_eq!(*reason, FailureReason::Refused);
+        assert!(detail.contains(why), "{detail}");
+    }
+    assert!(brake.try_receive().unwrap().is_none());
+    drop(brake);
+    domain.close().await;
+    gateway.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -223,13 +314,17 @@ async fn a_forged_name_of_the_gateway_is_refused_over_tcp() {
     let strict = Domain::open(&rules).await.unwrap();
     let arm = strict.register("arm").await.unwrap();
     let entry = gateway.directory().lookup("arm").unwrap();
+    let forged = async |incarnation, entry: &Entry| {
+        let name = gateway.name();
+        hand_over(peer(name, incarnation), name, entry, &entry.locations).await
+    };
     // No other peer can introduce itself with the incarnation of the gateway.
-    let refused = hand_over(&gateway, gateway.incarnation(), &entry).await;
+    let refused = forged(gateway.incarnation(), &entry).await;
     let Conclusion::NotSent(error) = &refused else {
         panic!("{refused:?}")
     };
     assert_eq!(error.fault, TransportErrorKind::Refused, "{error}");
-    let refused = hand_over(&gateway, Incarnation::random(), &entry).await;
+    let refused = forged(Incarnation::random(), &entry).await;
     let Conclusion::Answered(Answer::Failed { reason, detail }) = &refused else {
         panic!("{refused:?}")
     };

@@ -34,10 +34,11 @@ pub fn escape(text: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Whether the character can change how a terminal or a reader interprets a text.
+/// Whether the character can change how a terminal or a reader interprets a text, or is invisible.
 ///
 /// These are the control characters (Cc), the format characters (Cf), which include the
-/// bidirectional ones, and the separators of lines and paragraphs (Zl, Zp) of Unicode 17.
+/// bidirectional ones, the separators of lines and paragraphs (Zl, Zp), and the characters that are
+/// not shown if a font lacks them (`Default_Ignorable_Code_Point`) of Unicode 17.
 #[must_use]
 pub fn is_unprintable(c: char) -> bool {
     match c {
@@ -46,26 +47,30 @@ pub fn is_unprintable(c: char) -> bool {
         _ => matches!(
             c,
             '\u{ad}'
+                | '\u{34f}'
                 | '\u{600}'..='\u{605}'
                 | '\u{61c}'
                 | '\u{6dd}'
                 | '\u{70f}'
                 | '\u{890}'..='\u{891}'
                 | '\u{8e2}'
-                | '\u{180e}'
+                | '\u{115f}'..='\u{1160}'
+                | '\u{17b4}'..='\u{17b5}'
+                | '\u{180b}'..='\u{180f}'
                 | '\u{200b}'..='\u{200f}'
                 | '\u{2028}'..='\u{202e}'
-                | '\u{2060}'..='\u{2064}'
-                | '\u{2066}'..='\u{206f}'
+                | '\u{2060}'..='\u{206f}'
+                | '\u{3164}'
+                | '\u{fe00}'..='\u{fe0f}'
                 | '\u{feff}'
-                | '\u{fff9}'..='\u{fffb}'
+                | '\u{ffa0}'
+                | '\u{fff0}'..='\u{fffb}'
                 | '\u{110bd}'
                 | '\u{110cd}'
                 | '\u{13430}'..='\u{1343f}'
                 | '\u{1bca0}'..='\u{1bca3}'
                 | '\u{1d173}'..='\u{1d17a}'
-                | '\u{e0001}'
-                | '\u{e0020}'..='\u{e007f}'
+                | '\u{e0000}'..='\u{e0fff}'
         ),
     }
 }
@@ -129,14 +134,16 @@ mod tests {
         assert_eq!(escape("a\u{1b}[2J\nb"), r"a\u{1b}[2J\u{a}b");
         assert_eq!(escape("\u{9b}31m"), r"\u{9b}31m");
         assert_eq!(escape("x\u{202e}y\u{2028}"), r"x\u{202e}y\u{2028}");
+        assert_eq!(escape("a\u{34f}\u{3164}b"), r"a\u{34f}\u{3164}b");
         assert_eq!(escape(r"\u{1b}"), r"\u{5c}u{1b}");
         assert_eq!(escape("\\\u{1b}"), r"\\u{1b}");
     }
 
-    /// Compares with the categories of the crate `regex`, which follows the releases of Unicode.
+    /// Compares with the tables of the crate `regex`, which follows the releases of Unicode.
     #[test]
     fn unprintable_characters_are_those_of_unicode() {
-        let expected = regex::Regex::new(r"^[\p{Cc}\p{Cf}\p{Zl}\p{Zp}]$").unwrap();
+        let expected = r"^[\p{Cc}\p{Cf}\p{Zl}\p{Zp}\p{Default_Ignorable_Code_Point}]$";
+        let expected = regex::Regex::new(expected).unwrap();
         let mut text = String::new();
         for c in char::MIN..=char::MAX {
             text.clear();

@@ -11,6 +11,7 @@
 //! * [`Letter`]: an encoded envelope and an encoded message, the unit that the other crates of this
 //!   project transport.
 //! * [`escape`]: makes text from outside safe for a terminal or a log.
+//! * `Pattern`, with the feature `pattern`: a regular expression that matches whole names.
 //! * [`explain()`]: explains every byte of a bit-efficient message or letter.
 //!
 //! ```
@@ -50,6 +51,9 @@ mod explain;
 pub mod json;
 mod letter;
 mod message;
+mod name;
+#[cfg(feature = "pattern")]
+mod pattern;
 mod performative;
 mod representation;
 mod scan;
@@ -73,6 +77,9 @@ pub use escape::{escape, is_unprintable};
 pub use explain::{Explanation, Span, explain};
 pub use letter::{Letter, Payload};
 pub use message::{ContentError, Message};
+pub use name::{is_pattern, misleading_character};
+#[cfg(feature = "pattern")]
+pub use pattern::{Pattern, PatternError};
 pub use performative::{Performative, PerformativeError, UserPerformative};
 pub use representation::{AclRepresentation, Representation};
 pub use time::{Base, Time, TimeError, Zone};

@@ -4,17 +4,18 @@
 //! by itself. Nothing here joins a domain, so that a completion takes milliseconds.
 
 use std::ffi::{OsStr, OsString};
-use std::path::PathBuf;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 
 use clap_complete::CompleteEnv;
 use clap_complete::engine::{
     ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter as _,
 };
+use clap_complete::env::{Bash, EnvCompleter, Fish, Shells, Zsh};
 use fipa::Domain;
 use fipa::config::{Effective, Sources, Value};
 use fipa::locks::ENTRY_PREFIX;
 use fipa::monitor::Library;
-use fipa_acl::is_unprintable;
 
 use crate::options;
 
@@ -33,7 +34,58 @@ const TABLES: [&str; 4] = [
 pub(crate) fn answer() {
     CompleteEnv::with_factory(options::command)
         .var(VARIABLE)
+        .shells(Shells(&[&PlainBash, &Zsh, &Fish]))
         .complete();
+}
+
+/// The completions of bash that need no quotes. Bash inserts a completion into the command line as it is,
+/// where a file or an agent named `a;reboot` would become two commands. Zsh and fish add quotes.
+///
+/// Where no completion is left, bash completes names of files by itself, with quotes.
+struct PlainBash;
+
+impl EnvCompleter for PlainBash {
+    fn name(&self) -> &'static str {
+        Bash.name()
+    }
+
+    fn is(&self, name: &str) -> bool {
+        Bash.is(name)
+    }
+
+    fn write_registration(
+        &self,
+        variable: &str,
+        name: &str,
+        command: &str,
+        completer: &str,
+        out: &mut dyn Write,
+    ) -> io::Result<()> {
+        Bash.write_registration(variable, name, command, completer, out)
+    }
+
+    fn write_complete(
+        &self,
+        command: &mut clap::Command,
+        words: Vec<OsString>,
+        directory: Option<&Path>,
+        out: &mut dyn Write,
+    ) -> io::Result<()> {
+        let mut all = Vec::new();
+        Bash.write_complete(command, words, directory, &mut all)?;
+        // The script of clap sets this variable.
+        let separator = std::env::var("_CLAP_IFS").unwrap_or_else(|_| "\n".to_owned());
+        let all = String::from_utf8_lossy(&all);
+        let plain: Vec<&str> = all.split(&*separator).filter(|it| is_plain(it)).collect();
+        out.write_all(plain.join(&separator).as_bytes())
+    }
+}
+
+/// Whether the word means itself in bash, zsh and fish: a letter, a digit or one of these characters has no
+/// other meaning there. A `=` has one at the beginning only, in zsh.
+fn is_plain(word: &str) -> bool {
+    let is_plain = |c: char| c.is_alphanumeric() || "_-./@:,=".contains(c);
+    word.chars().all(is_plain) && !word.starts_with('=')
 }
 
 /// Completes the name of an agent of the domain.
@@ -76,12 +128,12 @@ fn names() -> Vec<String> {
     names.unwrap_or_default()
 }
 
-/// Of these names, those that begin with the incomplete word.
+/// Of these names, those that begin with the incomplete word. Names come from other hosts, too: one that
+/// needs quotes in a shell or begins like an option is left out.
 fn beginning(current: &OsStr, names: impl Iterator<Item = String>) -> Vec<CompletionCandidate> {
     let current = current.to_string_lossy();
     names
-        // A name with unprintable characters could change the terminal.
-        .filter(|name| name.starts_with(&*current) && !name.contains(is_unprintable))
+        .filter(|name| name.starts_with(&*current) && is_plain(name) && !name.starts_with('-'))
         .map(CompletionCandidate::new)
         .collect()
 }
@@ -142,6 +194,42 @@ fn sources(words: impl Iterator<Item = OsString>) -> Sources {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_names_that_need_no_quotes_are_completed() {
+        let plain = ["zrover", "zrover_2", "z.b-c/d@host:1099", "zéla", "z机器人"];
+        let hostile = [
+            "zrover;reboot",
+            "z`reboot`",
+            "z$HOME",
+            "z&",
+            "z|",
+            "z>f",
+            "z<f",
+            "z\"",
+            "z'",
+            "z\\",
+            "z f",
+            "z!",
+            "z#",
+            "z*",
+            "z~",
+            "z%self",
+            "z\n",
+            "z\u{a0}",
+            "z\u{3164}",
+            "z)",
+            "z}",
+            "z]",
+        ];
+        let names = plain.iter().chain(&hostile).map(|name| (*name).to_owned());
+        let found = beginning(OsStr::new("z"), names);
+        let found: Vec<_> = found.iter().map(CompletionCandidate::get_value).collect();
+        assert_eq!(found, plain);
+        for name in ["-x", "--set=a", "~root", "=reboot", "#x"] {
+            assert_eq!(beginning(OsStr::new(""), [name.to_owned()].into_iter()), []);
+        }
+    }
 
     #[test]
     fn the_options_of_the_command_line_select_the_configuration() {

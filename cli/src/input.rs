@@ -8,13 +8,20 @@ use fipa_acl::escape;
 
 use crate::report::Failure;
 
-/// Reads a whole file, or standard input for the path `-`. More than `limit` bytes are an error.
+/// Maximum size of a message that a tool converts, in bytes: four times the default maximum of a letter.
+pub(crate) const MAX_MESSAGE: u64 = 256 << 20;
+
+/// Reads a whole file, or standard input for the path `-`. More than `limit` bytes are an error. A file with
+/// more bytes is not read.
 pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
     let mut bytes = Vec::new();
     let read = if path == Path::new("-") {
         read_all(&mut io::stdin().lock(), limit, &mut bytes)
     } else {
-        File::open(path).and_then(|mut file| read_all(&mut file, limit, &mut bytes))
+        File::open(path).and_then(|mut file| match file.metadata()?.len() <= limit {
+            true => read_all(&mut file, limit, &mut bytes),
+            false => Ok(false),
+        })
     };
     match read {
         Ok(true) => Ok(bytes),

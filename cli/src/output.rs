@@ -37,6 +37,20 @@ pub(crate) fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(lines.collect::<Vec<_>>().join("\n"))
 }
 
+/// Writes the characters that have a meaning in Mermaid, or in HTML, into which Mermaid puts labels, as
+/// references to characters. The text is [escaped](escape) already, so it is one line.
+pub(crate) fn mermaid(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match "#;:<>{}%\"\\&`$".contains(c) {
+            // Writing to a string cannot fail.
+            true => drop(write!(out, "#{};", u32::from(c))),
+            false => out.push(c),
+        }
+    }
+    out
+}
+
 /// Creates a table in the style of all commands. On a terminal it has at most the width of the terminal:
 /// long cells continue in further lines.
 pub(crate) fn table<T: Into<Cell>>(columns: impl IntoIterator<Item = T>) -> Table {
@@ -219,6 +233,15 @@ pub(crate) fn deliveries(deliveries: &Deliveries) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn characters_with_a_meaning_in_mermaid_are_written_as_references() {
+        let hostile = "a;b#1:<img src=x>%%{init}\"&lt;`$$";
+        let expected =
+            "a#59;b#35;1#58;#60;img src=x#62;#37;#37;#123;init#125;#34;#38;lt#59;#96;#36;#36;";
+        assert_eq!(mermaid(hostile), expected);
+        assert_eq!(mermaid("cfp (tcp), béla@home/x"), "cfp (tcp), béla@home/x");
+    }
 
     #[test]
     fn escaping_a_json_document_keeps_its_meaning() {

@@ -1,4 +1,4 @@
-//! `fipa completions` in bash, and `fipa man`.
+//! `fipa completions` in bash, zsh and fish, and `fipa man`.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
@@ -12,8 +12,6 @@ use common::Host;
 
 /// Returns what bash completes in these words; the last one is incomplete.
 fn completed(host: &Host, words: &[&str]) -> Vec<String> {
-    let programs = Path::new(env!("CARGO_BIN_EXE_fipa")).parent().unwrap();
-    let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
     // Runs the function that the script registers, as bash does when the user presses TAB.
     let script = "\
         source <(fipa completions bash) || exit
@@ -23,9 +21,37 @@ fn completed(host: &Host, words: &[&str]) -> Vec<String> {
         COMP_WORDS=(\"$@\") COMP_CWORD=$(($# - 1)) COMP_TYPE=9
         $function fipa \"${COMP_WORDS[COMP_CWORD]}\" \"${COMP_WORDS[COMP_CWORD - 1]}\"
         printf '%s\\n' \"${COMPREPLY[@]}\"";
-    let done = Command::new("bash")
-        .args(["--norc", "-c", script, "bash"])
+    completed_by(host, "bash", &["--norc", "-c", script, "bash"], words)
+}
+
+/// The same for zsh. Its completion system works within the line editor only, so the functions that the script
+/// calls are replaced.
+fn completed_in_zsh(host: &Host, words: &[&str]) -> Vec<String> {
+    let script = "\
+        compdef() { registered=$1 }
+        _describe() { print -rl -- ${(P)3} }
+        source <(fipa completions zsh) || exit
+        words=(\"$@\") CURRENT=$#
+        $registered";
+    completed_by(host, "zsh", &["-f", "-c", script, "zsh"], words)
+}
+
+/// The same for fish.
+fn completed_in_fish(host: &Host, words: &[&str]) -> Vec<String> {
+    let script = "\
+        fipa completions fish | source
+        complete --do-complete \"$argv\"";
+    completed_by(host, "fish", &["--no-config", "-c", script], words)
+}
+
+/// Returns what a shell prints that runs this script, with these words as its arguments.
+fn completed_by(host: &Host, shell: &str, script: &[&str], words: &[&str]) -> Vec<String> {
+    let programs = Path::new(env!("CARGO_BIN_EXE_fipa")).parent().unwrap();
+    let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
+    let done = Command::new(shell)
+        .args(script)
         .args(words)
+        .current_dir(host.path("."))
         .env_clear()
         .env("PATH", path)
         .env("HOME", host.path("."))
@@ -42,6 +68,67 @@ fn completed(host: &Host, words: &[&str]) -> Vec<String> {
         .filter(|word| !word.is_empty())
         .map(str::to_owned)
         .collect()
+}
+
+/// Whether this shell is installed. If not, prints a note, or panics if `CI=true`.
+fn has(shell: &str) -> bool {
+    let found = Command::new(shell).args(["-c", "true"]).status();
+    let found = found.is_ok_and(|status| status.success());
+    if !found {
+        let in_ci = std::env::var("CI").as_deref() == Ok("true");
+        assert!(!in_ci, "{shell} is missing");
+        eprintln!("SKIPPED, not a success: needs {shell}");
+    }
+    found
+}
+
+/// Bash inserts completions without quotes, so a name of another host would be a command.
+#[test]
+fn names_that_mean_something_to_a_shell_are_not_completed() {
+    let host = Host::new();
+    let hostile = [
+        "zrover;touch injected;#",
+        "z`touch injected`",
+        "z&touch injected&",
+        "z>injected",
+        "z two",
+        "z'",
+    ];
+    let _hostile = hostile.map(|name| host.echo(name));
+    let _plain = ["zrover_1", "z.arm-2@béla:1099/JADE"].map(|name| host.echo(name));
+    let listed = host.run(&["agents"]).done();
+    assert!(hostile.iter().all(|name| listed.contains(name)), "{listed}");
+    let expected = ["z.arm-2@béla:1099/JADE", "zrover_1"];
+    let words = ["fipa", "send", "--to", "z"];
+    let mut found = completed(&host, &words);
+    found.sort();
+    assert_eq!(found, expected);
+    for (shell, complete) in [
+        ("zsh", completed_in_zsh as fn(&Host, &[&str]) -> Vec<String>),
+        ("fish", completed_in_fish),
+    ] {
+        if has(shell) {
+            let mut found = complete(&host, &words);
+            // zsh separates a description by a colon.
+            found.iter_mut().for_each(|it| *it = it.replace("\\:", ":"));
+            found.sort();
+            assert_eq!(found, expected, "{shell}");
+        }
+    }
+    // The user's line runs as it is after a completion.
+    let line = format!("set -- {}", completed(&host, &words).join(" "));
+    completed_by(&host, "bash", &["--norc", "-c", &line], &[]);
+    assert!(!host.path("injected").exists());
+}
+
+#[test]
+fn files_that_mean_something_to_bash_are_left_to_bash() {
+    let host = Host::new();
+    for name in ["zdata.bin", "z;touch injected", "z$(touch injected)"] {
+        fs::write(host.path(name), "").unwrap();
+    }
+    let found = completed(&host, &["fipa", "decode", "z"]);
+    assert_eq!(found, ["zdata.bin"]);
 }
 
 /// The files in the runtime directory, with their contents' versions.

@@ -167,3 +167,31 @@ fn vectors(initial: char) -> Vec<PathBuf> {
         .filter(|path| name(path).starts_with(initial))
         .collect()
 }
+
+/// Each command has memory for its largest input only.
+#[test]
+fn input_beyond_the_bound_is_refused_without_reading_it() {
+    const GIB: u64 = 1 << 30;
+    let host = Host::new();
+    let file = fs::File::create(host.path("huge")).unwrap();
+    // Takes no space.
+    file.set_len(8 * GIB).unwrap();
+    let refused = |arguments: &str, memory: u64| {
+        let program = env!("CARGO_BIN_EXE_fipa");
+        let line = format!("ulimit -v {} && exec {program} {arguments}", memory >> 10);
+        let ran = std::process::Command::new("sh")
+            .args(["-c", &line])
+            .current_dir(host.path("."))
+            .output()
+            .unwrap();
+        let errors = String::from_utf8(ran.stderr).unwrap();
+        assert_eq!(ran.status.code(), Some(1), "{arguments}: {errors}");
+        assert!(errors.contains("the input has more than"), "{errors}");
+    };
+    for command in ["decode", "decode --hex", "encode"] {
+        refused(&format!("{command} huge"), GIB / 2);
+    }
+    // A stream has no length before its end.
+    refused("decode < /dev/zero", 3 * GIB / 2);
+    refused("encode < /dev/zero", 3 * GIB / 2);
+}

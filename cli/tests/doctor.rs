@@ -7,9 +7,8 @@ mod common;
 
 use std::fs::{Permissions, set_permissions};
 use std::os::unix::fs::PermissionsExt;
-use std::process::{Command, Stdio};
 
-use common::{Host, Running};
+use common::{Host, Running, unshared};
 use fipa_testbed::until;
 use serde_json::Value;
 
@@ -158,45 +157,21 @@ fn a_directory_that_others_may_enter_is_bad() {
     set_permissions(&domain, Permissions::from_mode(0o700)).unwrap();
 }
 
-/// Wraps a command in a user namespace without inotify instances. Returns `None` if this user cannot
-/// create one; panics in that case if `CI=true`.
-fn without_inotify(command: &Command) -> Option<Command> {
-    let unshare = || {
-        let mut unshare = Command::new("unshare");
-        let limit = "echo 0 >/proc/sys/user/max_inotify_instances && exec \"$@\"";
-        unshare.args(["--user", "--map-root-user", "sh", "-c", limit, "sh"]);
-        unshare
-    };
-    let can = unshare().arg("true").status();
-    if !can.is_ok_and(|status| status.success()) {
-        let in_ci = std::env::var("CI").as_deref() == Ok("true");
-        assert!(!in_ci, "needs user namespaces");
-        eprintln!("SKIPPED, not a success: needs user namespaces");
-        return None;
-    }
-    let mut wrapped = unshare();
-    wrapped.arg(command.get_program()).args(command.get_args());
-    wrapped.env_clear().stdin(Stdio::null());
-    for (name, value) in command.get_envs() {
-        if let Some(value) = value {
-            wrapped.env(name, value);
-        }
-    }
-    wrapped.env("PATH", std::env::var_os("PATH").unwrap());
-    Some(wrapped)
-}
-
 #[test]
 fn without_inotify_letters_are_delivered_and_the_doctor_names_the_sysctl() {
     let host = Host::new();
-    let Some(echo) = without_inotify(&host.command(&["echo", "parrot"])) else {
+    let without_inotify = |arguments: &[&str]| {
+        let limit = "echo 0 >/proc/sys/user/max_inotify_instances";
+        unshared(&host.command(arguments), &[], limit)
+    };
+    let Some(echo) = without_inotify(&["echo", "parrot"]) else {
         return;
     };
     let parrot = Running::new(echo);
     let letter = ["send", "--to", "parrot", "--content", "hello"];
     let sent = host.run(&letter).done();
     assert!(sent.contains("delivered"), "{sent}");
-    let doctor = without_inotify(&host.command(&["doctor", "--json"]));
+    let doctor = without_inotify(&["doctor", "--json"]);
     let report = doctor.unwrap().output().unwrap().stdout;
     let report: Value = serde_json::from_slice(&report).unwrap();
     let (verdict, found) = check(&report, "inotify instances");

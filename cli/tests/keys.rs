@@ -126,6 +126,24 @@ fn only_hosts_that_trust_each_other_exchange_letters() {
 }
 
 #[test]
+fn a_pattern_that_stands_for_no_agent_is_refused() {
+    let host = Host::new();
+    let dir = host.path("keys").display().to_string();
+    for (agent, advice) in [("a*b", "as in a*,"), ("arm_[12]", "as in arm_*,")] {
+        let init = ["keys", "init", "--agent", agent, "--dir", &dir];
+        let errors = host.run(&init).failed(1);
+        assert!(
+            errors.contains(agent) && errors.contains(advice),
+            "{errors}"
+        );
+    }
+    let star = ["keys", "init", "--set", "mts.name=*", "--dir", &dir];
+    let errors = host.run(&star).failed(2);
+    assert!(errors.contains("mts.name"), "{errors}");
+    assert!(!host.path("keys/own.pem").exists());
+}
+
+#[test]
 fn a_certificate_is_not_revoked_without_confirmation() {
     let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
     let own = crex.certificate();

@@ -129,6 +129,28 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     );
 }
 
+/// The owner may be an agent of another host.
+#[test]
+fn the_name_of_the_owner_in_the_environment_is_no_command() {
+    let host = Host::new();
+    let owner = "crane;touch injected;`touch injected`&#";
+    let _crane = host.start(&["own", "bay", "--agent", owner]);
+    let printed = host.run(&[
+        "lock",
+        "bay",
+        "--",
+        "sh",
+        "-c",
+        "echo $FIPA_FENCE; $FIPA_FENCE",
+    ]);
+    let text = String::from_utf8(printed.stdout).unwrap();
+    assert!(
+        text.contains("crane;touch injected;`touch injected`&%23"),
+        "{text}"
+    );
+    assert!(!host.path("injected").exists());
+}
+
 #[test]
 fn exit_codes_are_those_of_the_command_and_of_env() {
     let host = Host::new();

@@ -8,9 +8,29 @@ use std::path::PathBuf;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use common::{Host, Running};
+use common::{Host, Running, unshared};
 use fipa_testbed::until;
 use serde_json::{Value, json};
+
+/// The kernel does not restrict the name of the host; `(none)` is its name before it was set.
+#[test]
+fn agents_register_on_a_host_of_any_name() {
+    for name in ["(none)", "[a]{b}*+?|^$ "] {
+        let host = Host::new();
+        let named = |arguments: &[&str]| {
+            let set = format!("printf %s '{name}' >/proc/sys/kernel/hostname");
+            unshared(&host.command(arguments), &["--uts"], &set)
+        };
+        let Some(echo) = named(&["echo", "arm_1"]) else {
+            return;
+        };
+        let echo = Running::new(echo);
+        assert!(echo.ready.starts_with("agent arm_1 "), "{}", echo.ready);
+        let send = named(&["send", "--to", "arm_1", "--content", "hello", "--wait"]);
+        let sent = send.unwrap().output().unwrap();
+        assert!(sent.status.success(), "{name}: {sent:?}");
+    }
+}
 
 #[test]
 fn a_message_is_answered_with_and_without_a_gateway() {

@@ -4,7 +4,7 @@
 //! * No accepted name contains unprintable characters.
 //! * A name matches itself as the pattern of a legacy peer.
 
-use fipa_acl::is_unprintable;
+use fipa_acl::{is_unprintable, misleading_character};
 use fipa_sds::{Matcher, Pattern, check_name, is_legacy_pattern, is_pattern};
 use fipa_transport::Location;
 use fipa_transport_net::fuzzing::certified;
@@ -36,7 +36,7 @@ pub fn play(bytes: &[u8]) {
         3 => location(text),
         4 => {
             let named = check_name(text);
-            assert!(named.is_err() || !text.contains(is_unprintable));
+            assert!(named.is_err() || misleading_character(text).is_none());
             let _ = (is_pattern(text), is_legacy_pattern(text));
             if let Err(error) = named {
                 assert!(!error.to_string().contains(is_unprintable), "{error}");
@@ -64,7 +64,7 @@ fn names(certified: &Certified) {
     let agents = certified.agents();
     for name in agents.iter().map(String::as_str).chain([certified.mts()]) {
         assert!(
-            !name.is_empty() && !name.contains(is_unprintable),
+            !name.is_empty() && misleading_character(name).is_none(),
             "{name:?}"
         );
     }

@@ -1,7 +1,6 @@
 //! Performatives in the form that the machines use: numbers for the 22 standard ones, and sets.
 
-use fipa_acl::Performative;
-use regex::Regex;
+use fipa_acl::{Pattern, PatternError, Performative};
 
 use crate::policy::one_edit_apart;
 
@@ -102,13 +101,13 @@ pub(crate) struct Acts {
     /// A bit for each standard performative.
     standard: u32,
     /// The pattern for user-defined performatives.
-    other: Option<Regex>,
+    other: Option<Pattern>,
 }
 
 impl Acts {
     /// # Errors
     /// The text is not a regular expression.
-    pub(crate) fn new(text: &str) -> Result<Self, regex::Error> {
+    pub(crate) fn new(text: &str) -> Result<Self, PatternError> {
         // Most protocols list standard names. Compiling a pattern takes a thousand times as long.
         if let Some(standard) = standard_names(text) {
             return Ok(Self {
@@ -117,10 +116,10 @@ impl Acts {
                 other: None,
             });
         }
-        let pattern = whole(text, true)?;
+        let pattern = Pattern::ignoring_case(text)?;
         let mut standard = 0;
         for (number, act) in Performative::STANDARD.iter().enumerate() {
-            if pattern.is_match(act.as_str()) {
+            if pattern.matches(act.as_str()) {
                 standard |= 1 << number;
             }
         }
@@ -136,7 +135,7 @@ impl Acts {
         match act {
             Act::Standard(number) => self.standard & (1 << number) != 0,
             Act::Other(name) => match &self.other {
-                Some(pattern) => pattern.is_match(name),
+                Some(pattern) => pattern.matches(name),
                 None => false,
             },
         }
@@ -186,18 +185,6 @@ fn standard_names(text: &str) -> Option<u32> {
         })
 }
 
-/// Maximum size of a compiled pattern, in bytes.
-const MAX_COMPILED: usize = 64 << 10;
-
-/// Compiles a pattern that matches whole texts only.
-pub(crate) fn whole(text: &str, any_case: bool) -> Result<Regex, regex::Error> {
-    regex::RegexBuilder::new(&format!("^(?:{text})$"))
-        .case_insensitive(any_case)
-        .size_limit(MAX_COMPILED)
-        .nest_limit(32)
-        .build()
-}
-
 /// Whether the pattern matches only its own text.
 pub(crate) fn is_word(text: &str) -> bool {
     let literal = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_' | ':' | ' ' | '@' | '/');
@@ -228,10 +215,10 @@ mod tests {
         ] {
             let acts = Acts::new(text).unwrap();
             assert!(acts.other.is_none(), "{text} needs a pattern");
-            let pattern = whole(text, true).unwrap();
+            let pattern = Pattern::ignoring_case(text).unwrap();
             for (number, act) in (0..).zip(&Performative::STANDARD) {
                 let is_in = acts.contains(Act::Standard(number));
-                assert_eq!(is_in, pattern.is_match(act.as_str()), "{text}: {act}");
+                assert_eq!(is_in, pattern.matches(act.as_str()), "{text}: {act}");
             }
         }
         for text in [

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use regex::Regex;
+use fipa_acl::Pattern;
 
 use crate::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 
@@ -96,7 +96,7 @@ pub(crate) struct Guard {
 #[derive(Debug, Clone)]
 pub struct Subprotocol {
     pub(crate) text: String,
-    pub(crate) name: Regex,
+    pub(crate) name: Pattern,
     pub(crate) from: Roles,
     pub(crate) proxied_to: Option<Roles>,
 }
@@ -389,7 +389,7 @@ impl Subprotocol {
 
     pub(crate) fn admits(&self, machine: &Machine) -> bool {
         let mut names = std::iter::once(&machine.name).chain(&machine.aliases);
-        names.any(|name| self.name.is_match(name))
+        names.any(|name| self.name.matches(name))
     }
 }
 

@@ -810,7 +810,7 @@ impl Monitor {
             embedded.any(|sub| {
                 let named = match inner {
                     Some(inner) => sub.admits(inner),
-                    None => sub.name.is_match(protocol),
+                    None => sub.name.matches(protocol),
                 };
                 named && sub.from.mask & roles != 0
             })

@@ -15,7 +15,8 @@
 //! The crate depends on `fipa-transport` for two types: an entry lists
 //! [`Location`](fipa_transport::Location)s, and an [`Incarnation`](fipa_transport::Incarnation)
 //! distinguishes a registration from an earlier one of the same name. It depends on `fipa-acl` for
-//! the characters that a name may have ([`is_unprintable`](fipa_acl::is_unprintable)).
+//! [`Pattern`] and the characters that a name may have
+//! ([`misleading_character`](fipa_acl::misleading_character)).
 //!
 //! Letters, routes and connections do not belong here. The delivery core decides which location of
 //! an agent is tried first.
@@ -51,6 +52,7 @@ pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use exchange::{
     DfEntry, EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, OwnDfEntry, Present,
 };
+pub use fipa_acl::{Pattern, PatternError, is_pattern};
 pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, probe};
@@ -59,6 +61,8 @@ pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};
 pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
 pub use reserved::{reserved_for, second_name};
+pub use name::{MAX_NAME, NameError, check_characters, check_name, to_name};
+pub use query::{Matcher, Query};
 pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
 pub use view::{Snapshot, View};
 pub use watch::{Change, Subscriber, Watch};

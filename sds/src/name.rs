@@ -1,6 +1,8 @@
 //! Names of agents.
 
-use fipa_acl::is_unprintable;
+use std::fmt;
+
+use fipa_acl::{escape, misleading_character};
 
 use crate::is_pattern;
 
@@ -10,7 +12,7 @@ use crate::is_pattern;
 /// JADE, coalitions of several agents), and an mDNS record holds many names of this length.
 pub const MAX_NAME: usize = 1024;
 
-/// Error of [`check_name`].
+/// Error of [`check_name`] and [`check_characters`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum NameError {
@@ -20,12 +22,13 @@ pub enum NameError {
     /// The name is longer than [`MAX_NAME`].
     #[error("the name has {0} bytes; at most {MAX_NAME} are allowed")]
     TooLong(usize),
-    /// The name has a control character, a format character (such as a bidirectional one) or a line
-    /// separator: it could look like another name.
+    /// The name has a [misleading character](misleading_character): it could look like another name.
     #[error(
-        "the name {name:?} has the control or format character {character:?} at byte {at}; remove it"
+        "the name {} has the character U+{:04X} at byte {at}, with which it could look like another \
+         name; remove this character",
+        Shown(name), u32::from(*character)
     )]
-    Unprintable {
+    Misleading {
         /// The name.
         name: String,
         /// The character.
@@ -36,13 +39,14 @@ pub enum NameError {
     /// The name is a pattern: the agent would receive letters that are meant for every matching
     /// agent.
     #[error(
-        "the name {0:?} is a pattern; use a name without any of * + ? [ ( {{ | ^ $ \\ (a dot is allowed)"
+        "the name {} is a pattern; use a name without any of * + ? [ ( {{ | ^ $ \\ (a dot is allowed)",
+        Shown(.0)
     )]
     Pattern(String),
 }
 
 /// Checks that `name` is a valid agent name: UTF-8 of 1 to [`MAX_NAME`] bytes without
-/// [unprintable](is_unprintable) characters that [is no pattern](is_pattern).
+/// [misleading characters](misleading_character) that [is no pattern](is_pattern).
 ///
 /// # Errors
 /// Returns the first rule that the name violates.
@@ -53,14 +57,63 @@ pub fn check_name(name: &str) -> Result<(), NameError> {
     if name.len() > MAX_NAME {
         return Err(NameError::TooLong(name.len()));
     }
-    match name.char_indices().find(|(_, c)| is_unprintable(*c)) {
-        Some((at, character)) => Err(NameError::Unprintable {
+    check_characters(name)?;
+    match is_pattern(name) {
+        true => Err(NameError::Pattern(name.to_owned())),
+        false => Ok(()),
+    }
+}
+
+/// Checks that `name` has no [misleading characters](misleading_character). The names in a letter of
+/// another host have to meet only this rule, because their agents may not be registered anywhere.
+///
+/// # Errors
+/// Returns the first misleading character.
+pub fn check_characters(name: &str) -> Result<(), NameError> {
+    match misleading_character(name) {
+        Some((at, character)) => Err(NameError::Misleading {
             name: name.to_owned(),
             character,
             at,
         }),
-        None if is_pattern(name) => Err(NameError::Pattern(name.to_owned())),
         None => Ok(()),
+    }
+}
+
+/// Returns a valid beginning of a name, of at most 64 bytes, that is made of this text: characters
+/// that are not allowed in names, and blanks, become `-`. For names that are derived from the name of
+/// the host, which the kernel does not restrict.
+#[must_use]
+pub fn to_name(text: &str) -> String {
+    const MAX: usize = 64;
+    let is_allowed = |c: char| {
+        let mut buffer = [0; 4];
+        let text: &str = c.encode_utf8(&mut buffer);
+        c != ' ' && check_characters(text).is_ok() && !is_pattern(text)
+    };
+    let mut name = String::new();
+    for c in text.chars() {
+        if name.len() + c.len_utf8() > MAX {
+            break;
+        }
+        name.push(if is_allowed(c) { c } else { '-' });
+    }
+    match name.is_empty() {
+        true => "localhost".to_owned(),
+        false => name,
+    }
+}
+
+/// The beginning of a name in quotes, for an error: a name from the network may have 4 KiB.
+struct Shown<'a>(&'a str);
+
+impl fmt::Display for Shown<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (start, rest) = match self.0.char_indices().nth(80) {
+            Some((end, _)) => (self.0.get(..end).unwrap_or_default(), "…"),
+            None => (self.0, ""),
+        };
+        write!(f, "\"{}{rest}\"", escape(start))
     }
 }
 
@@ -105,11 +158,45 @@ mod tests {
             ("rover\u{200b}", 5),
             ("\u{feff}rover", 0),
             ("a\u{2028}b", 1),
+            ("rover\u{34f}", 5),
+            ("\u{115f}rover", 0),
+            ("ro\u{3164}ver", 2),
+            ("rover\u{fe0f}", 5),
+            (" rover", 0),
+            ("rover ", 5),
+            ("arm\u{a0}left", 3),
         ] {
             assert!(
-                matches!(check_name(bad), Err(NameError::Unprintable { at, .. }) if at == place),
+                matches!(check_name(bad), Err(NameError::Misleading { at, .. }) if at == place),
                 "{bad:?}"
             );
         }
+    }
+
+    #[test]
+    fn a_name_is_derived_from_any_text() {
+        for (text, expected) in [
+            ("sherpa", "sherpa"),
+            ("(none)", "-none)"),
+            (r"([{*+?|^$\", "----------"),
+            ("a b\u{a0}c\n\u{3164}", "a-b-c--"),
+            ("béla.local", "béla.local"),
+            ("", "localhost"),
+        ] {
+            let name = to_name(text);
+            assert_eq!(name, expected);
+            assert_eq!(check_name(&name), Ok(()));
+        }
+        assert_eq!(to_name(&"é".repeat(100)), "é".repeat(32));
+    }
+
+    #[test]
+    fn an_error_shows_the_beginning_of_the_name_and_no_control_characters() {
+        let error = check_name("rov\n_1").unwrap_err().to_string();
+        let expected = r#"the name "rov\u{a}_1" has the character U+000A at byte 3,"#;
+        assert!(error.starts_with(expected), "{error}");
+        let long = format!("\u{1b}{}", "é".repeat(32_000));
+        let error = check_characters(&long).unwrap_err().to_string();
+        assert!(error.chars().count() < 200, "{error}");
     }
 }

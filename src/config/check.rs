@@ -388,8 +388,8 @@ impl Findings {
 
     fn name(&mut self, path: &[&str], name: &str) {
         let help = format!(
-            "use 1 to {} bytes of UTF-8 without control or format characters, and none of \
-             * + ? [ ( {{ | ^ $ \\",
+            "use 1 to {} bytes of UTF-8 without control, format or invisible characters, without \
+             blanks at the ends, and none of * + ? [ ( {{ | ^ $ \\",
             MAX_MTS_NAME
         );
         if name.len() > MAX_MTS_NAME {

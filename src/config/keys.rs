@@ -9,8 +9,6 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use bytesize::ByteSize;
-use fipa_acl::is_unprintable;
-use fipa_sds::is_pattern;
 use fipa_transport::{Kind, LocationError};
 use toml_edit::Value as Toml;
 
@@ -403,18 +401,9 @@ fn shown(rules: &[AccessRule]) -> Vec<(&str, Value)> {
         .collect()
 }
 
-/// Returns the default of `mts.name`: the host name with its invalid characters replaced, and `-mts`.
+/// Returns the default of `mts.name`: the name of the host, as far as it is valid, and `-mts`.
 pub(super) fn default_mts_name(host_name: &str) -> String {
-    let start: String = host_name.chars().take(60).collect();
-    let is_left_out =
-        |c: char| c.is_whitespace() || is_unprintable(c) || is_pattern(c.encode_utf8(&mut [0; 4]));
-    let host = start.replace(is_left_out, "-");
-    let host = if host.is_empty() {
-        "localhost"
-    } else {
-        host.as_str()
-    };
-    format!("{host}-mts")
+    format!("{}-mts", fipa_sds::to_name(host_name))
 }
 
 /// Formats a value for a message: as written in TOML, at most 80 characters.

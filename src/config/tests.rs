@@ -66,7 +66,14 @@ fn an_empty_configuration_yields_the_defaults() {
 
 #[test]
 fn unusual_host_names_yield_a_valid_name() {
-    for host in ["", "a b\n", &"é".repeat(300)] {
+    for host in [
+        "",
+        "a b\n",
+        "(none)",
+        r"([{*+?|^$\",
+        "\u{2800}",
+        &"é".repeat(300),
+    ] {
         Config::for_host(host).check().unwrap();
     }
 }

@@ -25,6 +25,43 @@ fn a_certificate_has_the_given_names_and_validity() {
     assert_eq!(keys.own().unwrap(), made);
 }
 
+/// The owner of the other host would read them as patterns, and no agent has such a name.
+#[test]
+fn names_that_are_patterns_are_refused() {
+    let (_dir, keys) = keys();
+    for mts in ["*", "crex*", "crex-mts|rover-mts", "(none)"] {
+        let refused = keys.init(mts, &[], VALID).unwrap_err();
+        let KeysError::Certificate(CertificateError::Gateway(named)) = &refused else {
+            panic!("{mts}: {refused:?}");
+        };
+        assert_eq!(named, mts);
+    }
+    for (agent, advice) in [
+        ("a*b", "as in a*,"),
+        ("arm_[12]", "as in arm_*,"),
+        ("**", "as in *,"),
+        (r"arm\.left", "as in arm*,"),
+    ] {
+        let agents = ["arm".to_owned(), agent.to_owned()];
+        let refused = keys.init("crex-mts", &agents, VALID).unwrap_err();
+        let KeysError::Certificate(error @ CertificateError::Agent(named)) = &refused else {
+            panic!("{agent}: {refused:?}");
+        };
+        assert_eq!(named, agent);
+        assert!(error.to_string().contains(advice), "{error}");
+    }
+    for name in ["crex ", " crex", "crex\u{3164}", "arm\u{fe0f}"] {
+        let refused = keys.init(name, &[], VALID).unwrap_err();
+        assert!(
+            matches!(refused, KeysError::Certificate(CertificateError::Name(_))),
+            "{name:?}"
+        );
+    }
+    assert!(!keys.own_file().exists());
+    keys.init("crex-mts", &["*".to_owned(), "arm_*".to_owned()], VALID)
+        .unwrap();
+}
+
 #[test]
 fn a_revoked_certificate_cannot_be_trusted_again() {
     let ((_a, crex), (_b, rover)) = (keys(), keys());

@@ -10,6 +10,7 @@ use fipa_acl::Representation;
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Value, json};
 
+use crate::input::MAX_MESSAGE;
 use crate::options::Global;
 use crate::report::{self, Failure};
 use crate::{input, output};
@@ -74,9 +75,6 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-/// Maximum input, in bytes: the largest content, and 1 MiB for the other fields.
-const MAX_INPUT: u64 = Message::MAX_CONTENT + (1 << 20);
-
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     let Arguments {
         file,
@@ -86,7 +84,7 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
         json,
     } = arguments;
     // A byte usually takes three characters.
-    let mut bytes = input::read(&file, if hex { 3 * MAX_INPUT } else { MAX_INPUT })?;
+    let mut bytes = input::read(&file, if hex { 3 * MAX_MESSAGE } else { MAX_MESSAGE })?;
     if hex {
         bytes = from_hex(&bytes, &file)?;
     }

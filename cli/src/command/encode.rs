@@ -3,11 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use fipa::{Envelope, Message};
+use fipa::Envelope;
 use fipa_acl::json::{Document, JsonError, document_from_json};
 use fipa_acl::{AclRepresentation, Dialect, EncodeError, Representation};
 use serde_json::Value;
 
+use crate::input::MAX_MESSAGE;
 use crate::options::Global;
 use crate::report::{self, Failure};
 use crate::{input, output};
@@ -131,8 +132,8 @@ impl From<Target> for Dialect {
 const HELP_JSON: &str = "give one JSON document in the format of `fipa decode`, for example \
     { \"performative\": \"request\", \"content\": \"lift\" }";
 
-/// Maximum input, in bytes: the largest content as base64, and 1 MiB for the other fields.
-const MAX_INPUT: u64 = Message::MAX_CONTENT / 3 * 4 + (1 << 20);
+/// Maximum input, in bytes: a message whose content is in base64.
+const MAX_INPUT: u64 = MAX_MESSAGE / 3 * 4;
 
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     let file = &arguments.file;

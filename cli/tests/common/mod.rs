@@ -123,6 +123,35 @@ impl Drop for Host {
     }
 }
 
+/// Wraps a command in a user namespace and these further ones, in which this line of shell runs first. Returns
+/// `None` if this user cannot create them; panics in that case if `CI=true`.
+pub(crate) fn unshared(command: &Command, namespaces: &[&str], first: &str) -> Option<Command> {
+    let unshare = || {
+        let mut unshare = Command::new("unshare");
+        let line = format!("{first} && exec \"$@\"");
+        unshare.args(["--user", "--map-root-user"]).args(namespaces);
+        unshare.args(["sh", "-c", &line, "sh"]);
+        unshare
+    };
+    let can = unshare().arg("true").status();
+    if !can.is_ok_and(|status| status.success()) {
+        let in_ci = std::env::var("CI").as_deref() == Ok("true");
+        assert!(!in_ci, "needs user namespaces");
+        eprintln!("SKIPPED, not a success: needs user namespaces");
+        return None;
+    }
+    let mut wrapped = unshare();
+    wrapped.arg(command.get_program()).args(command.get_args());
+    wrapped.env_clear().stdin(Stdio::null());
+    for (name, value) in command.get_envs() {
+        if let Some(value) = value {
+            wrapped.env(name, value);
+        }
+    }
+    wrapped.env("PATH", std::env::var_os("PATH").unwrap());
+    Some(wrapped)
+}
+
 /// The result of a command that has ended.
 #[derive(Debug)]
 pub(crate) struct Ran {

@@ -4,9 +4,11 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa_acl::{Pattern, PatternError};
+
 use super::document::{self, Document};
 use super::{Ambiguity, Doubt, MAX_MISTAKES, Mistake, Problem, Warning};
-use crate::act::{Acts, is_word, near_standard, whole};
+use crate::act::{Acts, is_word, near_standard};
 use crate::machine::{
     After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
@@ -243,7 +245,7 @@ impl<'d> Builder<'d> {
     }
 
     fn subprotocol(&mut self, read: &'d document::Subprotocol) -> Option<Subprotocol> {
-        let name = match whole(&read.name, true) {
+        let name = match Pattern::ignoring_case(&read.name) {
             Ok(name) => Some(name),
             Err(error) => self.no_pattern(read.line, "name", &read.name, &error),
         };
@@ -290,13 +292,13 @@ impl<'d> Builder<'d> {
         if let Some(known) = self.known_roles.get(text) {
             return Some(known.clone());
         }
-        let pattern = match whole(text, false) {
+        let pattern = match Pattern::new(text) {
             Ok(pattern) => pattern,
             Err(error) => return self.no_pattern(line, attribute, text, &error),
         };
         let mut mask = 0;
         for (number, role) in self.roles.iter().enumerate() {
-            if pattern.is_match(role) {
+            if pattern.matches(role) {
                 mask |= 1 << number;
             }
         }
@@ -525,13 +527,13 @@ impl<'d> Builder<'d> {
         line: usize,
         attribute: &'static str,
         text: &str,
-        error: &regex::Error,
+        error: &PatternError,
     ) -> Option<T> {
         let problem = Problem::Pattern {
             attribute,
             value: text.to_owned(),
             reason: match error {
-                regex::Error::CompiledTooBig(_) => "it is too large when compiled".to_owned(),
+                PatternError::TooBig => "it is too large when compiled".to_owned(),
                 // The last line of the error is the reason. The lines above show the position.
                 other => other
                     .to_string()

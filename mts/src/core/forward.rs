@@ -18,7 +18,7 @@ use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::{ask, link_of};
 use super::lane::{Delivery, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
-use super::reading::too_long;
+use super::reading::{refused_name_of_legacy_peer, too_long};
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
 use crate::gate::{self, LetterParts, Link};
 use smallvec::smallvec;
@@ -115,6 +115,7 @@ impl Unframed {
             Err(_) => Failed::of_envelope(&letter),
         };
         let mut letter = letter;
+        let named = stamp::sender(&letter).unwrap_or_default();
         let (sender, mut fault) = match (refused_names(&names), message) {
             (Some(fault), _) => {
                 names.truncate(1);
@@ -127,11 +128,12 @@ impl Unframed {
                 {
                     letter = divided;
                 }
-                (sender, too_long(&letter))
+                let in_envelope = names.iter().chain([&named]).map(String::as_str);
+                let fault = refused_name_of_legacy_peer(&message, in_envelope);
+                (sender, fault.or_else(|| too_long(&letter)))
             }
             (None, Err(error)) => (None, Some(cannot_be_decoded(&error))),
         };
-        let named = stamp::sender(&letter).unwrap_or_default();
         let first = names.first().cloned();
         let mut receivers = VecDeque::new();
         for name in names {

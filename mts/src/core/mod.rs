@@ -779,6 +779,9 @@ impl Core {
                 if let Some(detail) = reading::too_long(&letter) {
                     return Verdict::Now(Answer::failed(FailureReason::TooLarge, detail));
                 }
+                if let Some(detail) = read.as_ref().and_then(|read| read.fault.clone()) {
+                    return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
+                }
                 let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());

@@ -4,7 +4,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use fipa_acl::{DecodeError, Letter};
+use fipa_acl::{DecodeError, EnvelopeView, Letter, Message, MessageView};
 use fipa_transport::{Arrival, Body, Incarnation};
 
 use super::{CoreConfig, work};
@@ -26,6 +26,43 @@ pub(super) fn too_long(letter: &Letter) -> Option<String> {
     })
 }
 
+/// Returns the reason why a letter is refused for a name in it, if it is: no agent has a name with control
+/// characters or invisible ones, and rules, logs and programs need not expect one. Decoders accept such
+/// names, because recordings have them.
+fn refused_name(letter: &Letter) -> Option<String> {
+    let envelope = letter.envelope();
+    let envelope = EnvelopeView::parse(&envelope).ok();
+    let envelope = envelope.iter().flat_map(|envelope| {
+        let receivers = envelope.receivers();
+        envelope.from_name().into_iter().chain(receivers)
+    });
+    let message = MessageView::parse_payload(letter.payload()).ok();
+    let message = message.iter().flat_map(|message| {
+        let sender = message.sender().into_iter();
+        let agents = sender.chain(message.receivers()).chain(message.reply_to());
+        agents.map(|agent| agent.name())
+    });
+    let mut names = envelope.chain(message);
+    names.find_map(|name| name_fault(&name.as_str()))
+}
+
+/// Returns the reason why the letter of a legacy peer is refused for a name in it, if it is. `names` are
+/// those of its envelope.
+pub(super) fn refused_name_of_legacy_peer<'a>(
+    message: &'a Message,
+    names: impl IntoIterator<Item = &'a str>,
+) -> Option<String> {
+    let agents = message.sender().into_iter();
+    let agents = agents.chain(message.receivers()).chain(message.reply_to());
+    let mut names = names.into_iter().chain(agents.map(|agent| agent.name()));
+    names.find_map(name_fault)
+}
+
+fn name_fault(name: &str) -> Option<String> {
+    let error = fipa_sds::check_characters(name).err()?;
+    Some(format!("the letter is refused for a name in it: {error}"))
+}
+
 /// Reads arriving letters for one core.
 #[derive(Clone)]
 pub struct LetterReader {
@@ -38,6 +75,8 @@ pub struct LetterReader {
 /// A letter that was read.
 #[derive(Debug)]
 pub struct ReadLetter {
+    /// The reason why the letter is refused, if it is.
+    pub(super) fault: Option<String>,
     /// The parts for the gate; `None` without a gate.
     pub(super) parts: Option<LetterParts>,
     /// The parts for forwarding; `None` in a service that does not forward.
@@ -60,22 +99,25 @@ impl LetterReader {
         }
     }
 
-    /// Reads the letter of this arrival, if it has one. Returns `None` where no part is needed, in a
-    /// process without a gate, and for a letter that the core refuses for its length.
+    /// Reads the letter of this arrival, if it has one. Returns `None` where no part is needed, which is
+    /// in a process without a gate for a letter of this host, and for a letter that the core refuses for
+    /// its length.
     #[must_use]
     pub fn read_arrival(&self, arrival: &Arrival) -> Option<Box<ReadLetter>> {
         match &arrival.parcel.body {
-            Body::Letter(letter) => self.read(letter),
+            Body::Letter(letter) => self.read(letter, arrival.from.is_remote()),
             _ => None,
         }
     }
 
-    pub(super) fn read(&self, letter: &Letter) -> Option<Box<ReadLetter>> {
-        if (self.gate.is_none() && !self.forwards) || too_long(letter).is_some() {
+    fn read(&self, letter: &Letter, is_remote: bool) -> Option<Box<ReadLetter>> {
+        let is_needed = self.gate.is_some() || self.forwards || is_remote;
+        if !is_needed || too_long(letter).is_some() {
             return None;
         }
         work::steps(letter.len() / 512);
         Some(Box::new(ReadLetter {
+            fault: refused_name(letter),
             parts: self.parts(letter),
             envelope: self
                 .forwards

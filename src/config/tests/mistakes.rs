@@ -167,8 +167,8 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[mts]\nname = \"a\\nb\"\n",
             "fipa.toml:2: `mts.name` cannot be the name \"a\\nb\"; \
-             use 1 to 255 bytes of UTF-8 without control or format characters, \
-         and none of * + ? [ ( { | ^ $ \\",
+             use 1 to 255 bytes of UTF-8 without control, format or invisible characters, without \
+             blanks at the ends, and none of * + ? [ ( { | ^ $ \\",
         ),
         (
             "[mts]\ntransports = []\n",
@@ -360,8 +360,8 @@ fn lists_are_bounded() {
     assert_eq!(
         error(&format!("mts.name = {name:?}"), &[]),
         "fipa.toml:1: `mts.name` is a name of 256 bytes; \
-         use 1 to 255 bytes of UTF-8 without control or format characters, \
-         and none of * + ? [ ( { | ^ $ \\"
+         use 1 to 255 bytes of UTF-8 without control, format or invisible characters, \
+         without blanks at the ends, and none of * + ? [ ( { | ^ $ \\"
     );
     let deep = format!("domain = {}1{}", "[".repeat(10_000), "]".repeat(10_000));
     assert!(error(&deep, &[]).starts_with("fipa.toml:1: not TOML: "));

@@ -13,7 +13,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use fipa_acl::{escape, is_unprintable};
+use fipa_acl::{escape, is_pattern, misleading_character};
 use fipa_transport::Mandate;
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_decode_str, utf8_percent_encode};
 use ring::digest::{SHA256, SHA256_OUTPUT_LEN, digest};
@@ -118,12 +118,27 @@ pub enum CertificateError {
     #[error("the certificate names more than {MAX_AGENTS} agents")]
     Agents,
     /// A name is not UTF-8, empty, longer than 1,024 bytes, or has
-    /// [unprintable](fipa_acl::is_unprintable) characters.
+    /// [misleading characters](fipa_acl::misleading_character).
     #[error(
-        "{}: not a name (1 to {MAX_NAME} bytes of UTF-8 without control and format characters)",
+        "{}: not a name (1 to {MAX_NAME} bytes of UTF-8 without control, format and invisible \
+         characters, and without blanks at its ends)",
         escape(.0)
     )]
     Name(String),
+    /// The name of the service is a pattern, so no gateway has it.
+    #[error(
+        "the certificate names the gateway {}, which is a pattern; give the gateway a name (mts.name) \
+         without any of * + ? [ ( {{ | ^ $ \\",
+        escape(.0)
+    )]
+    Gateway(String),
+    /// The name of an agent is a pattern beyond a `*` at its end, so it stands for no agent.
+    #[error(
+        "the certificate names the agent {}; only a * at the end stands for other characters, as in \
+         {}*, and + ? [ ( {{ | ^ $ \\ are in no name",
+        escape(.0), escape(beginning(.0))
+    )]
+    Agent(String),
 }
 
 impl Certificate {
@@ -230,9 +245,17 @@ impl Certified {
                 continue;
             };
             if let Some(encoded) = uri.strip_prefix(MTS) {
-                services.push(decoded(encoded)?);
+                let name = decoded(encoded)?;
+                if is_pattern(&name) {
+                    return Err(CertificateError::Gateway(name));
+                }
+                services.push(name);
             } else if let Some(encoded) = uri.strip_prefix(AGENT) {
-                agents.push(decoded(encoded)?);
+                let name = decoded(encoded)?;
+                if is_pattern(name.strip_suffix('*').unwrap_or(&name)) {
+                    return Err(CertificateError::Agent(name));
+                }
+                agents.push(name);
             }
         }
         if agents.len() > MAX_AGENTS {
@@ -301,7 +324,15 @@ fn decoded(encoded: &str) -> Result<String, CertificateError> {
 /// Whether this is a valid name of a service or agent, or a valid prefix of an agent's name. A name
 /// that is shown to the owner for a decision about trust must not look like another one.
 fn is_name(name: &str) -> bool {
-    !name.is_empty() && name.len() <= MAX_NAME && !name.contains(is_unprintable)
+    !name.is_empty() && name.len() <= MAX_NAME && misleading_character(name).is_none()
+}
+
+/// Returns the part of a name before its first character of patterns.
+fn beginning(name: &str) -> &str {
+    let mut characters = name.char_indices();
+    let first = characters.find(|(_, c)| is_pattern(c.encode_utf8(&mut [0; 4])));
+    let end = first.map_or(name.len(), |(at, _)| at);
+    name.get(..end).unwrap_or_default()
 }
 
 /// Returns the alternative names of a certificate with this service and these agents.

@@ -6,6 +6,7 @@ use fipa::monitor::Machine;
 use fipa_acl::escape;
 
 use super::{act, defaults, role, within};
+use crate::output::mermaid;
 
 /// Draws a protocol, with the transitions that every protocol has if `with_defaults` is set.
 pub(super) fn diagram(machine: &Machine, with_defaults: bool) -> String {
@@ -70,20 +71,6 @@ pub(super) fn diagram(machine: &Machine, with_defaults: bool) -> String {
     out
 }
 
-/// Escapes the characters that have a meaning in Mermaid.
 fn escaped(text: &str) -> String {
-    let mut out = String::new();
-    for c in escape(text).chars() {
-        match c {
-            // Older versions end a label at a second colon.
-            ':' => out.push_str("#58;"),
-            '#' => out.push_str("#35;"),
-            ';' => out.push_str("#59;"),
-            '"' => out.push_str("#quot;"),
-            '<' => out.push_str("#lt;"),
-            '>' => out.push_str("#gt;"),
-            c => out.push(c),
-        }
-    }
-    out
+    mermaid(&escape(text))
 }

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use super::conversations::Conversation;
+use crate::output::mermaid;
 use crate::report::Failure;
 
 /// One diagram with all conversations in order.
@@ -16,7 +17,7 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
         if !aliases.contains_key(name) {
             // A name can contain any text, also with a meaning in Mermaid.
             let alias = format!("p{}", aliases.len() + 1);
-            let _ = writeln!(text, "    participant {alias} as {}", escaped(name));
+            let _ = writeln!(text, "    participant {alias} as {}", mermaid(name));
             aliases.insert(name, alias);
         }
     }
@@ -26,7 +27,7 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
         let (Some(first), Some(last)) = (participants.first(), participants.last()) else {
             continue;
         };
-        let title = escaped(&conversation.title());
+        let title = mermaid(&conversation.title());
         let over = match participants.len() {
             1 => alias(first).to_owned(),
             _ => format!("{},{}", alias(first), alias(last)),
@@ -34,16 +35,16 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
         let _ = writeln!(text, "    Note over {over}: {title}");
         for step in &conversation.steps {
             let (from, to) = (alias(&step.from), alias(&step.to));
-            let label = escaped(&step.label);
+            let label = mermaid(&step.label);
             let _ = match &step.failed {
                 None => writeln!(text, "    {from}->>{to}: {label}"),
-                Some(why) => writeln!(text, "    {from}-x{to}: {label}: {}", escaped(why)),
+                Some(why) => writeln!(text, "    {from}-x{to}: {label}: {}", mermaid(why)),
             };
             if let Some(violation) = &step.violation {
                 let _ = writeln!(
                     text,
                     "    Note over {from}: violation: {}",
-                    escaped(violation)
+                    mermaid(violation)
                 );
             }
         }
@@ -53,20 +54,6 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
         }
     }
     text
-}
-
-/// Escapes the characters that have a meaning in Mermaid.
-fn escaped(text: &str) -> String {
-    let mut out = String::new();
-    for c in text.chars() {
-        match c {
-            '#' | ';' | ':' | '<' | '>' | '{' | '}' | '%' | '"' | '\\' => {
-                let _ = write!(out, "#{};", u32::from(c));
-            }
-            c => out.push(c),
-        }
-    }
-    out
 }
 
 pub(super) fn write(file: &Path, text: &str) -> Result<(), Failure> {
@@ -103,10 +90,5 @@ sequenceDiagram
     p1-xp2: reject-proposal: no such agent
 "
         );
-    }
-
-    #[test]
-    fn characters_with_a_meaning_in_mermaid_are_escaped() {
-        assert_eq!(escaped("a;b#1:<end>"), "a#59;b#35;1#58;#60;end#62;");
     }
 }
