@@ -8,6 +8,8 @@
 //! * Agents take the letters of honest agents once, and in order.
 //! * Letters to the honest agents `arm` and `rover` are delivered if their deadline is long enough
 //!   and no queue is full.
+//! * A letter of an honest agent leaves each service at most 16 times and 4 times a second more, and
+//!   its content is repeated at most 4 times and with 1 MiB a second more.
 //!
 //! The cores accept the stream sender that a process of the same user names. So letters of the
 //! malicious process have no honest agent as the sender of their stream.
@@ -177,8 +179,47 @@ struct Sent {
     taken: bool,
 }
 
+/// A way in which the malicious services answer every letter.
+#[derive(Clone, Copy)]
+enum Habit {
+    /// No way: the input decides about each answer.
+    None,
+    Returned,
+    OutOfOrder,
+    BusyAndCredit,
+    CustodyAndReturned,
+    CustodyAndDenied,
+    Broken,
+    /// Each letter in another way.
+    Mixed,
+}
+
+const HABITS: [Habit; 8] = [
+    Habit::None,
+    Habit::Returned,
+    Habit::OutOfOrder,
+    Habit::BusyAndCredit,
+    Habit::CustodyAndReturned,
+    Habit::CustodyAndDenied,
+    Habit::Broken,
+    Habit::Mixed,
+];
+
+/// A letter at a service: the service, the stream's sender, and the sequence.
+type Copies = (Incarnation, Incarnation, u64);
+
+/// The number of times that a letter left a service.
+struct Repetitions {
+    first: Instant,
+    count: u32,
+}
+
 struct World {
     now: Instant,
+    habit: Habit,
+    repetitions: BTreeMap<Copies, Repetitions>,
+    /// Attempts with a letter.
+    letters: BTreeMap<(Incarnation, AttemptId), Copies>,
     services: BTreeMap<Incarnation, Service>,
     coming: VecDeque<(Instant, Incarnation, Coming)>,
     /// Attempts of honest services at malicious ones. The input decides about the answers.
@@ -261,6 +302,13 @@ pub fn seeds() -> Vec<Vec<u8>> {
             .concat(),
         );
     }
+    // A letter of an agent of each host to the malicious gateway, which has a habit meanwhile.
+    for habit in 0..HABITS.len() as u8 {
+        for from in [0, 1] {
+            let send = [0, from, 3, 200];
+            seeds.push([&[10, 192 + habit][..], &send, &pass, &pass].concat());
+        }
+    }
     seeds
 }
 
@@ -280,6 +328,9 @@ impl World {
         let now = Instant::now();
         let mut world = Self {
             now,
+            habit: Habit::None,
+            repetitions: BTreeMap::new(),
+            letters: BTreeMap::new(),
             services: BTreeMap::new(),
             coming: VecDeque::new(),
             held: Vec::new(),
@@ -496,12 +547,95 @@ impl World {
         }
     }
 
-    /// Answers a parcel of an honest service from a malicious one.
+    /// Answers a letter of an honest service to a malicious one out of habit.
+    fn answer_out_of_habit(
+        &mut self,
+        at: Incarnation,
+        attempt: AttemptId,
+        to: Hop,
+        parcel: Parcel,
+    ) {
+        let which = match self.habit {
+            Habit::Mixed => HABITS[1 + parcel.transfer as usize % (HABITS.len() - 2)],
+            habit => habit,
+        };
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        let returned = Answer::Returned { uncertain: false };
+        let answered = Conclusion::Answered;
+        let (conclusion, note) = match which {
+            Habit::None | Habit::Mixed => return self.held.push((at, attempt, parcel)),
+            _ if !is_letter => (answered(returned), None),
+            Habit::Returned => (answered(returned), None),
+            Habit::OutOfOrder => {
+                let last = parcel.after;
+                (answered(Answer::OutOfOrder { last }), None)
+            }
+            Habit::BusyAndCredit => (answered(Answer::Busy), Some(Body::Credit)),
+            Habit::CustodyAndReturned => {
+                let report = Report::Returned { uncertain: false };
+                (answered(Answer::Custody), Some(Body::Report(report)))
+            }
+            Habit::CustodyAndDenied => (answered(Answer::Custody), None),
+            Habit::Broken => {
+                let error = TransportError::new(TransportErrorKind::Broken, "");
+                (Conclusion::Unconfirmed(error), None)
+            }
+        };
+        let conclusion = Coming::Conclusion(attempt, conclusion);
+        self.coming.push_back((self.now + DELAY, at, conclusion));
+        if let Some(body) = note {
+            let note = Coming::Parcel {
+                from: to.location.incarnation(),
+                kind: to.location.kind(),
+                attempt: AttemptId(u64::MAX),
+                parcel: Parcel { body, ..parcel },
+            };
+            self.coming.push_back((self.now + DELAY, at, note));
+        }
+    }
+
+    /// Records that a letter leaves a service.
+    fn check_repetitions(&mut self, at: Incarnation, attempt: AttemptId, parcel: &Parcel) {
+        let (Body::Letter(letter), true) = (
+            &parcel.body,
+            [ARM, EYE, ROVER].contains(&parcel.stream.sender),
+        ) else {
+            return;
+        };
+        let first = Repetitions {
+            first: self.now,
+            count: 0,
+        };
+        let key = (at, parcel.stream.sender, parcel.sequence);
+        self.letters.insert((at, attempt), key);
+        let repetitions = self.repetitions.entry(key).or_insert(first);
+        repetitions.count += 1;
+        let (count, len) = (f64::from(repetitions.count), letter.len() as f64);
+        let seconds = (self.now - repetitions.first).as_secs_f64();
+        assert!(
+            count <= 16.0 + 4.0 * seconds
+                && (count - 1.0) * len <= 4.0 * len + (1 << 20) as f64 * seconds,
+            "a letter of {len} bytes leaves {at} {count} times within {seconds} s"
+        );
+    }
+
+    /// Answers a parcel of an honest service from a malicious one, or begins to answer all letters alike.
     fn answer_falsely(&mut self, input: &mut Input<'_>) {
+        let how = input.byte();
+        if how >= 192 {
+            self.habit = HABITS[usize::from(how) % HABITS.len()];
+            for (at, attempt, parcel) in std::mem::take(&mut self.held) {
+                let to = self.service(at).open.get(&attempt).cloned();
+                if let Some(to) = to.map(|to| hop(to.incarnation(), to.kind())) {
+                    self.answer_out_of_habit(at, attempt, to, parcel);
+                }
+            }
+            return;
+        }
         if self.held.is_empty() {
             return;
         }
-        let which = input.below(self.held.len().min(256));
+        let which = usize::from(how) % self.held.len();
         let (at, attempt, parcel) = self.held.swap_remove(which);
         let conclusion = match input.below(10) {
             0 => Conclusion::Answered(Answer::Accepted),
@@ -630,6 +764,7 @@ impl World {
                 } => {
                     let to = location.incarnation();
                     self.service(at).open.insert(attempt, location.clone());
+                    self.check_repetitions(at, attempt, &parcel);
                     if SERVICES.contains(&to) {
                         let parcel = Coming::Parcel {
                             from: at,
@@ -639,7 +774,8 @@ impl World {
                         };
                         self.coming.push_back((self.now + DELAY, to, parcel));
                     } else if [LIAR, MOLE].contains(&to) {
-                        self.held.push((at, attempt, parcel));
+                        let to = hop(to, location.kind());
+                        self.answer_out_of_habit(at, attempt, to, parcel);
                     } else {
                         let error = TransportError::new(TransportErrorKind::Unreachable, "");
                         let conclusion = Coming::Conclusion(attempt, Conclusion::NotSent(error));
@@ -677,6 +813,12 @@ impl World {
 
     fn conclude(&mut self, at: Incarnation, attempt: AttemptId, conclusion: Conclusion) {
         let now = self.clocks();
+        let letter = self.letters.remove(&(at, attempt));
+        if matches!(conclusion, Conclusion::NotSent(_))
+            && let Some(repetitions) = letter.and_then(|key| self.repetitions.get_mut(&key))
+        {
+            repetitions.count -= 1;
+        }
         let service = self.service(at);
         if service.open.remove(&attempt).is_some() {
             service.core.handle_conclusion(now, attempt, conclusion);
@@ -742,6 +884,8 @@ impl World {
 
     fn arrive(&mut self, to: Incarnation, coming: Coming) {
         let (from, kind, attempt, parcel) = match coming {
+            // A malicious service ignores the answers to its notes.
+            Coming::Conclusion(..) if !SERVICES.contains(&to) => return,
             Coming::Conclusion(attempt, conclusion) => {
                 return self.conclude(to, attempt, conclusion);
             }

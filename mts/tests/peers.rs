@@ -131,6 +131,23 @@ fn a_peer_that_answers_is_checked_seldom_and_after_its_connection_ends() {
     // A connection that ends frequently does not cause frequent checks.
     bench.core.handle_parted(bench.now, &parted);
     assert_eq!(bench.wait(), Duration::from_millis(200));
+    // A peer that answers and ends each connection is checked less and less often.
+    for pause in [400, 800, 1600, 2000, 2000] {
+        let (attempt, _) = bench.asked().unwrap();
+        bench.answers(attempt);
+        bench.core.handle_parted(bench.now, &parted);
+        assert_eq!(bench.wait(), Duration::from_millis(pause));
+    }
+    // A connection that lasts until the next check resets the pause.
+    for _ in 0..2 {
+        let (attempt, _) = bench.asked().unwrap();
+        bench.answers(attempt);
+        bench.wait();
+    }
+    let (attempt, _) = bench.asked().unwrap();
+    bench.answers(attempt);
+    bench.core.handle_parted(bench.now, &parted);
+    assert_eq!(bench.wait(), Duration::from_millis(200));
 }
 
 #[test]

@@ -58,11 +58,9 @@ pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, S
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, probe};
 pub use memory::{MemoryDirectory, StaticDirectory};
 pub use merged::MergedDirectory;
-pub use name::{MAX_NAME, NameError, check_name};
-pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
-pub use reserved::{reserved_for, second_name};
 pub use name::{MAX_NAME, NameError, check_characters, check_name, to_name};
 pub use query::{Matcher, Query};
+pub use reserved::{reserved_for, second_name};
 pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
 pub use view::{Snapshot, View};
 pub use watch::{Change, Subscriber, Watch};

@@ -10,6 +10,28 @@ use bytes::{BufMut, BytesMut};
 use fipa_transport::Answer;
 use fipa_transport::wire::{kind_code, kind_of_code, reason_code, reason_of_code, truncated};
 
+use crate::end::ConnectionEnd;
+
+/// Counts the answers of a peer that contradict their parcels.
+#[derive(Debug, Default)]
+pub(crate) struct Contradictions(u32);
+
+impl Contradictions {
+    /// Checks the answer to a parcel with this predecessor.
+    ///
+    /// # Errors
+    /// When the peer has given too many answers that contradict their parcels.
+    pub(crate) fn check(&mut self, answer: &Answer, after: u64) -> Result<(), ConnectionEnd> {
+        self.0 += u32::from(answer.contradicts(after));
+        if self.0 < Answer::MAX_CONTRADICTIONS {
+            return Ok(());
+        }
+        Err(ConnectionEnd::ProtocolViolation(
+            "answers that contradict their parcels".into(),
+        ))
+    }
+}
+
 /// Longest body of an answer, in bytes.
 pub(crate) const MAX_ANSWER: usize = 2 + Answer::MAX_DETAIL;
 

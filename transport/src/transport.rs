@@ -33,6 +33,9 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 /// 6. **Bounded.** A parcel without room is returned as an error, and not queued without limit. No
 ///    memory is allocated according to an unchecked length from outside.
 /// 7. **Lazy.** A connection to a location is opened only when a parcel needs it.
+/// 8. **Contradictions.** A transport with connections ends one whose peer gives
+///    [`Answer::MAX_CONTRADICTIONS`] answers that [contradict](Answer::contradicts) their parcels. The
+///    last attempt of them is unconfirmed, the others are answered.
 ///
 /// No method blocks. Methods may be called from any thread.
 pub trait Transport: Send + Sync + 'static {
@@ -359,6 +362,15 @@ pub enum Answer {
 impl Answer {
     /// Maximum length of a transmitted failure detail, in bytes.
     pub const MAX_DETAIL: usize = 160;
+    /// Number of answers that contradict their parcels at which a connection ends.
+    pub const MAX_CONTRADICTIONS: u32 = 16;
+
+    /// Whether no receiver can give this answer to a parcel with this predecessor: a letter is not out
+    /// of order after its predecessor was accepted.
+    #[must_use]
+    pub fn contradicts(&self, after: u64) -> bool {
+        matches!(self, Self::OutOfOrder { last } if *last >= after)
+    }
 
     /// A final refusal.
     pub fn failed(reason: FailureReason, detail: impl Into<String>) -> Self {

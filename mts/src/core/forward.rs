@@ -373,16 +373,16 @@ impl Core {
         let mut delivery = Delivery::new(now.instant, origin, stamped, letter_of, deadline);
         delivery.after = parcel.after;
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
-        delivery.not_before = self.found_by_peer(now, stream.sender, &entry, parcel.remaining);
-        if let Some(until) = delivery.not_before
-            && self.lanes.get(&id).is_some_and(|lane| lane.is_empty())
-        {
-            let wait = until.saturating_duration_since(now.instant);
-            log_limit::info!(
-                of: &*entry.name, receiver = %entry.name,
-                wait_ms = u64::try_from(wait.as_millis()).unwrap_or(u64::MAX),
-                "letters wait until the legacy peer has found their sender by mDNS"
-            );
+        if let Some(until) = self.found_by_peer(now, stream.sender, &entry, parcel.remaining) {
+            delivery.delay_until(until);
+            if self.lanes.get(&id).is_some_and(|lane| lane.is_empty()) {
+                let wait = until.saturating_duration_since(now.instant);
+                log_limit::info!(
+                    of: &*entry.name, receiver = %entry.name,
+                    wait_ms = u64::try_from(wait.as_millis()).unwrap_or(u64::MAX),
+                    "letters wait until the legacy peer has found their sender by mDNS"
+                );
+            }
         }
         self.put(now, id, delivery);
         taken

@@ -69,7 +69,7 @@ pub use failures::Undecodable;
 pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
-use lane::{Delivery, Lane, LaneId, LaneKey};
+use lane::{Delivery, Lane, LaneId, LaneKey, PauseEnd};
 use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
 use passes::{Concern, Passes, Step};
@@ -881,7 +881,9 @@ impl Core {
                 });
                 // The attempt that ended has made room.
                 if let Some(id) = route.and_then(|route| self.table.room_for(&route)) {
-                    self.with_lane(now, id, |lane, table| lane.resume(now.instant, table));
+                    self.with_lane(now, id, |lane, table| {
+                        lane.resume(now.instant, PauseEnd::Room, table);
+                    });
                 }
             }
             Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
@@ -983,7 +985,7 @@ impl Core {
             }),
             Concern::Reachable(service) => self.with_lane(now, id, |lane, table| {
                 if lane.is_paused_towards(table, |location| is_at(service, location)) {
-                    lane.resume(now.instant, table);
+                    lane.resume(now.instant, PauseEnd::Reachable, table);
                 }
             }),
             Concern::Idle => self.forget_idle_lane(now, id, IDLE_TIME),

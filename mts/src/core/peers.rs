@@ -47,7 +47,8 @@ const KEEP: Duration = Duration::from_secs(5);
 /// Backoff before a location that did not answer is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// Pause before a check after a connection with the peer has ended.
+/// Pause before a check after a connection with the peer has ended, which doubles while connections do not
+/// last until the next regular check.
 const PARTED_PAUSE: Duration = Duration::from_millis(200);
 
 /// The static peers of a service.
@@ -79,6 +80,10 @@ struct PeerLocation {
     /// Its latest error since a location of the peer last answered.
     error: Option<TransportError>,
     last_asked: Option<Instant>,
+    /// Number of connections that have ended since one lasted.
+    parted: u32,
+    /// Whether a connection has ended since the latest answer.
+    has_parted: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -128,9 +133,12 @@ impl Peers {
             .iter_mut()
             .flat_map(|static_peer| &mut static_peer.candidates);
         for candidate in candidates.filter(|candidate| candidate.location == *location) {
-            let soon = candidate
-                .last_asked
-                .map_or(now, |asked| asked + PARTED_PAUSE);
+            let again = candidate.parted.saturating_sub(1);
+            let pause = PARTED_PAUSE.saturating_mul(1 << again.min(10));
+            let pause = pause.min(LONGEST_PAUSE);
+            candidate.parted = candidate.parted.saturating_add(1);
+            candidate.has_parted = true;
+            let soon = candidate.last_asked.map_or(now, |asked| asked + pause);
             candidate.ask_by(soon.max(now));
         }
         self.update_due();
@@ -297,6 +305,9 @@ impl StaticPeer {
             log_limit::info!(of: &*self.peer.name, peer = %self.peer.name, at = %candidate.location, "the static peer answers");
         }
         candidate.state = State::AskAt(now + KEEP);
+        if !std::mem::replace(&mut candidate.has_parted, false) {
+            candidate.parted = 0;
+        }
         self.answers = Some(candidate.location.clone());
         for candidate in &mut self.candidates {
             candidate.failures = 0;
@@ -357,6 +368,8 @@ impl PeerLocation {
             failures: 0,
             error: None,
             last_asked: None,
+            parted: 0,
+            has_parted: false,
         }
     }
 

@@ -17,6 +17,8 @@
 
 use std::time::Duration;
 
+use fipa_transport::Answer;
+
 /// Decision of the receiver's process about a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Offer {
@@ -167,12 +169,80 @@ pub fn stays_uncertain(uncertain: bool, end: AttemptEnd) -> bool {
     uncertain || end != AttemptEnd::NotTaken
 }
 
-/// Whether a custodian dispatches a letter again that came back as out of order: its predecessor
-/// was lowered in the meantime, to one that the receiver has taken. `last` is the last letter that
-/// the receiver took, or 0 if the answer does not state it.
+/// The end of the latest hand-over of a letter that has no outcome yet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Cause {
+    /// The next service returned it: its predecessor is not there, or that service ends.
+    Returned,
+    /// The receiver has not taken its predecessor; `last` is the last letter that it took.
+    OutOfOrder {
+        /// Sequence of that letter.
+        last: u64,
+    },
+    /// The next service has no room.
+    Busy,
+    /// The receiver's registration has left the host of the next service.
+    Moved,
+    /// The next service does not know the receiver, which the directory shows.
+    NoSuchAgent,
+    /// The transport had no room. Nothing has left.
+    NoRoom,
+    /// Nothing has left, for another reason.
+    NotSent,
+    /// The connection broke, or no answer came in time.
+    Unconfirmed,
+    /// The custodian is gone, or denied that it has the letter.
+    CustodianLost,
+}
+
+impl Cause {
+    /// Whether the letter may have left this service.
+    #[must_use]
+    pub fn has_left(self) -> bool {
+        !matches!(self, Self::NoRoom | Self::NotSent)
+    }
+}
+
+/// The condition under which a letter goes again that came back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Again {
+    /// It goes at once, by the next route.
+    AtOnce,
+    /// Its lane pauses before.
+    AfterPause,
+    /// Its predecessor has to go first, or to arrive.
+    AfterPredecessor,
+}
+
+/// Decides when a letter goes again that came back. `sent_after` is the predecessor that the latest
+/// copy carried, and `after` the present one, which is never higher.
+///
+/// A letter that came back because of its predecessor goes at once only if the predecessor was
+/// lowered in the meantime. Only the sender's process lowers it, so the next service cannot cause
+/// repetitions without a pause.
 #[must_use]
-pub fn goes_again(after: u64, last: u64) -> bool {
-    after <= last
+pub fn again(cause: Cause, sent_after: u64, after: u64) -> Again {
+    match cause {
+        Cause::OutOfOrder { last } if (Answer::OutOfOrder { last }).contradicts(sent_after) => {
+            Again::AfterPause
+        }
+        Cause::Returned | Cause::OutOfOrder { .. } if after < sent_after => Again::AtOnce,
+        // No letter comes before it, so none can be missing.
+        Cause::Returned if sent_after == 0 => Again::AfterPause,
+        Cause::Returned | Cause::OutOfOrder { .. } => Again::AfterPredecessor,
+        Cause::Busy | Cause::NoSuchAgent | Cause::NoRoom => Again::AfterPause,
+        // The directory shows the next registration, or the letter ends.
+        Cause::Moved => Again::AtOnce,
+        // The lane pauses after the last route.
+        Cause::NotSent | Cause::Unconfirmed | Cause::CustodianLost => Again::AtOnce,
+    }
+}
+
+/// Whether a credit ends the pause of a lane after *busy*: only if a letter of the lane was settled since
+/// a credit last did. Otherwise a peer could have a letter repeated by a credit for each *busy*.
+#[must_use]
+pub fn credit_counts(has_settled: bool) -> bool {
+    has_settled
 }
 
 #[cfg(test)]
@@ -228,5 +298,27 @@ mod tests {
         assert!(admits_when_full(Some(9), 8));
         assert!(!admits_when_full(Some(9), 9));
         assert!(!admits_when_full(None, 1));
+    }
+
+    #[test]
+    fn only_a_lower_predecessor_sends_a_letter_again_at_once() {
+        for cause in [Cause::Returned, Cause::OutOfOrder { last: 2 }] {
+            assert_eq!(again(cause, 5, 3), Again::AtOnce, "{cause:?}");
+            assert_eq!(again(cause, 5, 5), Again::AfterPredecessor, "{cause:?}");
+        }
+        assert_eq!(again(Cause::Returned, 0, 0), Again::AfterPause);
+    }
+
+    /// [`offer`] never gives such an answer.
+    #[test]
+    fn an_answer_that_contradicts_the_copy_pauses_the_lane() {
+        for (after, last) in [(0, 0), (0, 7), (5, 5), (5, 9)] {
+            assert_ne!(offer(last, 10, after), Offer::OutOfOrder);
+            assert!(Answer::OutOfOrder { last }.contradicts(after));
+            let cause = Cause::OutOfOrder { last };
+            assert_eq!(again(cause, after, 0), Again::AfterPause);
+        }
+        assert_eq!(offer(4, 10, 5), Offer::OutOfOrder);
+        assert!(!Answer::OutOfOrder { last: 4 }.contradicts(5));
     }
 }

@@ -2,12 +2,13 @@
 
 use std::time::Duration;
 
-use fipa_mts::core::rules::{self, HoldDecision};
+use fipa_mts::core::rules::{self, Again, Cause, HoldDecision};
 
 use crate::hop::Heard;
 use crate::protocol::{Mutant, Protocol};
 use crate::state::{
-    CUSTODIANS, Custodian, Held, Key, LIVES, Message, Place, RECEIVER, Service, State, What,
+    CUSTODIANS, Custodian, Held, Key, LIVES, Message, PauseEnd, Place, RECEIVER, Service, State,
+    What,
 };
 
 /// Patience of a custodian. The model has no clock, so the patience may end at any time.
@@ -41,6 +42,8 @@ impl Protocol {
             return;
         };
         let gone = lane.remove(place);
+        self.has_settled(state, Self::at(state, custodian), key.sequence);
+        let lane = &mut state.custodians[custodian].held;
         let what = report(gone.uncertain && !self.is(Mutant::CertainReturn));
         for held in lane.iter_mut() {
             if held.key.registration == key.registration && held.after == key.sequence {
@@ -101,12 +104,17 @@ impl Protocol {
         } = copy;
         if let Some(held) = Self::held(state, custodian, key) {
             let lowered = rules::lower(held.after.into(), after.into()) as u8;
-            if lowered < held.after && held.place == Place::Blocked {
+            let is_lower = lowered < held.after;
+            if is_lower && held.place == Place::Blocked {
                 held.place = Place::Ready;
             }
             held.after = lowered;
             let upstream = &mut held.upstream[from.slot()];
             *upstream = (*upstream).max(transfer);
+            if is_lower {
+                let at = Self::at(state, custodian);
+                Self::end_pause(state, at, |it| it == PauseEnd::LowerPredecessor(key));
+            }
             return None;
         }
         if self.is_gone(state, custodian, key) {
@@ -134,6 +142,7 @@ impl Protocol {
                 uncertain: false,
                 place: Place::Ready,
                 handed: 0,
+                at_once: 0,
                 upstream,
             },
         );
@@ -156,6 +165,7 @@ impl Protocol {
                 to,
                 transfer,
                 after,
+                ..
             } if to.custodian().is_some() => {
                 *after = lowered;
                 let note = Message {
@@ -169,6 +179,7 @@ impl Protocol {
             }
             _ => {}
         }
+        Self::end_pause(state, from, |it| it == PauseEnd::LowerPredecessor(key));
     }
 
     pub(crate) fn ended(&self, state: &mut State, custodian: usize, message: Message) {
@@ -182,25 +193,25 @@ impl Protocol {
             Heard::Nothing => {}
             Heard::Doubt => held.uncertain = true,
             Heard::Delivered => self.leave(state, custodian, key, |_| What::Delivered),
-            Heard::NotNow(end) => {
-                held.place = Place::Ready;
-                Self::mark(&mut held.uncertain, end);
-            }
-            Heard::OutOfOrder(end, last) => {
-                Self::mark(&mut held.uncertain, end);
-                held.place = match rules::goes_again(after.into(), last.into()) {
-                    true => Place::Ready,
-                    false => Place::Blocked,
+            Heard::Back(cause, end) => {
+                let sent = match std::mem::replace(&mut held.place, Place::Ready) {
+                    Place::Out { sent, .. } => sent,
+                    _ => 0,
                 };
-            }
-            Heard::Returned(end) => {
                 Self::mark(&mut held.uncertain, end);
-                if rules::goes_again(after.into(), 0) {
-                    held.place = Place::Ready;
-                    return;
+                match self.again(cause, sent, after) {
+                    Again::AtOnce => {}
+                    Again::AfterPause => {
+                        let at = Self::at(state, custodian);
+                        self.pause(state, at, (cause, key));
+                    }
+                    Again::AfterPredecessor => {
+                        held.place = Place::Blocked;
+                        if cause == Cause::Returned {
+                            self.hold(state, custodian, key);
+                        }
+                    }
                 }
-                held.place = Place::Blocked;
-                self.hold(state, custodian, key);
             }
             Heard::Moved => {
                 self.leave(state, custodian, key, |uncertain| What::Returned {

@@ -1,10 +1,12 @@
 //! One hop: messages between services, the receiver, and the meaning of answers and reports to the
 //! service that handed a letter over.
 
-use fipa_mts::core::rules::{self, AttemptEnd, Belief, CustodyReport, Offer};
+use fipa_mts::core::rules::{self, Again, AttemptEnd, Belief, Cause, CustodyReport, Offer};
 
 use crate::protocol::{Mutant, Protocol};
-use crate::state::{CUSTODIANS, Custodian, Key, Message, Place, SENDER, Service, State, What};
+use crate::state::{
+    CUSTODIANS, Custodian, Key, Message, PauseEnd, Place, SENDER, Service, State, What,
+};
 
 /// The meaning of an answer or a report to the service that handed the letter over.
 pub(crate) enum Heard {
@@ -13,9 +15,7 @@ pub(crate) enum Heard {
     Doubt,
     Delivered,
     /// It is dispatched again.
-    NotNow(AttemptEnd),
-    OutOfOrder(AttemptEnd, u8),
-    Returned(AttemptEnd),
+    Back(Cause, AttemptEnd),
     Moved,
     Failed(AttemptEnd),
 }
@@ -95,8 +95,11 @@ impl Protocol {
             }
             _ if !answers => return Heard::Nothing,
             What::Accepted => return Heard::Delivered,
-            What::OutOfOrder { last } => return Heard::OutOfOrder(AttemptEnd::NotTaken, last),
-            What::Busy => return Heard::NotNow(AttemptEnd::NotTaken),
+            What::OutOfOrder { last } => {
+                let last = last.into();
+                return Heard::Back(Cause::OutOfOrder { last }, AttemptEnd::NotTaken);
+            }
+            What::Busy => return Heard::Back(Cause::Busy, AttemptEnd::NotTaken),
             What::Refused => return Heard::Failed(AttemptEnd::NotTaken),
             What::Gone => return Heard::Moved,
             What::Copy { .. } | What::Predecessor { .. } => return Heard::Nothing,
@@ -115,7 +118,7 @@ impl Protocol {
             (Belief::OnlyUncertain, _) => Heard::Doubt,
             (Belief::Believed, What::Delivered) => Heard::Delivered,
             (Belief::Believed, What::Failed { .. }) => Heard::Failed(end),
-            (Belief::Believed, _) => Heard::Returned(end),
+            (Belief::Believed, _) => Heard::Back(Cause::Returned, end),
         }
     }
 
@@ -151,6 +154,86 @@ impl Protocol {
             },
         };
         Self::reply(state, copy, answer);
+    }
+
+    /// Decides when a letter goes again that came back.
+    pub(crate) fn again(&self, cause: Cause, sent: u8, after: u8) -> Again {
+        match cause {
+            Cause::Returned | Cause::OutOfOrder { .. } if self.is(Mutant::AgainAtOnce) => {
+                Again::AtOnce
+            }
+            _ => rules::again(cause, sent.into(), after.into()),
+        }
+    }
+
+    /// The lane of a service in [`State::lanes`]. The hostile custodian has none.
+    pub(crate) fn lane(at: Service) -> Option<usize> {
+        match at.custodian() {
+            None => Some(0),
+            Some(0) => Some(1),
+            Some(_) => None,
+        }
+    }
+
+    /// Pauses the lane of a service.
+    pub(crate) fn pause(&self, state: &mut State, at: Service, (cause, key): (Cause, Key)) {
+        if let Some(lane) = Self::lane(at).filter(|_| self.hostile) {
+            let pause = match cause {
+                Cause::Busy => PauseEnd::Credit,
+                _ => PauseEnd::LowerPredecessor(key),
+            };
+            // Either of two pauses may be the longer one; this one ends early more often.
+            let pause = state.lanes[lane]
+                .pause
+                .map_or(pause, |other| other.min(pause));
+            state.lanes[lane].pause = Some(pause);
+        }
+    }
+
+    /// Ends the pause of a lane that this event ends.
+    pub(crate) fn end_pause(state: &mut State, at: Service, ends: impl Fn(PauseEnd) -> bool) {
+        if let Some(lane) = Self::lane(at) {
+            state.lanes[lane].pause.take_if(|pause| ends(*pause));
+        }
+    }
+
+    /// Records that a letter has left the lane of a service.
+    pub(crate) fn has_settled(&self, state: &mut State, at: Service, sequence: u8) {
+        if let Some(lane) = Self::lane(at).filter(|_| self.hostile) {
+            state.lanes[lane].has_settled = true;
+            let is_behind = |pause| matches!(pause, PauseEnd::LowerPredecessor(key) if sequence <= key.sequence);
+            Self::end_pause(state, at, is_behind);
+        }
+    }
+
+    /// Handles a credit, which ends the pause after *busy*.
+    pub(crate) fn credit(&self, state: &mut State, at: Service) {
+        let Some(lane) = Self::lane(at) else { return };
+        let has_settled = state.lanes[lane].has_settled;
+        if rules::credit_counts(has_settled) || self.is(Mutant::CreditAlways) {
+            Self::end_pause(state, at, |pause| pause == PauseEnd::Credit);
+            state.lanes[lane].has_settled = false;
+        }
+    }
+
+    /// Ends the pause of a lane because its time is over.
+    pub(crate) fn pause_is_over(state: &mut State, at: Service) {
+        Self::end_pause(state, at, |_| true);
+        match at.custodian() {
+            None => state.letters.iter_mut().for_each(|it| it.at_once = 0),
+            Some(at) => {
+                let held = state.custodians[at].held.iter_mut();
+                held.for_each(|it| it.at_once = 0);
+            }
+        }
+    }
+
+    /// Answers of the hostile custodian to a copy: all after which the letter goes on.
+    pub(crate) fn lies(&self) -> impl Iterator<Item = What> {
+        let last = 0..=self.letters as u8;
+        let returned = [false, true].map(|uncertain| What::Returned { uncertain });
+        let orders = last.map(|last| What::OutOfOrder { last });
+        orders.chain(returned).chain([What::Busy])
     }
 
     /// Ends an attempt or a custody without an answer or a report.

@@ -5,8 +5,8 @@ use fipa_mts::core::rules::AttemptEnd;
 use stateright::{Model, Property};
 
 use crate::state::{
-    CUSTODIANS, Custodian, Key, LIVES, MAX_LETTERS, Message, Outcome, Place, SENDER, Service,
-    State, What,
+    CUSTODIANS, Custodian, Key, LIVES, MAX_LETTERS, Message, Outcome, PauseEnd, Place, SENDER,
+    Service, State, What,
 };
 
 /// Arrangement of the two custodians between the sender and the receiver.
@@ -62,6 +62,10 @@ pub(crate) enum Mutant {
     LowerPastReturned,
     /// A note of a lower predecessor ignores open letters that have moved to another stream.
     NoteByStream,
+    /// A letter that was returned or out of order goes again at once.
+    AgainAtOnce,
+    /// Each credit ends a pause.
+    CreditAlways,
 }
 
 /// Kinds of faults. Each fault takes one of [`State::faults_left`].
@@ -118,6 +122,9 @@ pub(crate) struct Protocol {
     pub(crate) notes: bool,
     /// Whether each service dispatches the letters of a stream in order (rules 9 and 13).
     pub(crate) in_order: bool,
+    /// Whether the second custodian is hostile: it answers each copy in any way after which the letter
+    /// goes on, and sends credits at any time. Lanes pause then.
+    pub(crate) hostile: bool,
     pub(crate) mutant: Option<Mutant>,
 }
 
@@ -165,6 +172,12 @@ pub(crate) enum Action {
     Learn,
     /// Nothing was heard of a letter for the registration that has ended.
     ConcludeOld { sequence: u8 },
+    /// The hostile custodian answers a copy.
+    Lie { copy: Message, what: What },
+    /// The hostile custodian sends a credit.
+    Credit { to: Service },
+    /// The pause of a lane is over.
+    PauseIsOver { at: Service },
 }
 
 impl Action {
@@ -183,7 +196,18 @@ impl Action {
                 | Self::Die { .. }
                 | Self::Register
                 | Self::EndOld
+                | Self::Lie { .. }
+                | Self::Credit { .. }
         )
+    }
+
+    /// Whether the step takes one of the faults that a run may have.
+    fn is_counted(&self) -> bool {
+        let is_free = matches!(
+            self,
+            Self::Register | Self::EndOld | Self::Lie { .. } | Self::Credit { .. }
+        );
+        self.is_fault() && !is_free
     }
 
     /// Returns the step without the numbers that rise at each repetition. A fair run takes a step
@@ -209,6 +233,14 @@ impl Action {
 }
 
 impl Protocol {
+    /// Counts a hand-over with a hostile custodian, as far as the bound needs it.
+    fn counted(&self, at_once: u8) -> u8 {
+        match self.hostile {
+            true => at_once.saturating_add(1),
+            false => 0,
+        }
+    }
+
     pub(crate) fn is(&self, mutant: Mutant) -> bool {
         self.mutant == Some(mutant)
     }
@@ -262,7 +294,16 @@ impl Protocol {
         }
     }
 
+    /// Whether this is the hostile custodian.
+    fn is_hostile(&self, service: Service) -> bool {
+        self.hostile && service.custodian() == Some(1)
+    }
+
     fn message_actions(&self, state: &State, message: Message, actions: &mut Vec<Action>) {
+        if self.is_hostile(message.to) && matches!(message.what, What::Copy { .. }) {
+            let copy = message;
+            return actions.extend(self.lies().map(|what| Action::Lie { copy, what }));
+        }
         actions.push(Action::Arrive(message));
         let (copy, note, report) = match message.what {
             What::Copy { .. } => (true, false, false),
@@ -328,8 +369,10 @@ impl Model for Protocol {
                     .iter()
                     .filter(|other| other.key.registration == key.registration)
                     .find(|other| other.place == Place::Ready);
+                let pauses = Self::lane(at).is_some_and(|lane| state.lanes[lane].pause.is_some());
                 if first.is_some_and(|first| first.key == key || !self.in_order)
                     && held.place == Place::Ready
+                    && !pauses
                 {
                     for to in self.topology.next(node) {
                         actions.push(Action::Pass {
@@ -374,6 +417,15 @@ impl Model for Protocol {
                 self.message_actions(state, *message, actions);
             }
         }
+        for at in [SENDER, Self::at(state, 0)] {
+            let pause = Self::lane(at).and_then(|lane| state.lanes[lane].pause);
+            if pause.is_some() {
+                actions.push(Action::PauseIsOver { at });
+            }
+            if pause == Some(PauseEnd::Credit) {
+                actions.push(Action::Credit { to: at });
+            }
+        }
         if self.moves && !state.registered_anew {
             actions.push(Action::Register);
         }
@@ -388,7 +440,7 @@ impl Model for Protocol {
     fn next_state(&self, before: &State, action: Action) -> Option<State> {
         let mut next = before.clone();
         let state = &mut next;
-        if action.is_fault() && !matches!(action, Action::Register | Action::EndOld) {
+        if action.is_counted() {
             state.faults_left -= 1;
         }
         match action {
@@ -398,9 +450,11 @@ impl Model for Protocol {
                 let transfer = Self::next_transfer(state, SENDER, sequence);
                 let letter = &mut state.letters[usize::from(sequence) - 1];
                 letter.handed |= to.bit();
+                letter.at_once = self.counted(letter.at_once);
                 letter.place = Place::Out {
                     to,
                     transfer,
+                    sent: after,
                     after,
                 };
                 let key = Key {
@@ -422,10 +476,12 @@ impl Model for Protocol {
                 let transfer = Self::next_transfer(state, from, key.sequence);
                 let held = Self::held(state, custodian, key)?;
                 held.handed |= to.bit();
+                held.at_once = self.counted(held.at_once);
                 let after = held.after;
                 held.place = Place::Out {
                     to,
                     transfer,
+                    sent: after,
                     after,
                 };
                 let copy = Message {
@@ -492,6 +548,12 @@ impl Model for Protocol {
             Action::ConcludeOld { sequence } => {
                 self.conclude(state, sequence, Outcome::Unconfirmed);
             }
+            Action::Lie { copy, what } => {
+                Self::remove(state, copy);
+                Self::reply(state, copy, what);
+            }
+            Action::Credit { to } => self.credit(state, to),
+            Action::PauseIsOver { at } => Self::pause_is_over(state, at),
         }
         self.move_letters(state);
         Self::forget(state);
@@ -523,6 +585,17 @@ impl Model for Protocol {
             Property::always("no open letter is passed over", |_, state: &State| {
                 !state.passed_over
             }),
+            // The first time, once for each letter before it, which lowers its predecessor, and once for a
+            // credit at first and after each letter that is settled.
+            Property::always(
+                "no repetitions without a pause",
+                |model: &Self, state: &State| {
+                    let sent = state.letters.iter().map(|letter| letter.at_once);
+                    let passed = state.custodians.iter().flat_map(|it| &it.held);
+                    let mut all = sent.chain(passed.map(|held| held.at_once));
+                    all.all(|at_once| usize::from(at_once) <= 2 * model.letters)
+                },
+            ),
         ]
     }
 }

@@ -1,6 +1,6 @@
 //! The sender's process: assigns streams, computes predecessors, moves letters, gives outcomes.
 
-use fipa_mts::core::rules;
+use fipa_mts::core::rules::{self, Again, Cause};
 
 use crate::hop::Heard;
 use crate::protocol::{Mutant, Protocol};
@@ -37,7 +37,9 @@ impl Protocol {
             uncertain: false,
             place: Place::Ready,
             handed: 0,
+            at_once: 0,
         };
+        self.has_settled(state, SENDER, sequence);
         if !self.notes || outcome == Outcome::Delivered {
             return;
         }
@@ -46,6 +48,7 @@ impl Protocol {
             let Place::Out {
                 to,
                 transfer,
+                sent,
                 after: told,
             } = letter.place
             else {
@@ -59,6 +62,7 @@ impl Protocol {
             letter.place = Place::Out {
                 to,
                 transfer,
+                sent,
                 after,
             };
             let note = Message {
@@ -113,6 +117,7 @@ impl Protocol {
             .count();
         letter.outcome.is_none()
             && letter.place == Place::Ready
+            && state.lanes[0].pause.is_none()
             && under_way < self.window
             && (!self.in_order
                 || earlier().all(|(_, letter)| matches!(letter.place, Place::Out { .. })))
@@ -124,6 +129,7 @@ impl Protocol {
 
     pub(crate) fn to_sender(&self, state: &mut State, message: Message) {
         let sequence = message.key.sequence;
+        let after = self.predecessor_by_name(state, sequence);
         let letter = &mut state.letters[usize::from(sequence) - 1];
         if letter.outcome.is_some() || letter.registration != message.key.registration {
             return;
@@ -132,16 +138,24 @@ impl Protocol {
             Heard::Nothing => {}
             Heard::Doubt => letter.uncertain = true,
             Heard::Delivered => self.conclude(state, sequence, Outcome::Delivered),
-            Heard::NotNow(end) | Heard::OutOfOrder(end, _) => {
-                letter.place = Place::Ready;
-                Self::mark(&mut letter.uncertain, end);
-            }
-            Heard::Returned(end) => {
-                letter.place = Place::Ready;
-                if self.is(Mutant::ForgetUncertain) {
+            Heard::Back(cause, end) => {
+                let sent = match std::mem::replace(&mut letter.place, Place::Ready) {
+                    Place::Out { sent, .. } => sent,
+                    _ => 0,
+                };
+                if self.is(Mutant::ForgetUncertain) && cause == Cause::Returned {
                     letter.uncertain = false;
                 }
                 Self::mark(&mut letter.uncertain, end);
+                let lower = state.open().rfind(|(other, _)| *other < sequence);
+                let is_behind = lower.is_some_and(|(_, lower)| lower.place == Place::Ready);
+                match self.again(cause, sent, after) {
+                    Again::AtOnce => {}
+                    Again::AfterPredecessor if is_behind => {}
+                    Again::AfterPause | Again::AfterPredecessor => {
+                        self.pause(state, SENDER, (cause, message.key));
+                    }
+                }
             }
             Heard::Moved => letter.place = Place::Moved,
             Heard::Failed(end) => {

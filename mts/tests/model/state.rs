@@ -93,7 +93,9 @@ pub(crate) enum Place {
     Out {
         to: Service,
         transfer: u8,
-        /// The predecessor that the service was told.
+        /// The predecessor that the copy carried.
+        sent: u8,
+        /// The predecessor that the service was told, by the copy or a note.
         after: u8,
     },
     /// It came back as out of order and waits (custodians only).
@@ -119,6 +121,8 @@ pub(crate) struct Letter {
     pub(crate) place: Place,
     /// Custodians that the letter was ever handed to.
     pub(crate) handed: u8,
+    /// Number of hand-overs since its lane last paused; only with a hostile custodian.
+    pub(crate) at_once: u8,
 }
 
 /// A letter in the lane of a custodian.
@@ -129,6 +133,8 @@ pub(crate) struct Held {
     pub(crate) uncertain: bool,
     pub(crate) place: Place,
     pub(crate) handed: u8,
+    /// Number of hand-overs since its lane last paused; only with a hostile custodian.
+    pub(crate) at_once: u8,
     /// The highest transfer of each service that handed the letter over; 0 for none.
     pub(crate) upstream: [u8; 1 + LIVES as usize],
 }
@@ -138,6 +144,22 @@ pub(crate) struct Custodian {
     pub(crate) life: u8,
     /// In rising order of keys.
     pub(crate) held: Vec<Held>,
+}
+
+/// The event that ends the pause of a lane early; see [`Lane`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) enum PauseEnd {
+    Credit,
+    LowerPredecessor(Key),
+}
+
+/// The lane of a service. It pauses only with a hostile custodian: without one, a pause is one of the
+/// delays that any step may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Lane {
+    pub(crate) pause: Option<PauseEnd>,
+    /// Whether a letter was settled since a credit last ended a pause.
+    pub(crate) has_settled: bool,
 }
 
 /// One registration of the receiver.
@@ -202,6 +224,8 @@ impl fmt::Debug for Message {
 pub(crate) struct State {
     pub(crate) letters: [Letter; MAX_LETTERS],
     pub(crate) custodians: [Custodian; 2],
+    /// The lanes of the sender's process and of the first custodian.
+    pub(crate) lanes: [Lane; 2],
     pub(crate) registrations: [Registration; 2],
     /// Whether the receiver was registered again.
     pub(crate) registered_anew: bool,
@@ -227,8 +251,13 @@ impl State {
                 uncertain: false,
                 place: Place::Ready,
                 handed: 0,
+                at_once: 0,
             }; MAX_LETTERS],
             custodians: Default::default(),
+            lanes: [Lane {
+                pause: None,
+                has_settled: true,
+            }; 2],
             registrations: Default::default(),
             registered_anew: false,
             old_gone: false,

@@ -53,6 +53,8 @@ pub(crate) enum Invariant {
     NoRelay,
     /// The steps of cores are bounded by the received bytes.
     Work,
+    /// A letter leaves a service a limited number of times, whatever other services answer.
+    Repetitions,
     /// Without any fault no letter fails, and each failure is reported.
     Calm,
 }

@@ -7,7 +7,7 @@
 //! processes of one user are not isolated from each other.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Envelope, EnvelopeParams, Letter, Message, Performative, Received, Time};
@@ -32,6 +32,25 @@ const PAUSE_MS: u64 = 12;
 /// Fraction of letters that honest agents send to agents of hostile members.
 pub(super) const TO_LIARS: f64 = 0.1;
 
+/// Maximum time for which the hostile members answer every letter alike.
+const HABIT_MS: u64 = 1500;
+
+/// A way to answer every letter, with which a hostile member tries to have it sent again and again.
+#[derive(Debug, Clone, Copy)]
+enum Habit {
+    Returned,
+    /// As out of order. The last letter is the predecessor, or a letter near it.
+    OutOfOrder,
+    /// *Busy*, followed by a credit.
+    BusyAndCredit,
+    /// Custody, followed by a report *returned*.
+    CustodyAndReturn,
+    /// The connection breaks.
+    Broken,
+    /// Each letter in another of these ways.
+    Mixed,
+}
+
 /// State of the hostile members.
 pub(super) struct Liars {
     /// The hostile gateway, and the hostile process on the first host.
@@ -44,6 +63,10 @@ pub(super) struct Liars {
     /// Introductions with open connections, and their targets.
     introduced: Vec<(usize, Introduction)>,
     attempts: u64,
+    /// The present habit, and the time of the next one. Drawn apart from everything else.
+    habit: Option<Habit>,
+    next_habit: Instant,
+    habits: fastrand::Rng,
     /// Agents that are or were in a process's directory.
     learnt: Set<(usize, Incarnation)>,
 }
@@ -127,6 +150,9 @@ impl World {
             owed: Vec::new(),
             introduced: Vec::new(),
             attempts: 0,
+            habit: None,
+            next_habit: self.start,
+            habits: fastrand::Rng::with_seed(self.seed.wrapping_mul(31)),
             learnt: Set::default(),
         });
         self.at(self.start, Event::Lie);
@@ -218,8 +244,19 @@ impl World {
         }
     }
 
-    /// A parcel arrives at a hostile member, which answers arbitrarily.
-    pub(super) fn answer_falsely(&mut self, from: usize, attempt: AttemptId, parcel: Parcel) {
+    /// A parcel arrives at a hostile member, which answers arbitrarily, or out of habit.
+    pub(super) fn answer_falsely(
+        &mut self,
+        (from, to): (usize, usize),
+        kind: Kind,
+        attempt: AttemptId,
+        parcel: Parcel,
+    ) {
+        if let Body::Letter(_) = &parcel.body
+            && let Some(habit) = self.habit()
+        {
+            return self.answer_out_of_habit((from, to), kind, attempt, (parcel, habit));
+        }
         let answers = self.random.u32(..8);
         let answer = self.false_answer(parcel.sequence);
         let Some(liars) = &mut self.liars else { return };
@@ -238,6 +275,85 @@ impl World {
             }
             _ => self.conclude_within(20, from, attempt, Conclusion::Answered(answer)),
         }
+    }
+
+    /// The present habit of the hostile members, if they have one.
+    fn habit(&mut self) -> Option<Habit> {
+        let (now, ends) = (self.now, self.quiet + super::traffic::AFTER);
+        let Liars {
+            habit,
+            next_habit,
+            habits,
+            ..
+        } = self.liars.as_mut()?;
+        if now > ends {
+            return None;
+        }
+        if *next_habit <= now {
+            let all = [
+                Habit::Returned,
+                Habit::OutOfOrder,
+                Habit::BusyAndCredit,
+                Habit::CustodyAndReturn,
+                Habit::Broken,
+                Habit::Mixed,
+            ];
+            // Half of the time there is none.
+            *habit = all.get(habits.usize(..2 * all.len())).copied();
+            *next_habit = now + Duration::from_millis(habits.u64(50..HABIT_MS));
+        }
+        match habit {
+            Some(Habit::Mixed) => habits.choice([
+                Habit::Returned,
+                Habit::OutOfOrder,
+                Habit::BusyAndCredit,
+                Habit::CustodyAndReturn,
+            ]),
+            habit => *habit,
+        }
+    }
+
+    fn answer_out_of_habit(
+        &mut self,
+        (from, to): (usize, usize),
+        kind: Kind,
+        attempt: AttemptId,
+        (parcel, habit): (Parcel, Habit),
+    ) {
+        let uncertain = false;
+        let (conclusion, note) = match habit {
+            Habit::Returned | Habit::Mixed => (Answer::Returned { uncertain }, None),
+            Habit::OutOfOrder => {
+                let liars = self.liars.as_mut();
+                let more = liars.map_or(0, |liars| liars.habits.u64(..3));
+                let last = (parcel.after + more).saturating_sub(1);
+                (Answer::OutOfOrder { last }, None)
+            }
+            Habit::BusyAndCredit => (Answer::Busy, Some(Body::Credit)),
+            Habit::CustodyAndReturn => {
+                let report = Report::Returned { uncertain };
+                (Answer::Custody, Some(Body::Report(report)))
+            }
+            Habit::Broken => {
+                let error = TransportError::new(TransportErrorKind::Broken, "a lie");
+                return self.conclude_within(1, from, attempt, Conclusion::Unconfirmed(error));
+            }
+        };
+        self.conclude_within(1, from, attempt, Conclusion::Answered(conclusion));
+        let Some(body) = note else { return };
+        let note = Parcel {
+            remaining: Duration::ZERO,
+            body,
+            ..parcel
+        };
+        let attempts = self.liars.as_mut().map_or(0, |liars| {
+            liars.attempts += 1;
+            liars.attempts
+        });
+        let named = self.processes[to].incarnation;
+        let flown = Flown::lie((to, from), kind, (AttemptId(attempts), note), named);
+        let arrives = self.now + Duration::from_millis(2);
+        self.at(arrives, Event::Arrive(Box::new(flown)));
     }
 
     fn false_answer(&mut self, sequence: u64) -> Answer {

@@ -110,6 +110,7 @@ impl World {
             )
         });
         self.overhear(&parcel);
+        self.note_dispatch(at, attempt, &parcel);
         let target = self.by_incarnation.get(&location.incarnation()).copied();
         let target = target.filter(|target| self.processes[*target].alive);
         let flight = Flight {
@@ -280,6 +281,7 @@ impl World {
         {
             self.may_repeat.insert((at, attempt));
         }
+        self.check_repetitions(at, attempt, conclusion);
     }
 
     /// Ends an attempt. Returns whether no byte of its parcel has left and none ever will.
@@ -369,7 +371,7 @@ impl World {
         }
         if self.processes[to].hostile {
             if !copy {
-                self.answer_falsely(from, attempt, parcel);
+                self.answer_falsely((from, to), kind, attempt, parcel);
             }
             return Ok(());
         }

@@ -6,6 +6,7 @@ mod gates;
 mod liar;
 mod links;
 mod moves;
+mod repetitions;
 mod traffic;
 mod view;
 mod watching;
@@ -25,6 +26,7 @@ use self::checks::{Breaches, Invariant};
 use self::gates::{Denied, Refused, Rules};
 use self::liar::Liars;
 use self::links::{Flight, Flown, Link};
+use self::repetitions::Repetitions;
 use self::traffic::Sent;
 use self::view::{Registered, Registry, View};
 use self::watching::Watching;
@@ -210,6 +212,7 @@ pub(crate) struct World {
     liars: Option<Liars>,
     /// Received bytes, and the steps of cores for them.
     work: Work,
+    repetitions: Repetitions,
     /// Gateways that have or had a connection with each other.
     met: Set<(usize, usize)>,
     /// Agents that are about to read.
@@ -274,6 +277,7 @@ impl World {
             liars: None,
             met: Set::default(),
             work: Work::default(),
+            repetitions: Repetitions::default(),
             reading: Set::default(),
             failures_told: 0,
             followed: 0,

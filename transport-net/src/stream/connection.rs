@@ -19,6 +19,7 @@ use super::config::Limits;
 use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
+use crate::answer::Contradictions;
 use crate::end::ConnectionEnd;
 use crate::hello::{Hello, OWN_INCARNATION};
 
@@ -99,6 +100,7 @@ pub(crate) struct Connection {
     arrivals: HashSet<u64>,
     last_arrival: u64,
     answers_waiting: usize,
+    contradictions: Contradictions,
     control_waiting: usize,
     parcels_written: u64,
     writes: u64,
@@ -111,6 +113,7 @@ struct Sent {
     /// `None` when the attempt was abandoned.
     attempt: Option<AttemptId>,
     receiver: Arc<str>,
+    after: u64,
     letter_len: u64,
     /// Time at which the kernel began to take it.
     begun: Option<Instant>,
@@ -158,6 +161,7 @@ impl Connection {
             arrivals: HashSet::new(),
             last_arrival: 0,
             answers_waiting: 0,
+            contradictions: Contradictions::default(),
             control_waiting: 0,
             parcels_written: 0,
             writes: 0,
@@ -307,6 +311,7 @@ impl Connection {
             Sent {
                 attempt: Some(attempt),
                 receiver: Arc::clone(&parcel.receiver),
+                after: parcel.after,
                 letter_len,
                 begun: None,
             },
@@ -772,6 +777,11 @@ impl Connection {
     fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), ConnectionEnd> {
         match self.sent.remove(&id) {
             Some(sent) if sent.begun.is_some() => {
+                if let Err(end) = self.contradictions.check(&answer, sent.after) {
+                    // Reinserted because it still needs a conclusion.
+                    self.sent.insert(id, sent);
+                    return Err(end);
+                }
                 self.begun -= 1;
                 self.clock.busy = now;
                 if let Some(attempt) = sent.attempt {
@@ -782,7 +792,7 @@ impl Connection {
                 Ok(())
             }
             Some(unsent) => {
-                // Reinserted because it still needs a conclusion.
+                // As above.
                 self.sent.insert(id, unsent);
                 Err(ConnectionEnd::ProtocolViolation(
                     "an answer to a parcel that was not sent".into(),

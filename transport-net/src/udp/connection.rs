@@ -26,7 +26,7 @@ use super::mtu::Mtu;
 use super::packet::{self, BASE, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
 use super::received::Received;
 use super::recovery::{Recovery, SentContent};
-use crate::answer;
+use crate::answer::{self, Contradictions};
 use crate::datagrams::{Outbound, Path};
 use crate::end::ConnectionEnd;
 use crate::hello::Hello;
@@ -75,6 +75,7 @@ pub(crate) struct Connection {
     /// Sent parcels, until their answer arrives.
     sent: BTreeMap<u64, Sent>,
     attempts: HashMap<AttemptId, u64>,
+    contradictions: Contradictions,
     last_sent: u64,
     /// Parcels to retransmit.
     resend: BTreeSet<u64>,
@@ -112,6 +113,7 @@ pub(crate) struct Connection {
 #[derive(Debug)]
 struct Outgoing {
     attempt: AttemptId,
+    after: u64,
     header: ParcelHeader,
     pieces: Vec<Bytes>,
     /// Size of a datagram that carries nothing else.
@@ -122,6 +124,7 @@ struct Outgoing {
 struct Sent {
     /// `None` when the attempt was abandoned or concluded.
     attempt: Option<AttemptId>,
+    after: u64,
     /// `None` when the parcel was acknowledged or is not retransmitted.
     outgoing: Option<Outgoing>,
     losses: u8,
@@ -183,6 +186,7 @@ impl Connection {
             waiting_bytes: 0,
             sent: BTreeMap::new(),
             attempts: HashMap::new(),
+            contradictions: Contradictions::default(),
             last_sent: 0,
             resend: BTreeSet::new(),
             urgent: VecDeque::new(),
@@ -282,6 +286,7 @@ impl Connection {
         self.waiting_bytes += size;
         self.waiting.push_back(Outgoing {
             attempt,
+            after: parcel.after,
             header,
             pieces,
             size,

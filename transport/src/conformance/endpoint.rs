@@ -10,8 +10,8 @@ use parking_lot::Mutex;
 
 use super::Fixture;
 use crate::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Ticket, Transport, TransportErrorKind, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind,
+    LegacySource, Location, Parcel, Sink, Stream, Ticket, Transport, TransportErrorKind, Verdict,
 };
 
 /// Timeout after which the suite considers a transport broken.
@@ -23,6 +23,9 @@ type VerdictOf = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
 pub(super) struct Record {
     pub(super) arrivals: Vec<(Parcel, Hop, Option<Ticket>)>,
     pub(super) concluded: HashMap<AttemptId, Vec<Conclusion>>,
+    /// Numbers of connections that were opened, and that have ended.
+    pub(super) introduced: usize,
+    pub(super) parted: usize,
 }
 
 pub(super) struct RecordingSink {
@@ -53,6 +56,14 @@ impl Sink for RecordingSink {
             .entry(attempt)
             .or_default()
             .push(conclusion);
+    }
+
+    fn introduced(&self, _: &Introduction) {
+        self.record.lock().introduced += 1;
+    }
+
+    fn parted(&self, _: &Introduction) {
+        self.record.lock().parted += 1;
     }
 }
 

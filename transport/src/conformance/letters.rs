@@ -99,6 +99,63 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
     }
 }
 
+/// A connection ends whose peer answers that letters are out of order after it has taken their
+/// predecessors. Letters with other answers, and a transport without connections, are not affected.
+pub fn contradictions_end_a_connection(fixture: &dyn Fixture) {
+    let most = u64::from(Answer::MAX_CONTRADICTIONS);
+    let a = TestEndpoint::new(fixture);
+    let b = TestEndpoint::with_verdict(fixture, |arrival| {
+        let last = arrival.parcel.transfer;
+        Verdict::Now(Answer::OutOfOrder { last })
+    });
+    let mut sequence = 0;
+    let mut send = |last: u64| {
+        sequence += 1;
+        let sent = Parcel {
+            after: 7,
+            transfer: last,
+            ..parcel(sequence, letter("x"))
+        };
+        a.send(sequence, &b, sent);
+        let conclusion = concluded(&[&a, &b], &a, sequence);
+        (
+            conclusion,
+            Conclusion::Answered(Answer::OutOfOrder { last }),
+        )
+    };
+    let mut answered = |last: u64| {
+        let (conclusion, expected) = send(last);
+        assert_eq!(conclusion, expected);
+    };
+    for _ in 0..2 * most {
+        answered(6);
+    }
+    for last in 1..most {
+        answered(6 + last);
+    }
+    let counts = || {
+        let record = a.sink.record.lock();
+        (record.introduced, record.parted)
+    };
+    let (introduced, parted) = counts();
+    assert_eq!(parted, 0);
+    let (conclusion, expected) = send(7);
+    match introduced {
+        0 => assert_eq!(conclusion, expected),
+        _ => assert!(
+            matches!(conclusion, Conclusion::Unconfirmed(_)),
+            "{conclusion:?}"
+        ),
+    }
+    until(&[&a, &b], "the end of the connection", || {
+        let (_, parted) = counts();
+        (parted == introduced).then_some(())
+    });
+    // Another connection can be opened.
+    let (conclusion, expected) = send(6);
+    assert_eq!(conclusion, expected);
+}
+
 /// A letter is confirmed only after the receiving sink has it.
 pub fn the_sink_has_the_letter_before_it_is_confirmed(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));

@@ -54,6 +54,7 @@ macro_rules! conformance_tests {
         $crate::conformance_tests!(@each $fixture;
             every_field_and_kind_arrives
             answers_come_back_as_given
+            contradictions_end_a_connection
             the_sink_has_the_letter_before_it_is_confirmed
             a_late_answer_concludes_its_own_parcel
             order_is_kept

@@ -1,6 +1,6 @@
 //! Handling of answers, ends of attempts, reports of custodians, and changes of the directory.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use fipa_sds::Entry;
 use fipa_transport::{
@@ -10,12 +10,10 @@ use fipa_transport::{
 
 use super::super::attempts::{AttemptTable, Settlement, registration_of};
 use super::super::routes::Tally;
-use super::super::rules::{self, AttemptEnd, Belief, CustodyReport};
+use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::{Departure, State};
-use super::{
-    BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, LaneKey, MOVING_PATIENCE,
-};
+use super::{CONGESTED_TRIES, ENDED_PATIENCE, Lane, LaneKey, MOVING_PATIENCE};
 
 impl Lane {
     /// Handles the conclusion of an attempt.
@@ -38,7 +36,7 @@ impl Lane {
         if !is_current {
             return;
         }
-        let State::UnderWay { location, .. } = std::mem::replace(state, State::Waiting) else {
+        let State::UnderWay { location, .. } = std::mem::replace(state, State::Ended) else {
             return;
         };
         self.back();
@@ -73,7 +71,9 @@ impl Lane {
                 let outcome = Outcome::Sent { via, attempts };
                 self.settle(now, index, Settlement::Outcome(outcome), table);
             }
-            Conclusion::NotSent(error) => self.came_back(now, index, &location, error, table),
+            Conclusion::NotSent(error) => {
+                self.came_back(now, index, &location, (error, Cause::NotSent), table);
+            }
             Conclusion::Unconfirmed(error) if location.signature() != Signature::Frames => {
                 // A legacy peer would take a copy for a new letter.
                 self.letters[index].failed_at(&location, error);
@@ -81,13 +81,13 @@ impl Lane {
             }
             Conclusion::Unconfirmed(error) => {
                 self.letters[index].ended(AttemptEnd::Unknown);
-                self.came_back(now, index, &location, error, table);
+                self.came_back(now, index, &location, (error, Cause::Unconfirmed), table);
             }
             _ => {
                 let text = "the transport reported an unknown conclusion of the attempt";
                 self.letters[index].ended(AttemptEnd::Unknown);
                 let error = TransportError::new(TransportErrorKind::Incompatible, text);
-                self.came_back(now, index, &location, error, table);
+                self.came_back(now, index, &location, (error, Cause::Unconfirmed), table);
             }
         }
         self.pump(now, table);
@@ -133,19 +133,16 @@ impl Lane {
                 self.was_full(now);
                 let delivery = &mut self.letters[index];
                 delivery.progress.busy = true;
-                delivery.progress.tried.clear();
                 self.busy_at = delivery.handed_at(&location);
                 delivery.custody_taken(table);
-                self.recovering = true;
-                self.pause_until(now + BUSY_PAUSE);
+                self.again(now, index, Cause::Busy, table);
             }
             Answer::OutOfOrder { last } => {
-                let patience = self.predecessor_patience(index, table);
-                self.came_early(now, index, (last, patience), table);
+                self.again(now, index, Cause::OutOfOrder { last }, table);
             }
             Answer::Returned { uncertain } => {
                 self.letters[index].ended(end_of(uncertain));
-                self.came_early(now, index, (0, Duration::ZERO), table);
+                self.again(now, index, Cause::Returned, table);
             }
             Answer::Moved => self.receiver_moved(now, index, table),
             Answer::Failed {
@@ -153,7 +150,7 @@ impl Lane {
                 detail,
             } => {
                 let refused = Some((location, detail));
-                self.receiver_unknown(index, Departure::Unknown { refused }, table);
+                self.receiver_unknown(now, index, refused, table);
             }
             Answer::Failed { reason, detail } => {
                 self.refused(now, index, &location, (reason, detail), table);
@@ -166,40 +163,12 @@ impl Lane {
         }
     }
 
-    /// Handles a letter that came back because an earlier one is missing at the other side. `last`
-    /// is the last letter taken there, or 0 if unknown. The route has not failed.
-    fn came_early(
-        &mut self,
-        now: Instant,
-        index: usize,
-        (last, patience): (u64, Duration),
-        table: &mut AttemptTable,
-    ) {
-        self.recovering = true;
-        self.letters[index].progress.tried.clear();
-        if self.is_custody() {
-            if !rules::goes_again(self.letters[index].after, last) {
-                self.hold(now, index, patience, table);
-            }
-            return;
-        }
-        let lower_is_here = index
-            .checked_sub(1)
-            .is_some_and(|lower| self.letters[lower].is_waiting());
-        let same = self.after(index) >= self.letters[index].after;
-        if same && !lower_is_here && self.paused_until.is_none() {
-            // The letter before it is elsewhere, and slow.
-            self.pause(now);
-            self.paused_for_lower = true;
-        }
-    }
-
     /// Handles an answer that this registration of the receiver recently left its host.
     fn receiver_moved(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
-        self.recovering = true;
         let delivery = &self.letters[index];
         let registration = delivery.registration;
         if self.is_custody() {
+            self.recovering = true;
             match rules::may_move(delivery.progress.uncertain) {
                 true => self.settle(now, index, Settlement::Moved, table),
                 false => self.fail(now, index, FailureReason::Unconfirmed, table),
@@ -211,12 +180,25 @@ impl Lane {
             self.moving = Some((registration, until));
             self.due_at(until);
         }
-        self.receiver_unknown(index, Departure::Moved, table);
+        self.again(now, index, Cause::Moved, table);
+        self.await_directory(index, Departure::Moved, table);
     }
 
-    /// Handles a letter whose registration another service reports as moved or unknown: the letter
-    /// waits for a refresh of the directory.
-    fn receiver_unknown(&mut self, index: usize, departure: Departure, table: &mut AttemptTable) {
+    /// Handles a letter whose receiver another service does not know, according to this refusal or a report.
+    fn receiver_unknown(
+        &mut self,
+        now: Instant,
+        index: usize,
+        refused: Option<(Location, String)>,
+        table: &mut AttemptTable,
+    ) {
+        self.again(now, index, Cause::NoSuchAgent, table);
+        self.await_directory(index, Departure::Unknown { refused }, table);
+    }
+
+    /// Makes a letter whose registration another service reports as moved or unknown wait for a refresh of
+    /// the directory.
+    fn await_directory(&mut self, index: usize, departure: Departure, table: &mut AttemptTable) {
         self.letters[index].progress.departure = Some(Box::new(departure));
         self.want_refresh(table);
     }
@@ -282,11 +264,8 @@ impl Lane {
             LaneKey::Name(_, name) => table.view.named(name),
             LaneKey::Service(_) | LaneKey::Custody(_) => None,
         };
-        match successor.is_some_and(|entry| registration_of(&entry) != registration) {
-            true => {
-                self.receiver_left(now, index, table);
-            }
-            false => self.pause(now),
+        if successor.is_some_and(|entry| registration_of(&entry) != registration) {
+            self.receiver_left(now, index, table);
         }
     }
 
@@ -310,14 +289,14 @@ impl Lane {
         now: Instant,
         index: usize,
         location: &Location,
-        error: TransportError,
+        (error, cause): (TransportError, Cause),
         table: &mut AttemptTable,
     ) {
-        self.recovering = true;
         if let Some(tally) = self.tally() {
             tally.fail(now, &error);
         }
-        if error.fault.waits_for_room() && self.congested < CONGESTED_TRIES {
+        let waits_for_room = cause == Cause::NotSent && error.fault.waits_for_room();
+        if waits_for_room && self.congested < CONGESTED_TRIES {
             // The end of another attempt, in this lane or another, makes room.
             self.congested += 1;
             self.letters[index]
@@ -325,9 +304,9 @@ impl Lane {
                 .tried
                 .retain(|tried| tried != location);
             table.wait_for_room(location, self.id);
-            self.pause_until(now + CONGESTED_PAUSE);
-            return;
+            return self.again(now, index, Cause::NoRoom, table);
         }
+        self.again(now, index, cause, table);
         if !matches!(
             error.fault,
             TransportErrorKind::TooLarge | TransportErrorKind::Inexpressible
@@ -393,7 +372,7 @@ impl Lane {
             }
             Report::Returned { uncertain } => {
                 self.letters[index].ended(end_of(uncertain));
-                self.came_early(now, index, (0, Duration::ZERO), table);
+                self.again(now, index, Cause::Returned, table);
             }
             Report::Moved => self.receiver_moved(now, index, table),
             _ => self.fail(now, index, FailureReason::Unconfirmed, table),
@@ -405,7 +384,7 @@ impl Lane {
     /// attempt.
     fn end_hand_over(&mut self, index: usize, transfer: u64, table: &mut AttemptTable) {
         let state = &mut self.letters[index].progress.state;
-        let before = std::mem::replace(state, State::Waiting);
+        let before = std::mem::replace(state, State::Ended);
         if let State::UnderWay {
             attempt, location, ..
         } = before
@@ -454,10 +433,7 @@ impl Lane {
                     self.was_full(now);
                 }
                 match reason {
-                    FailureReason::NoSuchAgent => {
-                        let departure = Departure::Unknown { refused: None };
-                        self.receiver_unknown(index, departure, table);
-                    }
+                    FailureReason::NoSuchAgent => self.receiver_unknown(now, index, None, table),
                     _ => self.fail(now, index, reason, table),
                 }
                 return;
@@ -570,7 +546,7 @@ impl Lane {
                 let text = "the gateway that had the letter in custody is gone";
                 self.custodian_lost(now, index, text, table);
             }
-            State::Waiting => {}
+            State::Waiting(_) | State::Ended => {}
         }
     }
 }

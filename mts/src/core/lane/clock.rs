@@ -68,16 +68,17 @@ impl Lane {
                     self.fail(now, index, FailureReason::Unconfirmed, table);
                     continue;
                 }
-                State::Waiting if self.returning => {
+                State::Waiting(_) | State::Ended if self.returning => {
                     self.return_letter(now, index, table);
                     continue;
                 }
-                State::Waiting if expired => {
+                State::Waiting(_) | State::Ended if expired => {
                     let reason = self.reason_while_waiting(index);
                     self.fail(now, index, reason, table);
                     continue;
                 }
-                State::Waiting => {
+                State::Ended => debug_assert!(false, "a letter came back without a decision"),
+                State::Waiting(_) => {
                     if let Some(Holding::Until(until)) = delivery.progress.hold
                         && until <= now
                     {
@@ -112,10 +113,11 @@ impl Lane {
                 Some(Holding::Until(until)) => Some(until),
                 _ => None,
             };
-            let not_before = delivery.not_before.filter(|until| *until > now);
-            [deadline, delivery.custody_due, times_out, held, not_before]
+            let turn = delivery.begins_after(now);
+            [deadline, delivery.custody_due, times_out, held, turn]
         });
-        let paused = self.paused_until.filter(|until| *until > now);
+        let paused = self.pause.map(|pause| pause.until);
+        let paused = paused.filter(|until| *until > now);
         let still =
             |wait: Option<(_, Instant)>| wait.map(|(_, until)| until).filter(|until| *until > now);
         let (moving, absent) = (still(self.moving), still(self.absent));

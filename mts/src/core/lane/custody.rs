@@ -5,15 +5,18 @@
 //! It also has the previous hop's checks: that service periodically asks a custodian whether it has
 //! the letter. A custodian without the letter has lost it, even if its report was lost as well.
 
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{Answer, Hop, Incarnation, TransportError, TransportErrorKind};
 
 use super::super::attempts::{AttemptTable, Settlement, Upstream};
-use super::super::rules::{self, AttemptEnd, HoldDecision};
+use super::super::rules::{self, AttemptEnd, Cause, HoldDecision};
 use super::super::work;
 use super::Lane;
-use super::delivery::{Holding, State};
+use super::delivery::{Delivery, Holding, State};
+use super::pause::PauseEnd;
+use super::turns::Pace;
 
 /// Minimum and maximum time for a missing predecessor to arrive: two round trips to the service
 /// that handed the letter over. If the predecessor takes longer, the letter travels twice, and
@@ -177,11 +180,11 @@ impl Lane {
         table: &mut AttemptTable,
     ) {
         let delivery = &mut self.letters[index];
-        let before = std::mem::replace(&mut delivery.progress.state, State::Waiting);
-        if let State::Custody { location, .. } = before {
+        if let State::Custody { location, .. } = &delivery.progress.state {
+            let location = location.clone();
             delivery.ended(AttemptEnd::CustodianLost);
             let error = TransportError::new(TransportErrorKind::Broken, text);
-            self.came_back(now, index, &location, error, table);
+            self.came_back(now, index, &location, (error, Cause::CustodianLost), table);
         }
     }
 
@@ -194,9 +197,10 @@ impl Lane {
         }
         delivery.after = lower;
         match &delivery.progress.state {
-            State::Waiting => {
+            State::Waiting(_) | State::Ended => {
                 delivery.progress.hold = None;
-                self.paused_until = self.paused_until.filter(|_| !self.paused_for_lower);
+                let sequence = delivery.sequence;
+                self.end_pause(PauseEnd::LowerPredecessor(sequence));
             }
             State::UnderWay { location, .. } | State::Custody { location, .. } => {
                 let (sequence, location) = (delivery.sequence, location.clone());
@@ -238,9 +242,7 @@ impl Lane {
     ) {
         let delivery = &self.letters[index];
         let after = delivery.after;
-        work::steps(self.left.len());
-        let left = self.left.iter().rev().find(|(other, _)| *other == after);
-        let since = left.map_or(delivery.since, |(_, at)| *at);
+        let since = self.left.since(after).unwrap_or(delivery.since);
         let missing_for = now.saturating_duration_since(since);
         let here = self.index(after).is_some();
         match rules::hold(here, missing_for, patience) {
@@ -291,12 +293,64 @@ impl Lane {
             self.holds |= matches!(delivery.progress.hold, Some(Holding::Until(_)));
         }
     }
+}
 
-    /// Records a letter that left the lane without being delivered.
-    pub(super) fn predecessor_failed(&mut self, now: Instant, sequence: u64) {
-        if self.left.len() >= MAX_LEFT {
-            self.left.pop_front();
+/// Letters that left a lane without being delivered, and may come again.
+#[derive(Debug, Default)]
+pub(super) struct LettersLeft {
+    /// Sequences, and paces as they were when the letters left.
+    latest: VecDeque<(u64, Pace)>,
+    /// The highest sequence, and the slowest pace, of those that left earlier.
+    earlier: Option<(u64, Pace)>,
+    /// The highest sequence of all.
+    highest: u64,
+}
+
+impl LettersLeft {
+    pub(super) fn is_empty(&self) -> bool {
+        self.latest.is_empty()
+    }
+
+    /// Records a letter that leaves.
+    pub(super) fn push(&mut self, now: Instant, delivery: &Delivery) {
+        if self.latest.len() >= MAX_LEFT
+            && let Some((sequence, pace)) = self.latest.pop_front()
+        {
+            self.earlier = Some(match self.earlier {
+                Some((highest, slowest)) => (highest.max(sequence), slowest.slower(pace)),
+                None => (sequence, pace),
+            });
         }
-        self.left.push_back((sequence, now));
+        let pace = delivery.progress.hand_overs.pace().leaked(now);
+        self.latest.push_back((delivery.sequence, pace));
+        self.highest = self.highest.max(delivery.sequence);
+    }
+
+    /// The time at which this letter left, if it is known.
+    fn since(&self, sequence: u64) -> Option<Instant> {
+        self.position(sequence)
+            .and_then(|position| self.latest.get(position))
+            .map(|(_, pace)| pace.at())
+    }
+
+    /// Returns the pace of a letter that comes again. One that is no longer remembered has the slowest pace
+    /// of those.
+    pub(super) fn take(&mut self, sequence: u64) -> Option<Pace> {
+        let latest = self.position(sequence);
+        if let Some((_, pace)) = latest.and_then(|position| self.latest.remove(position)) {
+            return Some(pace);
+        }
+        let earlier = self.earlier.filter(|(highest, _)| sequence <= *highest);
+        earlier.map(|(_, pace)| pace)
+    }
+
+    fn position(&self, sequence: u64) -> Option<usize> {
+        if sequence > self.highest {
+            return None;
+        }
+        work::steps(self.latest.len());
+        self.latest
+            .iter()
+            .rposition(|(other, _)| *other == sequence)
     }
 }

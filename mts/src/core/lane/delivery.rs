@@ -11,6 +11,7 @@ use smallvec::SmallVec;
 
 use super::super::attempts::{Action, AttemptTable, Origin, Upstream};
 use super::super::rules::{self, AttemptEnd};
+use super::turns::{HandOvers, Pace, Turn};
 
 /// Maximum number of failed attempts in one letter's outcome.
 const MAX_ATTEMPTS: usize = 16;
@@ -38,8 +39,6 @@ pub(crate) struct Delivery {
     /// Time at which the service that handed the letter over is told that it is in custody, unless
     /// its outcome is known earlier.
     pub(crate) custody_due: Option<Instant>,
-    /// Earliest time of dispatch.
-    pub(crate) not_before: Option<Instant>,
     pub(super) progress: Progress,
 }
 
@@ -47,6 +46,7 @@ pub(crate) struct Delivery {
 #[derive(Debug)]
 pub(super) struct Progress {
     pub(super) state: State,
+    pub(super) hand_overs: HandOvers,
     /// Failed attempts, for the outcome.
     pub(super) attempts: Vec<Attempt>,
     /// Locations tried in this round.
@@ -91,7 +91,10 @@ pub(super) enum Holding {
 /// Position of a letter.
 #[derive(Debug)]
 pub(super) enum State {
-    Waiting,
+    /// It is in this lane, and can be dispatched in its turn.
+    Waiting(Turn),
+    /// Its latest hand-over has ended, and nothing was decided about it yet.
+    Ended,
     UnderWay {
         attempt: AttemptId,
         location: Location,
@@ -112,7 +115,7 @@ impl State {
     /// The latest hand-over and its location, unless the letter is in this lane.
     pub(super) fn handed_over(&self) -> Option<(AttemptId, &Location)> {
         match self {
-            Self::Waiting => None,
+            Self::Waiting(_) | Self::Ended => None,
             Self::UnderWay {
                 attempt, location, ..
             }
@@ -132,8 +135,10 @@ impl Delivery {
         (registration, sequence): (Incarnation, u64),
         deadline: Instant,
     ) -> Box<Self> {
+        let (hand_overs, first) = HandOvers::new(now);
         let progress = Progress {
-            state: State::Waiting,
+            state: State::Waiting(first),
+            hand_overs,
             attempts: Vec::new(),
             tried: SmallVec::new(),
             handed: SmallVec::new(),
@@ -154,13 +159,37 @@ impl Delivery {
             deadline,
             since: now,
             custody_due: None,
-            not_before: None,
             progress,
         })
     }
 
     pub(super) fn is_waiting(&self) -> bool {
-        matches!(self.progress.state, State::Waiting)
+        matches!(self.progress.state, State::Waiting(_))
+    }
+
+    /// The time at which a waiting letter may be dispatched, if it is still to come.
+    pub(super) fn begins_after(&self, now: Instant) -> Option<Instant> {
+        match &self.progress.state {
+            State::Waiting(turn) => turn.begins_after(now),
+            _ => None,
+        }
+    }
+
+    /// Delays the dispatch of a waiting letter until then.
+    pub(crate) fn delay_until(&mut self, until: Instant) {
+        if let State::Waiting(turn) = &mut self.progress.state {
+            turn.delay_until(until);
+        }
+    }
+
+    /// Continues with the pace that the letter had when it was in this lane before.
+    pub(super) fn came_before(&mut self, pace: Pace) {
+        let hand_overs = &mut self.progress.hand_overs;
+        if let State::Waiting(turn) = &mut self.progress.state
+            && let Some(from) = hand_overs.resume(self.since, pace, self.letter.len())
+        {
+            turn.delay_until(from);
+        }
     }
 
     /// Records the end of an attempt or a custody.

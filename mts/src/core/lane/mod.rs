@@ -9,8 +9,9 @@
 //! letter.
 //!
 //! This module dispatches letters; [`answers`] handles answers and reports, [`clock`] timeouts,
-//! [`custody`] predecessors at custodians, [`delivery`] the state of one letter, [`tried`] the
-//! attempts that are reported for letters that were never dispatched, [`trust`] withdrawn certificates.
+//! [`custody`] predecessors at custodians, [`delivery`] the state of one letter, [`turns`] the times
+//! at which it may be dispatched, [`pause`] letters that came back, [`tried`] the attempts that are
+//! reported for letters that were never dispatched, [`trust`] withdrawn certificates.
 //!
 //! [`rules`]: super::rules
 
@@ -18,8 +19,10 @@ mod answers;
 mod clock;
 mod custody;
 mod delivery;
+mod pause;
 mod tried;
 mod trust;
+mod turns;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -27,12 +30,15 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{Entry, Reach};
 use fipa_transport::{
-    Attempt, Body, FailureReason, Hop, Incarnation, Location, Outcome, Parcel, Stream,
-    TransportError, TransportErrorKind,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, TransportError,
+    TransportErrorKind,
 };
 
+use self::custody::LettersLeft;
 pub(crate) use self::delivery::Delivery;
-use self::delivery::{State, is_of};
+use self::delivery::State;
+use self::pause::Pause;
+pub(crate) use self::pause::PauseEnd;
 use super::attempts::{
     AttemptTable, FailureTarget, Origin, Purpose, Settlement, Undelivered, registration_of,
 };
@@ -40,16 +46,9 @@ use super::routes::Tally;
 use super::rules;
 use super::work;
 
-/// Pauses between rounds over all routes, and before a returned letter is dispatched again.
-const FIRST_PAUSE: Duration = Duration::from_millis(10);
-const LONGEST_PAUSE: Duration = Duration::from_millis(500);
-/// Pause for a busy receiver without a credit.
-const BUSY_PAUSE: Duration = Duration::from_millis(100);
-/// Pause of a lane that waits for room on its route, and the number of consecutive pauses that
-/// count as a failure of the route.
-const CONGESTED_PAUSE: Duration = Duration::from_millis(20);
+/// Number of consecutive attempts without room that count as a failure of the route.
 const CONGESTED_TRIES: u32 = 25;
-/// Minimum expected throughput, which extends the timeout of large letters.
+/// Minimum expected throughput, which extends the timeout of large letters, and limits repetitions of their content.
 const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
 /// Subtracted from the remaining time at every hop, so that services further down the route time
 /// out first and can still report the reason.
@@ -120,11 +119,11 @@ pub(crate) struct Lane {
     awaited: Option<u64>,
     /// Whether the directory has just been refreshed, so that an unknown receiver is final.
     is_fresh: bool,
-    paused_until: Option<Instant>,
-    /// Whether the pause is for a lower letter, with whose end it ends.
-    paused_for_lower: bool,
+    pause: Option<Pause>,
     /// Number of consecutive pauses, each longer than the one before, since a letter was delivered.
     pauses: u32,
+    /// Whether a letter was settled since a credit last ended a pause.
+    has_settled: bool,
     /// Whether the receiver's queue was full at its last answer.
     busy: bool,
     /// Time at which it was last full.
@@ -143,8 +142,7 @@ pub(crate) struct Lane {
     ask_custodian: Option<Instant>,
     /// Whether a letter may wait for its predecessor to arrive.
     holds: bool,
-    /// Letters that left this lane without being delivered, and when.
-    left: VecDeque<(u64, Instant)>,
+    left: LettersLeft,
     /// Earliest time at which a timer of this lane is due.
     due: Option<Instant>,
     /// Time at which the core's timer visits this lane next.
@@ -180,9 +178,9 @@ impl Lane {
             returning: false,
             awaited: None,
             is_fresh: false,
-            paused_until: None,
-            paused_for_lower: false,
+            pause: None,
             pauses: 0,
+            has_settled: true,
             busy: false,
             was_busy: None,
             busy_at: None,
@@ -192,7 +190,7 @@ impl Lane {
             ended: None,
             ask_custodian: None,
             holds: false,
-            left: VecDeque::new(),
+            left: LettersLeft::default(),
             due: None,
             scheduled: None,
             congested: 0,
@@ -286,7 +284,7 @@ impl Lane {
         table: &AttemptTable,
         is_meant: impl Fn(&Location) -> bool,
     ) -> bool {
-        let first = self.letters.front().filter(|_| self.paused_until.is_some());
+        let first = self.letters.front().filter(|_| self.pause.is_some());
         let entry = first.and_then(|first| self.entry(first.registration, table));
         entry.is_some_and(|entry| entry.locations.iter().any(is_meant))
     }
@@ -329,6 +327,9 @@ impl Lane {
             self.due_at(due);
         }
         let sequence = delivery.sequence;
+        if let Some(pace) = self.left.take(sequence) {
+            delivery.came_before(pace);
+        }
         let place = self
             .letters
             .partition_point(|other| other.sequence < sequence);
@@ -354,12 +355,8 @@ impl Lane {
             self.recovering = false;
             self.route = None;
         }
-        if !self.recovering
-            && self.awaited.is_none()
-            && self.paused_until.is_none_or(|until| until <= now)
-        {
-            self.paused_until = None;
-            self.paused_for_lower = false;
+        if !self.recovering && self.awaited.is_none() && !self.is_paused(now) {
+            self.pause = None;
             self.dispatch_waiting(now, table);
         }
         self.give_credit(table);
@@ -381,12 +378,6 @@ impl Lane {
             if !self.letters[index].is_waiting() || self.is_held_back(index) {
                 index += 1;
                 continue;
-            }
-            if let Some(until) = self.letters[index].not_before
-                && now < until
-            {
-                self.due_at(until);
-                break;
             }
             let Some(entry) = self.entry(registration, table) else {
                 if !self.is_fresh {
@@ -412,6 +403,10 @@ impl Lane {
                 // letter.
                 self.fail(now, index, FailureReason::Unconfirmed, table);
                 continue;
+            }
+            if let Some(from) = self.letters[index].begins_after(now) {
+                self.due_at(from);
+                break;
             }
             match table.choose(now, &entry, &self.letters[index].progress.tried) {
                 Some(route) if self.under_way == 0 || self.route.as_ref() == Some(&route) => {
@@ -459,6 +454,11 @@ impl Lane {
         table: &mut AttemptTable,
     ) {
         let after = self.after(index);
+        let progress = &mut self.letters[index].progress;
+        let State::Waiting(turn) = std::mem::replace(&mut progress.state, State::Ended) else {
+            return;
+        };
+        progress.hand_overs.handed_over(now, turn, after);
         if let Some(tally) = self.tally_of(&route, table) {
             Tally::add(&tally.tried);
         }
@@ -476,8 +476,7 @@ impl Lane {
             remaining: left - HOP_MARGIN.min(left / 8),
             body: Body::Letter(delivery.letter.clone()),
         };
-        let size = delivery.letter.len() as u64;
-        let allowance = Duration::from_millis(size.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND);
+        let allowance = transfer_time(delivery.letter.len());
         let times_out = now + table.config.timeout_at(&route) + allowance;
         let purpose = Purpose::Letter {
             lane: self.id,
@@ -572,7 +571,7 @@ impl Lane {
                 other.progress.tried.clear();
             }
         }
-        self.pause(now);
+        self.pause(now, PauseEnd::Reachable, Duration::ZERO);
         false
     }
 
@@ -599,20 +598,6 @@ impl Lane {
                 kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
             });
         (!waits).then_some(reason)
-    }
-
-    fn pause(&mut self, now: Instant) {
-        let pause = FIRST_PAUSE
-            .saturating_mul(1 << self.pauses.min(10))
-            .min(LONGEST_PAUSE);
-        self.pauses += 1;
-        self.pause_until(now + pause);
-    }
-
-    fn pause_until(&mut self, until: Instant) {
-        self.paused_until = Some(until);
-        self.paused_for_lower = false;
-        self.due_at(until);
     }
 
     /// Requests a refresh of the directory. The letters of the lane wait for it.
@@ -647,6 +632,7 @@ impl Lane {
             delivery.registration = successor;
             delivery.after = 0;
             delivery.progress.tried.clear();
+            self.end_pause(PauseEnd::Registration);
             return true;
         }
         match self.moving {
@@ -677,21 +663,6 @@ impl Lane {
         self.absent = Some((registration, until));
         self.due_at(until);
         now < until
-    }
-
-    /// Handles a credit: the service that answered that it was full has room again. Credits of
-    /// others do not count, because each one has a letter dispatched again.
-    pub(crate) fn credited(&mut self, now: Instant, from: &Hop, table: &mut AttemptTable) {
-        if self.busy_at.is_some_and(|busy| is_of(busy, from)) {
-            self.resume(now, table);
-        }
-    }
-
-    /// Continues after room was made, at the receiver or on the route to it.
-    pub(crate) fn resume(&mut self, now: Instant, table: &mut AttemptTable) {
-        self.paused_until = None;
-        self.pauses = 0;
-        self.pump(now, table);
     }
 
     /// Abandons all letters, when the sending agent goes away or the service ends. A letter in
@@ -725,11 +696,13 @@ impl Lane {
                     delivery.ended(rules::AttemptEnd::Unknown);
                     self.return_letter(now, index, table);
                 }
-                State::Waiting if self.returning => self.return_letter(now, index, table),
+                State::Waiting(_) | State::Ended if self.returning => {
+                    self.return_letter(now, index, table);
+                }
                 State::Custody { .. } => {
                     self.fail(now, index, FailureReason::Unconfirmed, table);
                 }
-                State::Waiting => {
+                State::Waiting(_) | State::Ended => {
                     let reason = match delivery.reason_at_deadline(false) {
                         FailureReason::TimedOut => FailureReason::Closed,
                         reason => reason,
@@ -815,19 +788,19 @@ impl Lane {
             settlement,
             Settlement::Outcome(Outcome::Delivered { .. } | Outcome::Sent { .. })
         );
+        self.has_settled = true;
         if delivered || is_last {
             self.busy = false;
             self.pauses = 0;
             self.congested = 0;
         }
-        if self.paused_for_lower || is_last {
-            self.paused_until = None;
-            self.paused_for_lower = false;
-            self.pauses = 0;
+        match is_last {
+            true => self.pause = None,
+            false => self.end_pause_behind(delivery.sequence),
         }
         match self.is_custody() {
             _ if delivered => {}
-            true => self.predecessor_failed(now, delivery.sequence),
+            true => self.left.push(now, &delivery),
             false => self.send_predecessor(index, table),
         }
         let stream = self.stream_of(&delivery);
@@ -873,6 +846,12 @@ impl Lane {
             .binary_search_by_key(&sequence, |delivery| delivery.sequence)
             .ok()
     }
+}
+
+/// Maximum time that this many bytes are expected to take to leave.
+fn transfer_time(len: usize) -> Duration {
+    let micros = (len as u64).saturating_mul(1_000_000);
+    Duration::from_micros(micros.div_ceil(SLOWEST_BYTES_PER_SECOND))
 }
 
 #[cfg(test)]

@@ -176,14 +176,20 @@ impl Connection {
             ));
         }
         // An absent parcel has been concluded before.
-        if let Some(sent) = self.sent.remove(&id) {
-            self.resend.remove(&id);
-            self.busy = now;
-            if let Some(attempt) = sent.attempt {
-                self.attempts.remove(&attempt);
-                let conclusion = Conclusion::Answered(answer);
-                self.events.push_back(Event::Concluded(attempt, conclusion));
-            }
+        let Some(sent) = self.sent.remove(&id) else {
+            return Ok(());
+        };
+        if let Err(end) = self.contradictions.check(&answer, sent.after) {
+            // Reinserted because it still needs a conclusion.
+            self.sent.insert(id, sent);
+            return Err(end);
+        }
+        self.resend.remove(&id);
+        self.busy = now;
+        if let Some(attempt) = sent.attempt {
+            self.attempts.remove(&attempt);
+            let conclusion = Conclusion::Answered(answer);
+            self.events.push_back(Event::Concluded(attempt, conclusion));
         }
         Ok(())
     }

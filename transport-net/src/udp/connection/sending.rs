@@ -120,6 +120,7 @@ impl Connection {
             counters.parcels_out += 1;
             let sent = Sent {
                 attempt: Some(outgoing.attempt),
+                after: outgoing.after,
                 outgoing: Some(outgoing),
                 losses: 0,
             };
