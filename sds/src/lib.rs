@@ -40,6 +40,7 @@ mod merged;
 mod name;
 mod query;
 mod resolve;
+mod shares;
 mod view;
 mod watch;
 
