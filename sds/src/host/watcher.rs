@@ -28,6 +28,9 @@ pub(super) struct Watcher {
     events: Events,
 }
 
+/// Bytes of events that are read at once.
+const BUFFER: usize = 16 * 1024;
+
 /// Source of changes of the directory.
 enum Events {
     Inotify {
@@ -82,7 +85,7 @@ impl Watcher {
             | WatchMask::ONLYDIR;
         let mut watches = inotify.watches();
         let dir = watches.add(host_dir.pinned_path(), mask)?;
-        Ok((inotify.into_event_stream(vec![0; 16 * 1024])?, dir))
+        Ok((inotify.into_event_stream(vec![0; BUFFER])?, dir))
     }
 
     /// Keeps the view up to date until it is aborted. At `settled`, entries from before a removal
@@ -93,7 +96,9 @@ impl Watcher {
     /// would take quadratic time.
     pub(super) async fn run(mut self, shared: Arc<Shared>, mut settled: Option<Instant>) {
         let mut ending = EndingProcesses::default();
+        let mut pause = Pause::default();
         loop {
+            let waiting = Instant::now();
             let changes = tokio::select! {
                 changes = self.changes(&shared) => changes,
                 () = ending.due() => Ok(DirChanges::default()),
@@ -116,8 +121,32 @@ impl Watcher {
                 tokio::time::sleep(Duration::from_millis(100)).await;
                 ending.rescan = true;
             }
-            tokio::time::sleep(pause_after(began.elapsed())).await;
+            let pause = pause.after(began - waiting, began.elapsed());
+            self = self.pause(pause).await;
         }
+    }
+
+    /// Collects changes for this time. The runtime does not watch the events meanwhile: each one would wake it,
+    /// in every process of the domain.
+    async fn pause(self, pause: Duration) -> Self {
+        let events = match self.events {
+            Events::Inotify { events, dir } => {
+                let inotify = events.into_inotify();
+                tokio::time::sleep(pause).await;
+                match inotify.into_event_stream(vec![0; BUFFER]) {
+                    Ok(events) => Events::Inotify { events, dir },
+                    Err(error) => {
+                        tracing::warn!(error = %ErrorChain(&error), "no inotify events: polling the directory");
+                        Events::Polling(Poller::default())
+                    }
+                }
+            }
+            polling @ Events::Polling(_) => {
+                tokio::time::sleep(pause).await;
+                polling
+            }
+        };
+        Self { events }
     }
 
     /// Waits for at least one change, and returns all since the last call.
@@ -149,7 +178,7 @@ async fn next_events(
     let mut changes = DirChanges::default();
     poll_fn(|context| {
         // Bounded, so that other tasks can run.
-        for _ in 0..4096 {
+        for _ in 0..MOST_EVENTS {
             match Pin::new(&mut *events).poll_next(context) {
                 Poll::Ready(Some(event)) => {
                     let event = event?;
@@ -164,13 +193,18 @@ async fn next_events(
                 // The stream does not end.
                 Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
                 Poll::Pending if changes.is_empty() => return Poll::Pending,
-                Poll::Pending => break,
+                Poll::Pending => return Poll::Ready(Ok(std::mem::take(&mut changes))),
             }
         }
+        // The pause that follows drops events that the stream has read ahead.
+        changes.lost = true;
         Poll::Ready(Ok(std::mem::take(&mut changes)))
     })
     .await
 }
+
+/// Maximum number of events that are handled together.
+const MOST_EVENTS: usize = 4096;
 
 /// Interval between polls of the directory without inotify.
 const POLL_EVERY: Duration = Duration::from_millis(100);
@@ -212,7 +246,7 @@ impl Poller {
         for name in host_dir.names()? {
             match name {
                 Name::Process(id) => drop(processes.insert(id)),
-                Name::Entries(id) => drop(changes.wrote.insert(id)),
+                Name::Entries(_) | Name::Remote(_) => drop(changes.wrote.insert(name)),
                 _ => {}
             }
         }
@@ -240,19 +274,37 @@ impl Poller {
     }
 }
 
-/// Time to collect changes after a read of this duration. With many changes or little CPU time,
-/// reading leaves most of the time to the writers. A lookup of an unknown name does not wait for
-/// this pause.
-fn pause_after(reading: Duration) -> Duration {
+/// Time to collect changes after a read. With many changes or little CPU time, reading leaves most of the time
+/// to the writers. A lookup of an unknown name does not wait for this pause.
+#[derive(Debug)]
+struct Pause(Duration);
+
+impl Pause {
     const LEAST: Duration = Duration::from_millis(5);
-    const MOST: Duration = Duration::from_millis(100);
-    (reading * 8).clamp(LEAST, MOST)
+    const MOST: Duration = Duration::from_millis(200);
+
+    /// Returns the pause after a read of this duration, for which the watcher waited that long. While changes
+    /// follow each other, each pause is twice as long as the one before.
+    fn after(&mut self, waited: Duration, reading: Duration) -> Duration {
+        self.0 = match waited > self.0 {
+            true => Self::LEAST,
+            false => self.0 * 2,
+        };
+        self.0 = self.0.max(reading * 8).clamp(Self::LEAST, Self::MOST);
+        self.0
+    }
+}
+
+impl Default for Pause {
+    fn default() -> Self {
+        Self(Self::LEAST)
+    }
 }
 
 /// Collected changes, without duplicates.
 #[derive(Debug, Default)]
 struct DirChanges {
-    wrote: BTreeSet<Id>,
+    wrote: BTreeSet<Name>,
     ended: BTreeSet<Id>,
     sockets: bool,
     /// Whether events are missing, or the directory was removed or moved.
@@ -271,11 +323,15 @@ impl DirChanges {
             self.lost = true;
         }
         match name.and_then(Name::parse) {
-            Some(Name::Entries(_) | Name::Domain) if mask.contains(EventMask::DELETE) => {
+            Some(Name::Entries(_) | Name::Remote(_) | Name::Domain)
+                if mask.contains(EventMask::DELETE) =>
+            {
                 self.disturbed = true;
             }
-            Some(Name::Entries(id)) if mask.contains(EventMask::MOVED_TO) => {
-                self.wrote.insert(id);
+            Some(name @ (Name::Entries(_) | Name::Remote(_)))
+                if mask.contains(EventMask::MOVED_TO) =>
+            {
+                self.wrote.insert(name);
             }
             Some(Name::Process(id))
                 if mask.intersects(EventMask::CLOSE_WRITE | EventMask::DELETE) =>
@@ -320,8 +376,8 @@ fn handle(
     if changes.sockets {
         shared.find_sockets()?;
     }
-    for id in changes.wrote {
-        shared.process_wrote(id)?;
+    for name in changes.wrote {
+        shared.replaced(name)?;
     }
     for id in changes.ended {
         ending.add(id);
