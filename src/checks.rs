@@ -78,9 +78,11 @@ impl Rules {
         let monitor = Monitor::agent(Arc::clone(&self.library), agent);
         let monitor = monitor.with_limits(self.limits);
         directory.refresh();
+        let entries = directory.entries();
+        let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
         Checks(Some(Arc::new(Monitored {
             monitor: Mutex::new(monitor.with_policy(self.policy.clone())),
-            earlier: Mutex::new(Some(directory.entries())),
+            earlier: Mutex::new(Some(here.cloned().collect())),
             ids,
             enforce: self.check == Check::Enforce,
             answer: self.answer,
@@ -95,7 +97,7 @@ pub(crate) struct Checks(Option<Arc<Monitored>>);
 /// The monitor of one agent.
 struct Monitored {
     monitor: Mutex<Monitor>,
-    /// The entries of the directory at the registration of the agent. An agent that is not among them
+    /// The agents of this host at the registration of the agent. An agent of this host that is not among them
     /// cannot continue a conversation of an earlier registration. None if there was no earlier one.
     earlier: Mutex<Option<Arc<[Arc<Entry>]>>>,
     /// The beginning of the conversation ids that only this registration issues.

@@ -90,13 +90,6 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
             ),
         ),
         (
-            Box::new(HostError::Entry {
-                name: "arm".into(),
-                source: EntryError::Name(NameError::Empty),
-            }),
-            format!("cannot publish \"arm\": {name}"),
-        ),
-        (
             Box::new(RegisterError::Invalid(EntryError::Name(NameError::Empty))),
             format!("cannot register: {name}"),
         ),

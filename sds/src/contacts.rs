@@ -3,21 +3,23 @@
 //! A letter may arrive before the announcement of its sender, and on some networks the announcement
 //! never arrives. This back end makes it possible to answer such a sender for a limited time.
 
-use std::collections::HashSet;
+use std::collections::{HashSet, HashMap};
+use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, Principal};
 use parking_lot::Mutex;
 
 use crate::entry::{millis_of_time, time_of_millis};
+use crate::shares::Peer;
 use crate::table::Table;
 use crate::{Directory, Entry, EntryError, Mts, Reach, Role, Source, Subscriber};
 
 /// Agents of other hosts that sent a letter, each until its entry expires.
 ///
 /// Bounded: beyond [`ContactDirectory::MAX_CONTACTS`] the contact with the oldest last letter is
-/// evicted. A contact must not replace the entries of other back ends: merge this directory last,
+/// evicted, among those of the host with most contacts. A contact must not replace the entries of other back ends: merge this directory last,
 /// and drop a contact as soon as another back end has the agent ([`forget`](Self::forget)).
 #[derive(Debug)]
 pub struct ContactDirectory {
@@ -73,8 +75,10 @@ impl ContactDirectory {
         let mut heard = self.heard.lock();
         let before = heard.iter().position(|(other, _)| *other.name == *name);
         let known = before.map(|index| heard.remove(index));
-        if heard.len() >= Self::MAX_CONTACTS {
-            let (oldest, _) = heard.remove(0);
+        if heard.len() >= Self::MAX_CONTACTS
+            && let Some(index) = to_evict(&heard)
+        {
+            let (oldest, _) = heard.remove(index);
             self.table.release((), &oldest.name, oldest.incarnation);
         }
         let entry = Arc::new(entry);
@@ -118,6 +122,22 @@ impl ContactDirectory {
         });
         next
     }
+}
+
+/// Returns the index of the first contact of the host with most contacts.
+fn to_evict(contacts: &[(Arc<Entry>, Instant)]) -> Option<usize> {
+    let hosts = contacts
+        .iter()
+        .map(|(entry, _)| Peer::of(Principal::Unproved, &entry.locations));
+    let mut of_host: HashMap<Peer, (usize, usize)> = HashMap::new();
+    for (index, host) in hosts.enumerate() {
+        let (count, _) = of_host.entry(host).or_insert((0, index));
+        *count += 1;
+    }
+    let most = of_host
+        .into_values()
+        .max_by_key(|(count, first)| (*count, Reverse(*first)));
+    most.map(|(_, first)| first)
 }
 
 impl Default for ContactDirectory {
@@ -236,6 +256,17 @@ mod tests {
         }
         assert_eq!(contacts.entries().len(), ContactDirectory::MAX_CONTACTS);
         assert!(contacts.lookup("agent 0").is_none());
+        // The contacts of another host stay.
+        let other = "tcp://192.0.2.2:7788#00000000000000ab".parse().unwrap();
+        contacts.heard(now, "other", incarnation(1), other).unwrap();
+        for number in 0..ContactDirectory::MAX_CONTACTS as u64 {
+            let name = format!("later {number}");
+            contacts
+                .heard(now, &name, incarnation(number + 9999), location())
+                .unwrap();
+        }
+        assert_eq!(contacts.entries().len(), ContactDirectory::MAX_CONTACTS);
+        assert!(contacts.lookup("other").is_some());
         assert!(contacts.heard(now, "", incarnation(1), location()).is_err());
         assert!(
             contacts

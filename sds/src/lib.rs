@@ -42,6 +42,7 @@ mod name;
 mod query;
 mod reserved;
 mod resolve;
+mod shares;
 mod view;
 mod watch;
 

@@ -5,8 +5,8 @@ use std::sync::{Arc, OnceLock};
 
 use arc_swap::ArcSwapOption;
 use fipa_transport::{Incarnation, Mandate};
-use parking_lot::Mutex;
 
+use crate::view::KeptEntries;
 use crate::{
     Change, DeregisterError, Directory, Entry, Reach, RegisterError, Registration, Role, Source,
     Subscriber, View, Watch,
@@ -158,12 +158,16 @@ impl Directory for MergedDirectory {
     }
 }
 
+/// Number of entries that a merged view keeps. Most letters have the sender and the receiver of one of the
+/// letters before, and a lookup asks all views, which may be merged themselves.
+const KEPT: usize = 8;
+
 /// Several views that do not change, merged into one.
 struct Merged {
     views: Vec<Arc<dyn View>>,
     sorted: OnceLock<Arc<[Arc<Entry>]>>,
-    by_name: KeptEntries,
-    by_incarnation: KeptEntries,
+    by_name: KeptEntries<KEPT>,
+    by_incarnation: KeptEntries<KEPT>,
 }
 
 impl View for Merged {
@@ -195,32 +199,6 @@ impl View for Merged {
 
     fn mandate_of(&self, mts: Incarnation) -> Mandate {
         mandate(&self.views, mts)
-    }
-}
-
-/// The entries that lookups returned last. Most letters have the sender and the receiver of one of the
-/// letters before, and a lookup asks all views, which may be merged themselves.
-#[derive(Default)]
-struct KeptEntries([Mutex<Option<Arc<Entry>>>; 8]);
-
-impl KeptEntries {
-    /// Returns the kept entry that is the wanted one, or else the one that `find` returns, which is kept.
-    fn get_or(
-        &self,
-        hash: usize,
-        is_it: impl FnOnce(&Entry) -> bool,
-        find: impl FnOnce() -> Option<Arc<Entry>>,
-    ) -> Option<Arc<Entry>> {
-        let place = self.0.get(hash % self.0.len())?;
-        let kept = place.lock().clone();
-        if let Some(kept) = kept.filter(|kept| is_it(kept)) {
-            return Some(kept);
-        }
-        let found = find()?;
-        let replaced = place.lock().replace(Arc::clone(&found));
-        // Without the lock: a view may be the last owner of the entry.
-        drop(replaced);
-        Some(found)
     }
 }
 

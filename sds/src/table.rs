@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::hash::Hash;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
 
 use arc_swap::ArcSwap;
 use fipa_transport::Incarnation;
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 
 use crate::watch::Subscribers;
 use crate::{Change, Entry, Snapshot, Subscriber, View};
@@ -53,16 +53,14 @@ macro_rules! reads_its_table {
 /// the entry that [precedes](Entry::precedes) the others holds it, and the others take over when it
 /// leaves. Of equal entries the first claim holds the name. Proved origins come before all others, in
 /// the order in which they claimed the name.
-#[derive(Debug)]
 pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
     /// The holders of names for views, which do not wait for a large update.
-    published: ArcSwap<Snapshot>,
+    published: ArcSwap<Layers>,
     generation: AtomicU64,
     subscribers: Subscribers,
 }
 
-#[derive(Debug)]
 struct Index<O> {
     /// No list is empty; the first entry of a list holds the name.
     claims: HashMap<Arc<str>, Vec<(O, Arc<Entry>)>>,
@@ -71,6 +69,8 @@ struct Index<O> {
     is_proved: fn(&O) -> bool,
     /// The entries that hold their names. Copied for a change, because a view has them.
     holders: Arc<Snapshot>,
+    /// Entries that hold the names that no origin claims.
+    beneath: Option<Arc<dyn View>>,
     /// The latest name claimed by each origin of a single entry.
     #[cfg(feature = "mdns")]
     origins: HashMap<O, Arc<str>>,
@@ -89,6 +89,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
                 contested: BTreeSet::new(),
                 is_proved,
                 holders: Arc::default(),
+                beneath: None,
                 #[cfg(feature = "mdns")]
                 origins: HashMap::new(),
             }),
@@ -99,11 +100,17 @@ impl<O: Clone + Eq + Hash> Table<O> {
     }
 
     pub(crate) fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.index.read().holders.named(name)
+        self.layers().named(name)
     }
 
     pub(crate) fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.index.read().holders.registered(incarnation)
+        self.layers().registered(incarnation)
+    }
+
+    /// Returns the present entries, after an update that has begun.
+    fn layers(&self) -> Arc<Layers> {
+        let _index = self.index.read();
+        self.published.load_full()
     }
 
     /// Returns the entry that holds the name, and its origin.
@@ -112,9 +119,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
     }
 
     pub(crate) fn entries(&self) -> Arc<[Arc<Entry>]> {
-        // Sorted without the lock.
-        let holders = Arc::clone(&self.index.read().holders);
-        holders.all()
+        self.layers().all()
     }
 
     pub(crate) fn lost_agents(&self) -> Vec<Arc<Entry>> {
@@ -160,7 +165,40 @@ impl<O: Clone + Eq + Hash> Table<O> {
 
     /// Makes the entries visible to later views. Precedes the notifications of their changes.
     fn publish(&self, index: &Index<O>) {
-        self.published.store(Arc::clone(&index.holders));
+        self.published.store(Arc::new(Layers {
+            holders: Arc::clone(&index.holders),
+            beneath: index.beneath.clone(),
+            all: Mutex::default(),
+        }));
+    }
+
+    /// Replaces the entries that hold the names that no origin claims. Watchers are notified by
+    /// [`changed_beneath`](Self::changed_beneath).
+    pub(crate) fn set_beneath(&self, beneath: Arc<dyn View>) {
+        let mut index = self.index.write();
+        index.beneath = Some(beneath);
+        self.publish(&index);
+        self.touch();
+    }
+
+    /// Whether a watcher is to be notified of changes. A later watcher reads the entries that were set before
+    /// this call.
+    pub(crate) fn is_watched(&self) -> bool {
+        self.subscribers.any()
+    }
+
+    /// Notifies watchers of changes beneath the names that no origin claims. `None` if there are more changes than
+    /// a watch holds.
+    pub(crate) fn changed_beneath(&self, changes: Option<Vec<Change>>) {
+        let index = self.index.write();
+        match changes {
+            Some(mut changes) => {
+                let is_claimed = |name: &Arc<str>| index.claims.contains_key(name);
+                changes.retain(|change| !change.name().is_some_and(is_claimed));
+                self.changed(&index, changes);
+            }
+            None => self.notify(Change::Lagged),
+        }
     }
 
     /// Changes the generation, because data beside the entries changed.
@@ -288,8 +326,13 @@ impl<O: Eq> Index<O> {
         let before = self.holder(&name).cloned();
         self.set(origin, &name, entry);
         let after = self.holder(&name).cloned();
-        let change = Change::between(before.clone(), after.clone());
-        if change.is_some() {
+        let visible = match (&before, &after) {
+            (Some(_), Some(_)) => None,
+            _ => self.beneath.as_ref().and_then(|it| it.named(&name)),
+        };
+        let or_visible = |entry: &Option<Arc<Entry>>| entry.clone().or_else(|| visible.clone());
+        let change = Change::between(or_visible(&before), or_visible(&after));
+        if before != after {
             let is_proved = self.claims.get(&name).and_then(|claims| claims.first());
             let is_proved = is_proved.is_some_and(|(origin, _)| (self.is_proved)(origin));
             let after = after.map(|after| (after, is_proved));
@@ -337,6 +380,64 @@ impl<O: Eq> Index<O> {
         if !claims.is_empty() {
             self.claims.insert(name.clone(), claims);
         }
+    }
+}
+
+/// The entries that hold names, and those that hold the other names.
+#[derive(Default)]
+struct Layers {
+    holders: Arc<Snapshot>,
+    beneath: Option<Arc<dyn View>>,
+    /// The list of all entries while a caller has it. It may be large, so nothing else keeps it.
+    all: Mutex<Option<Weak<[Arc<Entry>]>>>,
+}
+
+impl View for Layers {
+    fn named(&self, name: &str) -> Option<Arc<Entry>> {
+        let holder = self.holders.named(name);
+        holder.or_else(|| self.beneath.as_ref()?.named(name))
+    }
+
+    fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        let holder = self.holders.registered(incarnation);
+        holder.or_else(|| {
+            let entry = self.beneath.as_ref()?.registered(incarnation)?;
+            self.holders.named(&entry.name).is_none().then_some(entry)
+        })
+    }
+
+    fn all(&self) -> Arc<[Arc<Entry>]> {
+        let holders = self.holders.all();
+        let Some(beneath) = &self.beneath else {
+            return holders;
+        };
+        let mut kept = self.all.lock();
+        if let Some(all) = kept.as_ref().and_then(Weak::upgrade) {
+            return all;
+        }
+        let beneath = beneath.all();
+        let others = beneath
+            .iter()
+            .filter(|entry| self.holders.named(&entry.name).is_none());
+        let mut all: Vec<Arc<Entry>> = holders.iter().chain(others).cloned().collect();
+        // Both parts are sorted, of which this takes advantage.
+        all.sort_by(|a, b| a.name.cmp(&b.name));
+        let all = all.into();
+        *kept = Some(Arc::downgrade(&all));
+        all
+    }
+
+    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+        self.holders.lost(name)
+    }
+}
+
+impl<O> std::fmt::Debug for Table<O> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let index = self.index.read();
+        f.debug_struct("Table")
+            .field("names", &index.claims.len())
+            .finish_non_exhaustive()
     }
 }
 

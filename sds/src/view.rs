@@ -3,14 +3,15 @@
 use std::sync::{Arc, OnceLock};
 
 use fipa_transport::{Incarnation, Mandate};
+use parking_lot::Mutex;
 use rpds::{HashTrieMapSync, RedBlackTreeMapSync};
 
 use crate::{Directory, Entry};
 
 /// The entries of a directory, for readers that must not wait.
 ///
-/// No method reads files or waits for another process. [`Directory::view`] returns a view that does
-/// not change. A directory is also a view of itself, which changes with it.
+/// No method waits for another process. An entry of an agent of another host may be read from a file that
+/// is open and does not change. [`Directory::view`] returns a view that does not change. A directory is also a view of itself, which changes with it.
 pub trait View: Send + Sync {
     /// Returns the entry of exactly this name.
     fn named(&self, name: &str) -> Option<Arc<Entry>>;
@@ -221,5 +222,35 @@ impl View for Snapshot {
             entries.into()
         });
         Arc::clone(sorted)
+    }
+}
+
+/// The entries that lookups returned last, each at the place of its hash.
+pub(crate) struct KeptEntries<const COUNT: usize>([Mutex<Option<Arc<Entry>>>; COUNT]);
+
+impl<const COUNT: usize> Default for KeptEntries<COUNT> {
+    fn default() -> Self {
+        Self(std::array::from_fn(|_| Mutex::default()))
+    }
+}
+
+impl<const COUNT: usize> KeptEntries<COUNT> {
+    /// Returns the kept entry that is the wanted one, or else the one that `find` returns, which is kept.
+    pub(crate) fn get_or(
+        &self,
+        hash: usize,
+        is_it: impl FnOnce(&Entry) -> bool,
+        find: impl FnOnce() -> Option<Arc<Entry>>,
+    ) -> Option<Arc<Entry>> {
+        let place = self.0.get(hash % COUNT)?;
+        let kept = place.lock().clone();
+        if let Some(kept) = kept.filter(|kept| is_it(kept)) {
+            return Some(kept);
+        }
+        let found = find()?;
+        let replaced = place.lock().replace(Arc::clone(&found));
+        // Without the lock: a view may be the last owner of the entry.
+        drop(replaced);
+        Some(found)
     }
 }

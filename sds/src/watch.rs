@@ -228,6 +228,11 @@ impl Subscribers {
         subscribers.push(subscriber.clone());
     }
 
+    pub(crate) fn any(&self) -> bool {
+        let subscribers = self.subscribers.lock();
+        subscribers.iter().any(|one| !one.changes.is_closed())
+    }
+
     pub(crate) fn tell(&self, change: &Change) {
         let mut subscribers = self.subscribers.lock();
         subscribers.retain(|subscriber| subscriber.tell(change.clone()));

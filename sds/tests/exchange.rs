@@ -784,18 +784,18 @@ fn the_agents_of_a_gateway_are_bounded_also_by_changes() {
     for part in all.chunks(1000) {
         change(&mut exchange, part, &[]).unwrap();
     }
-    let too_many = |told| matches!(told, Err(ExchangeError::TooMany));
-    assert!(too_many(change(
-        &mut exchange,
-        &[Exchange::MAX_AGENTS],
-        &[]
-    )));
+    let directory = exchange.directory();
+    let kept = directory.entries().len();
+    // The names are charged, too.
+    assert!(
+        (Exchange::MAX_AGENTS * 19 / 20..Exchange::MAX_AGENTS).contains(&kept),
+        "{kept}"
+    );
     // One that leaves and returns, one that is named twice, and unknown ones.
     change(&mut exchange, &[3, 4, 4], &[3, 3, 1_000_000]).unwrap();
-    assert!(too_many(change(&mut exchange, &[3, 20_000], &[3])));
+    assert_eq!(directory.entries().len(), kept);
     change(&mut exchange, &[20_000], &[5, 1_000_000]).unwrap();
-    let directory = exchange.directory();
-    assert_eq!(directory.entries().len(), Exchange::MAX_AGENTS);
+    assert_eq!(directory.entries().len(), kept);
     assert!(directory.known("agent_5").is_none());
     assert!(directory.known("agent_3").is_some());
     assert!(directory.known("agent_20000").is_some());
@@ -1044,16 +1044,19 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
             r#"{{"version":1,"tell":{{"full":{{"version":9,"first":{first},"last":{last},"agents":[{agents}]}}}}}}"#
         )
     };
-    told(&mut exchange, &part(0, false)).unwrap();
-    told(&mut exchange, &part(1, false)).unwrap();
-    assert!(matches!(
-        told(&mut exchange, &part(2, true)),
-        Err(ExchangeError::TooMany)
-    ));
-    assert!(exchange.directory().entries().is_empty());
-    // Its next changes do not fit the stored state, and all entries are requested.
+    for (number, last) in [(0, false), (1, false), (2, true)] {
+        told(&mut exchange, &part(number, last)).unwrap();
+    }
+    let kept = exchange.directory().entries();
+    assert!(
+        (4500..=Exchange::MAX_AGENTS).contains(&kept.len()),
+        "{}",
+        kept.len()
+    );
+    assert!(kept.iter().all(|entry| entry.name.starts_with("agent 0 ")));
+    // A part of an unknown list does not fit the stored state, and all entries are requested.
     told(&mut exchange, &part(3, true)).unwrap();
-    assert!(exchange.directory().entries().is_empty());
+    assert_eq!(exchange.directory().entries().len(), kept.len());
     let now = Instant::now() + Duration::from_millis(1);
     let (to, question) = exchange.poll_letter(now).unwrap();
     assert_eq!(to, Incarnation::from_u64(7));
@@ -1085,6 +1088,161 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
     assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
 }
 
+/// Returns the letters with all agents of a gateway: `count` names that begin with `prefix`, with descriptions of
+/// this length.
+fn full(prefix: &str, count: usize, description: usize) -> Vec<String> {
+    let names: Vec<String> = (0..count)
+        .map(|number| format!("{prefix}{number}"))
+        .collect();
+    let description = "d".repeat(description);
+    let parts = names.chunks(300).collect::<Vec<_>>();
+    let letter = |(number, part): (usize, &&[String])| {
+        let agents = part.iter().map(|name| {
+            let id: u64 = name.bytes().fold(7, |id, byte| id * 31 % 0x7fff_ffff_ffff + u64::from(byte));
+            format!(
+                r#"{{"name":"{name}","id":"{id:016x}","description":"{description}","registered":1}}"#
+            )
+        });
+        let agents: Vec<String> = agents.collect();
+        let (first, last) = (number == 0, number + 1 == parts.len());
+        format!(
+            r#"{{"version":1,"tell":{{"full":{{"version":1,"first":{first},"last":{last},"agents":[{}]}}}}}}"#,
+            agents.join(",")
+        )
+    };
+    parts.iter().enumerate().map(letter).collect()
+}
+
+/// Neighbors at these hosts, with incarnations from 1.
+fn present(hosts: impl IntoIterator<Item = usize>) -> Vec<Present> {
+    let present = hosts.into_iter().enumerate().map(|(number, host)| {
+        let incarnation = Incarnation::from_u64(number as u64 + 1);
+        let at = format!("tcp://10.0.{}.{}:{}", host / 256, host % 256, number + 1);
+        let at = at
+            .parse::<Location>()
+            .unwrap()
+            .with_incarnation(incarnation);
+        Present::unproved(Mts::new("x", incarnation), vec![at])
+    });
+    present.collect()
+}
+
+fn count(exchange: &Exchange, prefix: &str) -> usize {
+    let entries = exchange.directory().entries();
+    entries
+        .iter()
+        .filter(|it| it.name.starts_with(prefix))
+        .count()
+}
+
+fn tell_all(exchange: &mut Exchange, from: u64, letters: &[String]) {
+    for letter in letters {
+        let from = Incarnation::from_u64(from);
+        exchange
+            .handle_letter(Instant::now(), from, letter.as_bytes())
+            .unwrap();
+    }
+}
+
+#[test]
+fn peers_with_the_longest_lists_are_cut_and_a_small_one_is_complete() {
+    let mut exchange = Exchange::new(0);
+    // Twelve hosts, and four more gateways at the last of them.
+    let now = Instant::now();
+    exchange.handle_neighbours(now, &present((0..12).chain([11; 4])));
+    for liar in 2..=16 {
+        tell_all(
+            &mut exchange,
+            liar,
+            &full(&format!("liar-{liar}-"), 3000, 1000),
+        );
+    }
+    tell_all(&mut exchange, 1, &full("honest-", 50, 100));
+    assert_eq!(count(&exchange, "honest-"), 50);
+    // Eleven hosts share what is left.
+    let lists: Vec<usize> = (2..=16)
+        .map(|it| count(&exchange, &format!("liar-{it}-")))
+        .collect();
+    let of_host = lists[0];
+    assert!((900..1100).contains(&of_host), "{lists:?}");
+    assert!(
+        lists[..10].iter().all(|it| it.abs_diff(of_host) <= 1),
+        "{lists:?}"
+    );
+    let at_last: usize = lists[10..].iter().sum();
+    assert!(at_last.abs_diff(of_host) <= 5, "{lists:?}");
+    // Changes are bounded as well, and the honest agents stay.
+    let more: Vec<String> = full("more-", 300, 1000);
+    let changes = more[0].replace(
+        r#""full":{"version":1,"first":true,"last":true,"#,
+        r#""changes":{"from":1,"to":2,"#,
+    );
+    tell_all(&mut exchange, 5, &[changes]);
+    assert_eq!(count(&exchange, "honest-"), 50);
+    let after = count(&exchange, "liar-5-") + count(&exchange, "more-");
+    assert!(after <= of_host + 10, "{after} after {of_host}");
+    // A list that was cut is requested again when others left.
+    let later = now + Duration::from_secs(60);
+    exchange.handle_neighbours(later, &present([0, 1, 2]));
+    while let Some((to, _)) = exchange.poll_letter(later) {
+        exchange.handle_sent(later, to, true);
+    }
+    exchange.handle_timeout(later + Exchange::MEMORY);
+    exchange.handle_timeout(later + Exchange::MEMORY);
+    let asked = |exchange: &mut Exchange| {
+        let mut asked = Vec::new();
+        let end = later + Exchange::MEMORY;
+        while let Some((to, letter)) = exchange.poll_letter(end) {
+            if letter == br#"{"version":1,"tell":"again"}"# {
+                asked.push(to.as_u64());
+            }
+            exchange.handle_sent(end, to, true);
+        }
+        asked.sort_unstable();
+        asked
+    };
+    assert_eq!(asked(&mut exchange), [2, 3]);
+    tell_all(&mut exchange, 2, &full("liar-2-", 3000, 1000));
+    assert!(count(&exchange, "liar-2-") > 1300);
+    exchange.handle_timeout(later + Duration::from_secs(60));
+    assert_eq!(count(&exchange, "honest-"), 50);
+    assert_eq!(asked(&mut exchange), [] as [u64; 0]);
+}
+
+#[test]
+fn gateways_of_one_host_keep_no_other_host_from_being_a_neighbor() {
+    let mut exchange = Exchange::new(0);
+    let hosts = std::iter::repeat_n(1, Exchange::MAX_NEIGHBOURS).chain([2, 3, 2]);
+    let all = present(hosts);
+    let (crowd, others) = all.split_at(Exchange::MAX_NEIGHBOURS);
+    exchange.handle_neighbours(Instant::now(), crowd);
+    tell_all(&mut exchange, 1, &full("crowd-", 10, 0));
+    for _ in 0..3 {
+        exchange.handle_neighbours(Instant::now(), &all);
+        let (known, _) = exchange.goodbye();
+        assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
+        assert!(others.iter().all(|it| known.contains(&it.mts.incarnation)));
+    }
+    assert_eq!(count(&exchange, "crowd-"), 10);
+}
+
+#[test]
+fn incomplete_lists_of_many_neighbors_are_bounded() {
+    let mut exchange = Exchange::new(0);
+    exchange.handle_neighbours(Instant::now(), &present(0..20));
+    let never_ends: Vec<String> = full("x", 3000, 1000);
+    for liar in 2..=20 {
+        tell_all(&mut exchange, liar, &never_ends[..9]);
+    }
+    let honest = full("honest-", 700, 100);
+    tell_all(&mut exchange, 1, &honest[..1]);
+    for liar in 2..=20 {
+        tell_all(&mut exchange, liar, &never_ends[..9]);
+    }
+    tell_all(&mut exchange, 1, &honest[1..]);
+    assert_eq!(count(&exchange, ""), 700);
+}
+
 /// Returns a letter with all agents: their names, and the values of their key `df`.
 fn full_with_df(agents: &[(String, String)]) -> String {
     let agents: Vec<String> = agents
@@ -1106,18 +1264,18 @@ fn full_with_df(agents: &[(String, String)]) -> String {
 #[test]
 fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
     let mut exchange = with_neighbour();
-    let many: Vec<(String, String)> = (0..9000)
+    let many: Vec<(String, String)> = (0..4500)
         .map(|number| (format!("a{number}"), r#"{"entry":"lifting"}"#.to_owned()))
         .collect();
     told(&mut exchange, &full_with_df(&many)).unwrap();
     let directory = exchange.directory();
-    assert_eq!(directory.entries().len(), 9000);
+    assert_eq!(directory.entries().len(), 4500);
     assert_eq!(directory.df_entries().len(), Exchange::MAX_DF_ENTRIES);
     // In changes, too.
     for from in 1..100 {
         let agents: Vec<String> = (0..90)
             .map(|number| {
-                let name = from * 90 + number;
+                let name = (from * 90 + number) % 4500;
                 format!(
                     r#"{{"name":"a{name}","id":"{:016x}","registered":1,"df":{{"entry":"{}"}}}}"#,
                     name + 100,
@@ -1136,9 +1294,7 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
         let bytes: usize = entries.iter().map(|entry| entry.text.len()).sum();
         assert!(bytes <= Exchange::MAX_DF_BYTES, "{bytes}");
     }
-    // 100,000 entries are more agents than a neighbor may have: what is stored stays.
-    let before = directory.df_entries().len();
-    let mut refused = 0;
+    // 100,000 entries are more agents than a neighbor may have.
     for part in 0..12 {
         let agents: Vec<_> = (0..9000)
             .map(|number| (format!("{part}.{number}"), r#"{"entry":""}"#.to_owned()))
@@ -1146,15 +1302,12 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
         let letter = full_with_df(&agents)
             .replace(r#""first":true"#, &format!(r#""first":{}"#, part == 0))
             .replace(r#""last":true"#, &format!(r#""last":{}"#, part == 11));
-        match told(&mut exchange, &letter) {
-            Ok(()) => {}
-            Err(ExchangeError::TooMany) => refused += 1,
-            Err(error) => panic!("{error}"),
-        }
+        told(&mut exchange, &letter).unwrap();
     }
-    assert!(refused > 0);
-    assert_eq!(directory.df_entries().len(), before);
-    assert!(!directory.df_entries().is_empty());
+    assert!(directory.entries().len() <= Exchange::MAX_AGENTS);
+    let entries = directory.df_entries();
+    assert!((1..=Exchange::MAX_DF_ENTRIES).contains(&entries.len()));
+    assert!(entries.iter().all(|df| directory.known(&df.name).is_some()));
     exchange.handle_neighbours(Instant::now(), &[]);
     exchange.handle_timeout(Instant::now() + Exchange::MEMORY);
     assert!(directory.df_entries().is_empty());

@@ -595,7 +595,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         reach: Reach::Local,
         role: Role::Agent,
     };
-    let denied = here.publish_remote(vec![entry.clone()], Vec::new());
+    let denied = here.publish_remote(&[Arc::new(entry.clone())], &[]);
     assert!(matches!(denied, Err(HostError::NoGateway)));
 
     let gateway = HostDirectory::open(HostConfig {
@@ -610,7 +610,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         .mts
         .incarnation;
     gateway
-        .publish_remote(vec![entry.clone()], Vec::new())
+        .publish_remote(&[Arc::new(entry.clone())], &[])
         .unwrap();
     let found = here.lookup("camera").unwrap();
     let expected = Entry {
@@ -634,7 +634,9 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         ..entry
     };
     let lost = vec![Arc::new(expected.clone())];
-    gateway.publish_remote(vec![impostor], lost).unwrap();
+    gateway
+        .publish_remote(&[Arc::new(impostor)], &lost)
+        .unwrap();
     let third = open(&dir);
     assert_eq!(third.lookup("arm").unwrap().incarnation, local.incarnation);
     until_some_async("camera is withdrawn", || {
@@ -864,7 +866,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         reach: Reach::Local,
         role: Role::Agent,
     };
-    gateway.publish_remote(vec![contact], Vec::new()).unwrap();
+    gateway.publish_remote(&[Arc::new(contact)], &[]).unwrap();
     assert_eq!(here.lookup("rover").unwrap().source, Source::Contact);
 
     let rover = here.register(registration("rover")).unwrap();
@@ -897,10 +899,239 @@ async fn changes_during_the_removal_of_the_directory_are_written_afterwards() {
         name: "far".into(),
         ..Entry::clone(&entry)
     };
-    gateway.publish_remote(vec![remote], Vec::new()).unwrap();
+    gateway.publish_remote(&[Arc::new(remote)], &[]).unwrap();
     gateway.deregister("arm", arm.incarnation).unwrap();
     assert!(gateway.rejoin().unwrap());
     let newcomer = open(&dir);
     assert!(newcomer.lookup("far").is_some());
     assert!(newcomer.lookup("arm").is_none());
+}
+
+/// Returns an agent at this gateway.
+fn remote(gateway: u64, number: u64, description: &str) -> Arc<Entry> {
+    Arc::new(Entry {
+        name: format!("{gateway}-agent-{number}").into(),
+        agent_type: String::new(),
+        incarnation: Incarnation::from_u64(gateway * 100_000 + number),
+        locations: vec!["shm://0123456789abcdef#0123456789abcdef".parse().unwrap()],
+        mts: Mts::new("theirs", Incarnation::from_u64(gateway)),
+        description: description.to_owned(),
+        registered: std::time::UNIX_EPOCH,
+        source: Source::Exchange,
+        reach: Reach::Local,
+        role: Role::Agent,
+    })
+}
+
+#[tokio::test]
+async fn a_gateway_with_too_many_agents_hides_no_agent_of_others() {
+    let (_parent, dir) = fresh_dir();
+    let gateway = HostConfig {
+        gateway: true,
+        ..config(&dir)
+    };
+    let gateway = HostDirectory::open(gateway).unwrap();
+    let here = open(&dir);
+    let quoted = "\"".repeat(Entry::MAX_DESCRIPTION);
+    let liars = (1..=4).flat_map(|liar| (0..10_000).map(move |number| (liar, number)));
+    let mut all: Vec<Arc<Entry>> = liars
+        .map(|(liar, number)| remote(liar, number, &quoted))
+        .collect();
+    all.extend((0..50).map(|number| remote(9, number, "honest")));
+    // An invalid entry is left out alone.
+    all.push(remote(8, 0, "two\nlines"));
+    all.push(remote(8, 1, "one line"));
+    gateway.publish_remote(&all, &[]).unwrap();
+    here.refresh();
+    let entries = here.entries();
+    let of = |gateway: u64| {
+        let of = |entry: &&Arc<Entry>| entry.mts.incarnation == Incarnation::from_u64(gateway);
+        entries.iter().filter(of).count()
+    };
+    assert_eq!((of(9), of(8)), (50, 1));
+    let liars = [of(1), of(2), of(3), of(4)];
+    assert!(
+        liars.iter().all(|liar| (5_000..10_000).contains(liar)),
+        "{liars:?}"
+    );
+    let largest = std::fs::read_dir(&dir).unwrap();
+    let largest = largest
+        .map(|file| file.unwrap().metadata().unwrap().len())
+        .max();
+    assert!(largest.unwrap() <= 64 << 20, "{largest:?}");
+    // The gateway can still register agents of its own.
+    gateway.register(registration("own")).unwrap();
+    assert!(here.lookup("own").is_some());
+}
+
+/// A process that is behind by more changes than the directory remembers reads all files.
+#[tokio::test]
+async fn a_process_that_is_far_behind_finds_every_agent() {
+    let (_parent, dir) = fresh_dir();
+    let here = open(&dir);
+    let other = open(&dir);
+    let third = open(&dir);
+    third.register(registration("third")).unwrap();
+    for number in 0..600 {
+        let name = format!("agent-{}", number % 7);
+        let incarnation = Incarnation::from_u64(number + 1);
+        let mut agent = registration(&name);
+        agent.incarnation = incarnation;
+        other.register(agent).unwrap();
+        if number + 7 < 600 {
+            other.deregister(&name, incarnation).unwrap();
+        }
+    }
+    let expected: Vec<String> = (0..7).map(|number| format!("agent-{number}")).collect();
+    for name in expected.iter().map(String::as_str).chain(["third"]) {
+        assert!(here.lookup(name).is_some(), "{name}");
+    }
+}
+
+/// Returns the next changes of a watch, until one concerns this name.
+async fn changes_until(watch: &mut fipa_sds::Watch, name: &str) -> Vec<Change> {
+    let mut changes = Vec::new();
+    loop {
+        let change = next(watch).await;
+        let singles = change.single();
+        let is_last = singles.iter().any(|it| match it {
+            Change::Joined(entry) | Change::Left(entry) | Change::Changed { after: entry, .. } => {
+                *entry.name == *name
+            }
+            _ => false,
+        });
+        changes.extend(singles.to_vec());
+        if is_last {
+            return changes;
+        }
+    }
+}
+
+/// Returns the kinds of the changes, and the names that they concern.
+fn kinds(changes: &[Change]) -> Vec<String> {
+    let mut kinds: Vec<String> = changes
+        .iter()
+        .map(|change| match change {
+            Change::Joined(entry) => format!("+{}", entry.name),
+            Change::Left(entry) => format!("-{}", entry.name),
+            Change::Changed { before, after } => {
+                format!(
+                    "{}>{} {}",
+                    before.description, after.description, after.name
+                )
+            }
+            other => format!("{other:?}"),
+        })
+        .collect();
+    kinds.sort();
+    kinds
+}
+
+#[tokio::test]
+async fn watchers_receive_the_changes_of_agents_of_other_hosts() {
+    let (_parent, dir) = fresh_dir();
+    let gateway = HostConfig {
+        gateway: true,
+        ..config(&dir)
+    };
+    let gateway = HostDirectory::open(gateway).unwrap();
+    let here = open(&dir);
+    let mut watch = here.watch();
+    let all: Vec<Arc<Entry>> = (0..5).map(|number| remote(2, number, "old")).collect();
+    let end = |number| remote(3, number, "end");
+    let publish = |agents: &[Arc<Entry>], ended| {
+        let agents: Vec<Arc<Entry>> = agents.iter().cloned().chain([end(ended)]).collect();
+        gateway.publish_remote(&agents, &[]).unwrap();
+    };
+    publish(&all, 1);
+    let changes = changes_until(&mut watch, "3-agent-1").await;
+    assert_eq!(changes.len(), 6, "{changes:?}");
+    let view = here.view();
+    let changed = [
+        remote(2, 0, "old"),
+        remote(2, 1, "new"),
+        remote(2, 7, "old"),
+    ];
+    publish(&changed, 2);
+    let changes = changes_until(&mut watch, "3-agent-2").await;
+    let expected = [
+        "+2-agent-7",
+        "+3-agent-2",
+        "-2-agent-2",
+        "-2-agent-3",
+        "-2-agent-4",
+        "-3-agent-1",
+        "old>new 2-agent-1",
+    ];
+    assert_eq!(kinds(&changes), expected);
+    // A view still has the agents of its time.
+    assert_eq!(view.named("2-agent-1").unwrap().description, "old");
+    assert_eq!(view.all().len(), 6);
+    assert!(here.known("2-agent-4").is_none());
+    assert_eq!(here.entries().len(), 4);
+    let found = here.by_incarnation(changed[2].incarnation).unwrap();
+    assert_eq!(&*found.name, "2-agent-7");
+
+    // An agent of this host hides one of another host of its name.
+    let mut local = registration("2-agent-7");
+    local.description = "local".to_owned();
+    let other = open(&dir);
+    gateway.publish_remote(&[end(3)], &[]).unwrap();
+    changes_until(&mut watch, "3-agent-3").await;
+    other.register(local.clone()).unwrap();
+    here.refresh();
+    publish(&changed, 9);
+    let changes = changes_until(&mut watch, "3-agent-9").await;
+    let of_name = |change: &&Change| match change {
+        Change::Joined(entry) | Change::Left(entry) | Change::Changed { after: entry, .. } => {
+            *entry.name == *"2-agent-7"
+        }
+        _ => false,
+    };
+    let of_name: Vec<&Change> = changes.iter().filter(of_name).collect();
+    assert!(
+        matches!(&*of_name, [Change::Left(_), Change::Joined(entry)] if entry.description == "local")
+            || matches!(&*of_name, [Change::Joined(entry)] if entry.description == "local"),
+        "{changes:?}"
+    );
+    assert_eq!(here.known("2-agent-7").unwrap().description, "local");
+    assert!(here.known_incarnation(changed[2].incarnation).is_none());
+    assert_eq!(here.entries().len(), 4);
+    other.deregister("2-agent-7", local.incarnation).unwrap();
+    let changes = changes_until(&mut watch, "2-agent-7").await;
+    assert_eq!(kinds(&changes), ["local>old 2-agent-7"]);
+    assert_eq!(here.known("2-agent-7").unwrap().description, "old");
+    // More changes than a watch holds are reported as one.
+    let many: Vec<Arc<Entry>> = (0..2000).map(|number| remote(4, number, "")).collect();
+    gateway.publish_remote(&many, &[]).unwrap();
+    assert_eq!(next(&mut watch).await, Change::Lagged);
+    assert_eq!(here.entries().len(), 2000);
+    drop(gateway);
+    assert_eq!(next(&mut watch).await, Change::Lagged);
+    assert_eq!(here.entries().len(), 0);
+}
+
+#[tokio::test]
+async fn of_several_agents_with_one_incarnation_the_last_one_published_has_it() {
+    let (_parent, dir) = fresh_dir();
+    let gateway = HostConfig {
+        gateway: true,
+        ..config(&dir)
+    };
+    let gateway = HostDirectory::open(gateway).unwrap();
+    let here = open(&dir);
+    let of_same = |name: &str| {
+        Arc::new(Entry {
+            name: name.into(),
+            ..Entry::clone(&remote(2, 5, ""))
+        })
+    };
+    let claims = [of_same("a"), of_same("c"), of_same("b")];
+    gateway.publish_remote(&claims, &[]).unwrap();
+    let found = here.by_incarnation(claims[0].incarnation).unwrap();
+    assert_eq!(&*found.name, "b");
+    for name in ["a", "b", "c"] {
+        assert_eq!(&*here.known(name).unwrap().name, name);
+    }
+    assert_eq!(HostDirectory::peek(&dir).unwrap().len(), 3);
 }

@@ -55,21 +55,27 @@ impl Publisher {
     pub(super) fn publish(&self) {
         let locations = self.service.locations();
         let (heard, known) = (self.contacts.entries(), self.known.entries());
-        // Of two entries with one name the later is used: that of a directory, not of a contact.
-        let all = heard.iter().chain(known.iter());
+        let is_proved = |entry: &&Arc<Entry>| {
+            let mandate = self.known.mandate(entry.mts.incarnation);
+            mandate.is_proved()
+        };
+        let (proved, unproved): (Vec<_>, Vec<_>) = known.iter().partition(is_proved);
+        // The last entry holds a name and a registration: that of a directory, not of a contact, and a
+        // proved one.
+        let all = heard.iter().chain(unproved).chain(proved);
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
             .map(|entry| match self.is_unsupported(entry) {
                 // Its own locations show the reason why letters cannot reach it.
-                true => Entry::clone(entry),
-                false => Entry {
+                true => Arc::clone(entry),
+                false => Arc::new(Entry {
                     locations: locations.clone(),
                     ..Entry::clone(entry)
-                },
+                }),
             });
-        let published = self
-            .host
-            .publish_remote(through_here.collect(), self.known.lost_agents());
+        let through_here: Vec<Arc<Entry>> = through_here.collect();
+        let lost = self.known.lost_agents();
+        let published = self.host.publish_remote(&through_here, &lost);
         match published {
             // A gateway that closes publishes nothing.
             Ok(()) | Err(HostError::Closed) => {}

@@ -1,6 +1,6 @@
 //! The back end with the entries that neighbors sent.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
@@ -8,8 +8,9 @@ use fipa_transport::{Incarnation, Location, Mandate, Principal};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
+use super::Agents;
 use super::df::{DfEntries, DfEntry, ReceivedDf};
-use super::{Agents, Exchange, ExchangeError};
+use crate::shares::{self, Peer};
 use crate::table::Table;
 use crate::{Directory, Entry, Role, Subscriber, View};
 
@@ -23,11 +24,11 @@ pub struct ExchangeDirectory {
     /// Mandates of the neighbors with certified links.
     mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
     /// Agents of each gateway. The lock is held while the table is updated.
-    agents_of: Mutex<HashMap<Incarnation, Agents>>,
-    /// The gateways among `agents_of`, for views, which do not wait for an update. A gateway is one of them
+    lists: Mutex<HashMap<Incarnation, AgentList>>,
+    /// The gateways among `lists`, for views, which do not wait for an update. A gateway is one of them
     /// only while the table has its entries.
     gateways: ArcSwap<HashSet<Incarnation>>,
-    /// DF entries of these agents. Locked after `agents_of`.
+    /// DF entries of these agents. Locked after `lists`.
     df: Mutex<ReceivedDf>,
     df_changed: Notify,
 }
@@ -37,7 +38,7 @@ impl Default for ExchangeDirectory {
         Self {
             table: Table::proved_by(|origin| origin.is_proved),
             mandates: ArcSwap::default(),
-            agents_of: Mutex::default(),
+            lists: Mutex::default(),
             gateways: ArcSwap::default(),
             df: Mutex::default(),
             df_changed: Notify::new(),
@@ -54,6 +55,80 @@ struct Origin {
 }
 
 type Update = (Origin, Arc<str>, Option<Arc<Entry>>);
+
+/// The gateway that sends a letter.
+#[derive(Debug, Clone)]
+pub(super) struct Sender {
+    pub(super) gateway: Incarnation,
+    pub(super) principal: Principal,
+    pub(super) peer: Peer,
+}
+
+/// The agents of one gateway. Its [share](shares) bounds them.
+#[derive(Debug)]
+pub(super) struct AgentList {
+    sender: Sender,
+    agents: Agents,
+    /// The charged bytes of the agents.
+    charged: usize,
+    /// Whether agents are missing for lack of room.
+    is_cut: bool,
+}
+
+impl AgentList {
+    pub(super) fn new(sender: Sender) -> Self {
+        Self {
+            sender,
+            agents: Agents::new(),
+            charged: 0,
+            is_cut: false,
+        }
+    }
+
+    pub(super) fn charged(&self) -> usize {
+        self.charged
+    }
+
+    pub(super) fn insert(&mut self, entry: Arc<Entry>) {
+        self.charged += shares::charge(&entry);
+        if let Some(before) = self.agents.insert(Arc::clone(&entry.name), entry) {
+            self.charged -= shares::charge(&before);
+        }
+    }
+
+    fn remove(&mut self, name: &str) -> Option<Arc<str>> {
+        let (name, before) = self.agents.remove_entry(name)?;
+        self.charged -= shares::charge(&before);
+        Some(name)
+    }
+
+    /// Removes the last agents by name until the others fit. Returns the names of the removed ones.
+    pub(super) fn cut(&mut self, most: usize) -> Vec<Arc<str>> {
+        let mut removed = Vec::new();
+        while self.charged > most
+            && let Some((name, before)) = self.agents.pop_last()
+        {
+            self.charged -= shares::charge(&before);
+            self.is_cut = true;
+            removed.push(name);
+        }
+        removed
+    }
+}
+
+fn is_listed(lists: &HashMap<Incarnation, AgentList>, gateway: Incarnation, name: &str) -> bool {
+    let list = lists.get(&gateway);
+    list.is_some_and(|list| list.agents.contains_key(name))
+}
+
+/// Returns the bytes that each list may take.
+fn allowances<'a>(
+    lists: impl IntoIterator<Item = (&'a Incarnation, (&'a Peer, usize))>,
+) -> HashMap<Incarnation, usize> {
+    let (gateways, sizes): (Vec<Incarnation>, Vec<_>) = lists.into_iter().unzip();
+    let allowed = shares::allowances(&sizes, shares::MAX_OF_PEER, shares::MAX_TOTAL);
+    gateways.into_iter().zip(allowed).collect()
+}
 
 impl ExchangeDirectory {
     /// Maximum number of pairs that [`contested`](Self::contested) returns.
@@ -133,76 +208,101 @@ impl ExchangeDirectory {
         }
     }
 
-    /// Replaces all agents of the gateway, and their DF entries.
-    pub(super) fn replace(
-        &self,
-        (gateway, principal): (Incarnation, Principal),
-        entries: Agents,
-        df: DfEntries,
-    ) -> Result<(), ExchangeError> {
+    /// Replaces all agents of the gateway, and their DF entries. Agents beyond the shares of their peers
+    /// are left out.
+    pub(super) fn replace(&self, list: AgentList, mut df: DfEntries) {
+        let Sender {
+            gateway, principal, ..
+        } = list.sender;
         let origin = self.origin(gateway);
-        let mut agents_of = self.agents_of.lock();
-        let others = agents_of.iter().filter(|(other, _)| **other != gateway);
-        let total: usize = others.map(|(_, entries)| entries.len()).sum();
-        if total + entries.len() > Exchange::MAX_TOTAL {
-            return Err(ExchangeError::TooMany);
-        }
-        let before = agents_of.insert(gateway, entries).unwrap_or_default();
-        let now = agents_of.get(&gateway);
+        let mut lists = self.lists.lock();
+        let new: Vec<Arc<Entry>> = list.agents.values().cloned().collect();
+        let before = lists.insert(gateway, list);
+        let now = lists.get(&gateway);
+        let before = before.map(|list| list.agents).unwrap_or_default();
         let left = before
             .into_keys()
-            .filter(|name| now.is_none_or(|now| !now.contains_key(name)))
+            .filter(|name| now.is_none_or(|now| !now.agents.contains_key(name)))
             .map(|name| (origin, name, None));
-        let here = now.into_iter().flatten();
-        let here = here.map(|(name, entry)| (origin, Arc::clone(name), Some(Arc::clone(entry))));
+        let here = new.into_iter();
+        let here = here.map(|entry| (origin, Arc::clone(&entry.name), Some(entry)));
         let updates: Vec<Update> = left.chain(here).collect();
-        self.table.update(updates);
+        self.update(&mut lists, updates);
         self.show(gateway);
+        df.retain(|name, _| is_listed(&lists, gateway, name));
         self.update_df(|all| all.replace(gateway, principal, df));
-        Ok(())
     }
 
-    /// Adds or updates some agents of the gateway with their DF entries, and removes others.
+    /// Adds or updates some agents of the gateway with their DF entries, and removes others. Agents
+    /// beyond the shares of their peers are left out.
     pub(super) fn change(
         &self,
-        (gateway, principal): (Incarnation, Principal),
+        sender: &Sender,
         joined: Vec<(Arc<Entry>, Option<Arc<DfEntry>>)>,
         left: Vec<String>,
-    ) -> Result<(), ExchangeError> {
+    ) {
+        let gateway = sender.gateway;
         let origin = self.origin(gateway);
-        let mut agents_of = self.agents_of.lock();
-        let total: usize = agents_of.values().map(Agents::len).sum();
-        let of_gateway = agents_of.entry(gateway).or_default();
-        // A small letter does not cost a copy of all agents.
-        let left: BTreeSet<Arc<str>> = left
-            .iter()
-            .filter_map(|name| Some(Arc::clone(of_gateway.get_key_value(name.as_str())?.0)))
-            .collect();
-        let is_new = |name: &Arc<str>| left.contains(name) || !of_gateway.contains_key(name);
-        let names = joined.iter().map(|(entry, _)| &entry.name);
-        let new: BTreeSet<&Arc<str>> = names.filter(|name| is_new(name)).collect();
-        let stay = of_gateway.len() - left.len();
-        let after = stay + new.len();
-        let total = total - of_gateway.len() + after;
-        if after > Exchange::MAX_AGENTS || total > Exchange::MAX_TOTAL {
-            return Err(ExchangeError::TooMany);
-        }
+        let mut lists = self.lists.lock();
+        let list = lists
+            .entry(gateway)
+            .or_insert_with(|| AgentList::new(sender.clone()));
         let mut updates: Vec<Update> = Vec::new();
         let mut df = Vec::new();
-        for name in left {
-            of_gateway.remove(&name);
+        for name in left.iter().filter_map(|name| list.remove(name)) {
             df.push((Arc::clone(&name), None));
             updates.push((origin, name, None));
         }
         for (entry, of_entry) in joined {
             df.push((Arc::clone(&entry.name), of_entry));
-            of_gateway.insert(Arc::clone(&entry.name), Arc::clone(&entry));
+            list.insert(Arc::clone(&entry));
             updates.push((origin, Arc::clone(&entry.name), Some(entry)));
         }
-        self.table.update(updates);
+        self.update(&mut lists, updates);
         self.show(gateway);
-        self.update_df(|all| all.change(gateway, principal, df));
-        Ok(())
+        df.retain(|(name, of_entry)| of_entry.is_none() || is_listed(&lists, gateway, name));
+        self.update_df(|all| all.change(gateway, sender.principal, df));
+    }
+
+    /// Cuts the lists to the shares of their peers, and applies the updates to the table without the agents that
+    /// are cut. The only way by which agents enter the table.
+    fn update(&self, lists: &mut HashMap<Incarnation, AgentList>, mut updates: Vec<Update>) {
+        let sizes = lists
+            .iter()
+            .map(|(gateway, list)| (gateway, (&list.sender.peer, list.charged)));
+        let allowed = allowances(sizes);
+        for (gateway, list) in lists.iter_mut() {
+            let most = allowed.get(gateway).copied().unwrap_or_default();
+            if list.charged > most {
+                let origin = self.origin(*gateway);
+                let cut = list.cut(most);
+                let ended = cut.iter().map(|name| (Arc::clone(name), None));
+                let df: Vec<(Arc<str>, Option<Arc<DfEntry>>)> = ended.collect();
+                self.update_df(|all| all.change(*gateway, list.sender.principal, df));
+                updates.extend(cut.into_iter().map(|name| (origin, name, None)));
+            }
+        }
+        self.table.update(updates);
+    }
+
+    /// Whether the list of this gateway lacks agents, and has room for more than a few.
+    pub(super) fn has_room(&self, gateway: Incarnation) -> bool {
+        /// Room that is worth another transfer of the whole list.
+        const WORTHWHILE: usize = shares::MAX_OF_PEER / 20;
+        let lists = self.lists.lock();
+        let Some(cut) = lists.get(&gateway).filter(|list| list.is_cut) else {
+            return false;
+        };
+        let wanted = cut.charged + WORTHWHILE;
+        let sizes = lists.iter().map(|(other, list)| {
+            let size = if *other == gateway {
+                wanted
+            } else {
+                list.charged
+            };
+            (other, (&list.sender.peer, size))
+        });
+        allowances(sizes).get(&gateway) == Some(&wanted)
     }
 
     /// Adds a gateway whose entries the table has.
@@ -219,18 +319,22 @@ impl ExchangeDirectory {
     }
 
     /// Sets new locations of the gateway and all its agents.
-    pub(super) fn relocate(&self, gateway: Incarnation, locations: &[Location]) {
-        let origin = self.origin(gateway);
-        let mut agents_of = self.agents_of.lock();
+    pub(super) fn relocate(&self, sender: &Sender, locations: &[Location]) {
+        let origin = self.origin(sender.gateway);
+        let mut lists = self.lists.lock();
+        let Some(list) = lists.get_mut(&sender.gateway) else {
+            return;
+        };
+        list.sender = sender.clone();
         let mut updates: Vec<Update> = Vec::new();
-        for (name, entry) in agents_of.get_mut(&gateway).into_iter().flatten() {
+        for (name, entry) in &mut list.agents {
             *entry = Arc::new(Entry {
                 locations: locations.to_vec(),
                 ..Entry::clone(entry)
             });
             updates.push((origin, Arc::clone(name), Some(Arc::clone(entry))));
         }
-        self.table.update(updates);
+        self.update(&mut lists, updates);
     }
 
     /// Drops agents of the gateway that another directory knows, unless they are proved. Returns
@@ -242,15 +346,15 @@ impl ExchangeDirectory {
         knows: impl Fn(&Entry) -> bool,
     ) -> bool {
         let origin = self.origin(gateway);
-        let mut agents_of = self.agents_of.lock();
-        let Some(agents) = agents_of.get_mut(&gateway).filter(|_| !origin.is_proved) else {
+        let mut lists = self.lists.lock();
+        let Some(list) = lists.get_mut(&gateway).filter(|_| !origin.is_proved) else {
             return false;
         };
         let agent = |entry: &&Arc<Entry>| entry.role == Role::Agent && knows(entry);
-        let known = agents.values().filter(agent);
+        let known = list.agents.values().filter(agent);
         let known: Vec<Arc<str>> = known.map(|entry| Arc::clone(&entry.name)).collect();
         for name in &known {
-            agents.remove(name);
+            list.remove(name);
         }
         let any = !known.is_empty();
         if any {
@@ -269,8 +373,9 @@ impl ExchangeDirectory {
 
     /// Returns at most `most` agents of the gateway.
     pub(super) fn agents_of(&self, gateway: Incarnation, most: usize) -> Vec<Arc<Entry>> {
-        let agents_of = self.agents_of.lock();
-        let entries = agents_of.get(&gateway).into_iter().flat_map(Agents::values);
+        let lists = self.lists.lock();
+        let entries = lists.get(&gateway).into_iter();
+        let entries = entries.flat_map(|list| list.agents.values());
         let agents = entries.filter(|entry| entry.role == Role::Agent);
         agents.take(most).cloned().collect()
     }
@@ -278,8 +383,8 @@ impl ExchangeDirectory {
     /// Removes the gateway's agents.
     pub(super) fn forget(&self, gateway: Incarnation) {
         let origin = self.origin(gateway);
-        let mut agents_of = self.agents_of.lock();
-        let removed = agents_of.remove(&gateway);
+        let mut lists = self.lists.lock();
+        let removed = lists.remove(&gateway);
         self.update_df(|all| all.forget(gateway));
         if self.gateways.load().contains(&gateway) {
             self.gateways.rcu(|gateways| {
@@ -289,7 +394,8 @@ impl ExchangeDirectory {
             });
             self.table.touch();
         }
-        let names = removed.unwrap_or_default().into_keys();
+        let removed = removed.map(|list| list.agents).unwrap_or_default();
+        let names = removed.into_keys();
         self.table.update(names.map(|name| (origin, name, None)));
     }
 }
@@ -342,7 +448,7 @@ impl Directory for ExchangeDirectory {
 
     /// The letters of a gateway apply atomically and contain all its coalitions.
     fn speaks_for(&self, mts: Incarnation) -> bool {
-        self.agents_of.lock().contains_key(&mts)
+        self.lists.lock().contains_key(&mts)
     }
 
     fn mandate(&self, mts: Incarnation) -> Mandate {

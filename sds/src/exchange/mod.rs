@@ -16,8 +16,9 @@
 //! so that a search there needs no letter to other gateways.
 //!
 //! A neighbor may be hostile. It can send only agents of its own that are reached through itself
-//! and, if its link has a certificate, that this certificate names. The number of its agents is
-//! bounded, and malformed letters are rejected. DF entries are bounded, too; those beyond the bounds are
+//! and, if its link has a certificate, that this certificate names. Malformed letters are rejected. Each peer
+//! has a share of the entries: of a longer list the last agents are left out, and no list affects that of a
+//! peer within its share. DF entries are bounded, too; those beyond the bounds are
 //! ignored.
 
 mod df;
@@ -35,9 +36,11 @@ use fipa_transport::{Incarnation, Location, Mandate, Principal};
 use df::DfEntries;
 pub use df::{DfEntry, OwnDfEntry};
 pub use directory::ExchangeDirectory;
+use directory::{AgentList, Sender};
 use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
+use crate::shares::{self, Peer};
 use crate::{Directory as _, Entry, Mts, Reach, Role, Source};
 
 /// Ontology of the letters of the exchange.
@@ -66,6 +69,7 @@ pub struct Exchange {
 #[derive(Debug)]
 struct LostGateway {
     mts: Mts,
+    peer: Peer,
     agents: Vec<Arc<Entry>>,
     /// Time at which they are forgotten.
     until: Instant,
@@ -163,15 +167,18 @@ enum SyncState {
 #[derive(Debug)]
 struct Staged {
     version: u64,
-    entries: Agents,
+    list: AgentList,
     df: DfEntries,
 }
 
 impl Exchange {
-    /// Maximum number of agents of one neighbor.
-    pub const MAX_AGENTS: usize = 10_000;
-    /// Maximum number of agents of all neighbors together.
-    pub const MAX_TOTAL: usize = 40_000;
+    /// Maximum number of agents of one peer: of all neighbors with one certificate, or without keys at
+    /// one address. Fewer with texts: each agent is charged 400 bytes and its texts, and a peer has a
+    /// share of 2,000,000 bytes. Further agents are left out.
+    pub const MAX_AGENTS: usize = shares::MAX_OF_PEER / shares::PER_ENTRY;
+    /// Maximum number of agents of all neighbors together, in the same measure. Beyond it, the lists of
+    /// the peers with most are cut. Each of `n` peers has room for at least `MAX_TOTAL / n`.
+    pub const MAX_TOTAL: usize = shares::MAX_TOTAL / shares::PER_ENTRY;
     /// Maximum number of neighbors.
     pub const MAX_NEIGHBOURS: usize = 256;
     /// Maximum length of a letter's content, in bytes.
@@ -195,7 +202,7 @@ impl Exchange {
     pub const MEMORY: Duration = Duration::from_secs(5);
     /// Time for which agents are [lost](crate::Directory::lost_agents) after that.
     pub const LOST: Duration = Duration::from_secs(60);
-    /// Maximum number of lost agents; further ones are forgotten at once.
+    /// Maximum number of lost agents. Beyond it, the lists of the peers with most are cut.
     pub const MAX_LOST: usize = 1024;
 
     /// Time for which changes are collected before they are sent.
@@ -353,11 +360,12 @@ impl Exchange {
                 }
                 if known.locations != *locations {
                     known.locations.clone_from(locations);
-                    self.directory.relocate(mts.incarnation, locations);
+                    self.directory.relocate(&known.sender(), locations);
                 }
                 continue;
             }
-            if self.neighbors.len() >= Self::MAX_NEIGHBOURS || !mts.incarnation.is_known() {
+            let peer = Peer::of(*principal, locations);
+            if !mts.incarnation.is_known() || !self.make_room(&peer) {
                 continue;
             }
             let due = now + self.jitter();
@@ -372,6 +380,30 @@ impl Exchange {
             self.neighbors.insert(mts.incarnation, neighbor);
         }
         self.end_replaced();
+    }
+
+    /// Makes room for another neighbor of this peer: ends one of the peer with most neighbors if there are
+    /// too many. Returns whether there is room.
+    fn make_room(&mut self, peer: &Peer) -> bool {
+        if self.neighbors.len() < Self::MAX_NEIGHBOURS {
+            return true;
+        }
+        let mut neighbors: HashMap<Peer, Vec<Incarnation>> = HashMap::new();
+        for neighbor in self.neighbors.values() {
+            let of_peer = neighbors.entry(neighbor.sender().peer).or_default();
+            of_peer.push(neighbor.mts.incarnation);
+        }
+        let own = neighbors.get(peer).map_or(0, Vec::len);
+        let most = neighbors.into_values().max_by_key(Vec::len);
+        // Without the margin, two peers with equally many would take turns.
+        let most = most.filter(|most| most.len() > own + 1);
+        match most.and_then(|most| most.into_iter().max()) {
+            Some(gateway) => {
+                self.end(gateway);
+                true
+            }
+            None => false,
+        }
     }
 
     /// Drops agents of disconnected gateways that another directory knows, because that one may
@@ -498,17 +530,36 @@ impl Exchange {
                 Ok(())
             }
             ExchangeMessage::Full(full) => {
-                neighbor.handle_full(now, full, &self.directory)?;
+                neighbor.handle_full(now, full, &self.directory);
                 if neighbor.stored.is_some() {
                     let returned = Arc::clone(&neighbor.mts.name);
                     self.forget_lost(|lost| lost.mts.name == returned);
                 }
+                self.bound_staged(now);
                 self.end_replaced();
                 Ok(())
             }
             ExchangeMessage::Changes(changes) => {
-                neighbor.handle_changes(now, changes, &self.directory)
+                neighbor.handle_changes(now, changes, &self.directory);
+                Ok(())
             }
+        }
+    }
+
+    /// Drops the largest incomplete lists while all together are too large. Their neighbors are asked for all
+    /// entries again.
+    fn bound_staged(&mut self, now: Instant) {
+        let charged = |neighbor: &Neighbor| {
+            let staged = neighbor.staged.as_ref();
+            staged.map_or(0, |staged| staged.list.charged())
+        };
+        while self.neighbors.values().map(charged).sum::<usize>() > shares::MAX_TOTAL {
+            let largest = self.neighbors.values_mut().max_by_key(|it| charged(it));
+            let Some(largest) = largest else {
+                return;
+            };
+            largest.staged = None;
+            largest.request_all(now);
         }
     }
 
@@ -561,8 +612,18 @@ impl Exchange {
     }
 
     /// Removes neighbors that have been disconnected for too long, with all their entries. Their
-    /// agents are lost. Renews the DF entries of this gateway.
+    /// agents are lost. Renews the DF entries of this gateway. Requests lists again that were cut when
+    /// there is room for them.
     pub fn handle_timeout(&mut self, now: Instant) {
+        for (gateway, neighbor) in &mut self.neighbors {
+            let rested = |asked: Instant| now >= asked + Self::LONGEST_PAUSE;
+            let may_ask = neighbor.gone.is_none()
+                && neighbor.ask.is_none()
+                && neighbor.asked.is_none_or(rested);
+            if may_ask && self.directory.has_room(*gateway) {
+                neighbor.request_all(now);
+            }
+        }
         if self.own.renew.is_some_and(|renew| renew <= now) {
             self.own.renew = Some(now + Self::DF_RENEWAL);
             self.own.renew_df();
@@ -579,22 +640,28 @@ impl Exchange {
         }
     }
 
-    /// Remembers the agents of a gateway that fell silent.
+    /// Remembers the agents of a gateway that fell silent. If there are too many, the lists with most are
+    /// cut.
     fn lose(&mut self, now: Instant, gateway: Incarnation) {
         let Some(neighbor) = self.neighbors.get(&gateway) else {
             return;
         };
-        let known: usize = self.lost.iter().map(|lost| lost.agents.len()).sum();
-        let room = Self::MAX_LOST.saturating_sub(known);
-        let agents = self.directory.agents_of(gateway, room);
+        let agents = self.directory.agents_of(gateway, Self::MAX_LOST);
         if agents.is_empty() {
             return;
         }
         self.lost.push_back(LostGateway {
             mts: neighbor.mts.clone(),
+            peer: neighbor.sender().peer,
             agents,
             until: now + Self::LOST,
         });
+        let lost = self.lost.iter();
+        let sizes: Vec<_> = lost.map(|lost| (&lost.peer, lost.agents.len())).collect();
+        let allowed = shares::allowances(&sizes, Self::MAX_LOST, Self::MAX_LOST);
+        for (lost, most) in self.lost.iter_mut().zip(allowed) {
+            lost.agents.truncate(most);
+        }
         self.show_lost();
     }
 
@@ -915,22 +982,25 @@ impl Neighbor {
         self.ask = Some(earliest.max(now));
     }
 
-    fn handle_full(
-        &mut self,
-        now: Instant,
-        full: Full,
-        directory: &ExchangeDirectory,
-    ) -> Result<(), ExchangeError> {
+    fn sender(&self) -> Sender {
+        Sender {
+            gateway: self.mts.incarnation,
+            principal: self.principal,
+            peer: Peer::of(self.principal, &self.locations),
+        }
+    }
+
+    fn handle_full(&mut self, now: Instant, full: Full, directory: &ExchangeDirectory) {
         let mut staged = match self.staged.take() {
             _ if full.first => Staged {
                 version: full.version,
-                entries: BTreeMap::new(),
+                list: AgentList::new(self.sender()),
                 df: BTreeMap::new(),
             },
             Some(staged) if staged.version == full.version => staged,
             _ => {
                 self.request_all(now);
-                return Ok(());
+                return;
             }
         };
         for agent in full.agents {
@@ -944,38 +1014,31 @@ impl Neighbor {
                 }
                 _ => drop(staged.df.remove(&entry.name)),
             }
-            staged.entries.insert(Arc::clone(&entry.name), entry);
+            staged.list.insert(entry);
         }
-        if staged.entries.len() > Exchange::MAX_AGENTS {
-            return Err(ExchangeError::TooMany);
+        let cut = staged.list.cut(shares::MAX_OF_PEER);
+        if let Some(first) = cut.last() {
+            let (gateway, first) = (escape(&self.mts.name), escape(first));
+            tracing::info!(%gateway, %first, count = cut.len(), "the agents of a gateway exceed its share; the last ones are left out");
         }
         if full.last {
-            let of = (self.mts.incarnation, self.principal);
-            directory.replace(of, staged.entries, staged.df)?;
+            directory.replace(staged.list, staged.df);
             self.stored = Some(full.version);
             self.ask = None;
         } else {
             self.staged = Some(staged);
         }
-        Ok(())
     }
 
-    fn handle_changes(
-        &mut self,
-        now: Instant,
-        changes: Changes,
-        directory: &ExchangeDirectory,
-    ) -> Result<(), ExchangeError> {
+    fn handle_changes(&mut self, now: Instant, changes: Changes, directory: &ExchangeDirectory) {
         if self.stored != Some(changes.from) {
             self.request_all(now);
-            return Ok(());
+            return;
         }
         let agents = changes.agents.into_iter();
         let joined = agents.filter_map(|agent| self.read(now, agent)).collect();
-        let of = (self.mts.incarnation, self.principal);
-        directory.change(of, joined, changes.left)?;
+        directory.change(&self.sender(), joined, changes.left);
         self.stored = Some(changes.to);
-        Ok(())
     }
 
     /// Reads an agent of this neighbor, and its DF entry.
@@ -1038,11 +1101,4 @@ pub enum ExchangeError {
     /// The content is not a valid letter of the exchange.
     #[error("the letter is not a valid exchange letter")]
     Malformed(#[from] serde_json::Error),
-    /// The number of agents exceeds a limit.
-    #[error(
-        "the neighbor sent too many agents; at most {one} per neighbor and {all} in total are kept",
-        one = Exchange::MAX_AGENTS,
-        all = Exchange::MAX_TOTAL
-    )]
-    TooMany,
 }

@@ -5,10 +5,8 @@
 //!  "entries":[{"name":"arm_left","type":"gripper","incarnation":"00cd…",
 //!    "locations":["shm://…#00ab…"],"description":"…","registered":1795172400000,"role":"agent"}]}
 //! ```
-//! `registered` is in milliseconds since 1970, UTC. An entry of an agent on another host, which
-//! only a gateway writes, has a `remote` with the message transport service of the agent; the
-//! gateway is the `mts` of the file. A gateway may also write `lost`: the last entries of agents of
-//! other hosts whose gateway fell silent.
+//! `registered` is in milliseconds since 1970, UTC. The agents of other hosts are in a file of their own
+//! ([`remote`](super::remote)).
 //!
 //! A process of the same user writes the file, which does not make it trustworthy: everything is
 //! checked, and a file with any error is rejected as a whole.
@@ -31,31 +29,21 @@ pub(super) type Entries = HashMap<Arc<str>, Arc<Entry>>;
 /// Maximum number of entries in one file.
 pub(super) const MAX_ENTRIES: usize = 65_536;
 
-/// Entries read from a file.
-#[derive(Debug, Default)]
-pub(super) struct Read {
-    pub(super) entries: Entries,
-    /// The [lost agents](crate::Directory::lost_agents).
-    pub(super) lost: Vec<Arc<Entry>>,
-}
+/// Largest file, in bytes.
+pub(super) const MAX_SIZE: usize = 32 * 1024 * 1024;
 
-pub(super) fn write<'a>(
-    mts: &Mts,
-    entries: impl Iterator<Item = &'a Arc<Entry>>,
-    lost: &[Arc<Entry>],
-) -> Vec<u8> {
+pub(super) fn write<'a>(mts: &Mts, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<u8> {
     let written = Written {
         format: FORMAT.into(),
         version: VERSION,
         mts: mts.clone(),
         entries: entries.map(|entry| WrittenEntry::of(entry)).collect(),
-        lost: lost.iter().map(|entry| WrittenEntry::of(entry)).collect(),
     };
     // Serialization of text, numbers and lists cannot fail.
     serde_json::to_vec(&written).unwrap_or_default()
 }
 
-pub(super) fn read(bytes: &[u8]) -> Result<Read, FileError> {
+pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
     let written: Written = serde_json::from_slice(bytes).map_err(FileError::Json)?;
     if written.format != FORMAT {
         return Err(FileError::Format(written.format));
@@ -63,23 +51,18 @@ pub(super) fn read(bytes: &[u8]) -> Result<Read, FileError> {
     if written.version != VERSION {
         return Err(FileError::Version(written.version));
     }
-    let count = written.entries.len() + written.lost.len();
+    let count = written.entries.len();
     if count > MAX_ENTRIES {
         return Err(FileError::TooMany(count));
     }
-    let mut entries = Entries::with_capacity(written.entries.len());
+    let mut entries = Entries::with_capacity(count);
     for one in written.entries {
         let entry = Arc::new(one.into_entry(&written.mts)?);
         if let Some(twice) = entries.insert(entry.name.clone(), entry) {
             return Err(FileError::Twice(twice.name.clone()));
         }
     }
-    let lost = written.lost.into_iter();
-    let lost = lost.map(|one| one.into_entry(&written.mts).map(Arc::new));
-    Ok(Read {
-        entries,
-        lost: lost.collect::<Result<_, _>>()?,
-    })
+    Ok(entries)
 }
 
 /// Error of [`read`].
@@ -107,8 +90,6 @@ struct Written {
     version: u32,
     mts: Mts,
     entries: Vec<WrittenEntry>,
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    lost: Vec<WrittenEntry>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -122,19 +103,10 @@ struct WrittenEntry {
     description: String,
     registered: u64,
     role: Role,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    remote: Option<Mts>,
-    /// Source from which the gateway learned it, for entries of other hosts.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    source: Option<Source>,
 }
 
 impl WrittenEntry {
     fn of(entry: &Entry) -> Self {
-        let remote = match entry.reach {
-            Reach::Local => None,
-            Reach::Remote { .. } => Some(entry.mts.clone()),
-        };
         Self {
             name: entry.name.clone(),
             agent_type: entry.agent_type.clone(),
@@ -143,20 +115,11 @@ impl WrittenEntry {
             description: entry.description.clone(),
             registered: millis_of_time(entry.registered),
             role: entry.role.clone(),
-            source: remote.is_some().then_some(entry.source),
-            remote,
         }
     }
 
     fn into_entry(self, mts: &Mts) -> Result<Entry, FileError> {
-        let reach = match self.remote {
-            None => Reach::Local,
-            Some(_) => Reach::Remote {
-                gateway: mts.incarnation,
-            },
-        };
-        // Legacy peers may have no incarnation; processes of this host always have one.
-        if reach == Reach::Local && !self.incarnation.is_known() {
+        if !self.incarnation.is_known() {
             return Err(FileError::NoIncarnation(self.name));
         }
         let entry = Entry {
@@ -164,11 +127,11 @@ impl WrittenEntry {
             agent_type: self.agent_type,
             incarnation: self.incarnation,
             locations: self.locations,
-            mts: self.remote.unwrap_or_else(|| mts.clone()),
+            mts: mts.clone(),
             description: self.description,
             registered: time_of_millis(self.registered),
-            source: self.source.unwrap_or(Source::Host),
-            reach,
+            source: Source::Host,
+            reach: Reach::Local,
             role: self.role,
         };
         match entry.check() {

@@ -1,10 +1,11 @@
-//! Entries files for the fuzz targets.
+//! Files of the host directory for the fuzz targets.
 
 use std::sync::Arc;
 
-use super::file;
 use super::host_dir::Name;
-use crate::{Entry, Mts, Reach, Source};
+use super::remote::RemoteAgents;
+use super::{file, remote};
+use crate::{Entry, Mts, View as _};
 
 /// Reads an entries file, writes it, asserts that reading it again gives the same, and returns it.
 ///
@@ -14,44 +15,51 @@ use crate::{Entry, Mts, Reach, Source};
 /// # Panics
 /// Panics when an accepted file exceeds a limit.
 pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
-    let read = file::read(bytes).map_err(|error| fipa_acl::ErrorChain(&error).to_string())?;
-    let file::Read { entries, lost } = read;
-    assert!(entries.len() + lost.len() <= file::MAX_ENTRIES);
+    let entries = file::read(bytes).map_err(|error| fipa_acl::ErrorChain(&error).to_string())?;
+    assert!(entries.len() <= file::MAX_ENTRIES);
     for (name, entry) in &entries {
         assert_eq!(*name, entry.name);
         entry
             .check()
             .expect("an accepted file is within the limits");
     }
-    let mut own: Option<Mts> = None;
-    for entry in entries.values().chain(&lost) {
-        if entry.reach == Reach::Local {
-            own = Some(entry.mts.clone());
-        }
-    }
-    let gateway = entries.values().chain(&lost).find_map(|it| match it.reach {
-        Reach::Remote { gateway } => Some(Mts::new("mts", gateway)),
-        Reach::Local => None,
-    });
-    let Some(mts) = own.or(gateway) else {
+    let Some(mts) = entries.values().next().map(|entry| entry.mts.clone()) else {
         return Ok(bytes.to_vec());
     };
-    let written = file::write(&mts, entries.values(), &lost);
+    let written = file::write(&mts, entries.values());
     let again = file::read(&written).expect("an accepted file can be written and read again");
-    let sorted = |entries: &file::Entries, lost: &[Arc<Entry>]| {
-        let all = entries.values().chain(lost);
-        let mut all: Vec<Entry> = all.map(|it| (**it).clone()).collect();
-        for entry in &mut all {
-            // The source of a local entry is not written.
-            if entry.reach == Reach::Local {
-                entry.source = Source::Host;
-            }
-        }
-        all.sort_by(|one, other| one.name.cmp(&other.name));
-        all
-    };
-    assert_eq!(sorted(&again.entries, &again.lost), sorted(&entries, &lost));
+    assert_eq!(again, entries);
     Ok(written)
+}
+
+/// Reads a file with agents of other hosts, asserts that lookups find what the list has, and that a file with the
+/// same agents has the same.
+///
+/// # Panics
+/// Panics when an accepted file exceeds a limit or is not consistent.
+pub fn read_remote(bytes: &[u8]) {
+    let Ok(agents) = RemoteAgents::open(bytes.to_vec()) else {
+        return;
+    };
+    let all = agents.all();
+    for entry in all.iter() {
+        entry
+            .check()
+            .expect("an accepted entry is within the limits");
+        assert_eq!(agents.named(&entry.name).as_ref(), Some(entry));
+    }
+    let lost: Vec<Arc<Entry>> = agents.lost().to_vec();
+    let Some(gateway) = all.first().map(|entry| match entry.reach {
+        crate::Reach::Remote { gateway } => Mts::new("mts", gateway),
+        crate::Reach::Local => panic!("an agent of another host is not local"),
+    }) else {
+        return;
+    };
+    let written = remote::write(&gateway, &all, &lost);
+    let again = RemoteAgents::open(written).expect("a written file can be read");
+    assert_eq!(again.all(), all);
+    assert_eq!(again.lost(), lost);
+    remote::changed(Some(&agents), Some(&again), all.len()).expect("both files can be compared");
 }
 
 /// Checks that a parsed file name is formatted the same again.

@@ -3,6 +3,7 @@
 //! All operations are relative to the directory's descriptor and do not follow symbolic links, so
 //! that the directory that was checked is the one that is used.
 
+use std::collections::BTreeSet;
 use std::fs::{DirBuilder, File, TryLockError};
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::OwnedFd;
@@ -15,6 +16,7 @@ use parking_lot::{Mutex, MutexGuard};
 use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
+use super::file::MAX_SIZE;
 use super::{Cancellation, HostError};
 
 /// Identifies the files of one process.
@@ -24,12 +26,15 @@ pub(super) struct Id(pub(super) u64);
 /// The files of the directory, by their names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Name {
-    /// `lock`: held while the directory is changed; its first eight bytes are the generation.
+    /// `lock`: held while the directory is changed. Its first eight bytes are the generation; a ring of the
+    /// processes that made the latest changes follows.
     Domain,
     /// `<id>.lock`: locked by its process while that runs.
     Process(Id),
     /// `<id>.entries`: the registrations of the process.
     Entries(Id),
+    /// `<id>.remote`: the agents of other hosts that the process publishes, if it is a gateway.
+    Remote(Id),
     /// `<id>.socket`: the socket of the process, if it accepts connections.
     Socket(Id),
     /// `<id>.tmp`: a file that will be renamed to one of the others.
@@ -49,6 +54,7 @@ impl Name {
         match kind {
             "lock" => Some(Self::Process(id)),
             "entries" => Some(Self::Entries(id)),
+            "remote" => Some(Self::Remote(id)),
             "socket" => Some(Self::Socket(id)),
             "tmp" => Some(Self::Temporary(id)),
             _ => None,
@@ -62,6 +68,7 @@ impl std::fmt::Display for Name {
             Self::Domain => f.write_str("lock"),
             Self::Process(Id(id)) => write!(f, "{id:016x}.lock"),
             Self::Entries(Id(id)) => write!(f, "{id:016x}.entries"),
+            Self::Remote(Id(id)) => write!(f, "{id:016x}.remote"),
             Self::Socket(Id(id)) => write!(f, "{id:016x}.socket"),
             Self::Temporary(Id(id)) => write!(f, "{id:016x}.tmp"),
         }
@@ -97,9 +104,9 @@ const SKIPPED: Duration = Duration::from_secs(1);
 /// Pause of the process that has the turn, between attempts to lock.
 const FIRST_PAUSE: Duration = Duration::from_micros(200);
 
-/// Maximum pause of the others, which poll at a decreasing rate: fifty of them would otherwise use
+/// Maximum pause of the others, which poll at a decreasing rate: a hundred of them would otherwise use
 /// more CPU time than the processes they wait for.
-const LAST_PAUSE: Duration = Duration::from_millis(8);
+const LAST_PAUSE: Duration = Duration::from_millis(20);
 
 /// Maximum time between two checks of whether a waiting call was canceled.
 const LONGEST_CHECK: Duration = Duration::from_millis(20);
@@ -247,6 +254,40 @@ impl HostDir {
             Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(0),
             Err(error) => Err(self.io("read", Name::Domain)(error)),
         }
+    }
+
+    /// Returns the processes that made the changes between two generations, without an order. `None` if they are
+    /// not known, because there were too many changes.
+    pub(super) fn writers_between(
+        &self,
+        known: u64,
+        generation: u64,
+    ) -> Result<Option<BTreeSet<Id>>, HostError> {
+        let behind = generation.wrapping_sub(known);
+        if known == 0 || behind > RING as u64 {
+            return Ok(None);
+        }
+        let mut ring = [0; RING * size_of::<u64>()];
+        let mut filled = 0;
+        while let Some(rest) = ring.get_mut(filled..).filter(|rest| !rest.is_empty()) {
+            let at = (size_of::<u64>() + filled) as u64;
+            match self.domain.read_at(rest, at) {
+                Ok(0) => break,
+                Ok(read) => filled += read,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(self.io("read", Name::Domain)(error)),
+            }
+        }
+        // Writers that were faster than this read have replaced some of the writers in question.
+        if self.generation()?.wrapping_sub(known) > RING as u64 {
+            return Ok(None);
+        }
+        let (slots, _) = ring.as_chunks();
+        let changes = (1..=behind).map(|change| known.wrapping_add(change));
+        let writers = changes.filter_map(|change| slots.get(slot(change)));
+        Ok(Some(
+            writers.map(|id| Id(u64::from_le_bytes(*id))).collect(),
+        ))
     }
 
     /// Waits for the lock of the domain.
@@ -402,9 +443,8 @@ impl HostDir {
         Ok(names)
     }
 
-    /// Version of the process's entries file; `None` if there is no such file.
-    pub(super) fn version(&self, id: Id) -> Result<Option<Version>, HostError> {
-        let name = Name::Entries(id);
+    /// Version of a file; `None` if it does not exist.
+    pub(super) fn version(&self, name: Name) -> Result<Option<Version>, HostError> {
         match rustix::fs::statat(&self.dir, name.to_string(), AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) => Ok(Some(Version {
                 modified: (stat.st_mtime, stat.st_mtime_nsec),
@@ -416,19 +456,18 @@ impl HostDir {
         }
     }
 
-    /// Content of the process's entries file; `None` if there is no such file.
-    pub(super) fn read_entries(&self, id: Id) -> Result<Option<Vec<u8>>, HostError> {
-        let name = Name::Entries(id);
+    /// Content of an entries file; `None` if it does not exist.
+    pub(super) fn read(&self, name: Name) -> Result<Option<Vec<u8>>, HostError> {
         let Some(file) = self.open(name)? else {
             return Ok(None);
         };
         let mut bytes = Vec::new();
-        let limit = MAX_ENTRIES_FILE as u64;
+        let limit = MAX_SIZE as u64;
         // The size may change before the read, so the read is limited too.
         file.take(limit + 1)
             .read_to_end(&mut bytes)
             .map_err(self.io("read", name))?;
-        if bytes.len() > MAX_ENTRIES_FILE {
+        if bytes.len() > MAX_SIZE {
             return Err(HostError::TooLarge {
                 path: self.path.join(name.to_string()),
             });
@@ -438,7 +477,7 @@ impl HostDir {
 
     /// Opens a file for reading; `None` if it does not exist. Fails when it is not a regular file
     /// of this user.
-    fn open(&self, name: Name) -> Result<Option<File>, HostError> {
+    pub(super) fn open(&self, name: Name) -> Result<Option<File>, HostError> {
         // Non-blocking, in case the name refers to a pipe.
         let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
         match rustix::fs::openat(&self.dir, name.to_string(), flags, Mode::empty()) {
@@ -473,20 +512,25 @@ impl HostDir {
     }
 }
 
+/// Number of changes whose processes are remembered.
+const RING: usize = 512;
+
+/// Index of a change in the ring.
+const fn slot(generation: u64) -> usize {
+    (generation % RING as u64) as usize
+}
+
 /// Distinguishes an entries file from its predecessor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Version {
-    /// Not a time: see [`Guard::write_entries`].
+    /// Not a time: see [`Guard::write`].
     modified: (i64, u64),
     inode: u64,
     len: i64,
 }
 
-/// Maximum number of files in a directory: four per process, for more processes than a host runs.
+/// Maximum number of files in a directory: five per process, for more processes than a host runs.
 const MAX_FILES: usize = 100_000;
-
-/// Largest entries file, in bytes.
-pub(super) const MAX_ENTRIES_FILE: usize = 32 * 1024 * 1024;
 
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
@@ -529,8 +573,12 @@ impl Guard<'_> {
         }
     }
 
-    /// Replaces this process's entries file and increments the generation, which it returns.
-    pub(super) fn write_entries(&self, bytes: &[u8]) -> Result<u64, HostError> {
+    pub(super) fn id(&self) -> Id {
+        self.host_dir.id
+    }
+
+    /// Replaces a file of this process and increments the generation.
+    pub(super) fn write(&self, name: Name, bytes: &[u8]) -> Result<(), HostError> {
         let host_dir = self.host_dir;
         let generation = host_dir.generation()?.wrapping_add(1);
         let temporary = Name::Temporary(host_dir.id);
@@ -555,17 +603,18 @@ impl Guard<'_> {
         });
         let renamed = written
             .map_err(host_dir.io("write", temporary))
-            .and_then(|()| host_dir.rename(temporary, Name::Entries(host_dir.id)));
+            .and_then(|()| host_dir.rename(temporary, name));
         if let Err(error) = renamed {
             // The first error is returned; the next sweep removes the temporary file.
             let _ = host_dir.remove(temporary);
             return Err(error);
         }
+        let at = size_of::<u64>() * (1 + slot(generation));
         host_dir
             .domain
-            .write_all_at(&generation.to_le_bytes(), 0)
-            .map_err(host_dir.io("write", Name::Domain))?;
-        Ok(generation)
+            .write_all_at(&host_dir.id.0.to_le_bytes(), at as u64)
+            .and_then(|()| host_dir.domain.write_all_at(&generation.to_le_bytes(), 0))
+            .map_err(host_dir.io("write", Name::Domain))
     }
 
     /// Removes the files of dead processes. Returns the number of running processes, including this
@@ -580,7 +629,7 @@ impl Guard<'_> {
                     self.host_dir.remove(name)?;
                     continue;
                 }
-                Name::Process(id) | Name::Entries(id) | Name::Socket(id) => id,
+                Name::Process(id) | Name::Entries(id) | Name::Remote(id) | Name::Socket(id) => id,
             };
             let lives = match living.get(&id) {
                 Some(lives) => *lives,
@@ -597,6 +646,7 @@ impl Guard<'_> {
     /// Removes the files of a dead process.
     pub(super) fn remove_files(&self, id: Id) -> Result<(), HostError> {
         self.host_dir.remove(Name::Entries(id))?;
+        self.host_dir.remove(Name::Remote(id))?;
         self.host_dir.remove(Name::Socket(id))?;
         self.host_dir.remove(Name::Temporary(id))?;
         self.host_dir.remove(Name::Process(id))
@@ -705,6 +755,7 @@ mod tests {
             Name::Domain,
             Name::Process(id),
             Name::Entries(id),
+            Name::Remote(id),
             Name::Socket(id),
             Name::Temporary(id),
         ] {

@@ -6,7 +6,9 @@
 //!   process holds the name, and writes. The name of a process that died is free at once.
 //! * All processes watch the directory. When a process ends, even by SIGKILL, its lock file is
 //!   closed, and the kernel notifies the others, which drop its agents and remove its files.
-//! * Reading takes no system call. Only a miss reads the generation (one call), and the files if it
+//! * A gateway writes the agents of other hosts to a third file. The other processes keep an index of it and
+//!   read an entry when it is used, so their memory does not depend on what other hosts announce.
+//! * Reading agents of this host takes no system call. Only a miss reads the generation (one call), and the files if it
 //!   changed.
 //!
 //! Nothing about the network belongs here. A gateway publishes the agents of other hosts here.
@@ -16,6 +18,7 @@ mod file;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
 mod host_dir;
+mod remote;
 mod shared;
 mod socket;
 mod watcher;
@@ -34,11 +37,12 @@ use tokio::sync::watch;
 
 pub use self::cancellation::Cancellation;
 use self::host_dir::{HostDir, Id, Name};
+use self::remote::RemoteAgents;
 use self::shared::Shared;
 use self::watcher::Watcher;
 use crate::{
-    DeregisterError, Directory, Entry, EntryError, Mts, Reach, RegisterError, Registration, Source,
-    Subscriber,
+    DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Source, Subscriber,
+    View as _,
 };
 
 /// Configuration of [`HostDirectory`].
@@ -124,12 +128,22 @@ impl HostDirectory {
         };
         let mut found: Vec<Arc<Entry>> = Vec::new();
         for name in host_dir.names()? {
-            if let Name::Entries(id) = name
-                && host_dir.is_running(id).unwrap_or(false)
-                && let Ok(Some(bytes)) = host_dir.read_entries(id)
-                && let Ok(read) = file::read(&bytes)
-            {
-                found.extend(read.entries.into_values());
+            match name {
+                Name::Entries(id)
+                    if host_dir.is_running(id).unwrap_or(false)
+                        && let Ok(Some(bytes)) = host_dir.read(name)
+                        && let Ok(entries) = file::read(&bytes) =>
+                {
+                    found.extend(entries.into_values());
+                }
+                Name::Remote(id)
+                    if host_dir.is_running(id).unwrap_or(false)
+                        && let Ok(Some(file)) = host_dir.open(name)
+                        && let Ok(agents) = RemoteAgents::open(file) =>
+                {
+                    found.extend(agents.all().iter().cloned());
+                }
+                _ => {}
             }
         }
         found.sort_by(|a, b| a.name.cmp(&b.name));
@@ -137,41 +151,27 @@ impl HostDirectory {
     }
 
     /// Replaces the agents of other hosts that this gateway publishes to the processes of this
-    /// host, in which they appear as [`Reach::Remote`] through this gateway. Their locations are
+    /// host, in which they appear as [`Reach::Remote`](crate::Reach::Remote) through this gateway. Their locations are
     /// those at which the gateway accepts letters for them. This directory's own view does not
     /// contain them. Processes of this host see `lost` as their [lost
     /// agents](Directory::lost_agents).
     ///
+    /// Of several entries with one name or one incarnation, the last one holds that. Entries that are not valid
+    /// are left out. So are those for which there is no room, from the gateways that have most.
+    ///
     /// # Errors
-    /// Fails when this process is not a gateway, an entry is not valid, there are too many, or they
-    /// cannot be written; nothing has changed then.
+    /// Fails when this process is not a gateway, or the entries cannot be written; nothing has changed
+    /// then.
     pub fn publish_remote(
         &self,
-        entries: Vec<Entry>,
-        lost: Vec<Arc<Entry>>,
+        entries: &[Arc<Entry>],
+        lost: &[Arc<Entry>],
     ) -> Result<(), HostError> {
         self.owner.check()?;
         if !self.config.gateway {
             return Err(HostError::NoGateway);
         }
-        let check = |entry: &Entry| {
-            let checked = entry.check();
-            checked.map_err(|source| HostError::Entry {
-                name: entry.name.clone(),
-                source,
-            })
-        };
-        lost.iter().try_for_each(|entry| check(entry))?;
-        let mut published = std::collections::BTreeMap::new();
-        for mut entry in entries {
-            entry.reach = Reach::Remote {
-                gateway: self.config.mts.incarnation,
-            };
-            check(&entry)?;
-            published.insert(entry.name.clone(), Arc::new(entry));
-        }
-        let published = published.into_values().collect();
-        self.shared.publish(published, lost)
+        self.shared.publish(entries, lost)
     }
 
     /// Registers an agent like [`Directory::register`], unless the call is canceled before the
@@ -436,15 +436,7 @@ pub enum HostError {
         /// Error of the system.
         source: io::Error,
     },
-    /// An entry to be published is not valid.
-    #[error("cannot publish {name:?}")]
-    Entry {
-        /// Its name.
-        name: Arc<str>,
-        /// The violated limit.
-        source: EntryError,
-    },
-    /// The entries to publish exceed a limit.
+    /// The entries of this process exceed a limit.
     #[error("the directory is full: {0}")]
     Full(String),
     /// Only a gateway publishes agents of other hosts.

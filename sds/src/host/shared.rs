@@ -1,6 +1,6 @@
 //! State of a host's directory: the entries of other processes, and those that this process writes.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
@@ -10,10 +10,11 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
 use super::file::{self, Entries, FileError};
-use super::host_dir::{Guard, HostDir, Id, MAX_ENTRIES_FILE, Name, Version};
+use super::host_dir::{Guard, HostDir, Id, Name, Version};
+use super::remote::{self, RemoteAgents, RemoteError, RemoteLists};
 use super::{Cancellation, HostError, SocketId};
 use crate::table::Table;
-use crate::{DeregisterError, Entry, Mts, Reach, RegisterError, Source};
+use crate::{Change, DeregisterError, Entry, Mts, RegisterError, Source, View, Watch};
 
 /// The state behind a [`HostDirectory`](super::HostDirectory), shared with its task.
 ///
@@ -38,11 +39,9 @@ pub(super) struct Shared {
 struct OwnEntries {
     closed: bool,
     agents: Entries,
-    /// Agents of other hosts that this gateway publishes. They are not in its own table, because it
-    /// has them from other back ends.
-    remote: Vec<Arc<Entry>>,
-    /// Lost agents of other hosts, which this gateway publishes.
-    lost: Vec<Arc<Entry>>,
+    /// The file with the agents of other hosts that this gateway publishes; empty if it has published none. They
+    /// are not in its own table, because it has them from other back ends.
+    remote: Vec<u8>,
 }
 
 /// The entries of the other processes.
@@ -50,15 +49,16 @@ struct OwnEntries {
 struct OtherProcesses {
     generation: u64,
     processes: HashMap<Id, Process>,
+    /// The files of gateways.
+    gateways: HashMap<Id, Gateway>,
 }
 
 impl OtherProcesses {
     /// Whether another process has registered an agent of this name in a file that exists now.
     fn has_registered(&self, name: &str) -> bool {
-        self.processes.values().any(|process| {
-            let entry = process.entries.get(name);
-            process.version.is_some() && entry.is_some_and(|entry| entry.reach == Reach::Local)
-        })
+        self.processes
+            .values()
+            .any(|process| process.version.is_some() && process.entries.contains_key(name))
     }
 }
 
@@ -66,7 +66,14 @@ impl OtherProcesses {
 struct Process {
     version: Option<Version>,
     entries: Entries,
-    lost: Vec<Arc<Entry>>,
+}
+
+/// The agents of other hosts that a gateway publishes.
+#[derive(Debug)]
+struct Gateway {
+    version: Option<Version>,
+    /// `None` if the file is not valid.
+    remote: Option<Arc<RemoteAgents>>,
 }
 
 impl Shared {
@@ -103,8 +110,14 @@ impl Shared {
             return Ok(true);
         }
         let host_dir = self.host_dir();
-        let nothing = own.agents.is_empty() && own.remote.is_empty() && own.lost.is_empty();
-        Ok(host_dir.is_there()? && (nothing || host_dir.version(host_dir.id())?.is_some()))
+        let id = host_dir.id();
+        let is_there = |name, is_empty| match is_empty {
+            true => Ok(true),
+            false => host_dir.version(name).map(|version| version.is_some()),
+        };
+        Ok(host_dir.is_there()?
+            && is_there(Name::Entries(id), own.agents.is_empty())?
+            && is_there(Name::Remote(id), own.remote.is_empty())?)
     }
 
     /// Joins the directory again after it, or files of this process in it, were removed; returns
@@ -136,6 +149,9 @@ impl Shared {
             // A new file may have the version of the removed one.
             process.version = None;
         }
+        for gateway in others.gateways.values_mut() {
+            gateway.version = None;
+        }
         self.scan(&mut others)?;
         let taken: Vec<Arc<str>> = own
             .agents
@@ -158,6 +174,9 @@ impl Shared {
             WriteError::Full(why) => HostError::Full(why),
             WriteError::Host(error) => error,
         })?;
+        if !own.remote.is_empty() {
+            guard.write(Name::Remote(host_dir.id()), &own.remote)?;
+        }
         drop((own, guard));
         self.find_sockets()?;
         Ok(true)
@@ -195,14 +214,23 @@ impl Shared {
         Ok(())
     }
 
-    /// Reads the changes of other processes; takes one system call when there are none.
+    /// Reads the changes of other processes; takes one system call when there are none, and examines the files
+    /// of the processes that made them. A file per process would make a start of many quadratic.
     pub(super) fn refresh(&self) -> Result<(), HostError> {
-        let generation = self.host_dir().generation()?;
+        let host_dir = self.host_dir();
+        let generation = host_dir.generation()?;
         let mut others = self.others.lock();
         if others.generation == generation {
             return Ok(());
         }
-        self.scan(&mut others)?;
+        match host_dir.writers_between(others.generation, generation)? {
+            Some(writers) => {
+                for id in writers.into_iter().filter(|id| *id != host_dir.id()) {
+                    self.read(&mut others, id)?;
+                }
+            }
+            None => self.scan(&mut others)?,
+        }
         // Read before the files, so that a change in between causes another read.
         others.generation = generation;
         Ok(())
@@ -211,7 +239,8 @@ impl Shared {
     /// Reads all files again and checks which processes are running, regardless of the generation.
     pub(super) fn rescan(&self) -> Result<(), HostError> {
         let mut others = self.others.lock();
-        let known: Vec<Id> = others.processes.keys().copied().collect();
+        let known = others.processes.keys().chain(others.gateways.keys());
+        let known: BTreeSet<Id> = known.copied().collect();
         for id in known {
             if !self.host_dir().is_running(id)? {
                 self.forget(&mut others, id);
@@ -225,11 +254,12 @@ impl Shared {
     }
 
     fn scan(&self, others: &mut OtherProcesses) -> Result<(), HostError> {
+        let own = self.host_dir().id();
         for name in self.host_dir().names()? {
-            if let Name::Entries(id) = name
-                && id != self.host_dir().id()
-            {
-                self.read(others, id)?;
+            match name {
+                Name::Entries(id) if id != own => self.read_entries(others, id)?,
+                Name::Remote(id) if id != own => self.read_remote(others, id)?,
+                _ => {}
             }
         }
         Ok(())
@@ -243,9 +273,16 @@ impl Shared {
         self.read(&mut self.others.lock(), id)
     }
 
+    /// Reads the files of the process that have changed.
     fn read(&self, others: &mut OtherProcesses, id: Id) -> Result<(), HostError> {
+        self.read_entries(others, id)?;
+        self.read_remote(others, id)
+    }
+
+    fn read_entries(&self, others: &mut OtherProcesses, id: Id) -> Result<(), HostError> {
         let known = others.processes.get(&id);
-        let version = self.host_dir().version(id)?;
+        let name = Name::Entries(id);
+        let version = self.host_dir().version(name)?;
         if known.is_some_and(|process| process.version == version) {
             return Ok(());
         }
@@ -253,37 +290,78 @@ impl Shared {
         if known.is_none() && !self.host_dir().is_running(id)? {
             return Ok(());
         }
-        let read = self.read_file(id).unwrap_or_else(|error| {
-            // Treated as empty; the process's next file may be valid.
-            let path = self.host_dir().path().join(Name::Entries(id).to_string());
-            log_limit::error!(path = %path.display(), error = %ErrorChain(&error), "entries file ignored");
-            file::Read::default()
-        });
+        let read = || -> Result<Entries, ReadError> {
+            match self.host_dir().read(name)? {
+                Some(bytes) => Ok(file::read(&bytes)?),
+                None => Ok(Entries::default()),
+            }
+        };
+        let entries = read().unwrap_or_else(|error| self.ignored(name, &error));
         let process = others.processes.entry(id).or_default();
         // Taken before reading, so that a replacement in between causes another read.
         process.version = version;
-        let before = std::mem::replace(&mut process.entries, read.entries);
-        let differs = process.lost != read.lost;
-        process.lost = read.lost;
+        let before = std::mem::replace(&mut process.entries, entries);
         self.tell(id, &before, &process.entries);
-        if differs {
-            self.show_lost(others);
-        }
         Ok(())
     }
 
-    fn read_file(&self, id: Id) -> Result<file::Read, ReadError> {
-        match self.host_dir().read_entries(id)? {
-            Some(bytes) => Ok(file::read(&bytes)?),
-            None => Ok(file::Read::default()),
+    fn read_remote(&self, others: &mut OtherProcesses, id: Id) -> Result<(), HostError> {
+        let known = others.gateways.get(&id);
+        let name = Name::Remote(id);
+        let version = self.host_dir().version(name)?;
+        if version == known.and_then(|gateway| gateway.version) {
+            return Ok(());
         }
+        if known.is_none() && !self.host_dir().is_running(id)? {
+            return Ok(());
+        }
+        let read = || -> Result<Option<Arc<RemoteAgents>>, ReadError> {
+            let file = self.host_dir().open(name)?;
+            Ok(file.map(RemoteAgents::open).transpose()?.map(Arc::new))
+        };
+        let remote = read().unwrap_or_else(|error| self.ignored(name, &error));
+        let gateway = Gateway { version, remote };
+        let before = others.gateways.insert(id, gateway);
+        self.show_remote(others, id, before);
+        Ok(())
     }
 
-    /// Shows the lost agents that the gateways among the other processes publish.
-    fn show_lost(&self, others: &OtherProcesses) {
-        let processes = others.processes.values();
-        let lost = processes.flat_map(|process| &process.lost);
-        self.table.set_lost(lost.cloned());
+    /// Logs a file that is treated as empty; the process's next file may be valid.
+    fn ignored<T: Default>(&self, name: Name, error: &ReadError) -> T {
+        let path = self.host_dir().path().join(name.to_string());
+        tracing::error!(path = %path.display(), error = %ErrorChain(error), "entries file ignored");
+        T::default()
+    }
+
+    /// Shows the agents that the gateways among the other processes publish, after that of this one
+    /// changed.
+    fn show_remote(&self, others: &OtherProcesses, id: Id, before: Option<Gateway>) {
+        let before = before.and_then(|gateway| gateway.remote);
+        let remotes = others.gateways.iter();
+        let remotes = remotes.filter_map(|(id, gateway)| Some((id, gateway.remote.as_ref()?)));
+        let after = others.gateways.get(&id).and_then(|it| it.remote.as_ref());
+        let lists = |changed: Option<&Arc<RemoteAgents>>| {
+            let others = remotes.clone().filter(|(other, _)| **other != id);
+            RemoteLists(others.map(|(_, it)| it).chain(changed).cloned().collect())
+        };
+        let earlier = lists(before.as_ref());
+        let later = Arc::new(lists(after));
+        let lost = later.0.iter().flat_map(|agents| agents.lost().to_vec());
+        self.table.set_lost(lost.collect::<Vec<_>>());
+        self.table.set_beneath(Arc::clone(&later) as Arc<dyn View>);
+        if !self.table.is_watched() {
+            return;
+        }
+        let names = remote::changed(before.as_deref(), after.map(|it| &**it), Watch::CAPACITY);
+        let names = names.unwrap_or_else(|error| {
+            tracing::error!(error = %ErrorChain(&error), "cannot compare the agents of other hosts");
+            None
+        });
+        let changes = names.map(|names| {
+            let change = |name: &Arc<str>| Change::between(earlier.named(name), later.named(name));
+            names.iter().filter_map(change).collect()
+        });
+        self.table.changed_beneath(changes);
     }
 
     fn tell(&self, id: Id, before: &Entries, after: &Entries) {
@@ -308,9 +386,9 @@ impl Shared {
     fn forget(&self, others: &mut OtherProcesses, id: Id) {
         if let Some(process) = others.processes.remove(&id) {
             self.tell(id, &process.entries, &Entries::new());
-            if !process.lost.is_empty() {
-                self.show_lost(others);
-            }
+        }
+        if let Some(gateway) = others.gateways.remove(&id) {
+            self.show_remote(others, id, Some(gateway));
         }
     }
 
@@ -397,18 +475,30 @@ impl Shared {
             if ours && holder.incarnation == entry.incarnation {
                 break;
             }
-            // A contact is only the sender of a letter, which may have left since. Claims of
-            // directories precede it, so no other process holds the name.
-            if holder.source == Source::Contact {
-                break;
-            }
             if ours || self.host_dir().is_running(id).map_err(failed)? {
                 return Err(RegisterError::AlreadyRegistered { holder });
             }
             self.forget(&mut self.others.lock(), id);
             guard.remove_files(id).map_err(failed)?;
         }
+        while let Some((id, holder)) = self.remote_holder(&entry.name) {
+            if self.host_dir().is_running(id).map_err(failed)? {
+                return Err(RegisterError::AlreadyRegistered { holder });
+            }
+            self.forget(&mut self.others.lock(), id);
+            guard.remove_files(id).map_err(failed)?;
+        }
         Ok(())
+    }
+
+    /// Returns a gateway that publishes an agent of this name, and that agent. A contact does not hold its
+    /// name: it is only the sender of a letter, which may have left since.
+    fn remote_holder(&self, name: &str) -> Option<(Id, Arc<Entry>)> {
+        let others = self.others.lock();
+        others.gateways.iter().find_map(|(id, gateway)| {
+            let holder = gateway.remote.as_ref()?.named(name)?;
+            (holder.source != Source::Contact).then_some((*id, holder))
+        })
     }
 
     pub(super) fn deregister(
@@ -438,25 +528,21 @@ impl Shared {
     /// Replaces the agents of other hosts that this gateway publishes, and the lost ones.
     pub(super) fn publish(
         &self,
-        remote: Vec<Arc<Entry>>,
-        lost: Vec<Arc<Entry>>,
+        remote: &[Arc<Entry>],
+        lost: &[Arc<Entry>],
     ) -> Result<(), HostError> {
+        let bytes = remote::write(&self.mts, remote, lost);
         self.change(|guard, own| {
             if own.closed {
                 return Err(HostError::Closed);
             }
-            if own.remote == remote && own.lost == lost {
+            if own.remote == bytes {
                 return Ok(());
             }
-            let remote = std::mem::replace(&mut own.remote, remote);
-            let lost = std::mem::replace(&mut own.lost, lost);
-            self.write_now_or_later(guard, own).map_err(|error| {
-                (own.remote, own.lost) = (remote, lost);
-                match error {
-                    WriteError::Full(why) => HostError::Full(why),
-                    WriteError::Host(error) => error,
-                }
-            })
+            let before = std::mem::replace(&mut own.remote, bytes);
+            let write = |guard: Guard<'_>| guard.write(Name::Remote(guard.id()), &own.remote);
+            self.now_or_later(guard.and_then(write))
+                .inspect_err(|_| own.remote = before)
         })
     }
 
@@ -485,33 +571,39 @@ impl Shared {
         guard: Result<Guard<'_>, HostError>,
         own: &OwnEntries,
     ) -> Result<(), WriteError> {
-        let written = guard.map_err(WriteError::from);
-        let written = written.and_then(|guard| self.write(&guard, own));
+        match guard
+            .map_err(WriteError::from)
+            .and_then(|guard| self.write(&guard, own))
+        {
+            Err(WriteError::Host(error)) => Ok(self.now_or_later(Err(error))?),
+            written => written,
+        }
+    }
+
+    /// Ignores an error if the directory was removed: [`rejoin`](Self::rejoin) writes later.
+    fn now_or_later(&self, written: Result<(), HostError>) -> Result<(), HostError> {
         match written {
-            Err(WriteError::Host(_)) if matches!(self.host_dir().is_there(), Ok(false)) => Ok(()),
+            Err(_) if matches!(self.host_dir().is_there(), Ok(false)) => Ok(()),
             written => written,
         }
     }
 
     fn write(&self, guard: &Guard<'_>, own: &OwnEntries) -> Result<(), WriteError> {
-        // A name that is registered here is not also published as a remote agent.
-        let remote = own.remote.iter();
-        let remote = remote.filter(|entry| !own.agents.contains_key(&entry.name));
-        let count = own.agents.len() + own.remote.len() + own.lost.len();
+        let count = own.agents.len();
         if count > file::MAX_ENTRIES {
             let most = file::MAX_ENTRIES;
-            let why = format!("this process has {count} entries; at most {most} are allowed");
+            let why = format!("this process has {count} agents; at most {most} are allowed");
             return Err(WriteError::Full(why));
         }
-        let bytes = file::write(&self.mts, own.agents.values().chain(remote), &own.lost);
-        if bytes.len() > MAX_ENTRIES_FILE {
-            let len = bytes.len();
+        let bytes = file::write(&self.mts, own.agents.values());
+        if bytes.len() > file::MAX_SIZE {
+            let (len, most) = (bytes.len(), file::MAX_SIZE);
             let why = format!(
-                "the entries of this process take {len} bytes, but at most {MAX_ENTRIES_FILE} are allowed"
+                "the entries of this process take {len} bytes, but at most {most} are allowed"
             );
             return Err(WriteError::Full(why));
         }
-        guard.write_entries(&bytes)?;
+        guard.write(Name::Entries(guard.id()), &bytes)?;
         Ok(())
     }
 
@@ -535,6 +627,8 @@ enum ReadError {
     Host(#[from] HostError),
     #[error(transparent)]
     File(#[from] FileError),
+    #[error(transparent)]
+    Remote(#[from] RemoteError),
 }
 
 #[derive(Debug, thiserror::Error)]

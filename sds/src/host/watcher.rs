@@ -94,7 +94,9 @@ impl Watcher {
     /// would take quadratic time.
     pub(super) async fn run(mut self, shared: Arc<Shared>, mut settled: Option<Instant>) {
         let mut ending = EndingProcesses::default();
+        let mut pause = Pause::default();
         loop {
+            let waiting = Instant::now();
             let changes = tokio::select! {
                 changes = self.changes(&shared) => changes,
                 () = ending.due() => Ok(DirChanges::default()),
@@ -117,7 +119,8 @@ impl Watcher {
                 tokio::time::sleep(Duration::from_millis(100)).await;
                 ending.rescan = true;
             }
-            tokio::time::sleep(pause_after(began.elapsed())).await;
+            let pause = pause.after(began - waiting, began.elapsed());
+            tokio::time::sleep(pause).await;
         }
     }
 
@@ -213,7 +216,7 @@ impl Poller {
         for name in host_dir.names()? {
             match name {
                 Name::Process(id) => drop(processes.insert(id)),
-                Name::Entries(id) => drop(changes.wrote.insert(id)),
+                Name::Entries(id) | Name::Remote(id) => drop(changes.wrote.insert(id)),
                 _ => {}
             }
         }
@@ -241,13 +244,31 @@ impl Poller {
     }
 }
 
-/// Time to collect changes after a read of this duration. With many changes or little CPU time,
-/// reading leaves most of the time to the writers. A lookup of an unknown name does not wait for
-/// this pause.
-fn pause_after(reading: Duration) -> Duration {
+/// Time to collect changes after a read. With many changes or little CPU time, reading leaves most of the time
+/// to the writers. A lookup of an unknown name does not wait for this pause.
+#[derive(Debug)]
+struct Pause(Duration);
+
+impl Pause {
     const LEAST: Duration = Duration::from_millis(5);
-    const MOST: Duration = Duration::from_millis(100);
-    (reading * 8).clamp(LEAST, MOST)
+    const MOST: Duration = Duration::from_millis(200);
+
+    /// Returns the pause after a read of this duration, for which the watcher waited that long. While changes
+    /// follow each other, each pause is twice as long as the one before.
+    fn after(&mut self, waited: Duration, reading: Duration) -> Duration {
+        self.0 = match waited > self.0 {
+            true => Self::LEAST,
+            false => self.0 * 2,
+        };
+        self.0 = self.0.max(reading * 8).clamp(Self::LEAST, Self::MOST);
+        self.0
+    }
+}
+
+impl Default for Pause {
+    fn default() -> Self {
+        Self(Self::LEAST)
+    }
 }
 
 /// Collected changes, without duplicates.
@@ -272,10 +293,12 @@ impl DirChanges {
             self.lost = true;
         }
         match name.and_then(Name::parse) {
-            Some(Name::Entries(_) | Name::Domain) if mask.contains(EventMask::DELETE) => {
+            Some(Name::Entries(_) | Name::Remote(_) | Name::Domain)
+                if mask.contains(EventMask::DELETE) =>
+            {
                 self.disturbed = true;
             }
-            Some(Name::Entries(id)) if mask.contains(EventMask::MOVED_TO) => {
+            Some(Name::Entries(id) | Name::Remote(id)) if mask.contains(EventMask::MOVED_TO) => {
                 self.wrote.insert(id);
             }
             Some(Name::Process(id))

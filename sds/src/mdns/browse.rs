@@ -38,9 +38,11 @@ use super::{MdnsDirectory, SERVICE_TYPE};
 /// times.
 const MAX_UNKNOWN: usize = 4096;
 /// Maximum share of one source address in the tables: a quarter, so that one source cannot fill
-/// them.
+/// them. The last quarter is only for sources with a small share, so that a few others cannot fill them either.
 const MAX_SHARE: usize = MdnsDirectory::MAX_RECORDS / 4;
 const MAX_SHARE_BYTES: usize = MdnsDirectory::MAX_BYTES / 4;
+const SMALL_SHARE: usize = MAX_SHARE / 40;
+const SMALL_SHARE_BYTES: usize = MAX_SHARE_BYTES / 40;
 const MAX_SHARE_UNKNOWN: usize = MAX_UNKNOWN / 4;
 /// Delays of the queries for missing parts of a record, each after the previous query. A host that
 /// has just sent a record must not repeat it within a second (RFC 6762 clause 6).
@@ -248,9 +250,11 @@ impl Browser {
                         let others = self.bytes - known.len;
                         let share = self.shares.entry(known.from).or_default();
                         let others_of_share = share.bytes - known.len;
-                        if others + len > MdnsDirectory::MAX_BYTES
-                            || others_of_share + len > MAX_SHARE_BYTES
-                        {
+                        let most = match others_of_share + len <= SMALL_SHARE_BYTES {
+                            true => MdnsDirectory::MAX_BYTES,
+                            false => MdnsDirectory::MAX_BYTES - MAX_SHARE_BYTES,
+                        };
+                        if others + len > most || others_of_share + len > MAX_SHARE_BYTES {
                             received.refused += 1;
                             continue;
                         }
@@ -304,7 +308,11 @@ impl Browser {
             return Introduced::Already;
         }
         let share = self.shares.get(&from).copied().unwrap_or_default();
-        if self.records.len() >= MdnsDirectory::MAX_RECORDS || share.records >= MAX_SHARE {
+        let most = match share.records < SMALL_SHARE {
+            true => MdnsDirectory::MAX_RECORDS,
+            false => MdnsDirectory::MAX_RECORDS - MAX_SHARE,
+        };
+        if self.records.len() >= most || share.records >= MAX_SHARE {
             return Introduced::Refused;
         }
         let jitter = JITTER.mul_f64(chance.clamp(0.0, 1.0));

@@ -357,7 +357,9 @@ fn the_stored_state_is_bounded() {
         browser.handle_packet(now, one_of_many(number), &answer(&label, &parts, 120), 0.0);
         assert!(browser.bytes <= MdnsDirectory::MAX_BYTES);
     }
-    assert_eq!(browser.records.len(), MdnsDirectory::MAX_RECORDS);
+    // The last quarter is for small sources.
+    let most = MdnsDirectory::MAX_RECORDS - MAX_SHARE;
+    assert_eq!(browser.records.len(), most);
     assert!(browser.unknown >= 5, "some records were refused");
     run_timers(&mut browser, now, 200.0);
     assert_eq!(
@@ -365,6 +367,30 @@ fn the_stored_state_is_bounded() {
         (0, 0, 0)
     );
     assert!(browser.shares.is_empty());
+}
+
+#[test]
+fn several_sources_leave_room_for_small_ones() {
+    let now = Instant::now();
+    let long = [b'x'; 255];
+    let long: Vec<&[u8]> = vec![&long; 33];
+    for strings in [&long[..], &[b"TYPE=x"]] {
+        let mut browser = Browser::new(now, OWN, 0.0);
+        let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(strings)];
+        for number in 0..MdnsDirectory::MAX_RECORDS + 1000 {
+            let packet = answer(&format!("agent {number}"), &parts, 120);
+            browser.handle_packet(now, one_of_many(number), &packet, 0.0);
+        }
+        let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(&[b"TYPE=x"])];
+        for host in 0..30 {
+            let from = Ipv4Addr::new(203, 0, 113, host).into();
+            for number in 0..100 {
+                let label = format!("arm {host} {number}");
+                let received = browser.handle_packet(now, from, &answer(&label, &parts, 120), 0.0);
+                assert_eq!(names(&received), [label]);
+            }
+        }
+    }
 }
 
 #[test]
