@@ -9,7 +9,7 @@
 use std::time::Duration;
 
 use fipa::Performative::{Inform, QueryRef};
-use fipa::{Agent, Domain};
+use fipa::{Agent, Domain, SenderTasks};
 
 #[tokio::main]
 async fn main() -> fipa::Result<()> {
@@ -33,20 +33,28 @@ async fn main() -> fipa::Result<()> {
 
     // The end of the registration ends the task, too.
     echo.deregister()?;
-    let answered = answering.await.unwrap_or(Ok(0))?;
+    let answered = answering.await.unwrap_or(0);
     println!("echo answered {answered} messages");
     domain.close().await;
     Ok(())
 }
 
 /// Answers until the agent is deregistered, and returns the number of answers.
-async fn answer_all(echo: Agent) -> fipa::Result<usize> {
+async fn answer_all(echo: Agent) -> usize {
+    // An agent that takes no answers must not delay the answers to others.
+    let mut tasks = SenderTasks::default();
     let mut answered = 0;
     while let Ok(letter) = echo.receive().await {
         let question = letter.message();
         let answer = echo.reply(question, Inform).content(question.text());
-        echo.send(answer).await?;
-        answered += 1;
+        let sending = echo.send(answer);
+        let send = async move {
+            if let Err(error) = sending.await {
+                println!("cannot answer: {error}");
+            }
+        };
+        answered += usize::from(tasks.run(&letter, send).await);
     }
-    Ok(answered)
+    tasks.finish().await;
+    answered
 }

@@ -120,12 +120,13 @@ impl Global {
     }
 
     /// Default log filter; `$RUST_LOG` overrides it. The events of iceoryx2 contain the `Debug` text of its
-    /// values; those that matter are part of the errors of the shared memory transport.
+    /// values; those that matter are part of the errors of the shared memory transport. Peers cause the
+    /// warnings of rustls and quinn, which have no rate limit; what matters is in the errors of their connections.
     pub(crate) fn log_filter(&self) -> &'static str {
         match (self.quiet, self.verbose) {
             (true, _) => "error,iceoryx2_bb_loggers=off",
-            (false, 0) => "warn,iceoryx2_bb_loggers=off",
-            (false, 1) => "info,iceoryx2_bb_loggers=off",
+            (false, 0) => "warn,iceoryx2_bb_loggers=off,rustls=error,quinn=error,quinn_proto=error",
+            (false, 1) => "info,iceoryx2_bb_loggers=off,rustls=error,quinn=error,quinn_proto=error",
             (false, 2) => "debug",
             (false, _) => "trace",
         }
