@@ -24,7 +24,7 @@ use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, Pattern, View};
 use fipa_transport::{
     Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
-    OwnerProcess, Transport, TransportError, TransportErrorKind, log_limit, Principal,
+    OwnerProcess, Principal, Transport, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;

@@ -3,8 +3,8 @@
 //! A letter may arrive before the announcement of its sender, and on some networks the announcement
 //! never arrives. This back end makes it possible to answer such a sender for a limited time.
 
-use std::collections::{HashSet, HashMap};
 use std::cmp::Reverse;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 

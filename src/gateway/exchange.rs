@@ -15,9 +15,9 @@ use fipa_sds::{
     Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, OwnDfEntry,
     Present,
 };
-use fipa_transport::{Incarnation, Location, TransportErrorKind, log_limit};
 #[cfg(feature = "secure")]
 use fipa_transport::Principal;
+use fipa_transport::{Incarnation, Location, TransportErrorKind, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;

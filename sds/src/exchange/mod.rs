@@ -31,7 +31,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{ErrorChain, escape};
-use fipa_transport::{Incarnation, Location, Mandate, Principal};
+use fipa_transport::{Incarnation, Location, Mandate, Principal, log_limit};
 
 use df::DfEntries;
 pub use df::{DfEntry, OwnDfEntry};
@@ -1019,7 +1019,7 @@ impl Neighbor {
         let cut = staged.list.cut(shares::MAX_OF_PEER);
         if let Some(first) = cut.last() {
             let (gateway, first) = (escape(&self.mts.name), escape(first));
-            tracing::info!(%gateway, %first, count = cut.len(), "the agents of a gateway exceed its share; the last ones are left out");
+            log_limit::info!(%gateway, %first, count = cut.len(), "the agents of a gateway exceed its share; the last ones are left out");
         }
         if full.last {
             directory.replace(staged.list, staged.df);

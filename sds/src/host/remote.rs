@@ -36,7 +36,7 @@ use std::os::unix::fs::FileExt;
 use std::sync::Arc;
 
 use fipa_acl::{ErrorChain, escape};
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, log_limit};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{millis_of_time, time_of_millis};
@@ -337,7 +337,7 @@ impl<F: ReadAt> RemoteAgents<F> {
             let mut buffer = Vec::new();
             let record = self.record_at(slot.at, &mut buffer);
             let record = record.unwrap_or_else(|error| {
-                tracing::error!(error = %ErrorChain(&error), "cannot read an agent of another host");
+                log_limit::error!(error = %ErrorChain(&error), "cannot read an agent of another host");
                 None
             })?;
             is_it(&record).then(|| self.entry(&record)).flatten()
@@ -406,7 +406,7 @@ impl<F: ReadAt> RemoteAgents<F> {
             Ok(entry) => Some(Arc::new(entry)),
             Err(error) => {
                 let name = escape(record.name);
-                tracing::error!(%name, error = %ErrorChain(&error), "an agent of another host is ignored");
+                log_limit::error!(%name, error = %ErrorChain(&error), "an agent of another host is ignored");
                 None
             }
         }
@@ -440,7 +440,7 @@ impl<F: ReadAt> View for RemoteAgents<F> {
             Ok(())
         };
         if let Err(error) = read() {
-            tracing::error!(error = %ErrorChain(&error), "cannot read the agents of other hosts");
+            log_limit::error!(error = %ErrorChain(&error), "cannot read the agents of other hosts");
         }
         all.into()
     }

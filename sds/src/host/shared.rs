@@ -329,7 +329,7 @@ impl Shared {
     /// Logs a file that is treated as empty; the process's next file may be valid.
     fn ignored<T: Default>(&self, name: Name, error: &ReadError) -> T {
         let path = self.host_dir().path().join(name.to_string());
-        tracing::error!(path = %path.display(), error = %ErrorChain(error), "entries file ignored");
+        log_limit::error!(path = %path.display(), error = %ErrorChain(error), "entries file ignored");
         T::default()
     }
 
@@ -354,7 +354,7 @@ impl Shared {
         }
         let names = remote::changed(before.as_deref(), after.map(|it| &**it), Watch::CAPACITY);
         let names = names.unwrap_or_else(|error| {
-            tracing::error!(error = %ErrorChain(&error), "cannot compare the agents of other hosts");
+            log_limit::error!(error = %ErrorChain(&error), "cannot compare the agents of other hosts");
             None
         });
         let changes = names.map(|names| {

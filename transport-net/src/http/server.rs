@@ -9,7 +9,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant as Now};
 
 use bytes::{BufMut, Bytes};
-use fipa_transport::{LegacySource, Signature, log_limit, quota_address, TransportError, TransportErrorKind};
+use fipa_transport::{
+    LegacySource, Signature, TransportError, TransportErrorKind, log_limit, quota_address,
+};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Stream, Ticket,
-    TransportErrorKind,
+    TransportErrorKind, log_limit,
 };
 
 use super::config::UdpLimits;
@@ -335,7 +335,7 @@ fn every_seed(test: impl Fn(u64)) {
     for seed in seeds() {
         let run = std::panic::AssertUnwindSafe(|| test(seed));
         if let Err(panic) = std::panic::catch_unwind(run) {
-            tracing::error!(seed, "broke");
+            log_limit::error!(seed, "broke");
             let said = panic
                 .downcast_ref::<String>()
                 .cloned()
