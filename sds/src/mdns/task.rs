@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::ErrorChain;
-use fipa_transport::{Incarnation, log_limit};
+use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
 use super::alarm::Alarm;

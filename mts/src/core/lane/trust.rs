@@ -41,7 +41,7 @@ impl Lane {
                     delivery.ended(AttemptEnd::Unknown);
                     self.refuse(now, index, &entry, table);
                 }
-                State::Waiting(_) => self.refuse(now, index, &entry, table),
+                State::Waiting(_) | State::Ended => self.refuse(now, index, &entry, table),
             }
         }
         self.pump(now, table);
