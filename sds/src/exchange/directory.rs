@@ -16,8 +16,9 @@ use crate::{Directory, Entry, Role, Subscriber, View};
 
 /// The agents that neighbors sent.
 ///
-/// If two neighbors with a [certified](Mandate::Certified) link claim one name, the first claim
-/// received holds it until its entry leaves: a neighbor cannot claim an earlier registration.
+/// If two neighbors claim one name, the first claim received holds it until its entry leaves: a neighbor
+/// cannot claim an earlier registration. Claims of neighbors with a [certified](Mandate::Certified) link
+/// precede the others.
 #[derive(Debug)]
 pub struct ExchangeDirectory {
     table: Table<Origin>,
@@ -134,8 +135,8 @@ impl ExchangeDirectory {
     /// Maximum number of pairs that [`contested`](Self::contested) returns.
     pub const MAX_CONTESTED: usize = 1024;
 
-    /// Returns the names that several neighbors with a certified link claim: the entry that holds
-    /// the name, and each other entry. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED) pairs.
+    /// Returns the names that several neighbors claim, with certified links or else without: the entry
+    /// that holds the name, and each other entry. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED) pairs.
     #[must_use]
     pub fn contested(&self) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         self.table.contested(Self::MAX_CONTESTED)

@@ -231,16 +231,20 @@ fn renamed(shared: &Shared, original: &str) {
     }
 }
 
-/// Takes another label for an own record if another gateway announces this one by the same label. Of
-/// two gateways the one with the greater incarnation does so. Two records of one label would replace
-/// each other in the caches of other hosts.
+/// Takes another label for an own record if another gateway announces one by the same label, because two
+/// records of one label replace each other in the caches of other hosts. Of two gateways, the one with
+/// the greater incarnation does so. A record that is not announced yet waits for its turn, so the pace
+/// of announcements bounds how often forged records cause this.
 fn give_way(shared: &Shared, fullname: &str, theirs: &Entry) {
     if theirs.mts.incarnation > shared.config.mts.incarnation {
         return;
     }
     let original = fullname.to_lowercase();
-    let is_own = |own: &OwnAgents| own.agents.values().any(|one| *one.fullname == *original);
-    if is_own(&shared.own.lock()) {
+    let is_announced = |own: &OwnAgents| {
+        let mut all = own.agents.values();
+        all.any(|one| *one.fullname == *original && one.told.is_some())
+    };
+    if is_announced(&shared.own.lock()) {
         renamed(shared, &original);
     }
 }
@@ -288,6 +292,32 @@ mod tests {
         listener.handle_beacon(at(100), shared, gateway.incarnation, beacon);
         assert_eq!(listener.browser.handle_timeout(at(150), 0.0).gone.len(), 0);
         assert_eq!(listener.browser.handle_timeout(at(221), 0.0).gone.len(), 1);
+    }
+
+    #[tokio::test]
+    async fn forged_records_of_own_labels_hold_back_no_other_announcement() {
+        let directory = directory();
+        let shared = &directory.shared;
+        let at = "tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap();
+        let arm = Registration::new("arm", Incarnation::random(), vec![at]);
+        directory.register(arm.clone()).unwrap();
+        let gateway = Mts::new("theirs", Incarnation::from_u64(1));
+        let theirs = arm.into_entry(&gateway, Source::Mdns).unwrap();
+        let label = || Arc::clone(&shared.own.lock().agents["arm"].fullname);
+        let first = label();
+        give_way(shared, "another label", &theirs);
+        assert_eq!(label(), first);
+        // The forger knows each label.
+        for _ in 0..1000 {
+            give_way(shared, &label(), &theirs);
+        }
+        assert_ne!(label(), first);
+        let now = Instant::now();
+        let turn = shared.own.lock().pace.turn(now, 0.0);
+        assert!(
+            turn.is_none_or(|turn| turn < now + Duration::from_secs(1)),
+            "{turn:?}"
+        );
     }
 
     #[test]
