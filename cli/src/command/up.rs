@@ -206,6 +206,6 @@ fn log_entry(change: &str, entry: &Entry) {
         of: &*entry.name, name = %entry.name,
         reach,
         mts = %entry.mts.name,
-        "an agent {change}"
+        "agent {change}"
     );
 }
