@@ -189,7 +189,6 @@ impl Expiry {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 mod tests {
     use rcgen::{CertificateParams, KeyPair, SanType};
 
