@@ -270,18 +270,18 @@ impl Security {
         let revision = self.revision();
         let chain = trust::Chain::new(presented?, name)?;
         let evidence = Evidence::Chain(chain);
-        let is_trusted = self.still_trusts(&evidence, SystemTime::now());
+        let is_trusted = self.still_trusts(&evidence);
         is_trusted.then(|| Trust::new(self, revision, evidence))
     }
 
     /// Whether the credentials still trust a peer that has presented this. The end of a trusted certificate
     /// does not count here, see [`left`](Self::left).
-    fn still_trusts(&self, evidence: &Evidence, now: SystemTime) -> bool {
+    fn still_trusts(&self, evidence: &Evidence) -> bool {
         let known = Arc::clone(&self.now.read().known);
         match evidence {
             Evidence::Listed(certificate) => known.trusts(certificate.fingerprint()),
             #[cfg(feature = "http")]
-            Evidence::Chain(chain) => known.trusts_chain(chain, now),
+            Evidence::Chain(chain) => known.trusts_chain(chain, SystemTime::now()),
         }
     }
 
@@ -290,7 +290,7 @@ impl Security {
         match evidence {
             Evidence::Listed(certificate) => certificate.left(now),
             #[cfg(feature = "http")]
-            Evidence::Chain(chain) => match self.still_trusts(evidence, now) {
+            Evidence::Chain(chain) => match self.still_trusts(evidence) {
                 true => chain.next_end(now),
                 false => Duration::ZERO,
             },
