@@ -16,6 +16,7 @@ use fipa::Domain;
 use fipa::config::{Effective, Sources, Value};
 use fipa::locks::ENTRY_PREFIX;
 use fipa::monitor::Library;
+use fipa_acl::is_unprintable;
 
 use crate::options;
 
@@ -84,7 +85,8 @@ impl EnvCompleter for PlainBash {
 /// Whether the word means itself in bash, zsh and fish: a letter, a digit or one of these characters has no
 /// other meaning there. A `=` has one at the beginning only, in zsh.
 fn is_plain(word: &str) -> bool {
-    let is_plain = |c: char| c.is_alphanumeric() || "_-./@:,=".contains(c);
+    // U+3164 is a letter, and invisible.
+    let is_plain = |c: char| c.is_alphanumeric() && !is_unprintable(c) || "_-./@:,=".contains(c);
     word.chars().all(is_plain) && !word.starts_with('=')
 }
 
