@@ -252,10 +252,7 @@ impl Monitored {
         origin: Origin,
         directory: &dyn Directory,
     ) -> Option<Box<Violation>> {
-        let mut header = Header::from(&incoming.view());
-        if let Some(agent) = incoming.undelivered_to.as_deref() {
-            header = header.undelivered_to(agent);
-        }
+        let mut header = incoming.header();
         // Only a message with both begins a conversation.
         if header.protocol_name().is_some() && header.conversation().is_some() {
             let sender = directory.known_incarnation(origin.sender);
@@ -428,7 +425,7 @@ fn groups<'m>(message: &'m Message, directory: &dyn Directory) -> Vec<(&'m str, 
 }
 
 /// Returns the current time. The monotonic clock counts while the machine is suspended.
-fn now() -> Now {
+pub(crate) fn now() -> Now {
     let elapsed = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     let elapsed = Duration::try_from(elapsed).unwrap_or_default();
     Now::new(SystemTime::now(), elapsed)
@@ -438,7 +435,7 @@ fn now() -> Now {
 mod tests {
     use std::time::SystemTime;
 
-    use fipa_acl::AgentId;
+    use fipa_acl::{AgentId, Time};
     use fipa_mts::letter_for;
     use fipa_sds::{MemoryDirectory, Mts, Registration};
     use fipa_transport::Kind;
@@ -462,8 +459,18 @@ mod tests {
     }
 
     fn received(message: &Message, sender: Incarnation, via: Option<Kind>) -> Received {
+        received_at(SystemTime::UNIX_EPOCH, message, sender, via)
+    }
+
+    /// A letter with this time of its sending.
+    fn received_at(
+        sent: SystemTime,
+        message: &Message,
+        sender: Incarnation,
+        via: Option<Kind>,
+    ) -> Received {
         Received {
-            letter: letter_for(message, SystemTime::UNIX_EPOCH).unwrap(),
+            letter: letter_for(message, sent).unwrap(),
             sender,
             via,
             service: PROCESS,
@@ -510,6 +517,40 @@ mod tests {
         let found = kind(request(), ARM, &mut answered);
         assert_eq!(found, Some(ViolationKind::NoConversation));
         assert_eq!(answered, 2);
+    }
+
+    /// The clock of the caller is an hour behind, or ahead. The proposal comes in time.
+    #[test]
+    fn a_call_needs_no_common_clock() {
+        let hour = Duration::from_secs(3600);
+        let here = SystemTime::now();
+        for caller in [here - hour, here, here + hour] {
+            let mut config = Config::for_host("here");
+            config.monitor.check = Check::Enforce;
+            let rules = Rules::load(&config.monitor).unwrap();
+            let directory = directory();
+            let checks = rules.checks("rover", "c-".to_owned(), &directory);
+            let arrived = |message: &Message| {
+                let received = received_at(caller, message, ARM, Some(Kind::Tcp));
+                let origin = Origin::of(&received);
+                let incoming = Incoming::new(received).unwrap();
+                let checked = checks.arrived(incoming, origin, &directory, |_, _| None);
+                checked.violation().map(|violation| violation.kind)
+            };
+            let by = Time::from_system_time(caller + Duration::from_secs(60)).unwrap();
+            let part = |act, from: &str, to: &str| {
+                let agent = |name: &str| AgentId::new(name).unwrap();
+                let message = Message::builder(act).sender(agent(from));
+                let message = message.receiver(agent(to)).protocol("fipa-contract-net");
+                message.conversation_id("c")
+            };
+            let call = part(Performative::Cfp, "arm", "rover").reply_by(by);
+            assert_eq!(arrived(&call.build().unwrap()), None);
+            let bid = part(Performative::Propose, "rover", "arm");
+            checks.leaving(&bid.build().unwrap(), &directory).unwrap();
+            let award = part(Performative::AcceptProposal, "arm", "rover");
+            assert_eq!(arrived(&award.build().unwrap()), None);
+        }
     }
 
     #[test]

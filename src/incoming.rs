@@ -5,9 +5,9 @@ use std::sync::OnceLock;
 use bytes::Bytes;
 use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
 #[cfg(feature = "protocols")]
-use fipa_acl::{Performative, Text};
+use fipa_acl::{Envelope, Performative, Text, Time};
 #[cfg(feature = "protocols")]
-use fipa_monitor::Violation;
+use fipa_monitor::{Header, Violation};
 use fipa_mts::core::Received;
 use fipa_transport::{Incarnation, Kind};
 
@@ -121,6 +121,31 @@ impl Incoming {
         self.parts.letter.len()
     }
 
+    /// Returns the parameters that a check of the protocol reads.
+    ///
+    /// A `reply-by` is relative to the date of the envelope, if the letter has one: both come from the clock of
+    /// the sender, which may differ from that of this host (FIPA00061 2.11 and FIPA00067 3.2 require no
+    /// common clock). The time to answer begins when the message is checked.
+    #[cfg(feature = "protocols")]
+    pub(crate) fn header(&self) -> Header<'_> {
+        let mut header = Header::from(&self.view());
+        if let Some(agent) = self.undelivered_to.as_deref() {
+            header = header.undelivered_to(agent);
+        }
+        match self.time_to_answer() {
+            Some(by) => header.reply_by(by),
+            None => header,
+        }
+    }
+
+    /// Returns the time by which an answer is due, relative to the sending of the message.
+    #[cfg(feature = "protocols")]
+    fn time_to_answer(&self) -> Option<Time> {
+        let by = self.view().reply_by()?;
+        let (envelope, _) = Envelope::decode(&self.parts.letter.envelope()).ok()?;
+        Time::after(by.span_since(envelope.effective().date?)?).ok()
+    }
+
     /// Whether the message has this communicative act of the standard.
     #[cfg(feature = "protocols")]
     pub(crate) fn is(&self, performative: &Performative) -> bool {
@@ -182,12 +207,9 @@ impl Incoming {
         self.violation = Some(violation);
     }
 
-    /// Separates the message from its violation.
     #[cfg(feature = "protocols")]
-    pub(crate) fn into_parts(self) -> (Message, Option<Box<Violation>>) {
-        let mut this = self;
-        let violation = this.violation.take();
-        (this.into_message(), violation)
+    pub(crate) fn take_violation(&mut self) -> Option<Box<Violation>> {
+        self.violation.take()
     }
 }
 

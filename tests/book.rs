@@ -60,7 +60,7 @@ async fn a_request_is_served() -> Result<()> {
 
 async fn offer(arm: &Agent, price: u32) -> Result<()> {
     // ANCHOR: propose
-    let call = arm.receive().await?.into_message();
+    let call = arm.receive().await?;
     let mut task = arm.take_part(&call)?;
     if task
         .propose(price.to_string(), Duration::from_secs(60))

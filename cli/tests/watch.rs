@@ -518,6 +518,7 @@ fn letters_that_were_lost_make_no_violations() {
         {
             let recorded = Recorded {
                 at: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
+                answer_within: None,
                 receiver: message.receivers()[0].name().to_owned(),
                 undelivered: false,
                 from_service: false,

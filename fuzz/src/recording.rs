@@ -71,6 +71,7 @@ pub fn seeds() -> Vec<Vec<u8>> {
             .build();
         let recorded = Recorded {
             at: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000 + number),
+            answer_within: None,
             receiver: to.to_owned(),
             undelivered: false,
             from_service: false,

@@ -2,11 +2,13 @@
 //!
 //! ```text
 //! recording := "fipa-rec" version(u32) entry*
-//! entry     := length(u32) time(u64) flags(u8) receiver-length(u16) receiver message
+//! entry     := length(u32) time(u64) answer-within(u64) flags(u8) receiver-length(u16) receiver message
 //! ```
 //!
 //! All integers are little-endian. `version` is 1. `length` counts the bytes of the entry after itself,
-//! at most [`MAX_ENTRY`]. `time` is in nanoseconds since 1970-01-01T00:00:00Z. `flags` is the sum of 1
+//! at most [`MAX_ENTRY`]. `time` is in nanoseconds since 1970-01-01T00:00:00Z.
+//! `answer-within` is the time from then, in milliseconds, by which the sender expects an answer, or 2^64 - 1 if only the
+//! `reply-by` of the message has it, by another clock. `flags` is the sum of 1
 //! for a letter that was not delivered, 2 for a letter of a message transport service, 4 for a letter
 //! whose conversation may have begun before the recording, and 8 if letters before this one are missing.
 //! A reader ignores other flags. `receiver` is the name of the agent that got, or was to get, the letter, in UTF-8. `message` is the message without
@@ -30,7 +32,10 @@ pub const VERSION: u32 = 1;
 pub const MAX_ENTRY: usize = 128 * 1024;
 
 /// Bytes of an entry before the name of the receiver.
-const FIXED: usize = 8 + 1 + 2;
+const FIXED: usize = 8 + 8 + 1 + 2;
+
+/// The value of `answer-within` for a letter without it.
+const UNKNOWN: u64 = u64::MAX;
 
 const UNDELIVERED: u8 = 1;
 const FROM_SERVICE: u8 = 2;
@@ -43,6 +48,8 @@ pub struct Recorded {
     /// The time of sending, with a resolution of 1 ns. Times before 1970 or after 2554 are not
     /// represented.
     pub at: SystemTime,
+    /// The time from `at` by which the sender expects an answer, with a resolution of 1 ms.
+    pub answer_within: Option<Duration>,
     /// The name of the receiver.
     pub receiver: String,
     /// Whether the letter was not delivered.
@@ -119,6 +126,11 @@ pub fn append(recorded: &Recorded, out: &mut Vec<u8>) -> Result<(), TooLong> {
         | flag(recorded.after_loss, AFTER_LOSS);
     out.extend_from_slice(&length.to_le_bytes());
     out.extend_from_slice(&nanos.to_le_bytes());
+    let within = recorded
+        .answer_within
+        .map(|it| u64::try_from(it.as_millis()));
+    let within = within.and_then(Result::ok).unwrap_or(UNKNOWN);
+    out.extend_from_slice(&within.to_le_bytes());
     out.push(flags);
     out.extend_from_slice(&receiver_len.to_le_bytes());
     out.extend_from_slice(receiver);
@@ -210,6 +222,10 @@ impl Reader {
 
 fn entry_of(entry: &[u8]) -> Result<Recorded, &'static str> {
     let (time, rest) = entry.split_first_chunk::<8>().ok_or("it has no time")?;
+    let (within, rest) = rest
+        .split_first_chunk::<8>()
+        .ok_or("it has no answer-within")?;
+    let within = Some(u64::from_le_bytes(*within)).filter(|within| *within != UNKNOWN);
     let ([flags], rest) = rest.split_first_chunk::<1>().ok_or("it has no flags")?;
     let (len, rest) = rest.split_first_chunk::<2>().ok_or("it has no receiver")?;
     let len = usize::from(u16::from_le_bytes(*len));
@@ -219,6 +235,7 @@ fn entry_of(entry: &[u8]) -> Result<Recorded, &'static str> {
     let at = UNIX_EPOCH.checked_add(Duration::from_nanos(u64::from_le_bytes(*time)));
     Ok(Recorded {
         at: at.ok_or("the time is out of range")?,
+        answer_within: within.map(Duration::from_millis),
         receiver: receiver.to_owned(),
         undelivered: flags & UNDELIVERED != 0,
         from_service: flags & FROM_SERVICE != 0,
@@ -244,6 +261,7 @@ mod tests {
             .build();
         Recorded {
             at: UNIX_EPOCH + Duration::from_nanos(1_700_000_000_000_000_001 + number),
+            answer_within: (number != 3).then(|| Duration::from_millis(number)),
             receiver: "ben".to_owned(),
             undelivered: number % 2 == 1,
             from_service: number % 3 == 1,

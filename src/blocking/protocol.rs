@@ -13,7 +13,7 @@ use crate::protocol::{
     Auction, Awarded, Bids, ContractNet, Decision, DialogueError, PartnerEvent, PartnerWatch,
     Proxied, Publisher, Reply, Request, Server, Subscription, Task,
 };
-use crate::{AgentId, AgentIdError};
+use crate::{AgentId, AgentIdError, Incoming};
 
 /// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
 /// [`Auction`], [`Proxied`] or [`Task`], or a [`Server`], [`Publisher`] or [`PartnerWatch`]. Dereferences to that type for the calls that do not wait.
@@ -210,7 +210,7 @@ impl Agent {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn take_part(&self, first: &Message) -> Result<Side<Task>, DialogueError> {
+    pub fn take_part(&self, first: &Incoming) -> Result<Side<Task>, DialogueError> {
         Ok(self.side_of(self.agent.take_part(first)?))
     }
 

@@ -17,7 +17,7 @@ use super::partners::PartnerEvent;
 use super::reachability::{Reachability, ReachabilitySender};
 use super::watching::PartnerWatch;
 use crate::agent::AgentCore;
-use crate::checks::header_of_outcomes;
+use crate::checks::{header_of_outcomes, now};
 use crate::delivery::{Deliveries, Delivery, Sent, deliveries};
 use crate::demultiplexer::{Admitted, Party, ReaderKey};
 use crate::error::{ReceiveError, SendError};
@@ -207,7 +207,8 @@ impl Dialogue {
     }
 
     /// Takes part in the conversation that a message has begun.
-    pub(super) fn join(core: &Arc<AgentCore>, first: &Message) -> Result<Self, DialogueError> {
+    pub(super) fn join(core: &Arc<AgentCore>, incoming: &Incoming) -> Result<Self, DialogueError> {
+        let first = incoming.message();
         let id = first.conversation_id();
         let id = id.ok_or(DialogueError::Unchecked(Unchecked::NoConversation))?;
         let initiator = name_of(first);
@@ -215,7 +216,7 @@ impl Dialogue {
             return Err(DialogueError::NotOpening(Box::new(first.clone())));
         }
         let mut speaker = Speaker::new(core, first.protocol().unwrap_or_default(), id.to_owned());
-        match speaker.check(first, None) {
+        match speaker.check(&incoming.header()) {
             Ok(meaning) if meaning.opened => {}
             Ok(_) => return Err(DialogueError::NotOpening(Box::new(first.clone()))),
             Err(CheckFailure::Violation(violation))
@@ -461,21 +462,21 @@ impl Dialogue {
     }
 
     fn interpret(&mut self, mut incoming: Incoming) -> Result<Interpreted, DialogueError> {
-        let undelivered_to = incoming.undelivered_to.take();
-        let (message, violation) = incoming.into_parts();
-        if let Some(sender) = message.sender() {
+        if let Some(sender) = incoming.message().sender() {
             self.partners.handle_message(sender.name());
         }
-        if let Some(violation) = violation {
-            let message = Box::new(message);
-            return Err(DialogueError::Violation { violation, message });
-        }
-        let meaning = match self.speaker.check(&message, undelivered_to.as_deref()) {
+        let checked = match incoming.take_violation() {
+            Some(violation) => Err(CheckFailure::Violation(violation)),
+            None => self.speaker.check(&incoming.header()),
+        };
+        let is_report = incoming.undelivered_to.is_some();
+        let message = incoming.into_message();
+        let meaning = match checked {
             // Of a message to a party that the monitor does not have any more.
-            Err(CheckFailure::Unchecked(_)) if undelivered_to.is_some() => {
+            Err(CheckFailure::Unchecked(_)) if is_report => {
                 return Err(DialogueError::Undelivered(Box::new(message)));
             }
-            meaning => meaning.map_err(|failure| failure.on_received(&message))?,
+            checked => checked.map_err(|failure| failure.on_received(&message))?,
         };
         self.follow_delegates(&message);
         match meaning.state {
@@ -588,7 +589,7 @@ impl Speaker {
         let deliveries = deliveries(sent).await;
         if let Some(last) = &self.last {
             for receiver in unreached(&deliveries) {
-                self.monitor.undelivered(last, receiver, SystemTime::now());
+                self.monitor.undelivered(last, receiver, now());
             }
         }
         deliveries
@@ -622,7 +623,8 @@ impl Speaker {
             }
         }
         let message = message.build()?;
-        self.check(&message, None).map_err(CheckFailure::on_sent)?;
+        self.check(&Header::from(&message))
+            .map_err(CheckFailure::on_sent)?;
         self.replies += 1;
         self.last = header_of_outcomes(&message);
         let letter = letter_for(&message, SystemTime::now());
@@ -663,27 +665,20 @@ impl Speaker {
         }
     }
 
-    /// Checks a message. `undelivered_to` is the agent that did not get a message, if this is the report
-    /// of a service.
-    fn check(
-        &mut self,
-        message: &Message,
-        undelivered_to: Option<&str>,
-    ) -> Result<Meaning, CheckFailure> {
-        let now = SystemTime::now();
-        let mut header = Header::from(message);
-        if let Some(agent) = undelivered_to {
-            header = header.undelivered_to(agent);
-        }
+    /// Checks a message that was received or is about to be sent.
+    fn check(&mut self, message: &Header<'_>) -> Result<Meaning, CheckFailure> {
         let own = Meaning {
             state: DialogueState::Own,
             over: false,
             void: false,
             opened: false,
         };
-        match self.monitor.check(&header, now) {
+        match self.monitor.check(message, now()) {
             Verdict::Accepted(accepted) => {
-                if message.protocol().is_none_or(|name| name == self.protocol) {
+                if message
+                    .protocol_name()
+                    .is_none_or(|name| name == self.protocol)
+                {
                     accepted.state.clone_into(&mut self.state);
                     self.over = accepted.over;
                 }
@@ -732,7 +727,7 @@ impl Drop for Dialogue {
 /// Whether a message begins a conversation of a known protocol with the agent of this name.
 pub(super) fn opens(library: &Arc<Library>, agent: &str, message: &Message) -> bool {
     let mut monitor = Monitor::agent(Arc::clone(library), agent);
-    let verdict = monitor.check(&Header::from(message), SystemTime::now());
+    let verdict = monitor.check(&Header::from(message), now());
     name_of(message) != agent
         && matches!(verdict, Verdict::Accepted(accepted) if accepted.opened && accepted.own)
 }

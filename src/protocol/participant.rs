@@ -13,6 +13,7 @@ use super::dialogue::{
 use super::receivers::expand;
 use crate::agent::{Agent, AgentCore};
 use crate::delivery::deliveries;
+use crate::incoming::Incoming;
 
 /// The last message of a participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -49,7 +50,7 @@ impl Agent {
     ///
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
     /// let incoming = agent.receive().await?;
-    /// let mut task = agent.take_part(incoming.message())?;
+    /// let mut task = agent.take_part(&incoming)?;
     /// let reply = lift(&mut task).await?;
     /// task.reply(reply).await?;
     /// # Ok(())
@@ -59,7 +60,7 @@ impl Agent {
     /// # Errors
     /// If the message does not begin a known protocol ([`DialogueError::NotOpening`] or
     /// [`DialogueError::Unchecked`]), for example because it is an answer.
-    pub fn take_part(&self, first: &Message) -> Result<Task, DialogueError> {
+    pub fn take_part(&self, first: &Incoming) -> Result<Task, DialogueError> {
         Task::join(&self.core, first, None)
     }
 }
@@ -167,13 +168,13 @@ impl Reply {
 impl Task {
     pub(super) fn join(
         core: &Arc<AgentCore>,
-        first: &Message,
+        first: &Incoming,
         home: Option<Home>,
     ) -> Result<Self, DialogueError> {
         Ok(Self {
             dialogue: Dialogue::join(core, first)?,
-            first: first.clone(),
-            last: first.clone(),
+            first: first.message().clone(),
+            last: first.message().clone(),
             early: None,
             asked: Vec::new(),
             is_done: false,

@@ -14,6 +14,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use super::dialogue::{Dialogue, DialogueError, name_of};
 use super::serving::{ServedQueue, opening};
 use crate::agent::{Agent, AgentCore};
+use crate::incoming::Incoming;
 
 /// Maximum number of notifications that wait for one subscriber. Beyond it, `publish` waits.
 const MAX_WAITING: usize = 64;
@@ -155,7 +156,7 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
         let is_full = subscribers.0.lock().all.len() >= MAX_SUBSCRIBERS;
         let subscribers = Arc::downgrade(&subscribers);
         tokio::spawn(async move {
-            let name = name_of(&first);
+            let name = name_of(first.message());
             let served = match is_full {
                 true => refuse(&core, &first).await,
                 false => serve(&core, &first, &subscribers).await,
@@ -167,21 +168,22 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
     }
 }
 
-async fn refuse(core: &Arc<AgentCore>, first: &Message) -> Result<(), DialogueError> {
+async fn refuse(core: &Arc<AgentCore>, first: &Incoming) -> Result<(), DialogueError> {
     let mut dialogue = Dialogue::join(core, first)?;
     let refuse = Performative::Refuse;
     dialogue
-        .answer(first, refuse, "too many subscribers", None)
+        .answer(first.message(), refuse, "too many subscribers", None)
         .await
 }
 
 /// Serves one subscription until its end.
 async fn serve(
     core: &Arc<AgentCore>,
-    first: &Message,
+    first: &Incoming,
     subscribers: &std::sync::Weak<Subscribers>,
 ) -> Result<(), DialogueError> {
     let mut dialogue = Dialogue::join(core, first)?;
+    let first = first.message();
     let (sender, mut notifications) = mpsc::channel(MAX_WAITING);
     let Some(registered) = subscribers.upgrade() else {
         return dialogue

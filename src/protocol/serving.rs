@@ -128,10 +128,10 @@ impl ServedQueue {
     }
 
     /// Waits for the next message. Returns `None` if the agent receives no further messages.
-    pub(super) async fn next(&self) -> Option<Message> {
+    pub(super) async fn next(&self) -> Option<Incoming> {
         let endpoint = &self.core.endpoint;
         let next = self.core.demultiplexer.next_served(endpoint, &self.key);
-        next.await.ok().map(Incoming::into_message)
+        next.await.ok()
     }
 }
 

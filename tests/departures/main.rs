@@ -190,7 +190,7 @@ async fn a_participant_learns_that_its_initiator_was_killed() {
     let domain = Domain::open(&support::load(host.clone())).await.unwrap();
     let rover = domain.register("rover").await.unwrap();
     let mut starter = Process::start("starter", &host);
-    let first = patient(rover.receive()).await.unwrap().into_message();
+    let first = patient(rover.receive()).await.unwrap();
     let mut task = rover.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     starter.kill();
@@ -208,7 +208,7 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
         let mut request = rover.request(request, PATIENCE).await.unwrap();
-        let first = patient(arm.receive()).await.unwrap().into_message();
+        let first = patient(arm.receive()).await.unwrap();
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         assert!(request.agreed().await.unwrap());

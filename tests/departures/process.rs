@@ -12,7 +12,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use fipa::protocol::{DialogueError, Reply, Task};
-use fipa::{Agent, AgentId, Config, Domain, Gateway, Kind, Message, Performative};
+use fipa::{Agent, AgentId, Config, Domain, Gateway, Incoming, Kind, Performative};
 use tokio::sync::Semaphore;
 
 use crate::support;
@@ -74,8 +74,8 @@ async fn agent(config: &Config, name: &str, finish: &Arc<Semaphore>) {
         tokio::spawn(start(Arc::clone(&agent)));
     }
     loop {
-        let first = agent.receive().await.unwrap().into_message();
-        say(&format!("got {}", first.performative()));
+        let first = agent.receive().await.unwrap();
+        say(&format!("got {}", first.message().performative()));
         if let Ok(task) = agent.take_part(&first) {
             tokio::spawn(take_part(task, first, Arc::clone(finish)));
         }
@@ -93,10 +93,10 @@ async fn start(agent: Arc<Agent>) {
 
 async fn take_part(
     mut task: Task,
-    first: Message,
+    first: Incoming,
     finish: Arc<Semaphore>,
 ) -> Result<(), DialogueError> {
-    match first.performative() {
+    match first.message().performative() {
         Performative::Request | Performative::QueryRef | Performative::RequestWhen => {
             task.agree("").await?;
             finish.acquire().await.unwrap().forget();

@@ -8,7 +8,7 @@ use super::*;
 
 /// Runs a rover and an arm of two processes. The arm runs `arm_does` with its first message.
 fn between<T: Send + 'static>(
-    arm_does: impl FnOnce(&blocking::Agent, &Message) -> T + Send + 'static,
+    arm_does: impl FnOnce(&blocking::Agent, &Incoming) -> T + Send + 'static,
     rover_does: impl FnOnce(&blocking::Agent),
 ) -> T {
     let config = config(&["monitor.check=enforce"]);
@@ -17,7 +17,7 @@ fn between<T: Send + 'static>(
     let rover = here.register("rover").unwrap();
     let arm = there.register("arm").unwrap();
     let arm = thread::spawn(move || {
-        let first = arm.receive().unwrap().into_message();
+        let first = arm.receive().unwrap();
         arm_does(&arm, &first)
     });
     rover_does(&rover);
@@ -41,7 +41,7 @@ fn a_request_is_answered_and_another_cancelled() {
             task.agree("").unwrap();
             assert_eq!(text(task.message()), "a crate");
             task.reply(Reply::Inform("lifted".into())).unwrap();
-            let second = arm.receive().unwrap().into_message();
+            let second = arm.receive().unwrap();
             let mut task = arm.take_part(&second).unwrap();
             task.agree("").unwrap();
             let mut asked = 1;
@@ -77,11 +77,11 @@ fn query_request_when_propose_and_subscribe() {
                 Reply::Accept("".into()),
             ] {
                 let mut task = arm.take_part(&first).unwrap();
-                if *first.performative() == Performative::RequestWhen {
+                if *first.message().performative() == Performative::RequestWhen {
                     task.agree("").unwrap();
                 }
                 task.reply(reply).unwrap();
-                first = arm.receive().unwrap().into_message();
+                first = arm.receive().unwrap();
             }
             let mut task = arm.take_part(&first).unwrap();
             task.agree("").unwrap();
@@ -114,7 +114,7 @@ fn contract_nets() {
             let mut task = arm.take_part(first).unwrap();
             assert!(task.propose("10", PATIENCE).unwrap());
             task.reply(Reply::Inform("done".into())).unwrap();
-            let call = arm.receive().unwrap().into_message();
+            let call = arm.receive().unwrap();
             let mut task = arm.take_part(&call).unwrap();
             assert!(!task.propose("10", PATIENCE).unwrap());
             assert!(task.next_call(PATIENCE).unwrap().is_some());
@@ -146,7 +146,7 @@ fn auctions() {
             assert!(task.next_call(PATIENCE).unwrap().is_some());
             assert!(task.propose("", PATIENCE).unwrap());
             assert!(task.next_call(PATIENCE).unwrap().is_none());
-            let opening = arm.receive().unwrap().into_message();
+            let opening = arm.receive().unwrap();
             let mut second = arm.take_part(&opening).unwrap();
             assert!(second.next_call(PATIENCE).unwrap().is_some());
             assert!(second.propose("", PATIENCE).unwrap());
@@ -187,7 +187,7 @@ fn brokering_and_recruiting() {
             task.inform("passed on").unwrap();
             let answer = broker.message(Performative::Confirm).build().unwrap();
             task.forward(&answer).unwrap();
-            let second = broker.receive().unwrap().into_message();
+            let second = broker.receive().unwrap();
             let mut task = broker.take_part(&second).unwrap();
             task.agree("").unwrap();
             task.pass_on(query(), PATIENCE).unwrap();

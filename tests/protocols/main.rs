@@ -72,7 +72,7 @@ fn to(agent: &Agent, act: Performative, receiver: &Agent, content: &str) -> Mess
 /// Takes part in the conversation of this message, and replies with the result of the handler.
 async fn respond(
     agent: &Agent,
-    first: &Message,
+    first: &Incoming,
     handler: impl AsyncFnOnce(&mut Task) -> Result<Reply, DialogueError>,
 ) -> Result<(), DialogueError> {
     let mut task = agent.take_part(first)?;
@@ -94,9 +94,9 @@ async fn a_request_is_agreed_to_and_answered() {
         assert_eq!(text(&request.result().await.unwrap()), "lifted");
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().into_message();
-        assert_eq!(first.protocol(), Some("fipa-request"));
-        assert!(first.reply_by().is_some() && first.reply_with().is_some());
+        let first = next_message(&arm).await.unwrap();
+        assert_eq!(first.message().protocol(), Some("fipa-request"));
+        assert!(first.message().reply_by().is_some() && first.message().reply_with().is_some());
         let handler = async |task: &mut Task| {
             assert_eq!(text(task.message()), "lift");
             task.agree("").await?;
@@ -147,8 +147,8 @@ async fn each_kind_of_answer_yields_its_result_or_error() {
             Reply::Accept("".into()),
             Reply::Reject("".into()),
         ] {
-            let first = next_message(&arm).await.unwrap().into_message();
-            let when = *first.performative() == Performative::RequestWhen;
+            let first = next_message(&arm).await.unwrap();
+            let when = *first.message().performative() == Performative::RequestWhen;
             let handler = async |task: &mut Task| {
                 if when {
                     task.agree("").await?;
@@ -199,7 +199,7 @@ async fn missing_and_invalid_answers_are_errors() {
     assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
     // A reply that violates the protocol is not sent.
     let _request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().into_message();
+    let first = next_message(&arm).await.unwrap();
     let wrong = respond(&arm, &first, async |_| Ok(Reply::Accept("".into()))).await;
     assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
 }
@@ -209,7 +209,7 @@ async fn other_messages_are_received_during_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().into_message();
+    let first = next_message(&arm).await.unwrap();
     for number in 0..5 {
         let note = to(&arm, Performative::Inform, &rover, &number.to_string());
         arm.send(note.build().unwrap()).await.unwrap();
@@ -239,7 +239,7 @@ async fn a_conversation_blocked_by_unread_messages_ends_with_the_domain() {
         tokio::time::timeout(PATIENCE, poses.next()).await.unwrap()
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().into_message();
+        let first = next_message(&arm).await.unwrap();
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         // As many messages as can be set aside for `receive`, which the rover does not call.
@@ -268,7 +268,7 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
         poses.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().into_message();
+        let first = next_message(&arm).await.unwrap();
         let handler = async |task: &mut Task| {
             task.agree("").await?;
             for number in 0..10 {
@@ -292,7 +292,7 @@ async fn a_request_is_cancelled() {
         request.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = next_message(&arm).await.unwrap().into_message();
+        let first = next_message(&arm).await.unwrap();
         let handler = async |task: &mut Task| {
             task.agree("").await?;
             tokio::select! {
@@ -318,7 +318,7 @@ async fn a_contract_net_with_several_participants() {
     called.push(AgentId::new("unknown").unwrap());
     let participants = async {
         let bid = async |arm: &Agent, price: &'static str| {
-            let call = next_message(arm).await.unwrap().into_message();
+            let call = next_message(arm).await.unwrap();
             respond(arm, &call, async |task| {
                 if task.propose(price, PATIENCE).await? {
                     return Ok(Reply::Inform("carried".into()));
@@ -329,7 +329,7 @@ async fn a_contract_net_with_several_participants() {
             .unwrap();
         };
         let refuse = async |arm: &Agent| {
-            let call = next_message(arm).await.unwrap().into_message();
+            let call = next_message(arm).await.unwrap();
             let answer = respond(arm, &call, async |_| Ok(Reply::Refuse("no".into())));
             answer.await.unwrap();
         };
@@ -489,7 +489,7 @@ async fn protocols_of_the_configuration_are_read_and_checked() {
     let (rover, arm) = pair(&[&set]).await;
     let propose = message(&rover, Performative::Propose, &arm);
     rover.send(propose).await.unwrap();
-    let first = next_message(&arm).await.unwrap().into_message();
+    let first = next_message(&arm).await.unwrap();
     let mut task = arm.take_part(&first).unwrap();
     let inform = message(&rover, Performative::Inform, &arm);
     rover.send(inform).await.unwrap();

@@ -17,7 +17,7 @@ fn ids(names: &[&str]) -> Vec<AgentId> {
 
 /// Proposes the own name, and carries if the proposal is accepted.
 async fn bid(arm: &Agent) {
-    let call = next_message(arm).await.unwrap().into_message();
+    let call = next_message(arm).await.unwrap();
     let name = arm.name().to_owned();
     respond(arm, &call, async |task| {
         Ok(match task.propose(name, PATIENCE).await? {
@@ -104,7 +104,7 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
         .form("platoon", ["arm_1", "arm_2"], None, options)
         .unwrap();
     let bidder = async |arm: &Agent| {
-        let opening = next_message(arm).await.unwrap().into_message();
+        let opening = next_message(arm).await.unwrap();
         let mut task = arm.take_part(&opening).unwrap();
         assert!(task.next_call(PATIENCE).await.unwrap().is_some());
         task.propose("", PATIENCE).await.unwrap();
@@ -202,7 +202,7 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
     for one in ["led", ".*_2"] {
         let lift = rover.message(Performative::Request).receivers(ids(&[one]));
         let request = rover.request(lift, PATIENCE).await.unwrap();
-        let first = next_message(&arms[1]).await.unwrap().into_message();
+        let first = next_message(&arms[1]).await.unwrap();
         respond(&arms[1], &first, async |_| Ok(Reply::Inform("done".into())))
             .await
             .unwrap();
@@ -226,7 +226,7 @@ async fn only_a_message_that_opens_a_protocol_becomes_a_task() {
         let message = to(&rover, act.clone(), &arm, "").protocol(protocol);
         let message = message.conversation_id(format!("c-{act}")).build().unwrap();
         rover.send(message).await.unwrap();
-        let message = next_message(&arm).await.unwrap().into_message();
+        let message = next_message(&arm).await.unwrap();
         let refused = arm.take_part(&message);
         assert!(
             matches!(&refused, Err(DialogueError::NotOpening(_))),
@@ -234,8 +234,10 @@ async fn only_a_message_that_opens_a_protocol_becomes_a_task() {
         );
     }
     // A message that the agent itself has sent.
-    let own = to(&rover, Performative::Request, &arm, "").protocol("fipa-request");
+    let own = to(&rover, Performative::Request, &rover, "").protocol("fipa-request");
     let own = own.conversation_id("own").build().unwrap();
+    rover.send(own).await.unwrap();
+    let own = next_message(&rover).await.unwrap();
     let refused = rover.take_part(&own);
     assert!(matches!(refused, Err(DialogueError::NotOpening(_))));
 }
@@ -246,7 +248,7 @@ async fn a_dropped_task_tells_its_initiator() {
     let ask = async |act| {
         let request = rover.request(to(&rover, act, &arm, "lift"), PATIENCE);
         let request = request.await.unwrap();
-        let first = next_message(&arm).await.unwrap().into_message();
+        let first = next_message(&arm).await.unwrap();
         (request, arm.take_part(&first).unwrap())
     };
     let (request, task) = ask(Performative::Request).await;
@@ -270,7 +272,7 @@ async fn a_dropped_task_tells_its_initiator() {
     // A bidder whose proposal is not decided on yet.
     let (dropped, is_dropped) = tokio::sync::oneshot::channel();
     let bidder = async {
-        let call = next_message(&arm).await.unwrap().into_message();
+        let call = next_message(&arm).await.unwrap();
         let mut task = arm.take_part(&call).unwrap();
         let late = task.propose("10", Duration::from_millis(50)).await;
         assert!(matches!(late, Err(DialogueError::TimedOut)));
@@ -436,19 +438,19 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     let mallory = arm.domain().register("mallory").await.unwrap();
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
-    let first = next_message(&arm).await.unwrap().into_message();
+    let first = next_message(&arm).await.unwrap();
     let id = request.conversation_id().to_owned();
     for act in [Performative::Inform, Performative::Failure] {
         let forged = to(&mallory, act, &rover, "forged")
             .protocol("fipa-request")
             .conversation_id(id.as_str())
             .ontology("fipa-agent-management")
-            .in_reply_to(first.reply_with().unwrap());
+            .in_reply_to(first.message().reply_with().unwrap());
         let sent = mallory.send(forged.build().unwrap()).await.unwrap();
         assert!(sent.all_succeeded());
     }
     let answered = async {
-        // The forged messages arrive first.
+        // The forged messages arrive first.message().
         for _ in 0..2 {
             let forged = next_message(&rover).await.unwrap().into_message();
             assert_eq!(forged.sender().unwrap().name(), "mallory");
@@ -466,9 +468,9 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
         .protocol("fipa-request")
         .conversation_id(request.conversation_id());
     mallory.send(opening.build().unwrap()).await.unwrap();
-    let opening = next_message(&rover).await.unwrap().into_message();
+    let opening = next_message(&rover).await.unwrap();
     let task = rover.take_part(&opening).unwrap();
-    let first = next_message(&arm).await.unwrap().into_message();
+    let first = next_message(&arm).await.unwrap();
     respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
         .await
         .unwrap();

@@ -31,15 +31,15 @@ fn query(from: &Agent, arm: &str) -> MessageBuilder {
 
 /// Agrees to a query and answers it.
 async fn answer(arm: &Agent) -> Message {
-    let first = next_message(arm).await.unwrap().into_message();
-    assert_eq!(first.protocol(), Some("fipa-query"));
+    let first = next_message(arm).await.unwrap();
+    assert_eq!(first.message().protocol(), Some("fipa-query"));
     respond(arm, &first, async |task| {
         task.agree("wait").await?;
         Ok(Reply::Inform("42".into()))
     })
     .await
     .unwrap();
-    first
+    first.into_message()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -59,7 +59,7 @@ async fn a_broker_forwards_answers() {
         assert!(matches!(&failed, Err(DialogueError::Failed(why)) if text(why) == "no more"));
     };
     let goes_between = async {
-        let first = next_message(&broker).await.unwrap().into_message();
+        let first = next_message(&broker).await.unwrap();
         let mut task = broker.take_part(&first).unwrap();
         // It cannot pass a message on before it has agreed.
         let early = task.pass_on(query(&broker, "arm"), PATIENCE).await;
@@ -105,7 +105,7 @@ async fn recruited_agents_answer_the_initiator_directly() {
     };
     let (early, answered) = tokio::sync::oneshot::channel();
     let goes_between = async {
-        let first = next_message(&recruiter).await.unwrap().into_message();
+        let first = next_message(&recruiter).await.unwrap();
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&recruiter, "arm"), PATIENCE)
@@ -127,7 +127,7 @@ async fn recruited_agents_answer_the_initiator_directly() {
 
 /// Passes a call for proposals on to the arm, with this agent as its `reply-to`.
 async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
-    let first = next_message(recruiter).await.unwrap().into_message();
+    let first = next_message(recruiter).await.unwrap();
     let mut task = recruiter.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     let mut call = recruiter
@@ -143,7 +143,7 @@ async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
 }
 
 async fn propose(arm: &Agent) {
-    let first = next_message(arm).await.unwrap().into_message();
+    let first = next_message(arm).await.unwrap();
     respond(arm, &first, async |task| {
         assert!(task.propose("20", PATIENCE).await?);
         Ok(Reply::Inform(task.message().content().unwrap().clone()))
@@ -205,7 +205,7 @@ async fn recruited_agents_answer_the_designated_receiver() {
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = next_message(&recruiter).await.unwrap().into_message();
+        let first = next_message(&recruiter).await.unwrap();
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         let query = query(&recruiter, "arm").reply_to(base.id().clone());
@@ -235,11 +235,11 @@ async fn a_broker_or_recruiter_may_refuse_or_find_no_agent() {
         assert!(matches!(silent.err(), Some(DialogueError::TimedOut)));
     };
     let goes_between = async {
-        let first = next_message(&broker).await.unwrap().into_message();
+        let first = next_message(&broker).await.unwrap();
         respond(&broker, &first, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
-        let first = next_message(&broker).await.unwrap().into_message();
+        let first = next_message(&broker).await.unwrap();
         respond(&broker, &first, async |task| {
             task.agree("").await?;
             Ok(Reply::Failure("no match".into()))
@@ -259,7 +259,7 @@ async fn brokering_is_cancelled() {
         answers.cancel(PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = next_message(&broker).await.unwrap().into_message();
+        let first = next_message(&broker).await.unwrap();
         let mut task = broker.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();

@@ -32,7 +32,7 @@ async fn an_iterated_contract_net_calls_some_participants_again() {
     let called = ids(&arms);
     // Proposes these prices in turn. Returns the number of calls, and whether a proposal was accepted.
     let bid = async |arm: &Agent, prices: &[&'static str]| {
-        let call = next_message(arm).await.unwrap().into_message();
+        let call = next_message(arm).await.unwrap();
         let mut task = arm.take_part(&call).unwrap();
         let mut calls = 1;
         for price in prices {
@@ -97,7 +97,7 @@ async fn a_second_call_in_a_contract_net_is_refused() {
         assert!(results[0].result.is_ok());
     };
     let participant = async {
-        let call = arms[0].receive().await.unwrap().into_message();
+        let call = arms[0].receive().await.unwrap();
         let mut task = arms[0].take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
         task.reply(Reply::Inform("done".into())).await.unwrap();
@@ -124,11 +124,14 @@ async fn a_violation_by_one_participant_does_not_affect_the_others() {
         wild.send(early).await.unwrap();
         let late = wild.reply(&call, Performative::Propose).build().unwrap();
         wild.send(late).await.unwrap();
-        let call = next_message(tame).await.unwrap().into_message();
+        let call = next_message(tame).await.unwrap();
         let mut task = tame.take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
         // Arrives while the other agent works.
-        let wrong = wild.reply(&call, Performative::Agree).build().unwrap();
+        let wrong = wild
+            .reply(call.message(), Performative::Agree)
+            .build()
+            .unwrap();
         wild.send(wrong).await.unwrap();
         task.reply(Reply::Inform("done".into())).await.unwrap();
     };
@@ -181,7 +184,7 @@ async fn winners_do_not_wait_for_losers() {
         assert_eq!(*rejected.performative(), Performative::RejectProposal);
     };
     let wins = async {
-        let call = next_message(winner).await.unwrap().into_message();
+        let call = next_message(winner).await.unwrap();
         first.await.unwrap();
         let mut task = winner.take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
@@ -207,7 +210,7 @@ async fn a_contract_net_is_cancelled_with_all_open_participants() {
     let (rover, arms) = rover_and(["waiting", "thinking", "refusing"]).await;
     let [waiting, thinking, refusing] = &arms;
     let waits = async {
-        let call = next_message(waiting).await.unwrap().into_message();
+        let call = next_message(waiting).await.unwrap();
         let mut task = waiting.take_part(&call).unwrap();
         let cancelled = task.propose("10", PATIENCE).await;
         assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
@@ -215,14 +218,14 @@ async fn a_contract_net_is_cancelled_with_all_open_participants() {
         task.reply(nothing).await.unwrap();
     };
     let thinks = async {
-        let call = next_message(thinking).await.unwrap().into_message();
+        let call = next_message(thinking).await.unwrap();
         let mut task = thinking.take_part(&call).unwrap();
         task.cancelled().await.unwrap();
         let nothing = task.confirm_cancel().await.unwrap();
         task.reply(nothing).await.unwrap();
     };
     let refuses = async {
-        let call = next_message(refusing).await.unwrap().into_message();
+        let call = next_message(refusing).await.unwrap();
         respond(refusing, &call, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
@@ -249,8 +252,8 @@ async fn bidder(
     accepts: impl Fn(u32) -> bool,
     buys: usize,
 ) -> (usize, usize, Option<String>) {
-    let opening = next_message(agent).await.unwrap().into_message();
-    assert_eq!(text(&opening), "a crate");
+    let opening = next_message(agent).await.unwrap();
+    assert_eq!(text(opening.message()), "a crate");
     let mut task = agent.take_part(&opening).unwrap();
     let (mut calls, mut bought) = (0, 0);
     while let Some(call) = task.next_call(PATIENCE).await.unwrap() {
@@ -386,7 +389,7 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
         auction.ask_winner("take it").await.unwrap();
     };
     let participant = async {
-        let opening = next_message(arm).await.unwrap().into_message();
+        let opening = next_message(arm).await.unwrap();
         let mut task = arm.take_part(&opening).unwrap();
         task.next_call(PATIENCE).await.unwrap().unwrap();
         // The time of the first call is over when this bid is sent.

@@ -76,7 +76,7 @@ async fn four_verdicts_for_a_request_and_its_inform() {
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
     let id = request.conversation_id().to_owned();
-    let asked = next_message(&arm).await.unwrap().into_message();
+    let asked = next_message(&arm).await.unwrap();
     let task = arm.take_part(&asked).unwrap();
     task.reply(Reply::Inform("done".into())).await.unwrap();
     request.result().await.unwrap();

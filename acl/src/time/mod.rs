@@ -158,6 +158,17 @@ impl Time {
         moved.unwrap_or(now)
     }
 
+    /// Returns the span from an earlier time that the same clock gave. `None` if that time is later, if a time
+    /// is relative, or if only one of them is in UTC.
+    #[must_use]
+    pub fn span_since(self, earlier: Self) -> Option<Duration> {
+        if self.is_relative() || earlier.is_relative() || self.zone != earlier.zone {
+            return None;
+        }
+        let span = self.unix_ms().checked_sub(earlier.unix_ms())?;
+        u64::try_from(span).ok().map(Duration::from_millis)
+    }
+
     /// Converts an absolute time without `Z` from local time to UTC. Other times are unchanged.
     ///
     /// `seconds_east` is the number of seconds that the local time is ahead of UTC.

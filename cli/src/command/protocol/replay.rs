@@ -149,6 +149,7 @@ impl Replay {
             message,
             receiver: &recorded.receiver,
             at: recorded.at,
+            answer_within: recorded.answer_within,
             from_service: recorded.from_service,
             undelivered: recorded.undelivered,
             may_continue: recorded.may_continue,

@@ -5,10 +5,11 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use fipa::watch::{Fate, Passage};
 use fipa::{DeliveryFailure, DirectoryView, Message, Outcome};
+use fipa_acl::Time;
 use fipa_monitor::{
     Event, Header, History, Library, LibraryError, Monitor, Unchecked, Verdict, Violation,
 };
@@ -83,6 +84,8 @@ pub(in crate::command) struct Letter<'a> {
     pub(in crate::command) message: Option<&'a Message>,
     pub(in crate::command) receiver: &'a str,
     pub(in crate::command) at: SystemTime,
+    /// The time from `at` by which its sender expects an answer, if the letter has it.
+    pub(in crate::command) answer_within: Option<Duration>,
     /// Whether a message transport service wrote it.
     pub(in crate::command) from_service: bool,
     pub(in crate::command) undelivered: bool,
@@ -97,11 +100,19 @@ impl<'a> Letter<'a> {
             message: passage.message.as_ref(),
             receiver: &passage.receiver,
             at: passage.at,
+            answer_within: answer_within(passage),
             from_service: passage.from_service || is_report_of_elsewhere(passage),
             undelivered: matches!(passage.fate, Fate::Settled(Outcome::Failed { .. })),
             may_continue: earlier.may_have_begun(passage),
         }
     }
+}
+
+/// Returns the time by which an answer is due, from the sending of a letter. The clock of its sender may
+/// differ from that of this host.
+fn answer_within(passage: &Passage) -> Option<Duration> {
+    let by = passage.message.as_ref()?.reply_by()?;
+    by.span_since(passage.envelope.as_ref()?.effective().date?)
 }
 
 /// Whether a service of another host, which sends no records, probably wrote the letter.
@@ -190,7 +201,10 @@ impl Checker {
             false => History::Complete,
         });
         // A letter has exactly one receiver, a message can have several.
-        let header = Header::from(message).copy_for(letter.receiver);
+        let mut header = Header::from(message).copy_for(letter.receiver);
+        if let Some(by) = letter.answer_within.and_then(|it| Time::after(it).ok()) {
+            header = header.reply_by(by);
+        }
         match self.monitor.check(&header, letter.at) {
             Verdict::Accepted(accepted) => CheckResult::Accepted {
                 protocol: accepted.protocol.to_owned(),

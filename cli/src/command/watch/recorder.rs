@@ -47,6 +47,7 @@ impl Recorder {
     pub(super) fn add(&mut self, letter: &Letter<'_>) -> Result<(), Failure> {
         let recorded = Recorded {
             at: letter.at,
+            answer_within: letter.answer_within,
             receiver: letter.receiver.to_owned(),
             undelivered: letter.undelivered,
             from_service: letter.from_service,
