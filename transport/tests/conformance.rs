@@ -262,7 +262,7 @@ mod faults {
             },
             sequence: 1,
             after: 0,
-            remaining: std::time::Duration::ZERO,
+            remaining: Duration::ZERO,
             transfer: 0,
             body: Body::Credit,
         }
