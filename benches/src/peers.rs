@@ -198,7 +198,7 @@ impl<'a> Side<'a> {
                 self.found.trips.push(micros);
             }
             _ => {
-                tracing::warn!(%deliveries, "a request had no reply");
+                fipa_transport::log_limit::warn!(%deliveries, "a request had no reply");
                 self.found.lost += 1;
             }
         }

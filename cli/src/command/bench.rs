@@ -209,10 +209,7 @@ fn report(
     measured: Measured<'_>,
 ) -> Result<(), Failure> {
     for note in measured.notes {
-        #[expect(clippy::disallowed_macros, reason = "no other process causes notes")]
-        {
-            tracing::info!("{note}");
-        }
+        fipa::log_limit::info!("{note}");
     }
     if let Some(file) = &arguments.svg {
         let drawn = (measured.svg)().and_then(|picture| {

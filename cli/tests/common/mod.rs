@@ -2,6 +2,7 @@
 
 #![allow(dead_code, reason = "no test uses all items")]
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stderr, reason = "a skipped test says so")]
 
 use std::ffi::OsStr;
 use std::fs;

@@ -335,7 +335,7 @@ fn every_seed(test: impl Fn(u64)) {
     for seed in seeds() {
         let run = std::panic::AssertUnwindSafe(|| test(seed));
         if let Err(panic) = std::panic::catch_unwind(run) {
-            log_limit::error!(seed, "broke");
+            fipa_transport::log_limit::error!(seed, "broke");
             let said = panic
                 .downcast_ref::<String>()
                 .cloned()
