@@ -37,7 +37,8 @@ pub(crate) struct Service {
     pub(crate) host: Arc<HostDirectory>,
     /// The current locations of the service.
     locations: watch::Receiver<Arc<[Location]>>,
-    /// The entry of the service in the directory.
+    pub(crate) name: Arc<str>,
+    /// The service in the directory.
     pub(crate) own: fipa_sds::Mts,
     dir: DomainDir,
     /// The task that serves the watchers.
@@ -122,6 +123,7 @@ impl Service {
             maintenance: handle.spawn(maintenance.run()),
             mts,
             host,
+            name: role.name,
             own,
             dir,
             runtime: handle,
@@ -181,7 +183,7 @@ impl Service {
     /// Reports the routes that letters to these agents would take now.
     pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
         Report {
-            mts: self.own.name.to_string(),
+            mts: self.name.to_string(),
             incarnation: self.own.incarnation,
             locations: self.locations(),
             routes: self.mts.routes(to),

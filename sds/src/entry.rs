@@ -87,7 +87,9 @@ impl Entry {
     /// Returns the first limit that the entry exceeds.
     pub fn check(&self) -> Result<(), EntryError> {
         check_name(&self.name)?;
-        check_name(&self.mts.name).map_err(EntryError::MtsName)?;
+        if let Some(mts) = &self.mts.name {
+            check_name(mts).map_err(EntryError::MtsName)?;
+        }
         check_text("type", &self.agent_type, Self::MAX_TYPE)?;
         check_text("description", &self.description, Self::MAX_DESCRIPTION)?;
         if self.locations.len() > Self::MAX_LOCATIONS {
@@ -114,8 +116,9 @@ fn check_text(field: &'static str, text: &str, max: usize) -> Result<(), EntryEr
 /// A message transport service: the process that accepts letters for an agent, or a gateway.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Mts {
-    /// Name of the service; several services may have the same name.
-    pub name: Arc<str>,
+    /// Name that the service states; several services may have the same name. Absent for a service that
+    /// is only known from its address, which is not a name.
+    pub name: Option<Arc<str>>,
     /// Incarnation of the service; unknown for a peer without incarnations.
     pub incarnation: Incarnation,
 }
@@ -125,9 +128,24 @@ impl Mts {
     #[must_use]
     pub fn new(name: impl Into<Arc<str>>, incarnation: Incarnation) -> Self {
         Self {
-            name: name.into(),
+            name: Some(name.into()),
             incarnation,
         }
+    }
+
+    /// Creates a service with this incarnation that has not stated its name.
+    #[must_use]
+    pub fn unnamed(incarnation: Incarnation) -> Self {
+        Self {
+            name: None,
+            incarnation,
+        }
+    }
+
+    /// Returns the name for texts that people read.
+    #[must_use]
+    pub fn shown(&self) -> &str {
+        self.name.as_deref().unwrap_or("(unknown)")
     }
 }
 

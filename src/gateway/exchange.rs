@@ -268,7 +268,9 @@ impl Greetings {
                 let kind = location.kind();
                 means.service.uses(kind) && kinds.insert(kind)
             });
-            let name = &entry.mts.name;
+            let Some(name) = &entry.mts.name else {
+                continue;
+            };
             let greetings = locations.map(|location| (Arc::clone(name), location.clone()));
             means.service.mts.greet(greetings.collect());
         }
@@ -402,7 +404,7 @@ impl Disputes {
     /// names of other agents, at most one per second is reported.
     fn report(&mut self, means: &Means, now: Instant, contested: &[(Arc<Entry>, Arc<Entry>)]) {
         for (holder, other) in self.next(now, contested) {
-            let (name, at, by) = (&other.name, &holder.mts.name, &other.mts.name);
+            let (name, at, by) = (&other.name, holder.mts.shown(), other.mts.shown());
             let (shown, by_shown) = (escape(at), escape(by));
             tracing::warn!(%name, holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
             let content = format!(
@@ -458,7 +460,7 @@ impl Contested {
     /// Logs the conflict and informs the agent of this host.
     fn report(&self, means: &Means) {
         let Self { entry, holder, .. } = self;
-        let (name, mts) = (&entry.name, escape(&holder.mts.name));
+        let (name, mts) = (&entry.name, escape(holder.mts.shown()));
         let content = if self.is_announced {
             tracing::warn!(%name, holder = %mts, "an agent of another host has the same name");
             format!(

@@ -68,7 +68,7 @@ impl PlatformAgents {
         let started = agents.into_iter().filter_map(|(kind, prefix, agent)| {
             let name = match agent {
                 config::PlatformAgent::Off => return None,
-                config::PlatformAgent::On => format!("{prefix}@{}", self.service.own.name),
+                config::PlatformAgent::On => format!("{prefix}@{}", self.service.name),
                 config::PlatformAgent::Named(name) => name.clone(),
             };
             let task = Task::register(self.clone(), kind, name)?;
@@ -151,7 +151,7 @@ impl PlatformAgents {
             }
         }
         ApDescription {
-            name: self.service.own.name.to_string(),
+            name: self.service.name.to_string(),
             services,
         }
     }
@@ -525,7 +525,7 @@ impl Task {
             return;
         };
         tracing::info!(
-            before = %self.name, now = id.name(), holder = %escape(&holder.mts.name),
+            before = %self.name, now = id.name(), holder = %escape(holder.mts.shown()),
             "an agent of the gateway has a new name: an agent of another host has its name"
         );
         let service = Arc::clone(&self.means.service);

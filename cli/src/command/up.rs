@@ -205,7 +205,7 @@ fn log_entry(change: &str, entry: &Entry) {
     tracing::info!(
         name = %entry.name,
         reach,
-        mts = %entry.mts.name,
+        mts = entry.mts.shown(),
         "{change}"
     );
 }

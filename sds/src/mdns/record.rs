@@ -78,7 +78,9 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     own("fipa-version", "1");
     own("fipa-name", &entry.name);
     own("fipa-id", &entry.incarnation.to_string());
-    own("fipa-mts", &entry.mts.name);
+    if let Some(mts) = &entry.mts.name {
+        own("fipa-mts", mts);
+    }
     own("fipa-mts-id", &entry.mts.incarnation.to_string());
     match &entry.role {
         Role::Agent => {}

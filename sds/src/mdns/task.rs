@@ -250,7 +250,7 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
     }
     drop(own);
     let name = &withdrawn.name;
-    tracing::warn!(%name, holder = %theirs.mts.name, "withdrawing a registration: another gateway registered the name earlier");
+    tracing::warn!(%name, holder = theirs.mts.shown(), "withdrawing a registration: another gateway registered the name earlier");
     // The owner may have no receiver.
     let _ = shared.withdrawals.send(Withdrawal {
         withdrawn,
