@@ -208,7 +208,7 @@ impl Prepared {
     fn new(credentials: Credentials) -> Result<Self, CredentialsError> {
         let Credentials { own, key, trusted } = credentials;
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let known = Arc::new(Known::new(trusted, &provider));
+        let known = Arc::new(Known::new(&own, trusted, &provider));
         let chain = vec![own.der().clone()];
         let mut server = ServerConfig::builder_with_provider(provider.clone())
             .with_protocol_versions(&[&TLS13])?

@@ -11,18 +11,25 @@ use rustls::{
     SignatureScheme,
 };
 
+use super::advice;
 use super::certificate::{Certificate, Fingerprint, Holds};
 
 /// The certificates of trusted peers.
 #[derive(Debug)]
 pub(super) struct Known {
+    own: Fingerprint,
     trusted: HashMap<Fingerprint, Certificate>,
     algorithms: WebPkiSupportedAlgorithms,
 }
 
 impl Known {
-    pub(super) fn new(trusted: Vec<Certificate>, provider: &CryptoProvider) -> Self {
+    pub(super) fn new(
+        own: &Certificate,
+        trusted: Vec<Certificate>,
+        provider: &CryptoProvider,
+    ) -> Self {
         Self {
+            own: own.fingerprint(),
             trusted: trusted
                 .into_iter()
                 .map(|certificate| (certificate.fingerprint(), certificate))
@@ -48,6 +55,9 @@ impl Known {
     /// Checks that a certificate is that of a trusted peer and valid now. The signature over the
     /// handshake proves that the peer has its key.
     fn check(&self, presented: &CertificateDer<'_>, now: UnixTime) -> Result<(), Error> {
+        if Fingerprint::of(presented) == self.own {
+            return Err(Error::General(advice::OWN_CERTIFICATE.into()));
+        }
         let certificate = self.find(presented);
         let certificate = certificate.ok_or(CertificateError::UnknownIssuer)?;
         match certificate.holds(now) {
