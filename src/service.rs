@@ -68,6 +68,26 @@ pub(crate) struct Role<'a> {
     pub(crate) view: &'a View<'a>,
 }
 
+/// Returns at most as many of these locations as an entry can have, in the same order. Each kind keeps its
+/// first ones: a host with many addresses is still reached over each of its transports.
+fn best(locations: Vec<Location>) -> Vec<Location> {
+    let mut counts: BTreeMap<Kind, usize> = BTreeMap::new();
+    let ranks = locations.iter().map(|location| {
+        let count = counts.entry(location.kind()).or_default();
+        *count += 1;
+        *count
+    });
+    let mut ranked: Vec<(usize, usize)> = ranks.zip(0..).collect();
+    ranked.sort_unstable();
+    ranked.truncate(Entry::MAX_LOCATIONS);
+    let kept = |place: &usize| ranked.iter().any(|(_, it)| it == place);
+    let places = 0..locations.len();
+    let kept: Vec<bool> = places.map(|place| kept(&place)).collect();
+    let all = locations.into_iter().zip(kept);
+    all.filter_map(|(location, kept)| kept.then_some(location))
+        .collect()
+}
+
 /// Creates a view from the directory of this host and the service that looks up receivers.
 pub(crate) type View<'a> =
     dyn Fn(Arc<HostDirectory>, &fipa_sds::Mts) -> Result<Arc<dyn Directory>, OpenError> + 'a;
@@ -166,12 +186,9 @@ impl Service {
     /// not use them.
     pub(crate) fn locations(&self) -> Vec<Location> {
         let locations = self.locations.borrow();
-        locations
-            .iter()
-            .filter(|location| location.signature() == Signature::Frames)
-            .take(Entry::MAX_LOCATIONS)
-            .cloned()
-            .collect()
+        let framed = locations.iter();
+        let framed = framed.filter(|location| location.signature() == Signature::Frames);
+        best(framed.cloned().collect())
     }
 
     /// Returns a receiver that is notified of changes of the locations.
@@ -602,6 +619,19 @@ fn identity(
 mod tests {
     use super::*;
     use crate::config::Sources;
+
+    #[test]
+    fn a_host_with_many_addresses_keeps_each_of_its_transports() {
+        let tcp = (1..=20).map(|last| format!("tcp://10.0.0.{last}:1"));
+        let others = ["udp://10.0.0.1:1", "quic://10.0.0.1:1"].map(str::to_owned);
+        let all: Vec<Location> = tcp.chain(others).map(|it| it.parse().unwrap()).collect();
+        let best = best(all.clone());
+        assert_eq!(best.len(), Entry::MAX_LOCATIONS);
+        let first = Entry::MAX_LOCATIONS - 2;
+        assert_eq!(best[..first], all[..first]);
+        assert_eq!(best[first..], all[20..]);
+        assert_eq!(super::best(all[..3].to_vec()), all[..3]);
+    }
 
     #[test]
     fn limits_per_peer_of_the_configuration_apply_to_every_transport() {

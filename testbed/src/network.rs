@@ -94,11 +94,12 @@ impl Host {
         };
         let (name, port) = (&host.name, host.port());
         run(&format!("ip netns add {name}"));
-        // A link-local address with the interface number of another host leads nowhere here.
-        let index = 10 + u32::from(number);
+        let index = 100 + u32::from(number);
         run(&format!(
-            "ip link add {port} type veth peer name eth0 index {index} netns {name}"
+            "ip link add eth0 index {index} type veth peer name {port}"
         ));
+        // The interface keeps its number, which differs from those of the other hosts.
+        run(&format!("ip link set eth0 netns {name}"));
         run(&format!("ip link set {port} master switch up"));
         host.ip("link set lo up");
         // The kernel adds no link-local address of its own.

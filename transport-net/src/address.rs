@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV6};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV6, ToSocketAddrs as _};
 use std::path::Path;
 
 use fipa_transport::{Incarnation, Kind, ListenError, Location, LocationError};
@@ -86,6 +86,18 @@ fn scoped(text: &str) -> Result<SocketAddr, AddressError> {
         Err(_) => interface_index(zone)?,
     };
     Ok(SocketAddrV6::new(ip, port, 0, scope).into())
+}
+
+/// Returns the addresses of a peer that is given by address or host name, and port. Blocks while the name
+/// is looked up.
+///
+/// # Errors
+/// When the text is neither, or the name cannot be resolved.
+pub fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
+    match target(text).map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error))? {
+        Target::Numeric(address) => Ok(vec![address]),
+        Target::Named(name, port) => Ok((name.as_str(), port).to_socket_addrs()?.collect()),
+    }
 }
 
 /// Returns the addresses at which other hosts presently reach an endpoint that listens on these
@@ -426,7 +438,7 @@ fn is_link_local(ip: IpAddr) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use if_addrs::{IfAddr, Ifv4Addr};
+    use if_addrs::{IfAddr, Ifv4Addr, Ifv6Addr};
     use proptest::prelude::*;
 
     use super::*;
@@ -535,6 +547,106 @@ mod tests {
         assert!(moved.relocated);
         assert_eq!(moved.lost, HashSet::from([own(1).into()]));
         assert_eq!(listening.reachable(), at(own(2)));
+    }
+
+    /// An interface with this link-local IPv6 address.
+    fn interface_v6(name: &str, index: u32, ip: &str) -> Interface {
+        Interface {
+            addr: IfAddr::V6(Ifv6Addr {
+                ip: ip.parse().unwrap(),
+                netmask: Ipv6Addr::UNSPECIFIED,
+                prefixlen: 64,
+                broadcast: None,
+            }),
+            ..interface(name, index, Ipv4Addr::LOCALHOST)
+        }
+    }
+
+    #[test]
+    fn link_local_addresses_are_listed_where_an_interface_has_no_other() {
+        let lo = [
+            interface("lo", 1, Ipv4Addr::LOCALHOST),
+            interface_v6("lo", 1, "::1"),
+        ];
+        let ethernet = [
+            interface_v6("eth0", 2, "fe80::2"),
+            interface_v6("eth0", 2, "fd00::2"),
+            interface("eth0", 2, Ipv4Addr::new(10, 0, 0, 2)),
+        ];
+        let cables = [
+            interface_v6("eth1", 3, "fe80::3"),
+            interface("eth2", 4, Ipv4Addr::new(169, 254, 0, 4)),
+        ];
+        let listed = |listen: &str, interfaces: &[&[Interface]]| {
+            let addresses = reachable(&to_bind(listen).unwrap(), &interfaces.concat());
+            addresses
+                .iter()
+                .map(ToString::to_string)
+                .collect::<Vec<_>>()
+        };
+        let all: [&[Interface]; 3] = [&lo, &ethernet, &cables];
+        let (v4, v6) = (
+            ["10.0.0.2:7", "169.254.0.4:7"],
+            ["[fd00::2]:7", "[fe80::3]:7"],
+        );
+        assert_eq!(listed("*:7", &all), [v4[0], v6[0], v4[1], v6[1]]);
+        assert_eq!(listed("0.0.0.0:7", &all), v4);
+        assert_eq!(listed("[::]:7", &all), v6);
+        // Without a scope, which names an interface of this host.
+        assert_eq!(listed("[fe80::3%3]:7", &all), ["[fe80::3]:7"]);
+        assert_eq!(listed("*:7", &[&lo, &cables[..1]]), ["[fe80::3]:7"]);
+        assert_eq!(listed("*:7", &[&lo]), ["127.0.0.1:7", "[::1]:7"]);
+        assert_eq!(listed("0.0.0.0:7", &[&lo, &ethernet[..2]]), ["127.0.0.1:7"]);
+    }
+
+    #[test]
+    fn own_addresses_are_those_of_the_sockets() {
+        let mut listening = Listening {
+            bound: to_bind("*:7788").unwrap(),
+            ..Listening::default()
+        };
+        listening.update(&[
+            interface("docker0", 3, Ipv4Addr::new(172, 17, 0, 1)),
+            interface_v6("eth0", 2, "fe80::2"),
+        ]);
+        let is_own = |text: &str| listening.is_own(text.parse().unwrap());
+        for own in [
+            "172.17.0.1:7788",
+            "[::ffff:172.17.0.1]:7788",
+            "[fe80::2%2]:7788",
+            "127.0.0.1:7788",
+        ] {
+            assert!(is_own(own), "{own}");
+        }
+        for other in ["172.17.0.1:7789", "172.17.0.2:7788", "[fe80::3%2]:7788"] {
+            assert!(!is_own(other), "{other}");
+        }
+        let one = Listening::new(vec!["127.0.0.1:7788".parse().unwrap()]).unwrap();
+        assert!(!one.is_own("127.0.0.2:7788".parse().unwrap()));
+    }
+
+    #[test]
+    fn a_link_local_address_without_a_scope_is_not_dialed() {
+        let bare = Err(AddressError::NoScope("fe80::1".parse().unwrap()));
+        assert_eq!(numeric("[fe80::1]:7788"), bare);
+        assert_eq!(target("[fe80::1]:7788"), bare.map(Target::Numeric));
+        assert!(target("[fe80::1%2]:7788").is_ok());
+    }
+
+    #[test]
+    fn a_family_that_the_host_lacks_is_left_out_of_all_addresses() {
+        let open = |lacking: &'static [bool]| {
+            move |address: SocketAddr| match lacking.contains(&address.is_ipv4()) {
+                true => Err(io::Error::from(Errno::AFNOSUPPORT)),
+                false => Ok(((), address)),
+            }
+        };
+        let bound = |listen: &str, lacking| bind_all(&[listen.to_owned()], open(lacking));
+        assert_eq!(bound("*:7", &[]).unwrap().len(), 2);
+        assert_eq!(bound("*:7", &[false]).unwrap().len(), 1);
+        assert!(bound("*:7", &[true, false]).is_err());
+        assert!(bound("[::]:7", &[false]).is_err());
+        assert!(bound("*:x", &[]).is_err());
     }
 
     #[test]

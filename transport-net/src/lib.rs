@@ -63,7 +63,7 @@ mod udt;
 mod unix;
 
 #[cfg(feature = "ip")]
-pub use address::{AddressError, reachable_at};
+pub use address::{AddressError, reachable_at, resolve};
 #[cfg(all(feature = "http", feature = "secure"))]
 pub use http::{Authorities, AuthoritiesError};
 #[cfg(feature = "http")]
