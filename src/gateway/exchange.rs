@@ -25,6 +25,9 @@ use super::neighbours::{Neighbour, Neighbours};
 use super::publisher::{Contested, own_agents};
 use crate::service::Service;
 
+/// The receiver of a greeting to a service whose name is not known. It is not read.
+const UNNAMED: &str = "gateway";
+
 /// Deadline for the delivery of a letter of the exchange. After a longer interruption of the link,
 /// a neighbor receives all agents again.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -180,7 +183,7 @@ impl Exchanging {
             } else if fault == TransportErrorKind::WrongIncarnation {
                 // The greeting makes the service that runs there now introduce itself.
                 let at = location.with_incarnation(Incarnation::UNKNOWN);
-                means.service.mts.greet(vec![(at.address().into(), at)]);
+                means.service.mts.greet(vec![(UNNAMED.into(), at)]);
             }
         }
         if let Some(announced) = announced {

@@ -636,10 +636,7 @@ fn a_peer_that_claims_to_be_this_service_is_refused() {
         let mut connection = Connection::new(limits(), role, sample(1), now);
         connection.connected(now);
         let other = connection.handle_frame(Frame::Hello(sample(1)), now);
-        assert!(
-            matches!(other, Err(ConnectionEnd::ProtocolViolation(_))),
-            "{other:?}"
-        );
+        assert_eq!(other, Err(ConnectionEnd::Itself));
         assert_eq!(connection.poll_event(), None);
     }
 }
