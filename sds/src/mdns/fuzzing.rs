@@ -59,7 +59,7 @@ impl Listener {
             let _ = self.beacons.handle(now, gateway, content.all, stored);
             self.browser.confirm(now, gateway);
         }
-        let interface = u32::from(bytes.len() % 8 == 0);
+        let interface = u32::from(bytes.len().is_multiple_of(8));
         let from = Origin {
             address: from,
             interface,
