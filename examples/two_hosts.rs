@@ -40,7 +40,7 @@ async fn main() -> fipa::Result<()> {
     while near.directory().lookup("arm_1").is_none() {
         let change = tokio::time::timeout(Duration::from_millis(100), changes.next()).await;
         if let Ok(Some(Change::Joined(entry))) = change {
-            println!("{} is at {}", entry.name, entry.mts.name);
+            println!("{} is at {}", entry.name, entry.mts.shown());
         }
     }
 

@@ -354,7 +354,11 @@ impl Origin {
             return None;
         }
         Some(match sender {
-            Some(entry) if entry.reach != Reach::Local => entry.mts.name.to_string(),
+            Some(entry) if entry.reach != Reach::Local => match &entry.mts.name {
+                Some(name) => name.to_string(),
+                None if entry.mts.incarnation.is_known() => entry.mts.incarnation.to_string(),
+                None => entry.name.to_string(),
+            },
             _ => self.service.to_string(),
         })
     }

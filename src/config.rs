@@ -24,7 +24,8 @@
 //! max_letter = "64MiB"
 //! spin = "50us"                       # time of polling before blocking; 0 saves battery
 //! [transport.tcp]
-//! listen = ["127.0.0.1:0"]            # of the gateway; other than loopback needs keys or insecure
+//! listen = ["127.0.0.1:0"]            # of the gateway; "*:7788": all addresses of this host; other than
+//!                                     # loopback needs keys or insecure
 //! processes = false                   # true: processes of one host use TCP among each other, too
 //! [transport.udp]
 //! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
@@ -217,7 +218,7 @@ pub struct Tcp {
 #[non_exhaustive]
 pub struct Listen {
     /// `listen`: numeric addresses with port, for example `127.0.0.1:0`, `[::1]:7788` or
-    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. If the list is empty, the gateway does
+    /// `[fe80::1%eth0]:7788`. `*:7788` means all addresses of this host, of both families. Port 0 lets the system choose. If the list is empty, the gateway does
     /// not listen, and peers send over the connections that the gateway has opened.
     ///
     /// The addresses are text, because an interface that does not exist yet has no numeric scope.

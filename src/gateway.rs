@@ -112,7 +112,7 @@ impl Gateway {
                 security: guard.as_ref().map(Guard::security),
                 refusals: refusals.clone(),
                 view: &|host, mts| {
-                    contacts.neighbours.name_own(&mts.name);
+                    contacts.neighbours.name_own(&config.mts.name);
                     let network = network(config, mts)?;
                     let exchanged = exchange.directory() as Arc<dyn Directory>;
                     let announced = network.clone().map(Network::directory);
@@ -148,7 +148,7 @@ impl Gateway {
         // The queue is created first, because letters arrive as soon as the name is registered.
         let own = &gateway.service.own;
         let mts = &gateway.service.mts;
-        mts.register(Arc::clone(&own.name), own.incarnation);
+        mts.register(Arc::clone(&gateway.service.name), own.incarnation);
         if let Err(error) = gateway.enter(cancellation) {
             gateway.abort();
             return Err(error);
@@ -225,7 +225,7 @@ impl Gateway {
     }
 
     fn means(&self) -> Result<Means, OpenError> {
-        let id = AgentId::new(&*self.service.own.name)
+        let id = AgentId::new(&*self.service.name)
             .map_err(|error| OpenError::Name(RegisterError::Failed(Arc::new(error))))?;
         Ok(Means {
             service: Arc::clone(&self.service),
@@ -262,7 +262,7 @@ impl Gateway {
     /// Returns the name of the gateway.
     #[must_use]
     pub fn name(&self) -> &str {
-        &self.service.own.name
+        &self.service.name
     }
 
     /// Returns the incarnation of the gateway.
@@ -421,7 +421,7 @@ fn register(service: &Service, cancellation: &Cancellation) -> Result<Arc<Entry>
         agent_type: "fipa-mts".to_owned(),
         description: "message transport service".to_owned(),
         ..Registration::new(
-            Arc::clone(&service.own.name),
+            Arc::clone(&service.name),
             service.own.incarnation,
             service.locations(),
         )

@@ -37,7 +37,8 @@ pub(crate) struct Service {
     pub(crate) host: Arc<HostDirectory>,
     /// The current locations of the service.
     locations: watch::Receiver<Arc<[Location]>>,
-    /// The entry of the service in the directory.
+    pub(crate) name: Arc<str>,
+    /// The service in the directory.
     pub(crate) own: fipa_sds::Mts,
     dir: DomainDir,
     /// The task that serves the watchers.
@@ -65,6 +66,26 @@ pub(crate) struct Role<'a> {
     pub(crate) refusals: fipa_transport_net::Refusals,
     /// Creates the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
+}
+
+/// Returns at most as many of these locations as an entry can have, in the same order. Each kind keeps its
+/// first ones: a host with many addresses is still reached over each of its transports.
+fn best(locations: Vec<Location>) -> Vec<Location> {
+    let mut counts: BTreeMap<Kind, usize> = BTreeMap::new();
+    let ranks = locations.iter().map(|location| {
+        let count = counts.entry(location.kind()).or_default();
+        *count += 1;
+        *count
+    });
+    let mut ranked: Vec<(usize, usize)> = ranks.zip(0..).collect();
+    ranked.sort_unstable();
+    ranked.truncate(Entry::MAX_LOCATIONS);
+    let kept = |place: &usize| ranked.iter().any(|(_, it)| it == place);
+    let places = 0..locations.len();
+    let kept: Vec<bool> = places.map(|place| kept(&place)).collect();
+    let all = locations.into_iter().zip(kept);
+    all.filter_map(|(location, kept)| kept.then_some(location))
+        .collect()
 }
 
 /// Creates a view from the directory of this host and the service that looks up receivers.
@@ -122,6 +143,7 @@ impl Service {
             maintenance: handle.spawn(maintenance.run()),
             mts,
             host,
+            name: role.name,
             own,
             dir,
             runtime: handle,
@@ -164,12 +186,9 @@ impl Service {
     /// not use them.
     pub(crate) fn locations(&self) -> Vec<Location> {
         let locations = self.locations.borrow();
-        locations
-            .iter()
-            .filter(|location| location.signature() == Signature::Frames)
-            .take(Entry::MAX_LOCATIONS)
-            .cloned()
-            .collect()
+        let framed = locations.iter();
+        let framed = framed.filter(|location| location.signature() == Signature::Frames);
+        best(framed.cloned().collect())
     }
 
     /// Returns a receiver that is notified of changes of the locations.
@@ -181,7 +200,7 @@ impl Service {
     /// Reports the routes that letters to these agents would take now.
     pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
         Report {
-            mts: self.own.name.to_string(),
+            mts: self.name.to_string(),
             incarnation: self.own.incarnation,
             locations: self.locations(),
             routes: self.mts.routes(to),
@@ -604,6 +623,19 @@ fn identity(
 mod tests {
     use super::*;
     use crate::config::Sources;
+
+    #[test]
+    fn a_host_with_many_addresses_keeps_each_of_its_transports() {
+        let tcp = (1..=20).map(|last| format!("tcp://10.0.0.{last}:1"));
+        let others = ["udp://10.0.0.1:1", "quic://10.0.0.1:1"].map(str::to_owned);
+        let all: Vec<Location> = tcp.chain(others).map(|it| it.parse().unwrap()).collect();
+        let best = best(all.clone());
+        assert_eq!(best.len(), Entry::MAX_LOCATIONS);
+        let first = Entry::MAX_LOCATIONS - 2;
+        assert_eq!(best[..first], all[..first]);
+        assert_eq!(best[first..], all[20..]);
+        assert_eq!(super::best(all[..3].to_vec()), all[..3]);
+    }
 
     #[test]
     fn limits_per_peer_of_the_configuration_apply_to_every_transport() {

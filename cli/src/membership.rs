@@ -222,7 +222,7 @@ pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) 
         RegisterError::AlreadyRegistered { holder } => Failure::failed(
             format!(
                 "the name {name:?} is already registered by an agent at {:?}",
-                holder.mts.name
+                holder.mts.shown()
             ),
             domain,
             "choose another name, or stop that agent (`fipa agents` shows its locations)",

@@ -15,7 +15,7 @@ use std::sync::mpsc::channel;
 use std::time::Duration;
 
 use fipa::Kind;
-use fipa_testbed::{ChildGuard, Network, enter, isolated};
+use fipa_testbed::{ChildGuard, Family, Network, enter, isolated};
 use fleet::{ADDRESSES, Fleet, Plan};
 use serde_json::Value;
 
@@ -67,20 +67,38 @@ on_a_network!(
     }
 );
 
+/// Kills gateways and starts them again.
+fn gateways_are_killed(family: Family) {
+    let fleet = Fleet::new(&Plan {
+        family,
+        ..Plan::default()
+    });
+    fleet.through(10_000, |fleet| {
+        for at in [0, 1, 2, 1] {
+            fleet.until_delivered(&[0, 1, 2]);
+            fleet.kill_gateway(at);
+            pause(200);
+            fleet.start_gateway(at);
+        }
+    });
+}
+
 on_a_network!(
     traffic_resumes_after_gateways_are_killed,
     inside_traffic_resumes_after_gateways_are_killed,
-    || {
-        let fleet = Fleet::new(&Plan::default());
-        fleet.through(10_000, |fleet| {
-            for at in [0, 1, 2, 1] {
-                fleet.until_delivered(&[0, 1, 2]);
-                fleet.kill_gateway(at);
-                pause(200);
-                fleet.start_gateway(at);
-            }
-        });
-    }
+    || gateways_are_killed(Family::Both)
+);
+
+on_a_network!(
+    traffic_resumes_after_gateways_are_killed_over_unique_local_addresses,
+    inside_traffic_resumes_after_gateways_are_killed_over_unique_local_addresses,
+    || gateways_are_killed(Family::UniqueLocal)
+);
+
+on_a_network!(
+    traffic_resumes_after_gateways_are_killed_over_link_local_addresses,
+    inside_traffic_resumes_after_gateways_are_killed_over_link_local_addresses,
+    || gateways_are_killed(Family::LinkLocal)
 );
 
 /// Changes the address of the second host, and then changes it back.

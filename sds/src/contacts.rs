@@ -63,7 +63,7 @@ impl ContactDirectory {
             name: name.into(),
             agent_type: String::new(),
             incarnation,
-            mts: Mts::new(location.address(), gateway),
+            mts: Mts::unnamed(gateway),
             locations: vec![location],
             description: String::new(),
             registered: time_of_millis(millis_of_time(SystemTime::now())),
@@ -192,6 +192,22 @@ mod tests {
         assert!(contacts.lookup("arm").is_some());
         assert_eq!(contacts.forget(end, &nothing()), None);
         assert!(contacts.lookup("arm").is_none());
+    }
+
+    #[test]
+    fn the_address_of_a_sender_is_no_name_of_its_service() {
+        let contacts = ContactDirectory::new();
+        for (number, at) in (1..).zip([
+            "tcp://192.0.2.1:7788#00000000000000aa",
+            "tcp://[fd99::1]:7788#00000000000000aa",
+            "tcp://[fe80::1%2]:7788#00000000000000aa",
+            "http://[::1]:7778/acc",
+        ]) {
+            let (name, location) = (format!("arm {number}"), at.parse().unwrap());
+            let heard = contacts.heard(Instant::now(), &name, incarnation(number), location);
+            assert_eq!(heard, Ok(true), "{at}");
+            assert_eq!(contacts.lookup(&name).unwrap().mts.name, None);
+        }
     }
 
     fn nothing() -> MergedDirectory {

@@ -147,7 +147,7 @@ pub enum RegisterError {
          choose another name or end that agent",
         holder.name,
         since(holder),
-        holder.mts.name
+        holder.mts.shown()
     )]
     AlreadyRegistered {
         /// The entry that holds the name.

@@ -97,14 +97,18 @@ impl Entry {
     /// Returns the first rule that the entry violates.
     pub fn check(&self) -> Result<(), EntryError> {
         check_name(&self.name)?;
-        check_name(&self.mts.name).map_err(EntryError::MtsName)?;
+        if let Some(mts) = &self.mts.name {
+            check_name(mts).map_err(EntryError::MtsName)?;
+        }
         check_text("type", &self.agent_type, Self::MAX_TYPE)?;
         check_text("description", &self.description, Self::MAX_DESCRIPTION)?;
         if self.locations.len() > Self::MAX_LOCATIONS {
             return Err(EntryError::TooManyLocations(self.locations.len()));
         }
         match reserved_for(&self.name) {
-            Some(gateway) if *self.mts.name != *gateway && !self.is_of_legacy_platform() => {
+            Some(gateway)
+                if self.mts.name.as_deref() != Some(gateway) && !self.is_of_legacy_platform() =>
+            {
                 Err(EntryError::Reserved(gateway.to_owned()))
             }
             _ => Ok(()),
@@ -129,8 +133,9 @@ fn check_text(field: &'static str, text: &str, max: usize) -> Result<(), EntryEr
 /// A message transport service: the process that accepts letters for an agent, or a gateway.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Mts {
-    /// Name of the service; several services may have the same name.
-    pub name: Arc<str>,
+    /// Name that the service states; several services may have the same name. Absent for a service that
+    /// is only known from its address, which is not a name.
+    pub name: Option<Arc<str>>,
     /// Incarnation of the service; unknown for a peer without incarnations.
     pub incarnation: Incarnation,
 }
@@ -140,9 +145,24 @@ impl Mts {
     #[must_use]
     pub fn new(name: impl Into<Arc<str>>, incarnation: Incarnation) -> Self {
         Self {
-            name: name.into(),
+            name: Some(name.into()),
             incarnation,
         }
+    }
+
+    /// Creates a service with this incarnation that has not stated its name.
+    #[must_use]
+    pub fn unnamed(incarnation: Incarnation) -> Self {
+        Self {
+            name: None,
+            incarnation,
+        }
+    }
+
+    /// Returns the name for texts that people read.
+    #[must_use]
+    pub fn shown(&self) -> &str {
+        self.name.as_deref().unwrap_or("(unknown)")
     }
 }
 

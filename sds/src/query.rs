@@ -88,7 +88,10 @@ impl Query {
                     matcher.matches(&format!("{}://{}", location.kind(), location.address()))
                 })
             })
-            && matches(&self.mts, &entry.mts.name)
+            && self.mts.as_ref().is_none_or(|matcher| {
+                let name = entry.mts.name.as_deref();
+                name.is_some_and(|name| matcher.matches(name))
+            })
             && self.registered.as_ref().is_none_or(|matcher| {
                 // Clamped to the years that RFC 3339 can represent.
                 let time = time_of_millis(millis_of_time(entry.registered));

@@ -647,7 +647,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
     for process in [&here, &third] {
         process.refresh();
         let lost = process.view().lost("camera").unwrap();
-        assert_eq!(&*lost.mts.name, "far-mts");
+        assert_eq!(lost.mts.shown(), "far-mts");
         assert_eq!(lost.locations, expected.locations);
         assert!(process.entries().iter().all(|it| *it.name != *"camera"));
     }
@@ -859,7 +859,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         agent_type: String::new(),
         incarnation: Incarnation::random(),
         locations: vec!["shm://gateway".parse().unwrap()],
-        mts: Mts::new("10.0.0.2:7788", Incarnation::random()),
+        mts: Mts::unnamed(Incarnation::random()),
         description: String::new(),
         registered: std::time::UNIX_EPOCH,
         source: Source::Contact,

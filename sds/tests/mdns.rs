@@ -36,7 +36,7 @@ async fn entries_are_marked_and_ones_own_are_not_read_back() {
     let arm = until_some_async("arm", || two.lookup("arm")).await;
     let leg = until_some_async("leg", || one.lookup("leg")).await;
     assert_eq!(leg.source, Source::Mdns);
-    assert_eq!(&*leg.mts.name, "two");
+    assert_eq!(leg.mts.shown(), "two");
     let gateway = leg.mts.incarnation;
     assert_eq!(leg.reach, Reach::Remote { gateway });
     // By now each directory has received both.
@@ -255,7 +255,7 @@ async fn announcing(port: u16, by: &MdnsDirectory) -> (ChildGuard, String) {
         .env("FIPA_SDS_TEST_PORT", port.to_string());
     let peer = ChildGuard::start(process);
     let found = until_some_async("the other process", || by.lookup("Arm")).await;
-    assert_eq!(&*found.mts.name, "elsewhere");
+    assert_eq!(found.mts.shown(), "elsewhere");
     (peer, format!("{}\x0d_fipa_gateway", found.mts.incarnation))
 }
 

@@ -495,7 +495,7 @@ impl Findings {
             self.add(
                 path,
                 format_args!("lists {wrong:?}, not a numeric address with port"),
-                "write for example 127.0.0.1:0 or [fe80::1%eth0]:7788",
+                "write for example 127.0.0.1:0 or [fe80::1%eth0]:7788, or *:7788 for all addresses of this host",
             );
         }
         if let Some(address) = repeated(addresses.iter().filter(|text| !text.ends_with(":0"))) {

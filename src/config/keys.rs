@@ -559,10 +559,13 @@ fn addresses(value: &Toml) -> Result<Vec<String>, InvalidValue> {
     })
 }
 
-/// Whether the text is `address:port`. The scope of an IPv6 address may be the name of an interface
+/// Whether the text is `address:port`, or `*:port` for all addresses of this host. The scope of an IPv6 address may be the name of an interface
 /// (RFC 4007 section 11.2), which `std` does not parse.
 pub(super) fn is_numeric_address(text: &str) -> bool {
-    if text.parse::<SocketAddr>().is_ok() {
+    let is_any = text.strip_prefix("*:").is_some_and(|port| {
+        port.bytes().all(|byte| byte.is_ascii_digit()) && port.parse::<u16>().is_ok()
+    });
+    if is_any || text.parse::<SocketAddr>().is_ok() {
         return true;
     }
     let scoped = text

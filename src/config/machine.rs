@@ -5,6 +5,8 @@
 
 use std::net::{IpAddr, UdpSocket};
 
+use fipa_transport::Location;
+
 use super::check::Finding;
 use super::{Config, Interface, Peer};
 
@@ -23,6 +25,15 @@ fn static_peers(config: &Config, found: &mut Vec<Finding>) {
     for Peer { name, locations } in &config.discovery.peers {
         let kinds: Vec<_> = locations.iter().map(|location| location.kind()).collect();
         let Some(first) = kinds.first() else { continue };
+        let has_no_scope =
+            |it: &&Location| it.is_link_local() && (*it).clone().without_scope() == **it;
+        if let Some(location) = locations.iter().find(has_no_scope) {
+            found.push(Finding::new(
+                &["discovery", "static", name.as_str()],
+                format_args!("lists {location}, a link-local address without an interface"),
+                "append the interface that leads to it, for example [fe80::1%eth0]:7788",
+            ));
+        }
         if !kinds.iter().any(|kind| on.contains(kind)) {
             found.push(Finding::new(
                 &["discovery", "static", name.as_str()],

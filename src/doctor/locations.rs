@@ -66,9 +66,23 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         })
         .collect();
     let texts = texts.join(", ");
+    // Other addresses than those that the configuration lists.
+    let others = fipa_transport_net::reachable_at(&["*:0".to_owned()]).unwrap_or_default();
+    let other = others.iter().find(|it| !it.ip().is_loopback());
     checks.push(match (open, has_address) {
         (false, _) => AREA.fine(LOCATIONS, format!("{texts}: reachable from this host only")),
         (true, true) => AREA.fine(LOCATIONS, texts),
+        (true, false) if other.is_some() => AREA.problem(
+            LOCATIONS,
+            Verdict::Bad,
+            format!(
+                "{texts}: the network interfaces have no address of the family that `listen` lists{}, so the \
+                 gateway announces no location",
+                other.map(|it| format!(", but {}", it.ip())).unwrap_or_default()
+            ),
+            "list \"*:PORT\" in transport.tcp.listen and restart the gateway: it means all addresses of this \
+             host, IPv4 and IPv6",
+        ),
         (true, false) => AREA.problem(
             LOCATIONS,
             Verdict::Doubtful,

@@ -1,7 +1,7 @@
 //! Tests whether the TCP ports of static peers, and of other gateways, let this host in.
 
 use std::io;
-use std::net::{SocketAddr, TcpStream, ToSocketAddrs as _};
+use std::net::TcpStream;
 use std::time::Duration;
 
 use super::{Area, Check, Verdict};
@@ -74,8 +74,7 @@ fn check(title: &'static str, name: &str, address: &str) -> Check {
 /// Opens a connection and closes it. The peer ignores a connection without a byte.
 fn connect(address: &str) -> io::Result<()> {
     let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
-    let addresses: Vec<SocketAddr> = address.to_socket_addrs()?.take(4).collect();
-    for address in addresses {
+    for address in fipa_transport_net::resolve(address)?.into_iter().take(4) {
         match TcpStream::connect_timeout(&address, TIMEOUT) {
             Ok(_) => return Ok(()),
             Err(error) => last = error,

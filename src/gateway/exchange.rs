@@ -28,6 +28,9 @@ use super::neighbours::{Neighbour, Neighbours};
 use crate::routes::ContestedName;
 use crate::service::Service;
 
+/// The receiver of a greeting to a service whose name is not known. It is not read.
+const UNNAMED: &str = "gateway";
+
 /// Deadline for the delivery of a letter of the exchange. After a longer interruption of the link,
 /// a neighbor receives all agents again.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -209,7 +212,7 @@ impl Exchanging {
             } else if fault == TransportErrorKind::WrongIncarnation {
                 // The greeting makes the service that runs there now introduce itself.
                 let at = location.with_incarnation(Incarnation::UNKNOWN);
-                means.service.mts.greet(vec![(at.address().into(), at)]);
+                means.service.mts.greet(vec![(UNNAMED.into(), at)]);
             }
         }
         if let Some(announced) = announced {
@@ -297,7 +300,9 @@ impl Greetings {
                 let kind = location.kind();
                 means.service.uses(kind) && kinds.insert(kind)
             });
-            let name = &entry.mts.name;
+            let Some(name) = &entry.mts.name else {
+                continue;
+            };
             let greetings = locations.map(|location| (Arc::clone(name), location.clone()));
             means.service.mts.greet(greetings.collect());
         }
@@ -431,7 +436,7 @@ impl Disputes {
     /// names of other agents, at most one per second is reported.
     fn report(&mut self, means: &Means, now: Instant, contested: &[(Arc<Entry>, Arc<Entry>)]) {
         for (holder, other) in self.next(now, contested) {
-            let (name, at, by) = (&other.name, &holder.mts.name, &other.mts.name);
+            let (name, at, by) = (&other.name, holder.mts.shown(), other.mts.shown());
             let (shown, by_shown) = (escape(at), escape(by));
             log_limit::warn!(of: other.mts.incarnation, %name, holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
             let content = format!(
@@ -487,7 +492,7 @@ impl Contested {
     /// Logs the conflict and informs the agent of this host.
     fn report(&self, means: &Means) {
         let Self { entry, claim } = self;
-        let (name, mts) = (&entry.name, escape(&claim.mts.name));
+        let (name, mts) = (&entry.name, escape(claim.mts.shown()));
         log_limit::warn!(%name, other = %mts, "an agent of another host has the same name");
         if entry.is_platform_agent() {
             // It gets a second name.

@@ -43,7 +43,7 @@ impl From<&Contested> for ContestedName {
     fn from(contested: &Contested) -> Self {
         Self {
             name: contested.entry.name.to_string(),
-            gateway: contested.claim.mts.name.to_string(),
+            gateway: contested.claim.mts.shown().to_owned(),
         }
     }
 }

@@ -113,8 +113,8 @@ fn security(principal: Principal) -> LinkSecurity {
 
 impl Neighbours {
     /// Sets the name of this gateway. The first neighbor with the same name is reported.
-    pub(super) fn name_own(&self, name: &Arc<str>) {
-        self.state.lock().own_name = Some(Arc::clone(name));
+    pub(super) fn name_own(&self, name: &str) {
+        self.state.lock().own_name = Some(name.into());
     }
 
     /// Sets the peers that the configuration names, with their locations.
@@ -517,7 +517,7 @@ mod tests {
     #[test]
     fn one_neighbour_with_the_name_of_this_gateway_is_reported() {
         let neighbours = Neighbours::default();
-        neighbours.name_own(&"crex-mts".into());
+        neighbours.name_own("crex-mts");
         let mut state = neighbours.state.lock();
         assert!(!state.is_namesake("sherpa-mts"));
         assert!(state.is_namesake("crex-mts"));

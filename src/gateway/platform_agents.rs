@@ -65,7 +65,7 @@ impl PlatformAgents {
         let started = agents.into_iter().filter_map(|(kind, prefix, agent)| {
             let name = match agent {
                 config::PlatformAgent::Off => return None,
-                config::PlatformAgent::On => format!("{prefix}@{}", self.service.own.name),
+                config::PlatformAgent::On => format!("{prefix}@{}", self.service.name),
                 config::PlatformAgent::Named(name) => name.clone(),
             };
             let task = Task::register(self.clone(), kind, name)?;
@@ -148,7 +148,7 @@ impl PlatformAgents {
             }
         }
         ApDescription {
-            name: self.service.own.name.to_string(),
+            name: self.service.name.to_string(),
             services,
         }
     }
@@ -560,7 +560,7 @@ impl Task {
         self.second = match enter(means, self.kind, Arc::clone(&name)) {
             Some(second) => {
                 log_limit::info!(
-                    agent = self.own.name(), second = %name, other = %escape(&claim.mts.name),
+                    agent = self.own.name(), second = %name, other = %escape(claim.mts.shown()),
                     "an agent of the gateway has a second name for other hosts: an agent of another host \
                      has its name"
                 );

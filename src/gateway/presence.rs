@@ -305,7 +305,7 @@ impl GatewayAgent {
             .filter_map(|asked| self.view.known_incarnation(asked.id));
         let agent = agents.find(|agent| agent.mts.incarnation == gateway)?;
         Some(Arc::new(Entry {
-            name: Arc::clone(&agent.mts.name),
+            name: agent.mts.name.clone()?,
             agent_type: String::new(),
             incarnation: gateway,
             locations: agent.locations.clone(),

@@ -334,8 +334,13 @@ impl Partner {
 fn is_move(before: &Entry, after: &Entry) -> bool {
     match (before.reach, after.reach) {
         (Reach::Local, Reach::Local) => false,
-        // The name of a gateway stays when it starts again.
-        (Reach::Remote { .. }, Reach::Remote { .. }) => before.mts.name != after.mts.name,
+        (Reach::Remote { .. }, Reach::Remote { .. }) => {
+            match (&before.mts.name, &after.mts.name) {
+                // The name of a gateway stays when it starts again.
+                (Some(before), Some(after)) => before != after,
+                _ => before.mts.incarnation != after.mts.incarnation,
+            }
+        }
         _ => true,
     }
 }

@@ -132,8 +132,8 @@ impl Watchers {
             source,
         })?;
         let connection = Arc::new(Connection::new(socket));
-        let fipa_sds::Mts { name, incarnation } = &self.mts;
-        let hello = record::hello(name, *incarnation, self.gateway, SystemTime::now());
+        let name = self.mts.shown();
+        let hello = record::hello(name, self.mts.incarnation, self.gateway, SystemTime::now());
         connection.send(hello);
         let connected = Connected {
             watchers: Arc::clone(self),
@@ -142,7 +142,10 @@ impl Watchers {
             service: service.clone(),
         };
         connected.change(|connections| connections.push(connection));
-        log_limit::info!(mts = %name, "a watcher connected; it gets records of the letters");
+        log_limit::info!(
+            mts = name,
+            "a watcher connected; it gets records of the letters"
+        );
         Ok(connected)
     }
 }

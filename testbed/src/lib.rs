@@ -44,7 +44,7 @@ use std::process::Command;
 
 pub use avahi::Avahi;
 pub use child::{ChildGuard, ignored_test, send_signal};
-pub use network::{Host, Network};
+pub use network::{Family, Host, Network};
 pub use packet_repeater::PacketRepeater;
 #[cfg(feature = "tls")]
 pub use peer::AnyPeer;

@@ -9,25 +9,55 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
 use crate::run;
 
-/// A network of hosts. Each host has one interface `eth0` on the same switch, with the addresses
-/// 10.99.0.1/24 and fd99::1/64 for the first host, and so on.
+/// The addresses that the hosts of a [`Network`] have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Family {
+    /// IPv4 only: 10.99.0.1/24 for the first host, and so on.
+    V4,
+    /// IPv6 with unique local addresses only: fd99::1/64 for the first host, and so on.
+    UniqueLocal,
+    /// IPv6 with link-local addresses only: fe80::1/64 for the first host, and so on.
+    LinkLocal,
+    /// All of these.
+    Both,
+}
+
+impl Family {
+    /// All families.
+    pub const ALL: [Self; 4] = [Self::V4, Self::UniqueLocal, Self::LinkLocal, Self::Both];
+}
+
+/// A network of hosts. Each host has one interface `eth0` on the same switch. Its number differs from
+/// host to host.
 #[derive(Debug)]
 pub struct Network {
     hosts: Vec<Host>,
 }
 
 impl Network {
-    /// Creates a network of this number of hosts, all connected. A process can have only one network.
+    /// Creates a network of this number of hosts with addresses of both families, all connected. A
+    /// process can have only one network.
     ///
     /// # Panics
     /// If the network cannot be created, or for more than 200 hosts.
     #[must_use]
     pub fn new(hosts: u8) -> Self {
+        Self::of(Family::Both, hosts)
+    }
+
+    /// The same with these addresses.
+    ///
+    /// # Panics
+    /// If the network cannot be created, or for more than 200 hosts.
+    #[must_use]
+    pub fn of(family: Family, hosts: u8) -> Self {
         assert!(hosts <= 200, "at most 200 hosts");
         // Without snooping, the bridge forwards multicast to all ports, as a simple switch does.
         run("ip link add switch type bridge mcast_snooping 0 stp_state 0");
         run("ip link set switch up");
-        let hosts = (1..=hosts).map(Host::new).collect();
+        let hosts = (1..=hosts)
+            .map(|number| Host::new(family, number))
+            .collect();
         Self { hosts }
     }
 
@@ -50,27 +80,49 @@ impl Network {
 /// A host: a network namespace.
 #[derive(Debug)]
 pub struct Host {
+    family: Family,
     number: u8,
     name: String,
 }
 
 impl Host {
-    fn new(number: u8) -> Self {
+    fn new(family: Family, number: u8) -> Self {
         let host = Self {
+            family,
             number,
             name: format!("host{number}"),
         };
         let (name, port) = (&host.name, host.port());
         run(&format!("ip netns add {name}"));
+        let index = 100 + u32::from(number);
         run(&format!(
-            "ip link add {port} type veth peer name eth0 netns {name}"
+            "ip link add eth0 index {index} type veth peer name {port}"
         ));
+        // The interface keeps its number, which differs from those of the other hosts.
+        run(&format!("ip link set eth0 netns {name}"));
         run(&format!("ip link set {port} master switch up"));
         host.ip("link set lo up");
-        host.ip(&format!("addr add {}/24 dev eth0", host.ipv4()));
-        // Skips duplicate address detection, which delays the use of the address.
-        host.ip(&format!("addr add {}/64 dev eth0 nodad", host.ipv6()));
+        // The kernel adds no link-local address of its own.
+        host.ip("link set eth0 addrgenmode none");
+        let addresses = match family {
+            Family::V4 => vec![format!("{}/24", host.ipv4())],
+            Family::UniqueLocal => vec![format!("{}/64 nodad", host.ipv6())],
+            Family::LinkLocal => vec![format!("{}/64 nodad", host.link_local())],
+            Family::Both => vec![
+                format!("{}/24", host.ipv4()),
+                format!("{}/64 nodad", host.ipv6()),
+                format!("{}/64 nodad", host.link_local()),
+            ],
+        };
+        for address in addresses {
+            // `nodad` skips duplicate address detection, which delays the use of the address.
+            host.ip(&format!("addr add dev eth0 {address}"));
+        }
         host.ip("link set eth0 up");
+        if family != Family::V4 {
+            // Multicast over IPv6 needs its route also where no address is link-local.
+            host.ip("-6 route replace multicast ff00::/8 dev eth0 table local");
+        }
         host
     }
 
@@ -80,16 +132,37 @@ impl Host {
         &self.name
     }
 
-    /// Its IPv4 address.
+    /// Its addresses on the network, as other hosts write them with a port: `10.99.0.1`, `[fd99::1]`,
+    /// `[fe80::1%eth0]`.
+    #[must_use]
+    pub fn addresses(&self) -> Vec<String> {
+        let v4 = || self.ipv4().to_string();
+        let unique_local = || format!("[{}]", self.ipv6());
+        let link_local = || format!("[{}%eth0]", self.link_local());
+        match self.family {
+            Family::V4 => vec![v4()],
+            Family::UniqueLocal => vec![unique_local()],
+            Family::LinkLocal => vec![link_local()],
+            Family::Both => vec![v4(), unique_local(), link_local()],
+        }
+    }
+
+    /// Its IPv4 address, if the network has such addresses.
     #[must_use]
     pub fn ipv4(&self) -> Ipv4Addr {
         Ipv4Addr::new(10, 99, 0, self.number)
     }
 
-    /// Its IPv6 address.
+    /// Its unique local IPv6 address, if the network has such addresses.
     #[must_use]
     pub fn ipv6(&self) -> Ipv6Addr {
         Ipv6Addr::new(0xfd99, 0, 0, 0, 0, 0, 0, self.number.into())
+    }
+
+    /// Its link-local IPv6 address, if the network has such addresses.
+    #[must_use]
+    pub fn link_local(&self) -> Ipv6Addr {
+        Ipv6Addr::new(0xfe80, 0, 0, 0, 0, 0, 0, self.number.into())
     }
 
     /// The name of its port at the switch.

@@ -2,10 +2,12 @@
 
 use std::collections::HashSet;
 use std::io;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr, SocketAddrV6};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV6, ToSocketAddrs as _};
+use std::path::Path;
 
 use fipa_transport::{Incarnation, Kind, ListenError, Location, LocationError};
 use if_addrs::{IfOperStatus, Interface};
+use rustix::io::Errno;
 
 /// The reason for which a text is not an address.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -19,6 +21,11 @@ pub enum AddressError {
     /// The scope names no interface of this host.
     #[error("no network interface has the name {0:?}; run `ip link` to list them")]
     NoSuchInterface(String),
+    /// A link-local IPv6 address has no scope, so it may be on any interface.
+    #[error(
+        "the address {0} is link-local and needs the interface that leads to it: [{0}%eth0] for eth0"
+    )]
+    NoScope(Ipv6Addr),
     /// The network interfaces cannot be listed.
     #[error("cannot list the network interfaces of this host: {0}")]
     Interfaces(String),
@@ -52,8 +59,17 @@ pub(crate) fn target(text: &str) -> Result<Target, AddressError> {
 }
 
 /// Parses a numeric `address:port`, with an IPv6 scope by number or by interface name
-/// (RFC 4007 section 11.2).
+/// (RFC 4007 section 11.2). A link-local IPv6 address without a scope is an error.
 pub(crate) fn numeric(text: &str) -> Result<SocketAddr, AddressError> {
+    match scoped(text)? {
+        SocketAddr::V6(v6) if v6.scope_id() == 0 && v6.ip().is_unicast_link_local() => {
+            Err(AddressError::NoScope(*v6.ip()))
+        }
+        address => Ok(address),
+    }
+}
+
+fn scoped(text: &str) -> Result<SocketAddr, AddressError> {
     if let Ok(address) = text.parse() {
         return Ok(address);
     }
@@ -72,19 +88,83 @@ pub(crate) fn numeric(text: &str) -> Result<SocketAddr, AddressError> {
     Ok(SocketAddrV6::new(ip, port, 0, scope).into())
 }
 
+/// Returns the addresses of a peer that is given by address or host name, and port. Blocks while the name
+/// is looked up.
+///
+/// # Errors
+/// When the text is neither, or the name cannot be resolved.
+pub fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
+    match target(text).map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error))? {
+        Target::Numeric(address) => Ok(vec![address]),
+        Target::Named(name, port) => Ok((name.as_str(), port).to_socket_addrs()?.collect()),
+    }
+}
+
 /// Returns the addresses at which other hosts presently reach an endpoint that listens on these
 /// addresses, best first. A port 0 stays 0.
 ///
 /// # Errors
 /// When a text is not an address, or the interfaces cannot be listed.
 pub fn reachable_at(listen: &[String]) -> Result<Vec<SocketAddr>, AddressError> {
-    let bound = listen.iter().map(|text| numeric(text));
-    let listening = Listening::new(bound.collect::<Result<_, _>>()?)?;
-    Ok(listening.reachable)
+    let mut bound = Vec::new();
+    for text in listen {
+        bound.extend(to_bind(text)?);
+    }
+    Ok(Listening::new(bound)?.reachable)
+}
+
+/// Returns the addresses of the sockets for an entry of `listen`: `*:port` means all addresses of this
+/// host, of both families.
+fn to_bind(text: &str) -> Result<Vec<SocketAddr>, AddressError> {
+    let Some(port) = text.strip_prefix("*:") else {
+        return Ok(vec![numeric(text)?]);
+    };
+    let port: u16 = port
+        .parse()
+        .map_err(|_| AddressError::Syntax(text.chars().take(80).collect()))?;
+    let any = [
+        IpAddr::from(Ipv4Addr::UNSPECIFIED),
+        Ipv6Addr::UNSPECIFIED.into(),
+    ];
+    Ok(any.map(|ip| SocketAddr::new(ip, port)).to_vec())
+}
+
+/// Opens the sockets for these entries of `listen` with `open`, which also returns the address that a
+/// socket is bound to. Of the two families of `*:port`, the host may lack one.
+///
+/// # Errors
+/// When a text is not an address, or a socket cannot be opened.
+pub(crate) fn bind_all<S>(
+    listen: &[String],
+    mut open: impl FnMut(SocketAddr) -> io::Result<(S, SocketAddr)>,
+) -> Result<Vec<(S, SocketAddr)>, ListenError> {
+    let mut sockets = Vec::new();
+    for text in listen {
+        let addresses =
+            to_bind(text).map_err(|error| ListenError::Unavailable(error.to_string()))?;
+        let (before, mut lacking) = (sockets.len(), None);
+        for address in &addresses {
+            match open(*address) {
+                Ok(socket) => sockets.push(socket),
+                Err(error) if addresses.len() > 1 && lacks_family(&error) => lacking = Some(error),
+                Err(error) => return Err(cannot_bind(text, &error)),
+            }
+        }
+        if let Some(error) = lacking.filter(|_| sockets.len() == before) {
+            return Err(cannot_bind(text, &error));
+        }
+    }
+    Ok(sockets)
+}
+
+/// Whether the kernel lacks the family of an address, or has switched it off.
+fn lacks_family(error: &io::Error) -> bool {
+    let unsupported = error.raw_os_error() == Some(Errno::AFNOSUPPORT.raw_os_error());
+    unsupported || error.kind() == io::ErrorKind::AddrNotAvailable
 }
 
 /// Returns the error of binding to an address, with a remedy.
-pub(crate) fn cannot_bind(text: &str, error: &io::Error) -> ListenError {
+fn cannot_bind(text: &str, error: &io::Error) -> ListenError {
     let advice = match error.kind() {
         io::ErrorKind::AddrInUse => {
             "; another process listens on this port: stop it, or choose another port \
@@ -106,6 +186,20 @@ fn interfaces() -> Result<Vec<Interface>, AddressError> {
     if_addrs::get_if_addrs().map_err(|error| AddressError::Interfaces(error.to_string()))
 }
 
+/// Returns the addresses of the interfaces, without the link-local ones of ports of a bridge or bond,
+/// such as those of containers: packets to them arrive at the bridge.
+fn own_addresses() -> Result<Vec<Interface>, AddressError> {
+    let is_port = |name: &str| {
+        Path::new("/sys/class/net")
+            .join(name)
+            .join("master")
+            .exists()
+    };
+    let mut interfaces = interfaces()?;
+    interfaces.retain(|interface| !interface.is_link_local() || !is_port(&interface.name));
+    Ok(interfaces)
+}
+
 fn interface_index(name: &str) -> Result<u32, AddressError> {
     interfaces()?
         .into_iter()
@@ -118,7 +212,7 @@ fn interface_index(name: &str) -> Result<u32, AddressError> {
 ///
 /// A socket bound to an unspecified address is reached at the addresses of the interfaces that are
 /// up; these change while the endpoint runs ([`refresh`](Self::refresh)).
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Listening {
     bound: Vec<SocketAddr>,
     /// Best first.
@@ -147,9 +241,9 @@ impl Listening {
             ..Self::default()
         };
         if listening.depends_on_interfaces() {
-            listening.update(&interfaces()?);
+            listening.update(&own_addresses()?);
         } else {
-            listening.reachable.clone_from(&listening.bound);
+            listening.reachable = reachable(&listening.bound, &[]);
         }
         Ok(listening)
     }
@@ -165,20 +259,31 @@ impl Listening {
     /// # Errors
     /// When the interfaces cannot be listed. The list is unchanged then.
     pub(crate) fn refresh(&mut self) -> Result<Moved, AddressError> {
-        Ok(self.update(&interfaces()?))
+        Ok(self.update(&own_addresses()?))
     }
 
     fn update(&mut self, interfaces: &[Interface]) -> Moved {
         let assigned: HashSet<IpAddr> = interfaces.iter().map(Interface::ip).collect();
-        let reachable: Vec<SocketAddr> = self
-            .bound
-            .iter()
-            .flat_map(|bound| reachable(*bound, interfaces))
-            .collect();
+        let reachable = reachable(&self.bound, interfaces);
         let lost = self.assigned.difference(&assigned).copied().collect();
         let relocated = reachable != self.reachable;
         (self.assigned, self.reachable) = (assigned, reachable);
         Moved { relocated, lost }
+    }
+
+    /// Whether a connection to this address leads to this endpoint itself.
+    pub(crate) fn is_own(&self, address: SocketAddr) -> bool {
+        let (ip, port) = (address.ip().to_canonical(), address.port());
+        self.bound.iter().any(|bound| {
+            let is_here = match bound.ip().is_unspecified() {
+                true => {
+                    let same_family = bound.is_ipv4() == ip.is_ipv4();
+                    same_family && (ip.is_loopback() || self.assigned.contains(&ip))
+                }
+                false => bound.ip() == ip,
+            };
+            bound.port() == port && is_here
+        })
     }
 
     /// Returns the addresses for a hello: first unspecified addresses, which tell the peer that the
@@ -218,46 +323,58 @@ impl Listening {
     }
 }
 
-/// Returns the addresses at which others reach a socket bound to `bound`, best first: `bound`
-/// itself, or for an unspecified address those of the interfaces that are up.
+/// Returns the addresses at which others reach sockets with these addresses, best first: each address
+/// itself, or for an unspecified one those of the interfaces that are up.
 ///
-/// Loopback and link-local addresses (whose scope is not valid on another host) are only returned
-/// when there are no others.
-fn reachable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
-    match bound.ip().is_unspecified() {
-        true => usable(bound, interfaces),
-        false => vec![bound],
+/// Link-local addresses come after all others, and only for an interface that has no other address. They
+/// have no scope: it names an interface of this host, and on another host another one. Loopback addresses
+/// are only returned when there are no others.
+fn reachable(bound: &[SocketAddr], interfaces: &[Interface]) -> Vec<SocketAddr> {
+    let any = bound.iter().filter(|bound| bound.ip().is_unspecified());
+    let ports = |ip: IpAddr| {
+        let of_family = any
+            .clone()
+            .filter(move |bound| bound.is_ipv4() == ip.is_ipv4());
+        of_family.map(|bound| bound.port())
+    };
+    let up = interfaces
+        .iter()
+        .filter(|interface| interface.oper_status != IfOperStatus::Down);
+    let has_other = |name: &str| {
+        let mut others = up.clone().filter(|other| *other.name == *name);
+        others.any(|other| !other.is_link_local() && ports(other.ip()).next().is_some())
+    };
+    let fixed = bound.iter().filter(|bound| !bound.ip().is_unspecified());
+    let mut reachable: Vec<SocketAddr> = fixed
+        .map(|bound| SocketAddr::new(bound.ip(), bound.port()))
+        .collect();
+    // In the order of the configuration, which prefers a family.
+    let of_interfaces = |which: &dyn Fn(&Interface) -> bool| {
+        let of_bound = any.clone().flat_map(|bound| {
+            let of_family = up.clone().filter(|it| it.ip().is_ipv4() == bound.is_ipv4());
+            let of_family = of_family.filter(|interface| which(interface));
+            of_family.map(|interface| SocketAddr::new(interface.ip(), bound.port()))
+        });
+        of_bound.collect::<Vec<_>>()
+    };
+    reachable.extend(of_interfaces(&|it| {
+        !it.is_loopback() && !it.is_link_local()
+    }));
+    reachable.extend(of_interfaces(&|it| {
+        !it.is_loopback() && it.is_link_local() && !has_other(&it.name)
+    }));
+    if reachable.is_empty() {
+        return of_interfaces(&Interface::is_loopback);
     }
+    let mut known = HashSet::new();
+    reachable.retain(|address| known.insert(*address));
+    reachable
 }
 
-fn usable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
-    let of_family = interfaces
-        .iter()
-        .filter(|interface| interface.oper_status != IfOperStatus::Down)
-        .filter(|interface| interface.ip().is_ipv4() == bound.is_ipv4());
-    let (mut local, mut global) = (Vec::new(), Vec::new());
-    for interface in of_family {
-        let ip = interface.ip();
-        let scope = match ip {
-            IpAddr::V6(v6) if v6.is_unicast_link_local() => interface.index.unwrap_or(0),
-            _ => 0,
-        };
-        let address = match ip {
-            IpAddr::V4(_) => SocketAddr::new(ip, bound.port()),
-            IpAddr::V6(v6) => SocketAddrV6::new(v6, bound.port(), 0, scope).into(),
-        };
-        if interface.is_loopback() || interface.is_link_local() {
-            local.push(address);
-        } else {
-            global.push(address);
-        }
-    }
-    if global.is_empty() {
-        // Loopback before link-local: it needs no scope.
-        local.sort_by_key(|address| !address.ip().is_loopback());
-        return local;
-    }
-    global
+/// The error of dialing an [own](Listening::is_own) address for a peer. Two hosts can have the same
+/// address, for example of a bridge for containers.
+pub(crate) fn itself(address: SocketAddr) -> String {
+    format!("{address} is an address of this host, at which this gateway itself listens")
 }
 
 /// Returns the address at which a connected peer can be reached again: the source address of its
@@ -321,9 +438,7 @@ fn is_link_local(ip: IpAddr) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use std::net::Ipv4Addr;
-
-    use if_addrs::{IfAddr, Ifv4Addr};
+    use if_addrs::{IfAddr, Ifv4Addr, Ifv6Addr};
     use proptest::prelude::*;
 
     use super::*;
@@ -432,6 +547,106 @@ mod tests {
         assert!(moved.relocated);
         assert_eq!(moved.lost, HashSet::from([own(1).into()]));
         assert_eq!(listening.reachable(), at(own(2)));
+    }
+
+    /// An interface with this link-local IPv6 address.
+    fn interface_v6(name: &str, index: u32, ip: &str) -> Interface {
+        Interface {
+            addr: IfAddr::V6(Ifv6Addr {
+                ip: ip.parse().unwrap(),
+                netmask: Ipv6Addr::UNSPECIFIED,
+                prefixlen: 64,
+                broadcast: None,
+            }),
+            ..interface(name, index, Ipv4Addr::LOCALHOST)
+        }
+    }
+
+    #[test]
+    fn link_local_addresses_are_listed_where_an_interface_has_no_other() {
+        let lo = [
+            interface("lo", 1, Ipv4Addr::LOCALHOST),
+            interface_v6("lo", 1, "::1"),
+        ];
+        let ethernet = [
+            interface_v6("eth0", 2, "fe80::2"),
+            interface_v6("eth0", 2, "fd00::2"),
+            interface("eth0", 2, Ipv4Addr::new(10, 0, 0, 2)),
+        ];
+        let cables = [
+            interface_v6("eth1", 3, "fe80::3"),
+            interface("eth2", 4, Ipv4Addr::new(169, 254, 0, 4)),
+        ];
+        let listed = |listen: &str, interfaces: &[&[Interface]]| {
+            let addresses = reachable(&to_bind(listen).unwrap(), &interfaces.concat());
+            addresses
+                .iter()
+                .map(ToString::to_string)
+                .collect::<Vec<_>>()
+        };
+        let all: [&[Interface]; 3] = [&lo, &ethernet, &cables];
+        let (v4, v6) = (
+            ["10.0.0.2:7", "169.254.0.4:7"],
+            ["[fd00::2]:7", "[fe80::3]:7"],
+        );
+        assert_eq!(listed("*:7", &all), [v4[0], v6[0], v4[1], v6[1]]);
+        assert_eq!(listed("0.0.0.0:7", &all), v4);
+        assert_eq!(listed("[::]:7", &all), v6);
+        // Without a scope, which names an interface of this host.
+        assert_eq!(listed("[fe80::3%3]:7", &all), ["[fe80::3]:7"]);
+        assert_eq!(listed("*:7", &[&lo, &cables[..1]]), ["[fe80::3]:7"]);
+        assert_eq!(listed("*:7", &[&lo]), ["127.0.0.1:7", "[::1]:7"]);
+        assert_eq!(listed("0.0.0.0:7", &[&lo, &ethernet[..2]]), ["127.0.0.1:7"]);
+    }
+
+    #[test]
+    fn own_addresses_are_those_of_the_sockets() {
+        let mut listening = Listening {
+            bound: to_bind("*:7788").unwrap(),
+            ..Listening::default()
+        };
+        listening.update(&[
+            interface("docker0", 3, Ipv4Addr::new(172, 17, 0, 1)),
+            interface_v6("eth0", 2, "fe80::2"),
+        ]);
+        let is_own = |text: &str| listening.is_own(text.parse().unwrap());
+        for own in [
+            "172.17.0.1:7788",
+            "[::ffff:172.17.0.1]:7788",
+            "[fe80::2%2]:7788",
+            "127.0.0.1:7788",
+        ] {
+            assert!(is_own(own), "{own}");
+        }
+        for other in ["172.17.0.1:7789", "172.17.0.2:7788", "[fe80::3%2]:7788"] {
+            assert!(!is_own(other), "{other}");
+        }
+        let one = Listening::new(vec!["127.0.0.1:7788".parse().unwrap()]).unwrap();
+        assert!(!one.is_own("127.0.0.2:7788".parse().unwrap()));
+    }
+
+    #[test]
+    fn a_link_local_address_without_a_scope_is_not_dialed() {
+        let bare = Err(AddressError::NoScope("fe80::1".parse().unwrap()));
+        assert_eq!(numeric("[fe80::1]:7788"), bare);
+        assert_eq!(target("[fe80::1]:7788"), bare.map(Target::Numeric));
+        assert!(target("[fe80::1%2]:7788").is_ok());
+    }
+
+    #[test]
+    fn a_family_that_the_host_lacks_is_left_out_of_all_addresses() {
+        let open = |lacking: &'static [bool]| {
+            move |address: SocketAddr| match lacking.contains(&address.is_ipv4()) {
+                true => Err(io::Error::from(Errno::AFNOSUPPORT)),
+                false => Ok(((), address)),
+            }
+        };
+        let bound = |listen: &str, lacking| bind_all(&[listen.to_owned()], open(lacking));
+        assert_eq!(bound("*:7", &[]).unwrap().len(), 2);
+        assert_eq!(bound("*:7", &[false]).unwrap().len(), 1);
+        assert!(bound("*:7", &[true, false]).is_err());
+        assert!(bound("[::]:7", &[false]).is_err());
+        assert!(bound("*:x", &[]).is_err());
     }
 
     #[test]

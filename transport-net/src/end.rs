@@ -15,6 +15,8 @@ pub(crate) enum ConnectionEnd {
         expected: Incarnation,
         found: Incarnation,
     },
+    /// The peer is this service itself: the address leads back here.
+    Itself,
     /// The peer dialled another incarnation than this one.
     NotSought,
     /// The peer violated the protocol.
@@ -71,6 +73,7 @@ impl ConnectionEnd {
         matches!(
             self,
             Self::WrongIncarnation { .. }
+                | Self::Itself
                 | Self::NotSought
                 | Self::Idle
                 | Self::TooManyConnections
@@ -124,6 +127,11 @@ impl ConnectionEnd {
             Self::WrongIncarnation { .. } => (
                 TransportErrorKind::Broken,
                 "the peer has another incarnation",
+            ),
+            Self::Itself => (
+                TransportErrorKind::Unreachable,
+                "this address leads to this gateway itself, for example by a port that is forwarded \
+                 here; use another address of the peer",
             ),
             Self::NotSought => (
                 TransportErrorKind::Broken,

@@ -22,9 +22,6 @@ const MAX_DIALLED: usize = Location::MAX_ADDRESS + 32;
 /// Maximum number of listening addresses in a hello; the best come first.
 const MAX_LISTENING: usize = 16;
 
-/// The error of a hello with the incarnation of the service that receives it.
-pub(crate) const OWN_INCARNATION: &str = "the peer claims the incarnation of this service itself";
-
 #[derive(FromBytes, IntoBytes, Immutable, KnownLayout, Unaligned)]
 #[repr(C)]
 struct Fixed {

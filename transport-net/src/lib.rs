@@ -58,7 +58,7 @@ mod udt;
 mod unix;
 
 #[cfg(feature = "ip")]
-pub use address::{AddressError, reachable_at};
+pub use address::{AddressError, reachable_at, resolve};
 #[cfg(feature = "http")]
 pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;

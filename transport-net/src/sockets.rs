@@ -3,11 +3,9 @@
 use std::io;
 use std::net::SocketAddr;
 
-use fipa_transport::ListenError;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::address::{self, AddressError};
 use crate::stream::config::Limits;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
@@ -16,17 +14,10 @@ const BACKLOG: i32 = 1024;
 
 /// Opens a listening socket, and returns the address that it is bound to. Must be called within a
 /// runtime.
-pub(crate) fn listen(text: &str) -> Result<(TcpListener, SocketAddr), ListenError> {
-    let unavailable = |error: AddressError| ListenError::Unavailable(error.to_string());
-    let failed = |source| ListenError::Bind {
-        address: text.to_owned(),
-        source,
-    };
-    let address = address::numeric(text).map_err(unavailable)?;
-    let socket = open(address).map_err(|error| address::cannot_bind(text, &error))?;
-    let bound = socket.local_addr().map_err(failed)?;
-    let socket = TcpListener::from_std(socket).map_err(failed)?;
-    Ok((socket, bound))
+pub(crate) fn listen(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
+    let socket = open(address)?;
+    let bound = socket.local_addr()?;
+    Ok((TcpListener::from_std(socket)?, bound))
 }
 
 fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {

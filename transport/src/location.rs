@@ -1,6 +1,7 @@
 //! Locations: the addresses of message transport services, with their transports.
 
 use std::fmt;
+use std::net::Ipv6Addr;
 use std::str::FromStr;
 use std::sync::Arc;
 
@@ -288,6 +289,51 @@ impl Location {
         }
     }
 
+    /// Whether this is a link-local IPv6 address, which is only valid together with the interface that leads
+    /// to it, its scope.
+    #[must_use]
+    pub fn is_link_local(&self) -> bool {
+        let ip = self
+            .ipv6()
+            .and_then(|(ip, _, _)| ip.parse::<Ipv6Addr>().ok());
+        ip.is_some_and(|ip| ip.is_unicast_link_local())
+    }
+
+    /// Returns this location without the scope of an IPv6 address. The scope is an interface of the host
+    /// that wrote it and has no meaning on another one (RFC 4007 section 6).
+    #[must_use]
+    pub fn without_scope(self) -> Self {
+        match self.ipv6() {
+            Some((ip, Some(_), rest)) => {
+                let address = format!("[{ip}]{rest}").into();
+                Self { address, ..self }
+            }
+            _ => self,
+        }
+    }
+
+    /// Returns this location with the interface of this number as the scope of its IPv6 address. Other
+    /// locations stay as they are.
+    #[must_use]
+    pub fn on_interface(self, interface: u32) -> Self {
+        match self.ipv6() {
+            Some((ip, _, rest)) => {
+                let address = format!("[{ip}%{interface}]{rest}").into();
+                Self { address, ..self }
+            }
+            None => self,
+        }
+    }
+
+    /// Splits an IPv6 address: the part before the scope, the scope, and the text after the bracket.
+    fn ipv6(&self) -> Option<(&str, Option<&str>, &str)> {
+        let (inner, rest) = self.address.strip_prefix('[')?.split_once(']')?;
+        Some(match inner.split_once('%') {
+            Some((ip, scope)) => (ip, Some(scope), rest),
+            None => (inner, None, rest),
+        })
+    }
+
     /// The protocol at the location.
     #[must_use]
     pub fn signature(&self) -> Signature {
@@ -401,6 +447,48 @@ impl<'de> Deserialize<'de> for Location {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn scopes_are_replaced_and_removed() {
+        let location = |text: &str| text.parse::<Location>().unwrap();
+        for (text, bare, on_seven, is_link_local) in [
+            (
+                "tcp://[fe80::1%eth0]:7788#00abcdef01234567",
+                "tcp://[fe80::1]:7788#00abcdef01234567",
+                "tcp://[fe80::1%7]:7788#00abcdef01234567",
+                true,
+            ),
+            (
+                "http://[fe80::1]:7778/acc",
+                "http://[fe80::1]:7778/acc",
+                "http://[fe80::1%7]:7778/acc",
+                true,
+            ),
+            (
+                "udp://[fd00::1%2]:1",
+                "udp://[fd00::1]:1",
+                "udp://[fd00::1%7]:1",
+                false,
+            ),
+            (
+                "tcp://169.254.0.1:1",
+                "tcp://169.254.0.1:1",
+                "tcp://169.254.0.1:1",
+                false,
+            ),
+            (
+                "tcp://crex.local:1",
+                "tcp://crex.local:1",
+                "tcp://crex.local:1",
+                false,
+            ),
+            ("tcp://[x%]y", "tcp://[x]y", "tcp://[x%7]y", false),
+        ] {
+            assert_eq!(location(text).without_scope().to_string(), bare);
+            assert_eq!(location(text).on_interface(7).to_string(), on_seven);
+            assert_eq!(location(text).is_link_local(), is_link_local, "{text}");
+        }
+    }
 
     #[test]
     fn text_round_trips() {

@@ -307,7 +307,7 @@ impl Row {
             escape(&entry.agent_type).into_owned(),
             reach,
             locations.join("\n"),
-            escape(&entry.mts.name).into_owned(),
+            escape(entry.mts.shown()).into_owned(),
             source(entry.source).to_owned(),
             age(entry),
         ];

@@ -27,7 +27,7 @@ use crate::{input, output};
 Examples, on the host of rover-mts (on the host of crex-mts with rover.pem):
   fipa keys init                           once; prints the path of the certificate
   fipa keys trust crex.pem                 crex.pem is the file own.pem of the other host
-  fipa up --set security.keys=$HOME/.config/fipa/keys --set transport.tcp.listen=0.0.0.0:7788")]
+  fipa up --set security.keys=$HOME/.config/fipa/keys --set 'transport.tcp.listen=*:7788'")]
 pub(crate) struct Arguments {
     /// Directory of the keys [default: security.keys, else ~/.config/fipa/keys]
     #[arg(long, value_name = "DIRECTORY", global = true)]

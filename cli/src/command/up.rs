@@ -28,7 +28,7 @@ use crate::report::{self, Failure};
 Examples:
   fipa up
   fipa up -v                                        logs agents that join and leave
-  fipa up --set security.keys=$HOME/.config/fipa/keys --set transport.tcp.listen=0.0.0.0:7788
+  fipa up --set security.keys=$HOME/.config/fipa/keys --set 'transport.tcp.listen=*:7788'
                                                     open to trusted hosts (see fipa keys)
   fipa up --set discovery.mdns=false                not discoverable; peers need a static address
   fipa up --json | head -n 1                        prints one line when the gateway is ready
@@ -205,7 +205,7 @@ fn log_entry(change: &str, entry: &Entry) {
     log_limit::info!(
         of: &*entry.name, name = %entry.name,
         reach,
-        mts = %entry.mts.name,
-        "agent {change}"
+        mts = entry.mts.shown(),
+        "{change}"
     );
 }

@@ -15,7 +15,7 @@ use fipa::config::Sources;
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
 };
-use fipa_testbed::{ChildGuard, Host, Network};
+use fipa_testbed::{ChildGuard, Family, Host, Network};
 use parking_lot::Mutex;
 use tokio::runtime::Runtime;
 
@@ -33,6 +33,8 @@ const IN_A_ROW: u64 = 40;
 /// Settings of a fleet.
 #[derive(Debug, Clone)]
 pub(crate) struct Plan {
+    /// The addresses of the hosts. With those of both families, the hosts use the IPv4 addresses.
+    pub(crate) family: Family,
     /// `mts.transports` of every process.
     pub(crate) transports: &'static [&'static str],
     /// `mts.deadline` of every letter.
@@ -46,6 +48,7 @@ pub(crate) struct Plan {
 impl Default for Plan {
     fn default() -> Self {
         Self {
+            family: Family::Both,
             transports: &["shm", "unix", "tcp"],
             deadline: Duration::from_secs(3),
             dials: None,
@@ -63,7 +66,18 @@ impl Plan {
         if self.is_dialed == Some(at) {
             return ADDRESSES.map(str::to_owned).to_vec();
         }
-        vec![network.host(at).ipv4().to_string()]
+        match self.family {
+            Family::Both => vec![network.host(at).ipv4().to_string()],
+            _ => network.host(at).addresses(),
+        }
+    }
+
+    /// The addresses on which the gateways listen.
+    fn listen(&self) -> &'static str {
+        match self.family {
+            Family::Both => "0.0.0.0",
+            _ => "*",
+        }
     }
 
     /// Whether host `at` has the address of host `other`.
@@ -117,7 +131,7 @@ impl Fleet {
         if plan.has_keys() {
             make_keys(3);
         }
-        let network = Network::new(3);
+        let network = Network::of(plan.family, 3);
         let accounts = Arc::new(Accounts::default());
         let parties = (0..3).map(|at| Party::new(&network, at, plan)).collect();
         let fleet = Self {
@@ -408,7 +422,10 @@ impl Party {
             format!("discovery.static={{ {} }}", peers.join(", ")),
         ];
         for kind in plan.transports.iter().filter(|kind| is_between_hosts(kind)) {
-            settings.push(format!("transport.{kind}.listen=[\"0.0.0.0:{PORT}\"]"));
+            settings.push(format!(
+                "transport.{kind}.listen=[\"{}:{PORT}\"]",
+                plan.listen()
+            ));
         }
         let gateway = start_gateway(host, &settings);
         let config = Config::load(&Sources {

@@ -1,5 +1,7 @@
 //! Gateway processes, keys and packet filters on the hosts of a test network.
 
+#![allow(dead_code, reason = "no test uses all items")]
+
 use std::process::{Command, Stdio};
 
 use fipa::keys::{Keys, VALID};

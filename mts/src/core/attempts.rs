@@ -292,7 +292,7 @@ impl AttemptTable {
         };
         let why = format!(
             "the connection with the gateway {} ended without a farewell, and has not been restored since",
-            lost.mts.name
+            lost.mts.shown()
         );
         let location = lost.locations.first();
         let attempt = location.map(|location| Attempt {

@@ -532,7 +532,7 @@ impl Exchange {
             ExchangeMessage::Full(full) => {
                 neighbor.handle_full(now, full, &self.directory);
                 if neighbor.stored.is_some() {
-                    let returned = Arc::clone(&neighbor.mts.name);
+                    let returned = neighbor.mts.name.clone();
                     self.forget_lost(|lost| lost.mts.name == returned);
                 }
                 self.bound_staged(now);
@@ -1018,7 +1018,7 @@ impl Neighbor {
         }
         let cut = staged.list.cut(shares::MAX_OF_PEER);
         if let Some(first) = cut.last() {
-            let (gateway, first) = (escape(&self.mts.name), escape(first));
+            let (gateway, first) = (escape(self.mts.shown()), escape(first));
             log_limit::info!(%gateway, %first, count = cut.len(), "the agents of a gateway exceed its share; the last ones are left out");
         }
         if full.last {
@@ -1062,7 +1062,7 @@ impl Neighbor {
     /// other agents of the letter are still used.
     fn entry(&self, agent: wire::Agent) -> Option<Arc<Entry>> {
         if !self.mandate.speaks_for(&agent.name) {
-            let (gateway, agent) = (escape(&self.mts.name), escape(&agent.name));
+            let (gateway, agent) = (escape(self.mts.shown()), escape(&agent.name));
             tracing::debug!(%gateway, %agent, "agent ignored: the certificate of its gateway does not name it");
             return None;
         }
@@ -1081,7 +1081,7 @@ impl Neighbor {
             role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {
-            tracing::debug!(gateway = %self.mts.name, error = %ErrorChain(&error), "agent ignored");
+            tracing::debug!(gateway = self.mts.shown(), error = %ErrorChain(&error), "agent ignored");
             return None;
         }
         entry.incarnation.is_known().then(|| Arc::new(entry))

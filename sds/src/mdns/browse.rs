@@ -82,6 +82,26 @@ const GRAIN_EACH: Duration = Duration::from_micros(10);
 /// Maximum number of known answers that take extra packets in a query for all records.
 const MAX_KNOWN: usize = 50 * KNOWN;
 
+/// Maximum number of interfaces of a record that are remembered.
+const MAX_INTERFACES: usize = 4;
+
+/// The origin of a packet.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Origin {
+    pub(super) address: IpAddr,
+    /// The number of the interface on which it was received.
+    pub(super) interface: u32,
+}
+
+/// A record that is new or has changed.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Found {
+    pub(super) fullname: Arc<str>,
+    pub(super) properties: Properties,
+    /// The interfaces on which it was received, the latest first.
+    pub(super) interfaces: Vec<u32>,
+}
+
 /// The records on the network.
 #[derive(Debug)]
 pub(super) struct Browser {
@@ -130,6 +150,8 @@ struct Record {
     len: usize,
     /// Properties that have not been reported yet.
     news: Option<Properties>,
+    /// The interfaces on which it was received, the latest first.
+    interfaces: Vec<u32>,
     /// Whether both its SRV and TXT record have arrived.
     known: bool,
     /// Expiry if nothing more arrives: the record is not known yet, is in doubt, or had a goodbye.
@@ -164,8 +186,7 @@ enum Introduced {
 /// Content of a packet.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct ParsedPacket {
-    /// Full names and properties of records that are new or have changed.
-    pub(super) found: Vec<(Arc<str>, Properties)>,
+    pub(super) found: Vec<Found>,
     /// Number of records that were refused for lack of space.
     pub(super) refused: u64,
 }
@@ -201,11 +222,11 @@ impl Browser {
         self.full_query = FullQuery::new(now, chance);
     }
 
-    /// Handles a packet from this address. `chance`, from 0 to 1, scales the jitter.
+    /// Handles a packet from this origin. `chance`, from 0 to 1, scales the jitter.
     pub(super) fn handle_packet(
         &mut self,
         now: Instant,
-        from: IpAddr,
+        from: Origin,
         packet: &[u8],
         chance: f64,
     ) -> ParsedPacket {
@@ -224,7 +245,7 @@ impl Browser {
         let mut new = Vec::new();
         for record in &there {
             if let Some(label) = introduced(&record.name, &record.rdata) {
-                match self.introduce(now, from, label, chance) {
+                match self.introduce(now, from.address, label, chance) {
                     Introduced::New => new.push(label),
                     Introduced::Refused => received.refused += 1,
                     Introduced::Already => {}
@@ -245,7 +266,12 @@ impl Browser {
                 RData::TXT(txt) => {
                     let properties = packet::properties(txt);
                     let digest = Digest::of(&properties);
-                    if known.text.is_none() || known.digest != digest {
+                    let is_elsewhere = !known.interfaces.contains(&from.interface);
+                    if is_elsewhere {
+                        known.interfaces.insert(0, from.interface);
+                        known.interfaces.truncate(MAX_INTERFACES);
+                    }
+                    if known.text.is_none() || known.digest != digest || is_elsewhere {
                         let len = record::len_of(&properties);
                         let others = self.bytes - known.len;
                         let share = self.shares.entry(known.from).or_default();
@@ -276,7 +302,11 @@ impl Browser {
             known.known = true;
             known.is_there();
             if let Some(news) = known.news.take() {
-                received.found.push((Arc::clone(&known.fullname), news));
+                received.found.push(Found {
+                    fullname: Arc::clone(&known.fullname),
+                    properties: news,
+                    interfaces: known.interfaces.clone(),
+                });
             }
             if let Some(due) = known.due(self.share, self.own) {
                 self.wake(due);
@@ -284,7 +314,7 @@ impl Browser {
         }
         // A new record that is complete in one packet does not count as unknown.
         for label in new {
-            let share = self.shares.get(&from).copied().unwrap_or_default();
+            let share = self.shares.get(&from.address).copied().unwrap_or_default();
             let are_too_many = self.unknown > MAX_UNKNOWN || share.unknown > MAX_SHARE_UNKNOWN;
             if are_too_many && self.records.get(label).is_some_and(|it| !it.known) {
                 self.remove(label);
@@ -328,6 +358,7 @@ impl Browser {
             digest: Digest::default(),
             len: 0,
             news: None,
+            interfaces: Vec::new(),
             known: false,
             ends: Some(now + INTRODUCED),
             questions: Some(questions),
@@ -338,6 +369,13 @@ impl Browser {
         self.unknown += 1;
         self.wake(due);
         Introduced::New
+    }
+
+    /// Keeps only the interfaces that are in use.
+    pub(super) fn retain_interfaces(&mut self, in_use: impl Fn(u32) -> bool) {
+        for record in self.records.values_mut() {
+            record.interfaces.retain(|interface| in_use(*interface));
+        }
     }
 
     fn remove(&mut self, label: &str) {

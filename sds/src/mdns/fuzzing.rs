@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_transport::Incarnation;
 
 use super::beacon::{self, Beacons};
-use super::browse::{Browser, label_of};
+use super::browse::{Browser, Found, Origin, label_of};
 use super::coalition_sync::CoalitionSync;
 use super::peer_records::PeerRecords;
 use super::{packet, record};
@@ -59,10 +59,20 @@ impl Listener {
             let _ = self.beacons.handle(now, gateway, content.all, stored);
             self.browser.confirm(now, gateway);
         }
+        let interface = u32::from(bytes.len().is_multiple_of(8));
+        let from = Origin {
+            address: from,
+            interface,
+        };
         let received = self.browser.handle_packet(now, from, bytes, 0.5);
         self.browser.check();
         let at = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
-        for (fullname, properties) in received.found {
+        for found in received.found {
+            let Found {
+                fullname,
+                properties,
+                interfaces,
+            } = found;
             self.found.insert(fullname.to_string());
             let entry = match record::decode(label_of(&fullname), &properties, at) {
                 Ok(entry) => entry,
@@ -78,6 +88,8 @@ impl Listener {
             if entry.incarnation.is_known() {
                 survives(&entry, at);
             }
+            let locations = record::on_interfaces(entry.locations.clone(), &interfaces);
+            let entry = Entry { locations, ..entry };
             self.browser.belongs(&fullname, entry.mts.incarnation);
             self.peer_records.put(now, &fullname, Some(&entry));
             let _ = self

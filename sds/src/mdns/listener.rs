@@ -8,7 +8,7 @@ use fipa_transport::Incarnation;
 
 use super::Shared;
 use super::beacon::{self, Beacons, Digest, Repair};
-use super::browse::{Browser, ParsedPacket};
+use super::browse::{Browser, Origin, ParsedPacket};
 use super::sockets::Sockets;
 
 /// Maximum jitter of the beacon interval, so that gateways do not send simultaneously.
@@ -67,6 +67,7 @@ impl Listener {
                     // The library notices a removed address only at its next poll, and until then
                     // would use it instead of the new one.
                     if changed.fewer {
+                        self.browser.retain_interfaces(|it| self.sockets.uses(it));
                         self.poll_fast(now, shared);
                     } else if changed.more {
                         shared.daemon_adds_interfaces();
@@ -123,7 +124,7 @@ impl Listener {
 
     /// Receives one packet and processes it.
     pub(super) async fn listen(&mut self, shared: &Shared) -> ParsedPacket {
-        let (packet, from) = self.sockets.receive().await;
+        let (packet, from, interface) = self.sockets.receive().await;
         let now = Instant::now();
         let is_question = packet.get(2).is_some_and(|flags| flags & 0x80 == 0);
         if is_question && from.port() != shared.config.port {
@@ -137,8 +138,12 @@ impl Listener {
             }
             return ParsedPacket::default();
         }
+        let origin = Origin {
+            address: from.ip(),
+            interface,
+        };
         self.browser
-            .handle_packet(now, from.ip(), packet, fastrand::f64())
+            .handle_packet(now, origin, packet, fastrand::f64())
     }
 
     pub(super) fn handle_beacon(

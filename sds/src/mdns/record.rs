@@ -17,7 +17,7 @@
 //! | `fipa-members` | names of the members of a coalition, with a line feed between two |
 //! | `fipa-leader` | the name of its leader, if it has one |
 //! | `fipa-time` | time of registration, in milliseconds since 1970, UTC |
-//! | `fipa-locations` | all locations that lead to this host, in order, with a space between two |
+//! | `fipa-locations` | all locations that lead to this host, in order, with a space between two; link-local IPv6 addresses without a scope |
 //! | `fipa-type`, `fipa-description` | full text, when the legacy key has only its beginning |
 //!
 //! Values for legacy peers stay within the limits of those: at most 200 bytes per value, only the
@@ -33,6 +33,7 @@
 //! The instance label is the name with `?` for every `.`, as the legacy peers write it, whenever
 //! that is reversible; see [`label`].
 
+use std::collections::HashSet;
 use std::time::SystemTime;
 
 use fipa_transport::{Incarnation, Kind, Location, LocationError, Signature};
@@ -78,7 +79,9 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     own("fipa-version", "1");
     own("fipa-name", &entry.name);
     own("fipa-id", &entry.incarnation.to_string());
-    own("fipa-mts", &entry.mts.name);
+    if let Some(mts) = &entry.mts.name {
+        own("fipa-mts", mts);
+    }
     own("fipa-mts-id", &entry.mts.incarnation.to_string());
     match &entry.role {
         Role::Agent => {}
@@ -95,7 +98,12 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     own("fipa-time", &time.to_string());
     let locations = entry.locations.iter();
     let locations = locations.filter(|location| !location.kind().is_host_local());
-    let locations: Vec<String> = locations.map(Location::to_string).collect();
+    let mut locations: Vec<String> = locations
+        .map(|location| location.clone().without_scope().to_string())
+        .collect();
+    // An address that was received on two interfaces is one address of the other host.
+    let mut known = HashSet::new();
+    locations.retain(|location| known.insert(location.clone()));
     own("fipa-locations", &locations.join(" "));
     for (key, whole) in [
         ("fipa-type", &entry.agent_type),
@@ -125,6 +133,24 @@ pub(super) fn decode(
     };
     entry.check()?;
     Ok(entry)
+}
+
+/// Completes link-local IPv6 addresses with the interfaces on which the record was received: they are valid
+/// there. One without an interface cannot be dialed.
+pub(super) fn on_interfaces(locations: Vec<Location>, interfaces: &[u32]) -> Vec<Location> {
+    let completed = locations.into_iter().flat_map(|location| {
+        let number = match location.is_link_local() {
+            true => interfaces,
+            false => &[],
+        };
+        let scoped = number.iter().map(|it| location.clone().on_interface(*it));
+        let scoped: Vec<Location> = scoped.collect();
+        match scoped.is_empty() {
+            true => vec![location],
+            false => scoped,
+        }
+    });
+    completed.collect()
 }
 
 /// The instance label of a name: at most 63 bytes, without dots and backslashes.
@@ -222,7 +248,7 @@ fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
             // Shared memory and sockets of another host are unreachable from here, and other hosts
             // must not announce those of this host.
             Ok(location) if Location::kind(&location).is_host_local() => {}
-            Ok(location) => known.push(location),
+            Ok(location) => known.push(location.without_scope()),
             // An unknown transport of a later version does not invalidate the other locations.
             Err(LocationError::UnknownKind(_) | LocationError::UnknownSignature(_)) => {}
             Err(_) => return Err(RecordError::Value(key)),
@@ -318,7 +344,8 @@ fn locations_of_locator(locator: &str) -> Vec<Location> {
         };
         address.with_signature(signature).ok()
     };
-    let mut locations: Vec<Location> = locator.split(';').filter_map(location).collect();
+    let locations = locator.split(';').filter_map(location);
+    let mut locations: Vec<Location> = locations.map(Location::without_scope).collect();
     locations.sort_by_key(|location| !location.kind().is_supported());
     locations.truncate(Entry::MAX_LOCATIONS);
     locations
@@ -410,7 +437,7 @@ mod tests {
             incarnation: Incarnation::from_u64(7),
             locations: vec![
                 "quic://10.0.0.2:1#00000000000000ab".parse().unwrap(),
-                "tcp://[fe80::1%eth0]:7788".parse().unwrap(),
+                "tcp://[fe80::1]:7788".parse().unwrap(),
                 "tcp://10.0.0.2:7788#00000000000000ab".parse().unwrap(),
             ],
             mts: Mts::new("crex-mts", gateway),
@@ -420,6 +447,36 @@ mod tests {
             reach: Reach::Remote { gateway },
             role: Role::Agent,
         }
+    }
+
+    #[test]
+    fn a_link_local_address_gets_the_interfaces_of_the_receiver() {
+        let mut entry = example();
+        entry.locations = [
+            "tcp://10.0.0.2:1",
+            "tcp://[fe80::1%7]:1",
+            "tcp://[fd00::1]:1",
+        ]
+        .map(|text| text.parse().unwrap())
+        .to_vec();
+        let read = read("arm", &encode(&entry)).unwrap();
+        let on = |interfaces: &[u32]| {
+            let locations = on_interfaces(read.locations.clone(), interfaces);
+            locations
+                .iter()
+                .map(Location::to_string)
+                .collect::<Vec<_>>()
+        };
+        let [first, last] = ["tcp://10.0.0.2:1", "tcp://[fd00::1]:1"];
+        assert_eq!(on(&[]), [first, "tcp://[fe80::1]:1", last]);
+        let both = [first, "tcp://[fe80::1%3]:1", "tcp://[fe80::1%2]:1", last];
+        assert_eq!(on(&[3, 2]), both);
+        // The digest of the stored record is that of the announced one.
+        let stored = Entry {
+            locations: on_interfaces(read.locations.clone(), &[3, 2]),
+            ..read.clone()
+        };
+        assert_eq!(encode(&stored), encode(&entry));
     }
 
     #[test]
@@ -559,7 +616,7 @@ mod tests {
     fn a_record_of_another_gateway_claims_no_name_of_a_platform_agent() {
         let entry = example();
         let own = Entry {
-            name: format!("df@{}", entry.mts.name).into(),
+            name: format!("df@{}", entry.mts.shown()).into(),
             ..entry.clone()
         };
         assert_eq!(read("label", &encode(&own)), Ok(own));
@@ -715,7 +772,7 @@ mod tests {
         fn every_valid_entry_survives_a_round_trip(entry in any_entry(), label in any_text(63)) {
             prop_assert_eq!(entry.check(), Ok(()));
             let properties = encode(&entry);
-            let mut keys = std::collections::HashSet::new();
+            let mut keys = HashSet::new();
             for (key, value) in &properties {
                 prop_assert!(keys.insert(key.to_lowercase()), "{} occurs twice", key);
                 prop_assert!(key.len() + 1 + value.len() <= 255);

@@ -22,10 +22,18 @@ const MAX_INTERFACES: usize = 32;
 /// Sockets of the multicast group, one for each interface and family of addresses.
 #[derive(Debug)]
 pub(super) struct Sockets {
-    open: Vec<(UdpSocket, SocketAddr)>,
+    open: Vec<GroupSocket>,
     /// The interfaces of these sockets.
     interfaces: Vec<Interface>,
     buffer: Vec<u8>,
+}
+
+/// A socket of the group, the group's address, and the number of the interface.
+#[derive(Debug)]
+struct GroupSocket {
+    socket: UdpSocket,
+    group: SocketAddr,
+    interface: u32,
 }
 
 /// Differences between the current and previous addresses of interfaces.
@@ -56,8 +64,14 @@ impl Sockets {
         }
         self.open.clear();
         let mut last_error = None;
-        for opened in groups(&interfaces, config.port) {
-            let opened = opened.and_then(|(socket, to)| Ok((UdpSocket::from_std(socket)?, to)));
+        for (interface, opened) in groups(&interfaces, config.port) {
+            let opened = opened.and_then(|(socket, group)| {
+                Ok(GroupSocket {
+                    socket: UdpSocket::from_std(socket)?,
+                    group,
+                    interface,
+                })
+            });
             match opened {
                 Ok(socket) => self.open.push(socket),
                 Err(error) => last_error = Some(error),
@@ -78,9 +92,14 @@ impl Sockets {
         }
     }
 
+    /// Whether the interface with this number is in use.
+    pub(super) fn uses(&self, interface: u32) -> bool {
+        self.open.iter().any(|open| open.interface == interface)
+    }
+
     /// Sends the packet on all interfaces; a failure on one does not affect the others.
     pub(super) fn send(&self, packet: &[u8]) {
-        for (socket, group) in &self.open {
+        for GroupSocket { socket, group, .. } in &self.open {
             if let Err(error) = SockRef::from(socket).send_to(packet, &(*group).into()) {
                 tracing::debug!(%error, %group, "cannot send an mDNS packet");
             }
@@ -97,7 +116,7 @@ impl Sockets {
 
     /// Sets whether this host receives what it sends.
     fn set_loopback(&self, on: bool) {
-        for (socket, group) in &self.open {
+        for GroupSocket { socket, group, .. } in &self.open {
             let of_socket = SockRef::from(socket);
             let set = match group {
                 SocketAddr::V4(_) => of_socket.set_multicast_loop_v4(on),
@@ -109,24 +128,27 @@ impl Sockets {
         }
     }
 
-    /// Waits for the next packet, and returns it with its source address and port. This method is
-    /// cancel-safe.
-    pub(super) async fn receive(&mut self) -> (&[u8], SocketAddr) {
+    /// Waits for the next packet, and returns it with its source address and port and the number of the
+    /// interface on which it was received. This method is cancel-safe.
+    pub(super) async fn receive(&mut self) -> (&[u8], SocketAddr, u32) {
         let Self { open, buffer, .. } = self;
-        let (len, from) = std::future::poll_fn(|context| {
-            for (socket, _) in open.iter() {
+        let (len, from, interface) = std::future::poll_fn(|context| {
+            for GroupSocket {
+                socket, interface, ..
+            } in open.iter()
+            {
                 let mut packet = ReadBuf::new(buffer);
                 // A socket error is reported once, in place of a packet.
                 while let Poll::Ready(received) = socket.poll_recv_from(context, &mut packet) {
                     if let Ok(from) = received {
-                        return Poll::Ready((packet.filled().len(), from));
+                        return Poll::Ready((packet.filled().len(), from, *interface));
                     }
                 }
             }
             Poll::Pending
         })
         .await;
-        (self.buffer.get(..len).unwrap_or_default(), from)
+        (self.buffer.get(..len).unwrap_or_default(), from, interface)
     }
 }
 
@@ -134,7 +156,7 @@ impl Sockets {
 /// others.
 pub(super) fn send_once(config: &MdnsConfig, packet: &[u8]) -> io::Result<()> {
     let mut last_error = None;
-    for opened in groups(&interfaces(config)?, config.port) {
+    for (_, opened) in groups(&interfaces(config)?, config.port) {
         let sent = opened.and_then(|(socket, group)| socket.send_to(packet, group));
         last_error = sent.err().or(last_error);
     }
@@ -159,18 +181,21 @@ pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
 /// A non-blocking socket in the group of an interface, and the group's address.
 pub(super) type Grouped = (std::net::UdpSocket, SocketAddr);
 
-/// Opens one socket for each IPv4 address, and one for each interface with IPv6.
-fn groups(interfaces: &[Interface], port: u16) -> impl Iterator<Item = io::Result<Grouped>> {
+/// Opens one socket for each IPv4 address, and one for each interface with IPv6. Each has the number of its
+/// interface.
+fn groups(interfaces: &[Interface], port: u16) -> impl Iterator<Item = (u32, io::Result<Grouped>)> {
     let mut indices = Vec::new();
-    let open = move |interface: &Interface| match interface.ip() {
-        IpAddr::V4(address) => Some(group_v4(address, port)),
-        IpAddr::V6(_) => {
-            let index = interface.index.unwrap_or_default();
-            if indices.contains(&index) {
-                return None;
+    let open = move |interface: &Interface| {
+        let index = interface.index.unwrap_or_default();
+        match interface.ip() {
+            IpAddr::V4(address) => Some((index, group_v4(address, port))),
+            IpAddr::V6(_) => {
+                if indices.contains(&index) {
+                    return None;
+                }
+                indices.push(index);
+                Some((index, group_v6(index, port)))
             }
-            indices.push(index);
-            Some(group_v6(index, port))
         }
     };
     interfaces.iter().filter_map(open)

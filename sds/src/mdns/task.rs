@@ -9,9 +9,9 @@ use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon
 
 use super::alarm::Alarm;
 use super::beacon::Digest;
-use super::browse::{ParsedPacket, label_of};
+use super::browse::{Found, ParsedPacket, label_of};
 use super::listener::Listener;
-use super::record::{self, Properties};
+use super::record;
 use super::restart::{self, CacheCheck, Pauses};
 use super::{MAX_SPOILT, OwnAgents, Shared};
 use crate::Entry;
@@ -135,9 +135,9 @@ async fn next<T>(of: Option<&Receiver<T>>) -> Option<T> {
 }
 
 fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
-    for (fullname, properties) in received.found {
-        if let Some(gateway) = found(shared, &fullname, &properties) {
-            listener.browser.belongs(&fullname, gateway);
+    for one in received.found {
+        if let Some(gateway) = found(shared, &one) {
+            listener.browser.belongs(&one.fullname, gateway);
         }
     }
     if received.refused > 0 {
@@ -148,10 +148,18 @@ fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
 }
 
 /// Decodes and stores a record. Returns the gateway that announces it, if it is valid.
-fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties) -> Option<Incarnation> {
+fn found(shared: &Shared, found: &Found) -> Option<Incarnation> {
+    let Found {
+        fullname,
+        properties,
+        interfaces,
+    } = found;
     let label = label_of(fullname);
     let entry = match record::decode(label, properties, SystemTime::now()) {
-        Ok(entry) => Arc::new(entry),
+        Ok(entry) => Arc::new(Entry {
+            locations: record::on_interfaces(entry.locations, interfaces),
+            ..entry
+        }),
         Err(error) => {
             shared.status.lock().refused += 1;
             tracing::debug!(record = label, error = %ErrorChain(&error), "record not used");
@@ -255,6 +263,7 @@ mod tests {
 
     use super::super::SERVICE_TYPE;
     use super::super::beacon::BeaconContent;
+    use super::super::browse::Origin;
     use super::super::packet::tests::{Part, answer};
     use super::super::restart::tests::directory;
     use super::*;
@@ -279,7 +288,10 @@ mod tests {
         let at = |seconds| now + Duration::from_secs(seconds);
         let received = listener.browser.handle_packet(
             now,
-            Ipv4Addr::LOCALHOST.into(),
+            Origin {
+                address: Ipv4Addr::LOCALHOST.into(),
+                interface: 1,
+            },
             &answer("arm", &parts, 120),
             0.0,
         );

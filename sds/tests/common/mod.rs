@@ -217,7 +217,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         .await;
     }
     let matcher = |text| Some(Matcher::parse(text).unwrap());
-    let mts = reader.lookup("camera").unwrap().mts.name.clone();
+    let mts = reader.lookup("camera").unwrap().mts.shown().to_owned();
     let all = Query::all();
     for (query, expected) in [
         (all.clone(), "arm_left arm_right camera"),
@@ -279,7 +279,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         ),
         (
             Query {
-                mts: Some(Matcher::Exact(mts.to_string())),
+                mts: Some(Matcher::Exact(mts)),
                 ..all.clone()
             },
             "arm_left arm_right camera",

@@ -482,7 +482,7 @@ fn a_changed_configuration_is_checked_again() {
              it becomes part of file names: use 1 to 32 of A-Z a-z 0-9 _ -",
             "`mts.queue` cannot be 0; use 1 to 65536 letters",
             "`transport.tcp.listen` lists \"nowhere\", not a numeric address with port; \
-             write for example 127.0.0.1:0 or [fe80::1%eth0]:7788",
+             write for example 127.0.0.1:0 or [fe80::1%eth0]:7788, or *:7788 for all addresses of this host",
             "`discovery.interfaces` lists \"a b\", which is not a possible name of an interface; \
              `ip link` lists the names",
         ]

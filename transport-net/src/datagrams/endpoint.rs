@@ -126,17 +126,13 @@ impl<P: Protocol> Endpoint<P> {
         let _inside = self.runtime.enter();
         let unavailable =
             |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
-        let mut sockets = Vec::new();
-        let mut bound = Vec::new();
-        for text in &self.listen {
-            let address = address::numeric(text).map_err(|error| unavailable(&error))?;
-            let number = state.last_socket + 1;
-            state.last_socket = number;
-            let cannot = |error| address::cannot_bind(text, &error);
-            let socket = Socket::listen(number, address, P::FRAGMENTS).map_err(cannot)?;
-            bound.push(socket.address().map_err(cannot)?);
-            sockets.push(socket);
-        }
+        let opened = address::bind_all(&self.listen, |address| {
+            state.last_socket += 1;
+            let socket = Socket::listen(state.last_socket, address, P::FRAGMENTS)?;
+            let bound = socket.address()?;
+            Ok((socket, bound))
+        });
+        let (sockets, bound): (Vec<Socket>, Vec<SocketAddr>) = opened?.into_iter().unzip();
         // Subscribed before the interfaces are listed, so that no change is missed.
         let changes = bound
             .iter()
@@ -288,6 +284,10 @@ impl<P: Protocol> Endpoint<P> {
         let mut paths = Vec::new();
         let mut fault = "the name has no address".to_owned();
         for remote in addresses.iter().take(MAX_TARGETS) {
+            if state.listening.is_own(*remote) {
+                fault = address::itself(*remote);
+                continue;
+            }
             state.last_socket = state.last_socket.wrapping_add(1);
             match Socket::connect(state.last_socket, connection, *remote, P::FRAGMENTS) {
                 Ok(socket) => {

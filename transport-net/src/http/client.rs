@@ -141,7 +141,7 @@ impl HttpSender {
     async fn open(&self, url: &Url) -> Result<Connection, TransportError> {
         let endpoint = &self.endpoint.stream;
         let addresses = vec![url.target().to_owned()];
-        let opened = first(endpoint.limits(), "tcp", addresses, sockets::connect).await;
+        let opened = first(endpoint, "tcp", addresses, sockets::connect).await;
         let (stream, peer) = opened.map_err(|Unreachable { what, .. }| {
             count(&endpoint.tally().dial_failures);
             let detail = format!("{}: {what}", url.target());

@@ -107,7 +107,7 @@ impl Transport for QuicTransport {
     }
 
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
-        let open = |text: &str| self.sockets.listen(text);
+        let open = |address| self.sockets.listen(address);
         self.endpoint.listen(sink, &self.listen, open, |socket| {
             let accept = accept::accept(self.endpoint.clone(), self.sockets.clone(), socket);
             self.endpoint.runtime.spawn(accept)

@@ -7,7 +7,6 @@ use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 
-use fipa_transport::ListenError;
 use parking_lot::Mutex;
 use quinn::{
     Connecting, ConnectionError, Endpoint, EndpointConfig, Incoming, ServerConfig, TokioRuntime,
@@ -17,10 +16,10 @@ use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use super::settings;
+use crate::Limits;
 use crate::secure::Security;
 use crate::secure::advice::{self, Finder};
 use crate::stream::proof::Proof;
-use crate::{Limits, address};
 
 #[derive(Debug)]
 pub(super) struct Sockets {
@@ -40,18 +39,11 @@ impl Sockets {
     }
 
     /// Listens on a configured address. Returns the address that the socket is bound to.
-    pub(super) fn listen(&self, text: &str) -> Result<(Endpoint, SocketAddr), ListenError> {
-        let unavailable = |error: String| ListenError::Unavailable(error);
-        let bind = address::numeric(text).map_err(|error| unavailable(error.to_string()))?;
-        let socket = open(bind).map_err(|error| address::cannot_bind(text, &error))?;
-        let failed = |source| ListenError::Bind {
-            address: text.to_owned(),
-            source,
-        };
-        let bound = socket.local_addr().map_err(failed)?;
-        let server = settings::server(&self.security, &self.transport).map_err(unavailable)?;
-        let socket = endpoint(Some(server), socket).map_err(failed)?;
-        Ok((socket, bound))
+    pub(super) fn listen(&self, address: SocketAddr) -> io::Result<(Endpoint, SocketAddr)> {
+        let socket = open(address)?;
+        let bound = socket.local_addr()?;
+        let server = settings::server(&self.security, &self.transport).map_err(io::Error::other)?;
+        Ok((endpoint(Some(server), socket)?, bound))
     }
 
     /// Continues the handshake of a peer.
@@ -107,10 +99,15 @@ pub(super) fn loss_reason(error: &ConnectionError) -> String {
     };
     // quinn only keeps the text and the alert of a TLS error, and the alert is that of an expired
     // certificate.
-    if let ConnectionError::TransportError(failed) = error
-        && failed.reason.ends_with("NotValidYet")
-    {
-        return format!("{} ({})", text(), advice::NOT_YET);
+    if let ConnectionError::TransportError(failed) = error {
+        for (end, remedy) in [
+            ("NotValidYet", advice::NOT_YET),
+            (advice::OWN_CERTIFICATE, advice::ITSELF),
+        ] {
+            if failed.reason.ends_with(end) {
+                return format!("{} ({remedy})", text());
+            }
+        }
     }
     // An alert of TLS (RFC 9001 section 4.8).
     match code.checked_sub(0x100).map(u8::try_from) {

@@ -9,6 +9,11 @@ const DEFAULT_REMEDY: &str = "run `fipa keys list` on both hosts";
 pub(crate) const NOT_YET: &str = "the peer's certificate is not valid yet by the clock of this host: set the clock \
                        of this host; if it is right, set the clock of the peer and run `fipa keys renew` there";
 
+/// The error for a peer with the certificate of this host, and its remedy.
+pub(crate) const OWN_CERTIFICATE: &str = "the certificate is that of this host";
+pub(crate) const ITSELF: &str =
+    "the address leads to this gateway itself, or another host uses a copy of its keys";
+
 /// Alerts about certificates (RFC 8446 section 6.2).
 const BAD_CERTIFICATE: u8 = 42;
 const CERTIFICATE_EXPIRED: u8 = 45;
@@ -78,6 +83,7 @@ pub(crate) fn of_error(error: &Error) -> &'static str {
             of_alert(CERTIFICATE_EXPIRED, Finder::Here)
         }
         Error::InvalidCertificate(CertificateError::NotValidYet) => NOT_YET,
+        Error::General(what) if what == OWN_CERTIFICATE => ITSELF,
         _ => DEFAULT_REMEDY,
     }
 }

@@ -314,7 +314,7 @@ impl Prepared {
             trusted,
             revoked,
         } = credentials;
-        let known = Known::default().with_certificates(trusted, revoked);
+        let known = Known::of(own.fingerprint()).with_certificates(trusted, revoked);
         Self::with(own, key, known)
     }
 

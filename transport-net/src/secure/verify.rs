@@ -15,6 +15,7 @@ use rustls::{
     SignatureScheme,
 };
 
+use super::advice;
 use super::certificate::{Certificate, Fingerprint, Holds};
 #[cfg(feature = "http")]
 use super::platform::Authorities;
@@ -24,6 +25,7 @@ use super::trust::Chain;
 /// The certificates that prove peers.
 #[derive(Debug)]
 pub(super) struct Known {
+    own: Fingerprint,
     /// The certificates of trusted peers, without revoked ones.
     trusted: HashMap<Fingerprint, Certificate>,
     revoked: HashSet<Fingerprint>,
@@ -32,10 +34,12 @@ pub(super) struct Known {
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl Default for Known {
-    fn default() -> Self {
+impl Known {
+    /// Returns what a service with this certificate knows before it trusts any peer.
+    pub(super) fn of(own: Fingerprint) -> Self {
         let provider = rustls::crypto::ring::default_provider();
         Self {
+            own,
             trusted: HashMap::new(),
             revoked: HashSet::new(),
             #[cfg(feature = "http")]
@@ -43,9 +47,7 @@ impl Default for Known {
             algorithms: provider.signature_verification_algorithms,
         }
     }
-}
 
-impl Known {
     /// Returns the same authorities with these certificates.
     pub(super) fn with_certificates(
         &self,
@@ -56,6 +58,7 @@ impl Known {
         let trusted = trusted.into_iter();
         let trusted = trusted.map(|certificate| (certificate.fingerprint(), certificate));
         Self {
+            own: self.own,
             trusted: trusted.filter(|(it, _)| !revoked.contains(it)).collect(),
             revoked,
             #[cfg(feature = "http")]
@@ -68,6 +71,7 @@ impl Known {
     #[cfg(feature = "http")]
     pub(super) fn with_authorities(&self, authorities: Authorities) -> Self {
         Self {
+            own: self.own,
             trusted: self.trusted.clone(),
             revoked: self.revoked.clone(),
             authorities,
@@ -124,6 +128,9 @@ impl Known {
     /// Checks that a certificate is that of a trusted peer and valid now. The signature over the
     /// handshake proves that the peer has its key.
     fn check(&self, presented: &CertificateDer<'_>, now: UnixTime) -> Result<(), Error> {
+        if Fingerprint::of(presented) == self.own {
+            return Err(Error::General(advice::OWN_CERTIFICATE.into()));
+        }
         let certificate = self.find(presented);
         let certificate = certificate.ok_or(CertificateError::UnknownIssuer)?;
         match certificate.holds(now) {

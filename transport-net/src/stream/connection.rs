@@ -21,7 +21,7 @@ use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
 use crate::answer::Contradictions;
 use crate::end::ConnectionEnd;
-use crate::hello::{Hello, OWN_INCARNATION};
+use crate::hello::Hello;
 
 /// Upper bound of parcel numbers, so that a ticket also holds the number of the connection.
 pub(crate) const MAX_ID: u64 = 1 << 40;
@@ -712,15 +712,19 @@ impl Connection {
 
     fn greet(&mut self, hello: Hello, now: Instant) -> Result<(), ConnectionEnd> {
         let found = hello.identity.incarnation;
+        if found == self.hello.identity.incarnation {
+            // This side would send letters and its directory to itself. The hello shows the dialing side
+            // why the connection ends.
+            if self.role == Role::Acceptor {
+                self.say_hello();
+            }
+            return Err(ConnectionEnd::Itself);
+        }
         if let Role::Dialler { expected } = self.role
             && expected.is_known()
             && expected != found
         {
             return Err(ConnectionEnd::WrongIncarnation { expected, found });
-        }
-        if found == self.hello.identity.incarnation {
-            // This side would send letters and its directory to itself.
-            return Err(ConnectionEnd::ProtocolViolation(OWN_INCARNATION.into()));
         }
         if hello.max_in_flight == 0 {
             return Err(ConnectionEnd::ProtocolViolation(

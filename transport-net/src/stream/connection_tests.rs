@@ -322,6 +322,27 @@ fn another_incarnation_ends_the_connection_before_a_parcel_is_sent() {
 }
 
 #[test]
+fn a_connection_that_leads_back_names_the_cause_on_both_ends() {
+    let now = Instant::now();
+    for expected in [Incarnation::UNKNOWN, Incarnation::from_u64(3)] {
+        let mut a = Side::new(Role::Dialler { expected }, 1, now);
+        let mut b = Side::new(Role::Acceptor, 1, now);
+        a.dispatch(10).unwrap();
+        settle(&mut a, &mut b, now);
+        assert_eq!(a.end, Some(ConnectionEnd::Itself));
+        assert_eq!(b.end, Some(ConnectionEnd::Itself));
+        match &a.concluded[&AttemptId(0)][..] {
+            // Another incarnation at an address would mean that the peer has ended.
+            [Conclusion::NotSent(error)] => {
+                assert_eq!(error.fault, TransportErrorKind::Unreachable)
+            }
+            other => panic!("{other:?}"),
+        }
+        assert!(b.arrived.is_empty(), "{:?}", b.arrived);
+    }
+}
+
+#[test]
 fn a_letter_that_the_peer_does_not_accept_is_not_sent() {
     let now = Instant::now();
     let (mut a, mut b) = pair(now);
@@ -615,10 +636,7 @@ fn a_peer_that_claims_to_be_this_service_is_refused() {
         let mut connection = Connection::new(limits(), role, sample(1), now);
         connection.connected(now);
         let other = connection.handle_frame(Frame::Hello(sample(1)), now);
-        assert!(
-            matches!(other, Err(ConnectionEnd::ProtocolViolation(_))),
-            "{other:?}"
-        );
+        assert_eq!(other, Err(ConnectionEnd::Itself));
         assert_eq!(connection.poll_event(), None);
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::io;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_transport::{Kind, Location, Sink, log_limit};
@@ -11,7 +12,6 @@ use tokio::net::lookup_host;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use super::config::Limits;
 use super::endpoint::Endpoint;
 use super::link::Link;
 use crate::address::{self, Target};
@@ -89,7 +89,7 @@ where
         _ => "udp",
     };
     tokio::select! {
-        connected = first(endpoint.limits(), protocol, addresses, connect) => match connected {
+        connected = first(endpoint, protocol, addresses, connect) => match connected {
             Ok(connected) => {
                 endpoint.silent_peers().answered(to);
                 Ok(connected)
@@ -113,10 +113,10 @@ pub(crate) struct Unreachable {
     is_silent: bool,
 }
 
-/// Tries these addresses with `connect` until one succeeds. `protocol` is that of the ports: `tcp` or
-/// `udp`.
+/// Tries these addresses with `connect` until one succeeds, except those of the endpoint itself.
+/// `protocol` is that of the ports: `tcp` or `udp`.
 pub(crate) async fn first<T, F>(
-    limits: &Limits,
+    endpoint: &Endpoint,
     protocol: &str,
     addresses: Vec<String>,
     connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,
@@ -125,6 +125,17 @@ where
     T: Send + 'static,
     F: Future<Output = io::Result<T>> + Send + 'static,
 {
+    let own = Arc::new(endpoint.own());
+    let connect = move |address| {
+        let connecting = match own.is_own(address) {
+            true => Err(io::Error::new(
+                io::ErrorKind::AddrInUse,
+                address::itself(address),
+            )),
+            false => Ok(connect(address)),
+        };
+        async move { connecting?.await }
+    };
     let several = addresses.len() > 1;
     let all = addresses.join(", ");
     let attempts = addresses.into_iter().map(|address| {
@@ -137,7 +148,7 @@ where
             })
         }
     });
-    let patience = limits.connect_timeout;
+    let patience = endpoint.limits().connect_timeout;
     match timeout(patience, race(attempts)).await {
         Ok(connected) => connected.map_err(|error| Unreachable {
             what: error.to_string(),

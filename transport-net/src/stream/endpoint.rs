@@ -375,8 +375,8 @@ impl Endpoint {
         }
     }
 
-    /// Opens a socket at each of these addresses with `open`, which also returns the address that
-    /// the socket is bound to, and starts the task that serves it with `accept`. Returns the
+    /// Opens the sockets for these entries of `listen` with `open`, which also returns the address
+    /// that the socket is bound to, and starts the task that serves it with `accept`. Returns the
     /// present locations of the endpoint; the sink is notified when they change.
     ///
     /// # Errors
@@ -386,17 +386,13 @@ impl Endpoint {
         self: &Arc<Self>,
         sink: Arc<dyn Sink>,
         listen: &[String],
-        open: impl Fn(&str) -> Result<(S, SocketAddr), ListenError>,
+        open: impl Fn(SocketAddr) -> io::Result<(S, SocketAddr)>,
         accept: impl Fn(S) -> JoinHandle<()>,
     ) -> Result<Vec<Location>, ListenError> {
         self.may_listen()?;
         let _inside = self.runtime.enter();
-        let (mut sockets, mut bound) = (Vec::new(), Vec::new());
-        for text in listen {
-            let (socket, address) = open(text)?;
-            bound.push(address);
-            sockets.push(socket);
-        }
+        let (sockets, bound): (Vec<S>, Vec<SocketAddr>) =
+            address::bind_all(listen, open)?.into_iter().unzip();
         let unavailable =
             |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
         // Subscribed before the interfaces are listed, so that no change is missed.
@@ -427,6 +423,15 @@ impl Endpoint {
     #[cfg(feature = "ip")]
     pub(crate) fn listening(&self) -> Vec<String> {
         self.registry.lock().listening.texts()
+    }
+
+    /// Returns the sockets of this endpoint and their addresses.
+    #[cfg(feature = "ip")]
+    pub(crate) fn own(&self) -> Listening {
+        match &self.registry.lock().listening {
+            Reached::Addresses(listening) => listening.clone(),
+            Reached::Nowhere | Reached::Socket(_) => Listening::default(),
+        }
     }
 
     /// Handles a change of the network interfaces: reports the new locations to the sink, and ends

@@ -9,8 +9,8 @@ use crate::stream::config::Limits;
 #[non_exhaustive]
 pub struct TcpConfig {
     /// Numeric addresses to listen on, for example `127.0.0.1:0`, `[::1]:7788`, `0.0.0.0:7788` or
-    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. `[::]` is IPv6 only: list `0.0.0.0`
-    /// beside it for both. May be empty: letters can still be sent, and peers can answer over the
+    /// `[fe80::1%eth0]:7788`. `*:7788` means all addresses of this host, `0.0.0.0` and `[::]`
+    /// those of one family. Port 0 lets the system choose. May be empty: letters can still be sent, and peers can answer over the
     /// connections that this side opens.
     pub listen: Vec<String>,
     /// Identity of this endpoint.

@@ -52,7 +52,7 @@ impl TcpSender {
         // descriptor in fipa_services.
         let mut letter = in_dialect(None)?;
         let addresses = vec![to.address().to_owned()];
-        let opened = first(endpoint.limits(), "tcp", addresses, sockets::connect).await;
+        let opened = first(endpoint, "tcp", addresses, sockets::connect).await;
         let (mut stream, peer) = opened.map_err(|Unreachable { what, .. }| {
             count(&endpoint.tally().dial_failures);
             let detail = format!("{}: {what}", to.address());

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Stream, Ticket,
-    TransportErrorKind, log_limit,
+    TransportErrorKind,
 };
 
 use super::config::UdpLimits;

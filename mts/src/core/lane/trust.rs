@@ -71,7 +71,7 @@ pub(super) fn is_withdrawn(entry: &Entry, table: &AttemptTable) -> bool {
 }
 
 fn error(entry: &Entry) -> TransportError {
-    let service = &entry.mts.name;
+    let service = entry.mts.shown();
     let detail = format!("the trust in the certificate of {service} was withdrawn");
     TransportError::new(TransportErrorKind::Refused, detail)
 }

@@ -8,8 +8,11 @@ use super::super::packet::tests::{Part, answer, asked};
 use super::*;
 
 const HOST: &str = "host.local";
-/// Source address of the packets.
-const FROM: IpAddr = IpAddr::V4(Ipv4Addr::new(192, 0, 2, 9));
+/// Origin of the packets.
+const FROM: Origin = Origin {
+    address: IpAddr::V4(Ipv4Addr::new(192, 0, 2, 9)),
+    interface: 2,
+};
 const OWN: Incarnation = Incarnation::from_u64(1);
 const OTHER: Incarnation = Incarnation::from_u64(7);
 
@@ -37,7 +40,7 @@ fn browser(now: Instant, labels: &[&str]) -> Browser {
 
 fn names(received: &ParsedPacket) -> Vec<&str> {
     let found = received.found.iter();
-    found.map(|(fullname, _)| label_of(fullname)).collect()
+    found.map(|found| label_of(&found.fullname)).collect()
 }
 
 /// Runs the timers until then. Returns the queries, except those for all records, and the removals,
@@ -78,10 +81,10 @@ fn an_announced_record_is_reported_once_with_all_its_strings() {
     ];
     let parts = [Part::Txt(&strings), Part::Srv(HOST), Part::Ptr];
     let received = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
-    let [(fullname, properties)] = &received.found[..] else {
+    let [found] = &received.found[..] else {
         panic!("{received:?}");
     };
-    assert_eq!(**fullname, format!("Arm.left.{SERVICE_TYPE}"));
+    assert_eq!(*found.fullname, *format!("Arm.left.{SERVICE_TYPE}"));
     let expected: [(&str, &[u8]); 4] = [
         ("LOCATOR", b"tcp://a"),
         ("TYPE", b"\xff"),
@@ -89,7 +92,7 @@ fn an_announced_record_is_reported_once_with_all_its_strings() {
         ("flag", b""),
     ];
     let expected = expected.map(|(key, value)| (key.to_owned(), value.to_vec()));
-    assert_eq!(*properties, expected);
+    assert_eq!(found.properties, expected);
     // An identical record is not reported again; a changed one is.
     let again = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
     assert_eq!(again, ParsedPacket::default());
@@ -326,9 +329,39 @@ fn legacy_peers_are_listed_first_as_known_answers() {
 }
 
 /// The address of one of eight hosts.
-fn one_of_many(number: usize) -> IpAddr {
+fn one_of_many(number: usize) -> Origin {
     let last = u8::try_from(number % 8).unwrap();
-    Ipv4Addr::new(198, 51, 100, last).into()
+    Origin {
+        address: Ipv4Addr::new(198, 51, 100, last).into(),
+        ..FROM
+    }
+}
+
+#[test]
+fn the_interfaces_of_a_record_are_reported() {
+    let now = Instant::now();
+    let mut browser = browser(now, &["arm"]);
+    let arm = announced("arm", b"TYPE=x", 120);
+    let mut interfaces_after = |interface| {
+        let from = Origin { interface, ..FROM };
+        let received = browser.handle_packet(now, from, &arm, 0.0);
+        let mut found = received.found.into_iter();
+        found.next().map(|found| found.interfaces)
+    };
+    assert_eq!(interfaces_after(FROM.interface), None);
+    assert_eq!(interfaces_after(3), Some(vec![3, FROM.interface]));
+    assert_eq!(interfaces_after(3), None);
+    for interface in 4..10 {
+        let known = interfaces_after(interface).unwrap();
+        assert!(known[0] == interface && known.len() <= MAX_INTERFACES);
+    }
+    browser.retain_interfaces(|interface| interface == 9);
+    let from = Origin {
+        interface: 8,
+        ..FROM
+    };
+    let received = browser.handle_packet(now, from, &arm, 0.0);
+    assert_eq!(received.found[0].interfaces, [8, 9]);
 }
 
 #[test]
@@ -383,7 +416,10 @@ fn several_sources_leave_room_for_small_ones() {
         }
         let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(&[b"TYPE=x"])];
         for host in 0..30 {
-            let from = Ipv4Addr::new(203, 0, 113, host).into();
+            let from = Origin {
+                address: Ipv4Addr::new(203, 0, 113, host).into(),
+                ..FROM
+            };
             for number in 0..100 {
                 let label = format!("arm {host} {number}");
                 let received = browser.handle_packet(now, from, &answer(&label, &parts, 120), 0.0);

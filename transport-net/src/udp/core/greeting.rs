@@ -12,7 +12,7 @@ use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::datagrams::Path;
 use crate::end::ConnectionEnd;
-use crate::hello::{Hello, OWN_INCARNATION};
+use crate::hello::Hello;
 
 /// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.
@@ -200,7 +200,7 @@ impl Core {
         let (own, mut greeted) = (self.identity.incarnation, None);
         self.of_dialling(to, path, |number, connection| {
             if peer.identity.incarnation == own {
-                return Err(ConnectionEnd::ProtocolViolation(OWN_INCARNATION.into()));
+                return Err(ConnectionEnd::Itself);
             }
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
