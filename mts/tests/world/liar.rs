@@ -326,7 +326,7 @@ impl World {
             Habit::OutOfOrder => {
                 let liars = self.liars.as_mut();
                 let more = liars.map_or(0, |liars| liars.habits.u64(..3));
-                let last = (parcel.after + more).saturating_sub(1);
+                let last = parcel.after.saturating_add(more).saturating_sub(1);
                 (Answer::OutOfOrder { last }, None)
             }
             Habit::BusyAndCredit => (Answer::Busy, Some(Body::Credit)),
