@@ -8,8 +8,9 @@ use crate::{Entry, EntryError, Query, Registration, Snapshot, Subscriber, View, 
 
 /// A view of the known agents.
 ///
-/// Every method is synchronous and cheap. Reading a known entry takes no system call; on a miss, a
-/// back end with external storage reads that storage first.
+/// Every method is synchronous and cheap, and waits for no other process. Reading a known entry takes no
+/// system call, except for an agent of another host in the [directory of the host](crate::HostDirectory), which
+/// is read from an open file. On a miss, a back end with external storage reads that storage first.
 pub trait Directory: Send + Sync {
     /// Returns the entry of this name from memory, without [`refresh`](Self::refresh).
     fn known(&self, name: &str) -> Option<Arc<Entry>>;

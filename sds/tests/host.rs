@@ -964,13 +964,16 @@ async fn a_gateway_with_too_many_agents_hides_no_agent_of_others() {
     assert!(here.lookup("own").is_some());
 }
 
-/// A process that is behind by more changes than the directory remembers reads all files.
+/// A process that is behind by more changes than the directory remembers reads all files. Its watcher does not run
+/// meanwhile, because the test does not wait.
 #[tokio::test]
 async fn a_process_that_is_far_behind_finds_every_agent() {
     let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let other = open(&dir);
     let third = open(&dir);
+    here.register(registration("here")).unwrap();
+    here.refresh();
     third.register(registration("third")).unwrap();
     for number in 0..600 {
         let name = format!("agent-{}", number % 7);

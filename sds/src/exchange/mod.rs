@@ -149,6 +149,8 @@ struct Neighbor {
     asked: Option<Instant>,
     /// Time at which this gateway last started to send all entries.
     told: Option<Instant>,
+    /// Whether a list that exceeds the share was logged.
+    is_cut_reported: bool,
 }
 
 /// State of a neighbor's copy of this gateway's agents.
@@ -956,6 +958,7 @@ impl Neighbor {
             ask: None,
             asked: None,
             told: None,
+            is_cut_reported: false,
         }
     }
 
@@ -1017,9 +1020,21 @@ impl Neighbor {
             staged.list.insert(entry);
         }
         let cut = staged.list.cut(shares::MAX_OF_PEER);
+<<<<<<< ours
         if let Some(first) = cut.last() {
             let (gateway, first) = (escape(self.mts.shown()), escape(first));
             log_limit::info!(%gateway, %first, count = cut.len(), "the agents of a gateway exceed its share; the last ones are left out");
+=======
+        if let Some(first) = cut.last()
+            && !std::mem::replace(&mut self.is_cut_reported, true)
+        {
+            let (gateway, first) = (escape(&self.mts.name), escape(first));
+            tracing::warn!(
+                %gateway,
+                %first,
+                "the agents of a gateway exceed its share; the last ones by name are not listed"
+            );
+>>>>>>> theirs
         }
         if full.last {
             directory.replace(staged.list, staged.df);

@@ -27,7 +27,7 @@ pub(super) struct Id(pub(super) u64);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Name {
     /// `lock`: held while the directory is changed. Its first eight bytes are the generation; a ring of the
-    /// processes that made the latest changes follows.
+    /// files that the latest changes replaced follows.
     Domain,
     /// `<id>.lock`: locked by its process while that runs.
     Process(Id),
@@ -256,38 +256,35 @@ impl HostDir {
         }
     }
 
-    /// Returns the processes that made the changes between two generations, without an order. `None` if they are
-    /// not known, because there were too many changes.
-    pub(super) fn writers_between(
+    /// Returns the files that were replaced between two generations. `None` if they are not known, because there
+    /// were too many changes.
+    pub(super) fn replaced_between(
         &self,
         known: u64,
         generation: u64,
-    ) -> Result<Option<BTreeSet<Id>>, HostError> {
+    ) -> Result<Option<BTreeSet<Name>>, HostError> {
         let behind = generation.wrapping_sub(known);
         if known == 0 || behind > RING as u64 {
             return Ok(None);
         }
-        let mut ring = [0; RING * size_of::<u64>()];
+        let mut ring = [0; RING * SLOT];
         let mut filled = 0;
         while let Some(rest) = ring.get_mut(filled..).filter(|rest| !rest.is_empty()) {
-            let at = (size_of::<u64>() + filled) as u64;
-            match self.domain.read_at(rest, at) {
+            match self.domain.read_at(rest, RING_START + filled as u64) {
                 Ok(0) => break,
                 Ok(read) => filled += read,
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                 Err(error) => return Err(self.io("read", Name::Domain)(error)),
             }
         }
-        // Writers that were faster than this read have replaced some of the writers in question.
+        // Writers that were faster than this read have replaced some of the slots in question.
         if self.generation()?.wrapping_sub(known) > RING as u64 {
             return Ok(None);
         }
         let (slots, _) = ring.as_chunks();
         let changes = (1..=behind).map(|change| known.wrapping_add(change));
-        let writers = changes.filter_map(|change| slots.get(slot(change)));
-        Ok(Some(
-            writers.map(|id| Id(u64::from_le_bytes(*id))).collect(),
-        ))
+        let names = changes.filter_map(|change| name_in(slots.get(index_of(change))?));
+        Ok(Some(names.collect()))
     }
 
     /// Waits for the lock of the domain.
@@ -512,12 +509,34 @@ impl HostDir {
     }
 }
 
-/// Number of changes whose processes are remembered.
+/// Number of changes whose files are remembered, and the bytes of each: its process, and the kind of the file.
 const RING: usize = 512;
+const SLOT: usize = 16;
+/// Offset of the ring, which follows the generation.
+const RING_START: u64 = 8;
 
 /// Index of a change in the ring.
-const fn slot(generation: u64) -> usize {
+const fn index_of(generation: u64) -> usize {
     (generation % RING as u64) as usize
+}
+
+fn slot_of(name: Name) -> [u8; SLOT] {
+    let (Id(id), kind) = match name {
+        Name::Remote(id) => (id, 1_u64),
+        Name::Entries(id) | Name::Process(id) | Name::Socket(id) | Name::Temporary(id) => (id, 0),
+        Name::Domain => (Id(0), 0),
+    };
+    (u128::from(id) | u128::from(kind) << 64).to_le_bytes()
+}
+
+fn name_in(slot: &[u8; SLOT]) -> Option<Name> {
+    let slot = u128::from_le_bytes(*slot);
+    let id = Id((slot & u128::from(u64::MAX)) as u64);
+    match slot >> 64 {
+        0 => Some(Name::Entries(id)),
+        1 => Some(Name::Remote(id)),
+        _ => None,
+    }
 }
 
 /// Distinguishes an entries file from its predecessor.
@@ -609,10 +628,10 @@ impl Guard<'_> {
             let _ = host_dir.remove(temporary);
             return Err(error);
         }
-        let at = size_of::<u64>() * (1 + slot(generation));
+        let at = RING_START + (SLOT * index_of(generation)) as u64;
         host_dir
             .domain
-            .write_all_at(&host_dir.id.0.to_le_bytes(), at as u64)
+            .write_all_at(&slot_of(name), at)
             .and_then(|()| host_dir.domain.write_all_at(&generation.to_le_bytes(), 0))
             .map_err(host_dir.io("write", Name::Domain))
     }

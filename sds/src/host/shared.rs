@@ -223,10 +223,10 @@ impl Shared {
         if others.generation == generation {
             return Ok(());
         }
-        match host_dir.writers_between(others.generation, generation)? {
-            Some(writers) => {
-                for id in writers.into_iter().filter(|id| *id != host_dir.id()) {
-                    self.read(&mut others, id)?;
+        match host_dir.replaced_between(others.generation, generation)? {
+            Some(names) => {
+                for name in names {
+                    self.read(&mut others, name)?;
                 }
             }
             None => self.scan(&mut others)?,
@@ -254,29 +254,25 @@ impl Shared {
     }
 
     fn scan(&self, others: &mut OtherProcesses) -> Result<(), HostError> {
-        let own = self.host_dir().id();
         for name in self.host_dir().names()? {
-            match name {
-                Name::Entries(id) if id != own => self.read_entries(others, id)?,
-                Name::Remote(id) if id != own => self.read_remote(others, id)?,
-                _ => {}
-            }
+            self.read(others, name)?;
         }
         Ok(())
     }
 
-    /// Reads the process's entries file if it has changed.
-    pub(super) fn process_wrote(&self, id: Id) -> Result<(), HostError> {
-        if id == self.host_dir().id() {
-            return Ok(());
-        }
-        self.read(&mut self.others.lock(), id)
+    /// Reads a file that another process has replaced.
+    pub(super) fn replaced(&self, name: Name) -> Result<(), HostError> {
+        self.read(&mut self.others.lock(), name)
     }
 
-    /// Reads the files of the process that have changed.
-    fn read(&self, others: &mut OtherProcesses, id: Id) -> Result<(), HostError> {
-        self.read_entries(others, id)?;
-        self.read_remote(others, id)
+    /// Reads a file of another process if it has changed.
+    fn read(&self, others: &mut OtherProcesses, name: Name) -> Result<(), HostError> {
+        let own = self.host_dir().id();
+        match name {
+            Name::Entries(id) if id != own => self.read_entries(others, id),
+            Name::Remote(id) if id != own => self.read_remote(others, id),
+            _ => Ok(()),
+        }
     }
 
     fn read_entries(&self, others: &mut OtherProcesses, id: Id) -> Result<(), HostError> {

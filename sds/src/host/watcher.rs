@@ -29,6 +29,9 @@ pub(super) struct Watcher {
     events: Events,
 }
 
+/// Bytes of events that are read at once.
+const BUFFER: usize = 16 * 1024;
+
 /// Source of changes of the directory.
 enum Events {
     Inotify {
@@ -83,7 +86,7 @@ impl Watcher {
             | WatchMask::ONLYDIR;
         let mut watches = inotify.watches();
         let dir = watches.add(host_dir.pinned_path(), mask)?;
-        Ok((inotify.into_event_stream(vec![0; 16 * 1024])?, dir))
+        Ok((inotify.into_event_stream(vec![0; BUFFER])?, dir))
     }
 
     /// Keeps the view up to date until it is aborted. At `settled`, entries from before a removal
@@ -120,8 +123,31 @@ impl Watcher {
                 ending.rescan = true;
             }
             let pause = pause.after(began - waiting, began.elapsed());
-            tokio::time::sleep(pause).await;
+            self = self.pause(pause).await;
         }
+    }
+
+    /// Collects changes for this time. The runtime does not watch the events meanwhile: each one would wake it,
+    /// in every process of the domain.
+    async fn pause(self, pause: Duration) -> Self {
+        let events = match self.events {
+            Events::Inotify { events, dir } => {
+                let inotify = events.into_inotify();
+                tokio::time::sleep(pause).await;
+                match inotify.into_event_stream(vec![0; BUFFER]) {
+                    Ok(events) => Events::Inotify { events, dir },
+                    Err(error) => {
+                        tracing::warn!(error = %ErrorChain(&error), "no inotify events: polling the directory");
+                        Events::Polling(Poller::default())
+                    }
+                }
+            }
+            polling @ Events::Polling(_) => {
+                tokio::time::sleep(pause).await;
+                polling
+            }
+        };
+        Self { events }
     }
 
     /// Waits for at least one change, and returns all since the last call.
@@ -153,7 +179,7 @@ async fn next_events(
     let mut changes = DirChanges::default();
     poll_fn(|context| {
         // Bounded, so that other tasks can run.
-        for _ in 0..4096 {
+        for _ in 0..MOST_EVENTS {
             match Pin::new(&mut *events).poll_next(context) {
                 Poll::Ready(Some(event)) => {
                     let event = event?;
@@ -168,13 +194,18 @@ async fn next_events(
                 // The stream does not end.
                 Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
                 Poll::Pending if changes.is_empty() => return Poll::Pending,
-                Poll::Pending => break,
+                Poll::Pending => return Poll::Ready(Ok(std::mem::take(&mut changes))),
             }
         }
+        // The pause that follows drops events that the stream has read ahead.
+        changes.lost = true;
         Poll::Ready(Ok(std::mem::take(&mut changes)))
     })
     .await
 }
+
+/// Maximum number of events that are handled together.
+const MOST_EVENTS: usize = 4096;
 
 /// Interval between polls of the directory without inotify.
 const POLL_EVERY: Duration = Duration::from_millis(100);
@@ -216,7 +247,7 @@ impl Poller {
         for name in host_dir.names()? {
             match name {
                 Name::Process(id) => drop(processes.insert(id)),
-                Name::Entries(id) | Name::Remote(id) => drop(changes.wrote.insert(id)),
+                Name::Entries(_) | Name::Remote(_) => drop(changes.wrote.insert(name)),
                 _ => {}
             }
         }
@@ -274,7 +305,7 @@ impl Default for Pause {
 /// Collected changes, without duplicates.
 #[derive(Debug, Default)]
 struct DirChanges {
-    wrote: BTreeSet<Id>,
+    wrote: BTreeSet<Name>,
     ended: BTreeSet<Id>,
     sockets: bool,
     /// Whether events are missing, or the directory was removed or moved.
@@ -298,8 +329,10 @@ impl DirChanges {
             {
                 self.disturbed = true;
             }
-            Some(Name::Entries(id) | Name::Remote(id)) if mask.contains(EventMask::MOVED_TO) => {
-                self.wrote.insert(id);
+            Some(name @ (Name::Entries(_) | Name::Remote(_)))
+                if mask.contains(EventMask::MOVED_TO) =>
+            {
+                self.wrote.insert(name);
             }
             Some(Name::Process(id))
                 if mask.intersects(EventMask::CLOSE_WRITE | EventMask::DELETE) =>
@@ -344,8 +377,8 @@ fn handle(
     if changes.sockets {
         shared.find_sockets()?;
     }
-    for id in changes.wrote {
-        shared.process_wrote(id)?;
+    for name in changes.wrote {
+        shared.replaced(name)?;
     }
     for id in changes.ended {
         ending.add(id);
