@@ -5,6 +5,7 @@
 //! The hosts are network namespaces; see `fipa-testbed`.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stdout, reason = "the test prints its progress")]
 
 mod hosts;
 
