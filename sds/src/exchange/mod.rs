@@ -1029,7 +1029,7 @@ impl Neighbor {
             && !std::mem::replace(&mut self.is_cut_reported, true)
         {
             let (gateway, first) = (escape(&self.mts.name), escape(first));
-            tracing::warn!(
+            log_limit::warn!(
                 %gateway,
                 %first,
                 "the agents of a gateway exceed its share; the last ones by name are not listed"

@@ -137,7 +137,7 @@ impl Watcher {
                 match inotify.into_event_stream(vec![0; BUFFER]) {
                     Ok(events) => Events::Inotify { events, dir },
                     Err(error) => {
-                        tracing::warn!(error = %ErrorChain(&error), "no inotify events: polling the directory");
+                        log_limit::warn!(error = %ErrorChain(&error), "no inotify events: polling the directory");
                         Events::Polling(Poller::default())
                     }
                 }
