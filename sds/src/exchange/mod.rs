@@ -1020,21 +1020,15 @@ impl Neighbor {
             staged.list.insert(entry);
         }
         let cut = staged.list.cut(shares::MAX_OF_PEER);
-<<<<<<< ours
-        if let Some(first) = cut.last() {
-            let (gateway, first) = (escape(self.mts.shown()), escape(first));
-            log_limit::info!(%gateway, %first, count = cut.len(), "the agents of a gateway exceed its share; the last ones are left out");
-=======
         if let Some(first) = cut.last()
             && !std::mem::replace(&mut self.is_cut_reported, true)
         {
-            let (gateway, first) = (escape(&self.mts.name), escape(first));
+            let (gateway, first) = (escape(self.mts.shown()), escape(first));
             log_limit::warn!(
                 %gateway,
                 %first,
                 "the agents of a gateway exceed its share; the last ones by name are not listed"
             );
->>>>>>> theirs
         }
         if full.last {
             directory.replace(staged.list, staged.df);
