@@ -6,7 +6,8 @@
 //! * [`letter`]: the letter of a body.
 //! * [`repeats`]: letters that a platform repeats on another connection.
 //! * [`connections`]: the accepted connections.
-//! * `socket`, `tls`: the sockets of connections, and TLS over them for `https`.
+//! * `socket`, `tls`, `guarded`: the sockets of connections, TLS over them for `https`, and streams that end with the
+//!   trust in their peer.
 //!
 //! [`server`] and [`client`] do the I/O. A platform is a legacy peer: it proves no identity and
 //! confirms no delivery. [`crate::legacy`] has the parts that it shares with those over TCP.
@@ -16,6 +17,8 @@ mod config;
 mod connections;
 #[cfg(feature = "fuzzing")]
 pub mod fuzzing;
+#[cfg(feature = "secure")]
+mod guarded;
 mod head;
 mod letter;
 mod multipart;

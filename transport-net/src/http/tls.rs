@@ -13,9 +13,9 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 
+use super::guarded::Guarded;
 use super::url::Url;
 use crate::secure::Security;
-use crate::secure::guarded::Guarded;
 use crate::stream::proof::Proof;
 
 /// A connection over TLS, which ends when what the platform has proved no longer counts.

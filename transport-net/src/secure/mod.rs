@@ -11,14 +11,11 @@
 //! * `verify`: the verification of a presented certificate.
 //! * `platform`: the same for platforms that are reached over `https`, and their authorities.
 //! * `trust`: the trust in the peer of a connection, for as long as the connection is open.
-//! * `guarded`: a byte stream that ends with it.
 //!
 //! Files and the handling of letters do not belong here.
 
 pub(crate) mod advice;
 mod certificate;
-#[cfg(feature = "http")]
-pub(crate) mod guarded;
 #[cfg(feature = "http")]
 mod platform;
 mod trust;

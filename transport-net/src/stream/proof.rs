@@ -2,7 +2,7 @@
 //!
 //! Without TLS, peers prove nothing, and letters are not restricted. A transport reads no letter and
 //! writes none after [`Proof::check`] has failed: frames are read and written by `link`, HTTP by
-//! `secure::guarded`.
+//! `http::guarded`.
 
 use fipa_transport::{Mandate, Principal};
 
