@@ -424,8 +424,9 @@ fn request_of_jade(sender: &str, act: &str) -> Vec<u8> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_of_jade_uses_the_directory_facilitator() {
-    let df = "platform.df=df@jadetest";
-    let host = Host::with("rusty@rustap", "jade", &[df]).await;
+    // The recorded messages are addressed to the agents of this platform.
+    let name = "mts.name=jadetest";
+    let host = Host::with("rusty@rustap", "jade", &[name]).await;
     let rover = host.domain.register("rover").await.unwrap();
     let ask = async |letter: Vec<u8>| {
         send_as_peer(&letter, &host.address()).await;
