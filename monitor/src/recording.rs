@@ -336,7 +336,7 @@ mod tests {
             matches!(huge, Err(RecordingError::Length { number: 1, .. })),
             "{huge:?}"
         );
-        let receiver = changed(12 + 4 + 9 + 1, 200);
+        let receiver = changed(12 + 4 + 17 + 1, 200);
         assert!(
             matches!(receiver, Err(RecordingError::Malformed { number: 1, .. })),
             "{receiver:?}"

@@ -293,10 +293,8 @@ impl Location {
     /// to it, its scope.
     #[must_use]
     pub fn is_link_local(&self) -> bool {
-        let ip = self
-            .ipv6()
-            .and_then(|(ip, _, _)| ip.parse::<Ipv6Addr>().ok());
-        ip.is_some_and(|ip| ip.is_unicast_link_local())
+        self.ipv6()
+            .is_some_and(|(ip, _, _)| ip.is_unicast_link_local())
     }
 
     /// Returns this location without the scope of an IPv6 address. The scope is an interface of the host
@@ -326,12 +324,13 @@ impl Location {
     }
 
     /// Splits an IPv6 address: the part before the scope, the scope, and the text after the bracket.
-    fn ipv6(&self) -> Option<(&str, Option<&str>, &str)> {
+    fn ipv6(&self) -> Option<(Ipv6Addr, Option<&str>, &str)> {
         let (inner, rest) = self.address.strip_prefix('[')?.split_once(']')?;
-        Some(match inner.split_once('%') {
-            Some((ip, scope)) => (ip, Some(scope), rest),
-            None => (inner, None, rest),
-        })
+        let (ip, scope) = match inner.split_once('%') {
+            Some((ip, scope)) => (ip, Some(scope)),
+            None => (inner, None),
+        };
+        Some((ip.parse().ok()?, scope, rest))
     }
 
     /// The protocol at the location.

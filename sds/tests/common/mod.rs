@@ -110,7 +110,7 @@ async fn names_survive_whatever_they_contain(writer: &dyn Directory, reader: &dy
         "arm.left".to_owned(),
         "ARM.left".to_owned(),
         "béla@192.0.2.2:1099/JADE".to_owned(),
-        " 2) ~ \u{1F980}".to_owned(),
+        "2) ~ \u{1F980}".to_owned(),
         "x".repeat(63),
         "x".repeat(64),
         "é.".repeat(341),
