@@ -481,7 +481,7 @@ mod tests {
                 "tcp://crex.local:1",
                 false,
             ),
-            ("tcp://[x%]y", "tcp://[x]y", "tcp://[x%7]y", false),
+            ("tcp://[x%]y", "tcp://[x%]y", "tcp://[x%]y", false),
         ] {
             assert_eq!(location(text).without_scope().to_string(), bare);
             assert_eq!(location(text).on_interface(7).to_string(), on_seven);
