@@ -201,9 +201,11 @@ async fn large_entries_are_announced_and_too_large_ones_refused() {
     let (one, two) = (open(port, "one"), open(port, "two"));
     let mut large = registration("large");
     large.description = "x".repeat(1024);
-    let location =
-        |len: usize| -> Location { format!("quic://{}", "y".repeat(len)).parse().unwrap() };
-    large.locations = (0..8).map(|_| location(400)).collect();
+    let location = |number: usize, len: usize| -> Location {
+        let address = format!("{number}{}", "y".repeat(len - 1));
+        format!("quic://{address}").parse().unwrap()
+    };
+    large.locations = (0..8).map(|number| location(number, 400)).collect();
     one.register(large.clone()).unwrap();
     let found = until_some_async("large", || two.lookup("large")).await;
     assert_eq!(found.locations, large.locations);
@@ -214,7 +216,7 @@ async fn large_entries_are_announced_and_too_large_ones_refused() {
     huge.description = "x".repeat(1024);
     huge.agent_type = "x".repeat(255);
     huge.locations = (0..8)
-        .map(|_| location(512).with_incarnation(Incarnation::random()))
+        .map(|number| location(number, 512).with_incarnation(Incarnation::random()))
         .collect();
     match three.register(huge) {
         Err(RegisterError::Full(why)) => assert!(why.contains("8000"), "{why}"),
