@@ -128,11 +128,12 @@ impl Known {
     /// Checks that a certificate is that of a trusted peer and valid now. The signature over the
     /// handshake proves that the peer has its key.
     fn check(&self, presented: &CertificateDer<'_>, now: UnixTime) -> Result<(), Error> {
-        if Fingerprint::of(presented) == self.own {
-            return Err(Error::General(advice::OWN_CERTIFICATE.into()));
-        }
-        let certificate = self.find(presented);
-        let certificate = certificate.ok_or(CertificateError::UnknownIssuer)?;
+        let Some(certificate) = self.find(presented) else {
+            return Err(match Fingerprint::of(presented) == self.own {
+                true => Error::General(advice::OWN_CERTIFICATE.into()),
+                false => CertificateError::UnknownIssuer.into(),
+            });
+        };
         match certificate.holds(now) {
             Holds::Now => Ok(()),
             Holds::NotYet => Err(CertificateError::NotValidYet.into()),
