@@ -23,6 +23,9 @@ use crate::{lock_slot, presence};
 /// Beyond it letters stay in the agent's queue, and their senders wait.
 const MAX_SET_ASIDE: usize = 1_024;
 
+/// The same in bytes of their letters; one message is always set aside.
+const MAX_SET_ASIDE_BYTES: usize = 64 << 20;
+
 /// The messages that one reader received for another.
 #[derive(Default)]
 pub(crate) struct Demultiplexer {
@@ -35,7 +38,7 @@ struct State {
     /// The led conversations, by conversation id. Several agents may have begun one with the same id.
     led: HashMap<Arc<str>, Vec<Conversation>>,
     served: Vec<Served>,
-    others: VecDeque<Incoming>,
+    others: SetAside,
     /// Whether the application has ever read the other messages.
     is_read: bool,
     readers: u64,
@@ -46,13 +49,52 @@ struct Conversation {
     from: Admitted,
     /// Whether messages that are left at the end are discarded.
     is_internal: bool,
-    queue: VecDeque<Incoming>,
+    queue: SetAside,
 }
 
 struct Served {
     number: u64,
     opens: Opens,
-    queue: VecDeque<Incoming>,
+    queue: SetAside,
+}
+
+/// The messages that are set aside for one reader, in order.
+#[derive(Default)]
+struct SetAside {
+    messages: VecDeque<Incoming>,
+    /// Bytes of their letters.
+    bytes: usize,
+}
+
+impl SetAside {
+    fn push_back(&mut self, message: Incoming) {
+        self.bytes = self.bytes.saturating_add(message.bytes());
+        self.messages.push_back(message);
+    }
+
+    fn pop_front(&mut self) -> Option<Incoming> {
+        let message = self.messages.pop_front()?;
+        self.bytes = self.bytes.saturating_sub(message.bytes());
+        Some(message)
+    }
+
+    fn is_empty(&self) -> bool {
+        self.messages.is_empty()
+    }
+
+    fn is_full(&self) -> bool {
+        self.messages.len() >= MAX_SET_ASIDE || self.bytes >= MAX_SET_ASIDE_BYTES
+    }
+
+    /// Adds the messages of another queue.
+    fn extend(&mut self, messages: impl IntoIterator<Item = Incoming>) {
+        messages.into_iter().for_each(|it| self.push_back(it));
+    }
+
+    /// Removes all messages.
+    fn take(&mut self) -> VecDeque<Incoming> {
+        std::mem::take(self).messages
+    }
 }
 
 /// Decides whether a message is for a server.
@@ -119,7 +161,7 @@ impl Demultiplexer {
             number: key.number,
             from,
             is_internal,
-            queue: VecDeque::new(),
+            queue: SetAside::default(),
         });
         key
     }
@@ -153,7 +195,7 @@ impl Demultiplexer {
             state.led.remove(&key.id);
         }
         if let Some(ended) = ended.filter(|ended| !ended.is_internal) {
-            state.others.extend(ended.queue);
+            state.others.extend(ended.queue.messages);
         }
         drop(state);
         self.changed.notify_waiters();
@@ -165,11 +207,10 @@ impl Demultiplexer {
         let mut state = self.state.lock();
         let key = state.key("");
         let number = key.number;
-        let queue = VecDeque::new();
         state.served.push(Served {
             number,
             opens,
-            queue,
+            queue: SetAside::default(),
         });
         key
     }
@@ -178,7 +219,7 @@ impl Demultiplexer {
     pub(crate) fn end_serving(&self, key: &ReaderKey) {
         let mut state = self.state.lock();
         if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
-            let left = state.served.remove(at).queue;
+            let left = state.served.remove(at).queue.messages;
             let is_other = |left: &Incoming| !lock_slot::is_for_locks(left);
             state.others.extend(left.into_iter().filter(is_other));
         }
@@ -250,15 +291,15 @@ impl Demultiplexer {
     /// Removes and returns all messages that were set aside.
     pub(crate) fn drain(&self) -> Vec<Incoming> {
         let mut state = self.state.lock();
-        let mut all: Vec<Incoming> = state.others.drain(..).collect();
+        let mut all: Vec<Incoming> = state.others.take().into();
         let led = state
             .led
             .drain()
             .flat_map(|(_, conversations)| conversations);
         let led = led.filter(|conversation| !conversation.is_internal);
-        all.extend(led.flat_map(|conversation| conversation.queue));
+        all.extend(led.flat_map(|conversation| conversation.queue.messages));
         let served = state.served.iter_mut();
-        all.extend(served.flat_map(|server| std::mem::take(&mut server.queue)));
+        all.extend(served.flat_map(|server| server.queue.take()));
         all
     }
 
@@ -365,15 +406,12 @@ impl State {
     }
 
     fn has_room(&self) -> bool {
-        let led = self.led.values().flatten().map(|it| it.queue.len());
-        let served = self.served.iter().map(|server| server.queue.len());
-        let longest = led.chain(served).max().unwrap_or(0);
+        let led = self.led.values().flatten().map(|it| &it.queue);
+        let served = self.served.iter().map(|server| &server.queue);
         // An application that only serves reads no other messages.
-        let others = match self.is_read || self.served.is_empty() {
-            true => self.others.len(),
-            false => 0,
-        };
-        others.max(longest) < MAX_SET_ASIDE
+        let are_read = self.is_read || self.served.is_empty();
+        let mut queues = led.chain(served).chain(are_read.then_some(&self.others));
+        !queues.any(SetAside::is_full)
     }
 
     /// Adds a message to the queue of its reader, or returns it if the reader is the caller, for which no
@@ -402,10 +440,11 @@ impl State {
         if lock_slot::is_for_locks(&received) {
             return None;
         }
-        if !self.is_read && !self.served.is_empty() && self.others.len() >= MAX_SET_ASIDE {
+        while !self.is_read && !self.served.is_empty() && self.others.is_full() {
             let dropped = self.others.pop_front();
+            let sender = dropped.as_ref().and_then(|it| it.message().sender());
             log_limit::warn!(
-                message = dropped.map(|it| it.message().to_string()),
+                sender = sender.map(|sender| sender.name()),
                 "dropped a message: this agent serves protocols and reads no other messages; call \
                  Agent::receive to read them"
             );
@@ -416,11 +455,7 @@ impl State {
 }
 
 /// Returns the message if it is the caller's own and the queue is empty; otherwise adds it to the queue.
-fn put_unless(
-    is_own: bool,
-    received: Incoming,
-    queue: &mut VecDeque<Incoming>,
-) -> Option<Incoming> {
+fn put_unless(is_own: bool, received: Incoming, queue: &mut SetAside) -> Option<Incoming> {
     if is_own && queue.is_empty() {
         return Some(received);
     }
@@ -534,13 +569,13 @@ mod tests {
         assert!(state.put(inform(), Some(&arm), conversation).is_some());
         assert!(state.put(inform(), Some(&arm), Reader::Others).is_none());
         assert!(state.put(inform(), Some(&arm), conversation).is_none());
-        assert_eq!(state.conversation(&key).unwrap().queue.len(), 2);
+        assert_eq!(state.conversation(&key).unwrap().queue.messages.len(), 2);
         // Of no conversation.
         let other = || message("mallory", MALLORY, Performative::Inform);
         assert!(state.put(other(), None, Reader::Others).is_some());
         assert!(state.put(other(), None, conversation).is_none());
         assert!(state.put(other(), None, Reader::Others).is_none());
-        assert_eq!(state.others.len(), 2);
+        assert_eq!(state.others.messages.len(), 2);
     }
 
     /// The gateway of the host is the sender of the stream in which their letters arrive.
@@ -612,7 +647,7 @@ mod tests {
         about_mallory.undelivered_to = Some("mallory".into());
         set_aside(&mut state, about_mallory, None);
         assert!(state.take(Reader::Conversation(&key)).is_none());
-        assert_eq!(state.others.len(), 5);
+        assert_eq!(state.others.messages.len(), 5);
     }
 
     #[test]
@@ -646,7 +681,7 @@ mod tests {
             report.undelivered_to = Some(lost.into());
             set_aside(&mut state, report, None);
         }
-        assert_eq!(state.others.len(), 0);
+        assert_eq!(state.others.messages.len(), 0);
         let taken = std::iter::from_fn(|| state.take(Reader::Conversation(&key)));
         assert_eq!(taken.count(), 6);
     }
@@ -698,7 +733,7 @@ mod tests {
             assert!(state.has_room());
             set_aside(&mut state, other(), None);
         }
-        assert_eq!(state.others.len(), MAX_SET_ASIDE);
+        assert_eq!(state.others.messages.len(), MAX_SET_ASIDE);
         set_aside(&mut state, message("arm", ARM, Performative::QueryIf), None);
         assert!(state.take(Reader::Server(&key)).is_some());
         state.is_read = true;

@@ -14,9 +14,6 @@ use std::time::{Duration, Instant};
 use fipa_transport::log_limit;
 use rustix::fs::{FlockOperation, Mode, OFlags};
 
-/// Maximum number of entries of `/tmp` that are examined.
-const MAX_ENTRIES: usize = 100_000;
-
 /// Length of the end of another name, in hexadecimal digits.
 const DIGITS: usize = 16;
 
@@ -88,7 +85,7 @@ pub(crate) fn user_in(name: &str) -> Option<u32> {
 /// Returns the directory with another name. Of several, which processes have created at the same time, all
 /// choose the first in the order of names.
 fn other(temporary: &Path, user: u32) -> Option<PathBuf> {
-    let entries = fs::read_dir(temporary).ok()?.take(MAX_ENTRIES).flatten();
+    let entries = fs::read_dir(temporary).ok()?.flatten();
     let named = entries.filter(|entry| {
         let name = entry.file_name();
         name.to_str()

@@ -62,10 +62,18 @@ fn log_to_stderr(global: &options::Global) {
         .init();
 }
 
+/// Maximum length of a value in the log, in bytes. Peers can cause values of any length.
+const MAX_LOGGED: usize = 2_048;
+
 /// Writes one field of an event. A value can contain names and texts of peers, so a value with
 /// unprintable characters is escaped. Other values stay as they are: they may be escaped already.
 fn log_field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> fmt::Result {
     let mut text = format!("{value:?}");
+    let len = text.len();
+    if len > MAX_LOGGED {
+        text.truncate(text.floor_char_boundary(MAX_LOGGED));
+        text.push_str(&format!("... ({len} bytes)"));
+    }
     if text.contains(is_unprintable) {
         text = escape(&text).into_owned();
     }

@@ -646,7 +646,13 @@ impl Task {
     fn handle_change(&mut self, change: &Change) {
         for change in change.single() {
             match change {
-                Change::Joined(entry) | Change::Changed { after: entry, .. } => self.greet(entry),
+                Change::Joined(entry) => self.greet(entry),
+                Change::Changed { before, after } => {
+                    if before.incarnation != after.incarnation {
+                        self.greeted.remove(&before.incarnation);
+                    }
+                    self.greet(after);
+                }
                 Change::Left(entry) => {
                     self.greeted.remove(&entry.incarnation);
                     if let (Some(legacy), false) =

@@ -15,8 +15,8 @@ use common::{Party, Recorder, accepted, config, letter_parcel, parcel};
 use fipa_acl::{ErrorChain, Letter};
 use fipa_testbed::{until, until_async, until_some};
 use fipa_transport::{
-    Answer, AttemptId, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport,
-    TransportErrorKind, Verdict,
+    Answer, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, ListenError, Location,
+    Transport, TransportErrorKind, Verdict,
 };
 use fipa_transport_net::TcpTransport;
 
@@ -71,13 +71,15 @@ fn late_answers_may_come_in_any_order() {
         assert_eq!(order, (0..100).collect::<Vec<_>>());
         record.arrivals.iter().map(|arrival| arrival.2).collect()
     };
-    for (last, ticket) in tickets.into_iter().enumerate().rev() {
-        let last = last as u64;
-        b.transport.answer(ticket, Answer::OutOfOrder { last });
+    let answer = |number: u64| Answer::Failed {
+        reason: FailureReason::Refused,
+        detail: number.to_string(),
+    };
+    for (number, ticket) in tickets.into_iter().enumerate().rev() {
+        b.transport.answer(ticket, answer(number as u64));
     }
-    for last in 0..100 {
-        let answer = Answer::OutOfOrder { last };
-        assert_eq!(a.conclusion(last), Conclusion::Answered(answer));
+    for number in 0..100 {
+        assert_eq!(a.conclusion(number), Conclusion::Answered(answer(number)));
     }
 }
 

@@ -264,8 +264,9 @@ fn send(from: &ShmTransport, root: &str, prefix: &str, rng: &mut Rng) -> Result<
         .flatten()
         .filter_map(|file| {
             let name = file.file_name().into_string().ok()?;
+            // The secret of the domain comes before the digits.
             let digits = name.strip_prefix(&prefix)?.strip_suffix(".live")?;
-            digits.parse().ok()
+            digits.rsplit('_').next()?.parse().ok()
         })
         .filter(|one| location_of(*one) != from.location())
         .collect();

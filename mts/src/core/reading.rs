@@ -4,7 +4,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use fipa_acl::{DecodeError, EnvelopeView, Letter, Message, MessageView};
+use fipa_acl::{DecodeError, EnvelopeView, Letter, Message, MessageView, Payload, Representation};
 use fipa_transport::{Arrival, Body, Incarnation};
 
 use super::{CoreConfig, work};
@@ -36,7 +36,14 @@ fn refused_name(letter: &Letter) -> Option<String> {
         let receivers = envelope.receivers();
         envelope.from_name().into_iter().chain(receivers)
     });
-    let message = MessageView::parse_payload(letter.payload()).ok();
+    // A text is read as a whole, as its receiver does. Only bit-efficient messages are read in pieces.
+    let payload = letter.payload();
+    let is_text = matches!(
+        Representation::detect(&payload.head),
+        Some(Representation::String | Representation::Xml)
+    );
+    let whole = (is_text && payload.is_split()).then(|| Payload::from(payload.to_bytes()));
+    let message = MessageView::parse_payload(whole.as_ref().unwrap_or(payload)).ok();
     let message = message.iter().flat_map(|message| {
         let sender = message.sender().into_iter();
         let agents = sender.chain(message.receivers()).chain(message.reply_to());

@@ -548,20 +548,22 @@ impl Exchange {
         }
     }
 
-    /// Drops the largest incomplete lists while all together are too large. Their neighbors are asked for all
+    /// Drops the incomplete lists that exceed the shares of their peers. Their neighbors are asked for all
     /// entries again.
     fn bound_staged(&mut self, now: Instant) {
-        let charged = |neighbor: &Neighbor| {
-            let staged = neighbor.staged.as_ref();
-            staged.map_or(0, |staged| staged.list.charged())
-        };
-        while self.neighbors.values().map(charged).sum::<usize>() > shares::MAX_TOTAL {
-            let largest = self.neighbors.values_mut().max_by_key(|it| charged(it));
-            let Some(largest) = largest else {
-                return;
-            };
-            largest.staged = None;
-            largest.request_all(now);
+        let staged = self.neighbors.iter().filter_map(|(gateway, neighbor)| {
+            let charged = neighbor.staged.as_ref()?.list.charged();
+            Some((*gateway, (neighbor.sender().peer, charged)))
+        });
+        let (gateways, lists): (Vec<Incarnation>, Vec<_>) = staged.unzip();
+        let allowed = shares::allowances(&lists, shares::MAX_OF_PEER, shares::MAX_TOTAL);
+        for ((gateway, (_, charged)), allowed) in gateways.iter().zip(&lists).zip(allowed) {
+            if *charged > allowed
+                && let Some(neighbor) = self.neighbors.get_mut(gateway)
+            {
+                neighbor.staged = None;
+                neighbor.request_all(now);
+            }
         }
     }
 
