@@ -528,10 +528,20 @@ mod tests {
 
     /// Creates a received message with the conversation id `c`.
     fn message(sender: &str, from: Incarnation, act: Performative) -> Incoming {
+        message_with(sender, from, act, "")
+    }
+
+    fn message_with(
+        sender: &str,
+        from: Incarnation,
+        act: Performative,
+        content: impl Into<bytes::Bytes>,
+    ) -> Incoming {
         let message = Message::builder(act)
             .sender(AgentId::new(sender).unwrap())
             .receiver(AgentId::new("rover").unwrap())
             .conversation_id("c")
+            .content(content)
             .build()
             .unwrap();
         let letter = letter_for(&message, SystemTime::UNIX_EPOCH).unwrap();
@@ -720,6 +730,25 @@ mod tests {
             Some(&leg_entry),
         );
         assert!(state.take(Reader::Conversation(&with_leg)).is_some());
+    }
+
+    #[test]
+    fn set_aside_messages_are_bounded_in_bytes() {
+        let demultiplexer = Demultiplexer::default();
+        let never = demultiplexer.serve(Box::new(|_| false));
+        let mut state = demultiplexer.state.lock();
+        let content = bytes::Bytes::from(vec![0; MAX_SET_ASIDE_BYTES / 4]);
+        let large = message_with("arm", ARM, Performative::Inform, content);
+        for _ in 0..20 {
+            set_aside(&mut state, large.clone(), None);
+            assert!(state.others.bytes <= MAX_SET_ASIDE_BYTES + MAX_SET_ASIDE_BYTES / 4);
+        }
+        state.is_read = true;
+        assert!(!state.has_room());
+        while state.others.pop_front().is_some() {}
+        assert_eq!(state.others.bytes, 0);
+        drop(state);
+        demultiplexer.end_serving(&never);
     }
 
     #[test]

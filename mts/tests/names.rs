@@ -7,7 +7,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Unframed};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
@@ -96,7 +96,18 @@ fn arrive(core: &mut Core, principal: Principal, sequence: u64, letter: Letter) 
 fn misleading() -> Vec<(Letter, &'static str)> {
     let clean = letter(&message("rover", "arm", "rover"));
     let payload = message("rov\n_1", "arm", "rover").to_payload();
+    // A text that is split as only bit-efficient messages are.
+    let text = message("rov\u{200b}er", "arm", "rover");
+    let text = text
+        .encode(Representation::String, Dialect::Standard)
+        .unwrap();
+    let split = Payload {
+        head: text.slice(..20),
+        content: text.slice(20..30),
+        tail: text.slice(30..),
+    };
     vec![
+        (Letter::new(clean.envelope(), split), "U+200B"),
         (letter(&message("rov\n_1", "arm", "rover")), "U+000A"),
         (letter(&message("rover\u{3164}", "arm", "rover")), "U+3164"),
         (letter(&message(" rover", "arm", "rover")), "U+0020"),

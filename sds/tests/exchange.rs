@@ -1243,6 +1243,21 @@ fn incomplete_lists_of_many_neighbors_are_bounded() {
     assert_eq!(count(&exchange, ""), 700);
 }
 
+#[test]
+fn incomplete_lists_of_one_host_drop_no_list_of_another() {
+    let mut exchange = Exchange::new(0);
+    let hosts = std::iter::once(0).chain(std::iter::repeat_n(1, 64));
+    exchange.handle_neighbours(Instant::now(), &present(hosts));
+    let honest = full("honest-", 1500, 0);
+    tell_all(&mut exchange, 1, &honest[..4]);
+    for liar in 2..=65 {
+        let never_ends = full(&format!("x{liar}-"), 618, 0);
+        tell_all(&mut exchange, liar, &never_ends[..2]);
+    }
+    tell_all(&mut exchange, 1, &honest[4..]);
+    assert_eq!(count(&exchange, "honest-"), 1500);
+}
+
 /// Returns a letter with all agents: their names, and the values of their key `df`.
 fn full_with_df(agents: &[(String, String)]) -> String {
     let agents: Vec<String> = agents
