@@ -143,7 +143,7 @@ impl ExchangeDirectory {
     }
 
     /// Returns the entries of agents in the directory facilitators of the neighbors, in no particular
-    /// order. At most [`Exchange::MAX_TOTAL_DF_ENTRIES`].
+    /// order. At most [`Exchange::MAX_TOTAL_DF_ENTRIES`](super::Exchange::MAX_TOTAL_DF_ENTRIES).
     ///
     /// Another agent may hold the name of an entry: it counts only while the directory shows the
     /// registration of the entry under this name.
