@@ -373,7 +373,8 @@ impl Core {
         let mut delivery = Delivery::new(now.instant, origin, stamped, letter_of, deadline);
         delivery.after = parcel.after;
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
-        if let Some(until) = self.found_by_peer(now, stream.sender, &entry, parcel.remaining) {
+        let sender = (stream.sender, from.is_remote());
+        if let Some(until) = self.found_by_peer(now, sender, &entry, parcel.remaining) {
             delivery.delay_until(until);
             if self.lanes.get(&id).is_some_and(|lane| lane.is_empty()) {
                 let wait = until.saturating_duration_since(now.instant);
@@ -394,7 +395,7 @@ impl Core {
     fn found_by_peer(
         &self,
         now: Now,
-        sender: Incarnation,
+        (sender, is_remote): (Incarnation, bool),
         receiver: &Entry,
         remaining: Duration,
     ) -> Option<Instant> {
@@ -402,10 +403,17 @@ impl Core {
         if receiver.source != Source::Mdns || !receiver.locations.iter().any(is_legacy) {
             return None;
         }
-        let sender = self.table.view.registered(sender)?;
-        // A registration in the future means that the clock was set back.
-        let ago = now.utc.duration_since(sender.registered);
-        let wait = FOUND_AFTER.checked_sub(ago.unwrap_or_default())?;
+        let ago = match self.table.view.registered(sender) {
+            // A registration in the future means that the clock was set back.
+            Some(sender) => now
+                .utc
+                .duration_since(sender.registered)
+                .unwrap_or_default(),
+            // An agent of this host that the view does not show yet has just registered.
+            None if !is_remote => Duration::ZERO,
+            None => return None,
+        };
+        let wait = FOUND_AFTER.checked_sub(ago)?;
         let latest = remaining - LEFT_FOR_DELIVERY.min(remaining / 2);
         let wait = wait.min(latest);
         (!wait.is_zero()).then(|| now.instant + wait)
