@@ -75,7 +75,7 @@ fn a_sender_that_takes_no_answers_does_not_delay_the_answers_to_others() {
         Some(dir) => echo.env("FIPA_RUNTIME_DIR", dir),
         None => echo.env_remove("FIPA_RUNTIME_DIR"),
     };
-    let _echo = Running::new(echo);
+    let echo = Running::new(echo);
     let domain = format!("domain={}", host.domain);
     let config = Config::load(&Sources {
         // One answer fills the queue of an agent.
@@ -104,4 +104,9 @@ fn a_sender_that_takes_no_answers_does_not_delay_the_answers_to_others() {
         let answer = silent.receive_within(PATIENCE).unwrap();
         assert_eq!(answer.unwrap().message().text(), number.to_string());
     }
+    // A killed process would leave its files in the directory of this user.
+    let (code, log) = echo.signal("-INT");
+    assert_eq!(code, Some(0), "{log}");
+    drop((silent, honest));
+    domain.close();
 }
