@@ -171,7 +171,7 @@ mod tests {
         }
         // Also after the other user has removed its own.
         assert_eq!(UserDir::find(temporary, user).path, named(first));
-        // What other users could enter, or have created, is not used.
+        // A directory that other users could enter, or a link, is not used.
         fs::set_permissions(named(first), fs::Permissions::from_mode(0o755)).unwrap();
         assert_eq!(UserDir::find(temporary, user).path, named(second));
         fs::remove_dir(named(second)).unwrap();

@@ -43,7 +43,7 @@ struct World {
     random: fastrand::Rng,
     sent: usize,
     next: u64,
-    /// What the clock of each host is ahead of the first one, in milliseconds.
+    /// Milliseconds by which the clock of each host is ahead of that of the first one.
     clocks: Vec<u64>,
     /// The proof of each gateway's links, and addresses of other gateways that it also lists.
     proofs: Vec<(Mandate, Principal, Vec<Location>)>,

@@ -39,7 +39,7 @@ impl Secret {
 
     /// Makes this the secret of a domain without one. The caller must hold the domain's lock.
     pub(crate) fn store(&self, root: &Path) -> io::Result<()> {
-        // What another program has left in its place.
+        // Another program may have left something else in its place.
         remove(root);
         std::os::unix::fs::symlink(&self.0, path(root))
     }

@@ -56,7 +56,7 @@ enum Refusal {
     #[cfg(feature = "secure")]
     #[error("the certificate of the platform does not name the sender of the letter")]
     NotItsAgent,
-    /// What the platform has proved no longer counts.
+    /// The proof of the platform no longer counts.
     #[error(transparent)]
     Withdrawn(TransportError),
     #[error("the head of the request arrived too slowly (handshake_timeout)")]
@@ -174,7 +174,7 @@ struct Serving {
     reader: RequestReader,
     /// Whether no letter has arrived yet.
     first: bool,
-    /// What the platform has proved with a trusted certificate.
+    /// The proof of the platform by a trusted certificate.
     proof: Proof,
 }
 

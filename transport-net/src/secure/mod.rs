@@ -115,13 +115,7 @@ impl Security {
     /// # Errors
     /// When the credentials cannot be used; the previous ones stay in use.
     pub fn replace(&self, credentials: Credentials) -> Result<(), CredentialsError> {
-        let Credentials {
-            own,
-            key,
-            trusted,
-            revoked,
-        } = credentials;
-        self.change(|now| Prepared::with(own, key, now.known.with_certificates(trusted, revoked)))
+        self.change(|now| Prepared::after(&now.known, credentials))
     }
 
     /// Replaces the trusted peers, and keeps the key and certificate. These certificates are revoked in
@@ -136,7 +130,8 @@ impl Security {
     ) -> Result<(), CredentialsError> {
         self.change(|now| {
             revoked.extend(now.known.revoked());
-            let known = now.known.with_certificates(trusted, revoked);
+            let own = now.own.fingerprint();
+            let known = now.known.with_certificates(own, trusted, revoked);
             Prepared::with(now.own.clone(), now.key.clone_key(), known)
         })
     }
@@ -305,13 +300,19 @@ impl fmt::Debug for Security {
 
 impl Prepared {
     fn new(credentials: Credentials) -> Result<Self, CredentialsError> {
+        let nothing = Known::of(credentials.own.fingerprint());
+        Self::after(&nothing, credentials)
+    }
+
+    /// Prepares credentials that take the place of earlier ones, whose authorities stay.
+    fn after(before: &Known, credentials: Credentials) -> Result<Self, CredentialsError> {
         let Credentials {
             own,
             key,
             trusted,
             revoked,
         } = credentials;
-        let known = Known::of(own.fingerprint()).with_certificates(trusted, revoked);
+        let known = before.with_certificates(own.fingerprint(), trusted, revoked);
         Self::with(own, key, known)
     }
 

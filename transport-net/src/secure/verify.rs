@@ -51,6 +51,7 @@ impl Known {
     /// Returns the same authorities with these certificates.
     pub(super) fn with_certificates(
         &self,
+        own: Fingerprint,
         trusted: Vec<Certificate>,
         revoked: Vec<Fingerprint>,
     ) -> Self {
@@ -58,7 +59,7 @@ impl Known {
         let trusted = trusted.into_iter();
         let trusted = trusted.map(|certificate| (certificate.fingerprint(), certificate));
         Self {
-            own: self.own,
+            own,
             trusted: trusted.filter(|(it, _)| !revoked.contains(it)).collect(),
             revoked,
             #[cfg(feature = "http")]
