@@ -13,6 +13,7 @@ mod names;
 mod neighbours;
 mod platform_agents;
 mod presence;
+mod publish_pace;
 mod publisher;
 
 use std::collections::BTreeMap;
@@ -160,6 +161,7 @@ impl Gateway {
             contacts: Arc::clone(&contacts.directory),
             service: Arc::clone(&gateway.service),
             only_loopback: announces_on_loopback_only(config),
+            pace: Default::default(),
         });
         // From here on, the sender of a letter from another host is published on this host before
         // the letter is delivered.
@@ -613,7 +615,7 @@ impl Contacts for KnownPeers {
         let heard = self.heard.load(Ordering::Acquire);
         let publisher = self.publisher.lock().clone();
         if let Some(publisher) = publisher {
-            publisher.publish();
+            publisher.publish_for_letter();
         }
         *published = heard;
     }

@@ -11,9 +11,11 @@ use fipa_sds::{
     Role,
 };
 use fipa_transport::{Incarnation, Location, log_limit};
+use parking_lot::Mutex;
 
 use super::Network;
 use super::names::own_agents;
+use super::publish_pace::PublishPace;
 use crate::config::is_on_loopback;
 use crate::service::Service;
 
@@ -31,6 +33,7 @@ pub(super) struct Publisher {
     pub(super) service: Arc<Service>,
     /// Whether announcements stay on this host.
     pub(super) only_loopback: bool,
+    pub(super) pace: Mutex<PublishPace>,
 }
 
 impl Publisher {
@@ -51,8 +54,17 @@ impl Publisher {
         entry.is_unsupported() && !entry.locations.iter().any(used)
     }
 
+    /// Publishes the agents of other hosts because a letter is about to be handed to an agent that may reply. In a
+    /// flood of such letters, the task does it after its pause.
+    pub(super) fn publish_for_letter(&self) {
+        let may_hurry = self.pace.lock().may_hurry(Instant::now());
+        if may_hurry {
+            self.publish();
+        }
+    }
+
     /// Publishes all agents of other hosts on this host.
-    pub(super) fn publish(&self) {
+    fn publish(&self) {
         let locations = self.service.locations();
         let (heard, known) = (self.contacts.entries(), self.known.entries());
         let is_proved = |entry: &&Arc<Entry>| {
@@ -76,9 +88,11 @@ impl Publisher {
         let through_here: Vec<Arc<Entry>> = through_here.collect();
         let lost = self.known.lost_agents();
         let published = self.host.publish_remote(&through_here, &lost);
+        let size = *published.as_ref().unwrap_or(&0);
+        self.pace.lock().wrote(Instant::now(), size);
         match published {
             // A gateway that closes publishes nothing.
-            Ok(()) | Err(HostError::Closed) => {}
+            Ok(_) | Err(HostError::Closed) => {}
             Err(error) => {
                 log_limit::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
             }
@@ -126,11 +140,17 @@ impl PublishTask {
                 self.announce(&**network);
             }
             let now = Instant::now();
-            let next = publisher.contacts.forget(now, &*known);
-            publisher.publish();
+            let forget = publisher.contacts.forget(now, &*known);
+            // Announcements do not wait for the pause after a publication.
+            let publish = publisher.pace.lock().next(now);
             // Lost agents end without a notification.
-            let longest = now + ContactDirectory::MEMORY / 4;
-            let next = next.map_or(longest, |next| next.min(longest));
+            let mut next = now + ContactDirectory::MEMORY / 4;
+            if publish <= now {
+                publisher.publish();
+            } else {
+                next = next.min(publish);
+            }
+            let next = forget.map_or(next, |forget| forget.min(next));
             let goes_on = tokio::select! {
                 change = here.next() => change.is_some(),
                 change = there.next() => change.is_some(),

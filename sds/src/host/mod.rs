@@ -159,6 +159,8 @@ impl HostDirectory {
     /// Of several entries with one name or one incarnation, the last one holds that. Entries that are not valid
     /// are left out. So are those for which there is no room, from the gateways that have most.
     ///
+    /// Returns the number of bytes that this takes. The processes of this host read them again after each change.
+    ///
     /// # Errors
     /// Fails when this process is not a gateway, or the entries cannot be written; nothing has changed
     /// then.
@@ -166,7 +168,7 @@ impl HostDirectory {
         &self,
         entries: &[Arc<Entry>],
         lost: &[Arc<Entry>],
-    ) -> Result<(), HostError> {
+    ) -> Result<usize, HostError> {
         self.owner.check()?;
         if !self.config.gateway {
             return Err(HostError::NoGateway);

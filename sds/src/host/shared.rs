@@ -526,19 +526,21 @@ impl Shared {
         &self,
         remote: &[Arc<Entry>],
         lost: &[Arc<Entry>],
-    ) -> Result<(), HostError> {
+    ) -> Result<usize, HostError> {
         let bytes = remote::write(&self.mts, remote, lost);
+        let size = bytes.len();
         self.change(|guard, own| {
             if own.closed {
                 return Err(HostError::Closed);
             }
             if own.remote == bytes {
-                return Ok(());
+                return Ok(size);
             }
             let before = std::mem::replace(&mut own.remote, bytes);
             let write = |guard: Guard<'_>| guard.write(Name::Remote(guard.id()), &own.remote);
             self.now_or_later(guard.and_then(write))
-                .inspect_err(|_| own.remote = before)
+                .inspect_err(|_| own.remote = before)?;
+            Ok(size)
         })
     }
 
