@@ -38,13 +38,7 @@ impl Source {
         match hop.principal {
             Principal::Host => Self::Process(hop.location.incarnation()),
             Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
-            Principal::Unproved => {
-                let address = hop.location.address();
-                let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
-                let host = host.trim_matches(['[', ']']);
-                let host = host.split_once('%').map_or(host, |(host, _)| host);
-                Self::Address(host.parse().ok().map(quota_address))
-            }
+            Principal::Unproved => Self::Address(hop.location.quota_address()),
         }
     }
 

@@ -5,6 +5,7 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
+use std::net::IpAddr;
 use std::sync::Arc;
 
 use fipa_transport::{Location, Principal};
@@ -35,7 +36,9 @@ pub(crate) fn charge(entry: &Entry) -> usize {
 pub(crate) enum Peer {
     /// The holder of the key of this certificate.
     Certificate([u8; 32]),
-    /// A host without a proved identity, by its address without the port.
+    /// A host without a proved identity, by its [address](fipa_transport::quota_address).
+    Address(IpAddr),
+    /// A host whose location has another address, without the port.
     Host(Arc<str>),
 }
 
@@ -46,9 +49,11 @@ impl Peer {
         match principal {
             Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
             Principal::Host | Principal::Unproved => {
-                let address = locations.first().map_or("", Location::address);
-                let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
-                Self::Host(host.into())
+                let first = locations.first();
+                match first.and_then(Location::quota_address) {
+                    Some(address) => Self::Address(address),
+                    None => Self::Host(first.map_or("", Location::host).into()),
+                }
             }
         }
     }
@@ -163,8 +168,26 @@ mod tests {
         let one = of("tcp://192.0.2.1:7788#0000000000000001");
         assert_eq!(one, of("udp://192.0.2.1:9#0000000000000002"));
         assert_ne!(one, of("tcp://192.0.2.2:7788#0000000000000001"));
-        assert_eq!(of("tcp://[fe80::1%eth0]:1"), of("tcp://[fe80::1%eth0]:2"));
-        let certified = Peer::of(Principal::Certificate([7; 32]), &at("tcp://192.0.2.1:7788"));
+        assert_eq!(of("tcp://[fe80::1%2]:1"), of("tcp://[fe80::1%2]:2"));
+        assert_ne!(of("tcp://[fe80::1%2]:1"), of("tcp://[fe80::1%3]:1"));
+        assert_ne!(of("tcp://[fe80::1%2]:1"), of("tcp://[fe80::2%2]:1"));
+        assert_eq!(of("http://host:1/acc"), of("tcp://host:2"));
+    }
+
+    #[test]
+    fn an_ipv6_network_is_one_peer() {
+        let of = |text: &str| Peer::of(Principal::Unproved, &[text.parse().unwrap()]);
+        let one = of("tcp://[2001:db8::1]:7788");
+        assert_eq!(one, of("quic://[2001:db8::ffff:2]:9"));
+        assert_eq!(one, of("http://[2001:db8::3]:9/acc"));
+        assert_ne!(one, of("tcp://[2001:db8:0:1::1]:7788"));
+        assert_eq!(of("tcp://[::ffff:192.0.2.1]:1"), of("tcp://192.0.2.1:2"));
+    }
+
+    #[test]
+    fn a_certificate_is_one_peer_at_all_addresses() {
+        let at = ["tcp://192.0.2.1:7788".parse().unwrap()];
+        let certified = Peer::of(Principal::Certificate([7; 32]), &at);
         assert_eq!(certified, Peer::Certificate([7; 32]));
     }
 }

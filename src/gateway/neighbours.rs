@@ -170,12 +170,12 @@ impl Neighbours {
         let before = state.present.get(&incarnation);
         if before.is_some_and(|before| before.principal != peer.hop.principal) {
             let (name, at) = (escape(&peer.name), &peer.hop.location);
-            log_limit::info!(of: host(at), %name, %at, "ignored a connection with another certificate");
+            log_limit::info!(of: source(at), %name, %at, "ignored a connection with another certificate");
             return;
         }
         let neighbour = state.neighbour(peer, before);
         if let Err(error) = neighbour.entry.check() {
-            log_limit::info!(of: host(&peer.hop.location), error = %ErrorChain(&error), at = %peer.hop.location, "ignored a gateway with an invalid entry");
+            log_limit::info!(of: source(&peer.hop.location), error = %ErrorChain(&error), at = %peer.hop.location, "ignored a gateway with an invalid entry");
             return;
         }
         let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));
@@ -183,7 +183,7 @@ impl Neighbours {
         if is_new {
             let security = security(peer.hop.principal);
             log_limit::info!(
-                of: host(&peer.hop.location), name = %peer.name,
+                of: source(&peer.hop.location), name = %peer.name,
                 at = %peer.hop.location,
                 encrypted = security.encrypted,
                 certificate = security.certificate.as_deref(),
@@ -192,7 +192,7 @@ impl Neighbours {
         }
         if is_new && state.is_namesake(&peer.name) {
             log_limit::warn!(
-                of: host(&peer.hop.location), "the gateway at {} has the name of this gateway, {}: logs and lists do not tell the hosts \
+                of: source(&peer.hop.location), "the gateway at {} has the name of this gateway, {}: logs and lists do not tell the hosts \
                  apart; set mts.name on one of them",
                 peer.hop.location,
                 escape(&peer.name)
@@ -236,7 +236,7 @@ impl Neighbours {
         }
         self.generation.fetch_add(1, Ordering::Release);
         self.changed.notify_one();
-        log_limit::info!(of: host(&peer.hop.location), name = %peer.name, at = %peer.hop.location, "no longer connected");
+        log_limit::info!(of: source(&peer.hop.location), name = %peer.name, at = %peer.hop.location, "no longer connected");
     }
 
     /// Returns the gateways to greet from the current locations of this one, by name and location:
@@ -338,7 +338,7 @@ impl Neighbour {
         // Locations at an address of an open connection come first.
         let configured = self.configured.iter();
         let mut others: Vec<&Location> = configured.filter(|it| !is_open(it.kind())).collect();
-        others.sort_by_key(|location| !hops.iter().any(|hop| host(hop) == host(location)));
+        others.sort_by_key(|location| !hops.iter().any(|hop| hop.host() == location.host()));
         let mut locations: Vec<Location> = Vec::new();
         for location in hops.iter().copied().chain(others) {
             if locations.len() < Entry::MAX_LOCATIONS && !locations.contains(location) {
@@ -353,10 +353,12 @@ impl Neighbour {
     }
 }
 
-/// Returns the host of an address with a port.
-fn host(location: &Location) -> &str {
-    let address = location.address();
-    address.rsplit_once(':').map_or(address, |(host, _)| host)
+/// Returns what log lines count by: the source at an IP address, or the host.
+fn source(location: &Location) -> String {
+    match location.quota_address() {
+        Some(address) => address.to_string(),
+        None => location.host().to_owned(),
+    }
 }
 
 /// The directory in which the gateway looks up receivers: all directories, and the neighbors by

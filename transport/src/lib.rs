@@ -33,7 +33,7 @@ pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
-pub use quota_address::quota_address;
+pub use quota_address::{quota_address, scoped_quota_address};
 pub use token_bucket::TokenBucket;
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,

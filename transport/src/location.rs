@@ -1,14 +1,14 @@
 //! Locations: the addresses of message transport services, with their transports.
 
 use std::fmt;
-use std::net::Ipv6Addr;
+use std::net::{IpAddr, Ipv6Addr};
 use std::str::FromStr;
 use std::sync::Arc;
 
 use fipa_acl::is_unprintable;
 use serde::{Deserialize, Serialize};
 
-use crate::Incarnation;
+use crate::{Incarnation, quota_address, scoped_quota_address};
 
 /// A kind of transport, as named in the configuration and in addresses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -287,6 +287,28 @@ impl Location {
             (Kind::Http | Kind::Https, Some(path)) => self.address.get(..path).unwrap_or_default(),
             _ => &self.address,
         }
+    }
+
+    /// Host of the address: the [authority](Self::authority) without the port.
+    #[must_use]
+    pub fn host(&self) -> &str {
+        let authority = self.authority();
+        authority
+            .rsplit_once(':')
+            .map_or(authority, |(host, _)| host)
+    }
+
+    /// The address by which quotas count the host, if the host is an IP address; see [`quota_address`].
+    /// The scope counts if it is the number of an interface.
+    ///
+    /// [`quota_address`]: crate::quota_address
+    #[must_use]
+    pub fn quota_address(&self) -> Option<IpAddr> {
+        if let Some((ip, scope, _)) = self.ipv6() {
+            let interface = scope.and_then(|scope| scope.parse().ok());
+            return Some(scoped_quota_address(ip.into(), interface.unwrap_or(0)));
+        }
+        self.host().parse().ok().map(quota_address)
     }
 
     /// Whether this is a link-local IPv6 address, which is only valid together with the interface that leads

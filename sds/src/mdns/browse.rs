@@ -24,7 +24,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, scoped_quota_address};
 use simple_dns::rdata::RData;
 use simple_dns::{CLASS, Name, Packet, PacketFlag, QTYPE, TYPE};
 
@@ -113,7 +113,7 @@ pub(super) struct Browser {
     unknown: usize,
     /// Total bytes of their TXT records.
     bytes: usize,
-    /// Share of each source address in these.
+    /// Share of each [source](scoped_quota_address) in these.
     shares: HashMap<IpAddr, Share>,
     /// Time at which the beacon of a gateway last matched its stored records.
     confirmed: HashMap<Incarnation, Instant>,
@@ -125,7 +125,7 @@ pub(super) struct Browser {
     next: Option<Instant>,
 }
 
-/// The records that one source address introduced.
+/// The records that one source introduced.
 #[derive(Debug, Clone, Copy, Default)]
 struct Share {
     records: usize,
@@ -137,7 +137,7 @@ struct Share {
 #[derive(Debug)]
 struct Record {
     fullname: Arc<str>,
-    /// The address that introduced it.
+    /// The [source](scoped_quota_address) that introduced it.
     from: IpAddr,
     /// The gateway that announces it, if it is not a legacy peer's record.
     gateway: Incarnation,
@@ -243,9 +243,10 @@ impl Browser {
         let all = all.filter(|record| record.class == CLASS::IN);
         let (goodbyes, there): (Vec<_>, Vec<_>) = all.partition(|record| record.ttl == 0);
         let mut new = Vec::new();
+        let source = scoped_quota_address(from.address, from.interface);
         for record in &there {
             if let Some(label) = introduced(&record.name, &record.rdata) {
-                match self.introduce(now, from.address, label, chance) {
+                match self.introduce(now, source, label, chance) {
                     Introduced::New => new.push(label),
                     Introduced::Refused => received.refused += 1,
                     Introduced::Already => {}
@@ -314,7 +315,7 @@ impl Browser {
         }
         // A new record that is complete in one packet does not count as unknown.
         for label in new {
-            let share = self.shares.get(&from.address).copied().unwrap_or_default();
+            let share = self.shares.get(&source).copied().unwrap_or_default();
             let are_too_many = self.unknown > MAX_UNKNOWN || share.unknown > MAX_SHARE_UNKNOWN;
             if are_too_many && self.records.get(label).is_some_and(|it| !it.known) {
                 self.remove(label);

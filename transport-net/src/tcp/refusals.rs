@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
+use fipa_transport::quota_address;
 use parking_lot::Mutex;
 
 /// A connection that was refused because only one side has keys, or because a side does not trust the
@@ -20,12 +21,12 @@ pub struct Refusal {
     pub at: Instant,
 }
 
-/// The latest [`Refusal`] of each address. All clones have the same contents.
+/// The latest [`Refusal`] of each [source](quota_address). All clones have the same contents.
 #[derive(Debug, Clone, Default)]
 pub struct Refusals(Arc<Mutex<VecDeque<Refusal>>>);
 
 impl Refusals {
-    /// Maximum number of addresses. Another address replaces the one that was refused longest ago.
+    /// Maximum number of sources. Another source replaces the one that was refused longest ago.
     pub const MAX: usize = 16;
 
     /// Returns the refusals, the latest first.
@@ -37,7 +38,7 @@ impl Refusals {
     pub(crate) fn add(&self, from: IpAddr, why: &str) {
         let from = from.to_canonical();
         let mut all = self.0.lock();
-        all.retain(|known| known.from != from);
+        all.retain(|known| quota_address(known.from) != quota_address(from));
         all.truncate(Self::MAX - 1);
         all.push_front(Refusal {
             from,
@@ -54,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_latest_refusal_of_each_address_is_kept() {
+    fn the_latest_refusal_of_each_source_is_kept() {
         let refusals = Refusals::default();
         let address = |last| IpAddr::from(Ipv4Addr::new(10, 0, 0, last));
         for last in 0..=20 {
@@ -67,5 +68,12 @@ mod tests {
         assert_eq!(latest[1].from, address(20));
         let of_seven = latest.iter().filter(|it| it.from == address(7));
         assert_eq!(of_seven.count(), 1);
+        for last in 0..=20 {
+            refusals.add(
+                std::net::Ipv6Addr::new(0xfd00, 0, 0, 1, 0, 0, 0, last).into(),
+                "many",
+            );
+        }
+        assert_eq!(refusals.latest()[1..], latest[..Refusals::MAX - 1]);
     }
 }

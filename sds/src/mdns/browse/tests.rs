@@ -1,6 +1,6 @@
 //! Reactions of a browser to packets and time.
 
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, Ipv6Addr};
 
 use proptest::prelude::*;
 
@@ -460,6 +460,30 @@ fn one_source_cannot_fill_the_tables() {
         run_timers(&mut browser, now, 200.0);
         assert!(browser.shares.is_empty());
     }
+}
+
+#[test]
+fn the_addresses_of_an_ipv6_network_are_one_source() {
+    let now = Instant::now();
+    let known_of = |from: &dyn Fn(u16) -> Origin| {
+        let mut browser = Browser::new(now, OWN, 0.0);
+        for number in 0..MAX_SHARE_UNKNOWN + 10 {
+            let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
+            let number = u16::try_from(number).unwrap();
+            browser.handle_packet(now, from(number), &introduced, 1.0);
+        }
+        browser.unknown
+    };
+    let of = |network: u16, host, interface| Origin {
+        address: Ipv6Addr::new(network, 0, 0, 0, 0, 0, 0, host).into(),
+        interface,
+    };
+    assert_eq!(known_of(&|host| of(0xfd00, host, 2)), MAX_SHARE_UNKNOWN);
+    assert_eq!(known_of(&|_| of(0xfe80, 1, 2)), MAX_SHARE_UNKNOWN);
+    // Each neighbor has an address of its own in the network of link-local addresses, on each link.
+    let all = MAX_SHARE_UNKNOWN + 10;
+    assert_eq!(known_of(&|host| of(0xfe80, host, 2)), all);
+    assert_eq!(known_of(&|link| of(0xfe80, 1, link.into())), all);
 }
 
 proptest! {
