@@ -1244,6 +1244,56 @@ fn incomplete_lists_of_many_neighbors_are_bounded() {
 }
 
 #[test]
+fn an_incomplete_list_ends_unless_it_grows() {
+    let start = Instant::now();
+    let letters = full("arm-", 900, 0);
+    let from = Incarnation::from_u64(1);
+    let connected = || {
+        let mut exchange = Exchange::new(0);
+        exchange.handle_neighbours(start, &present([0]));
+        // The own list goes to the neighbor.
+        let first = start + Duration::from_secs(1);
+        assert!(exchange.poll_letter(first).is_some());
+        exchange.handle_sent(first, from, true);
+        exchange
+    };
+    let pause = Duration::from_secs(50);
+
+    let mut slow = connected();
+    let mut now = start;
+    for letter in &letters {
+        now += pause;
+        slow.handle_timeout(now);
+        slow.handle_letter(now, from, letter.as_bytes()).unwrap();
+    }
+    assert_eq!(count(&slow, ""), 900);
+
+    let mut stopped = connected();
+    let at = |seconds| start + Duration::from_secs(seconds);
+    stopped
+        .handle_letter(at(1), from, letters[0].as_bytes())
+        .unwrap();
+    // Repeated agents are no progress.
+    let more = letters[0].replace(r#""first":true"#, r#""first":false"#);
+    stopped
+        .handle_letter(at(50), from, more.as_bytes())
+        .unwrap();
+    while let Some((to, _)) = stopped.poll_letter(at(50)) {
+        stopped.handle_sent(at(50), to, true);
+    }
+    assert_eq!(stopped.poll_timeout(), Some(at(61)));
+    stopped.handle_timeout(at(61));
+    let (_, asked) = stopped.poll_letter(at(61)).unwrap();
+    assert!(String::from_utf8(asked).unwrap().contains("again"));
+    for letter in &letters[1..] {
+        stopped
+            .handle_letter(at(62), from, letter.as_bytes())
+            .unwrap();
+    }
+    assert_eq!(count(&stopped, ""), 0);
+}
+
+#[test]
 fn incomplete_lists_of_one_host_drop_no_list_of_another() {
     let mut exchange = Exchange::new(0);
     let hosts = std::iter::once(0).chain(std::iter::repeat_n(1, 64));

@@ -169,6 +169,8 @@ enum SyncState {
 #[derive(Debug)]
 struct Staged {
     version: u64,
+    /// Time of the last letter that added an agent.
+    grew: Instant,
     list: AgentList,
     df: DfEntries,
 }
@@ -218,6 +220,8 @@ impl Exchange {
     /// Backoff after a letter that did not arrive, and minimum time between two requests.
     const FIRST_PAUSE: Duration = Duration::from_secs(1);
     const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+    /// Time for which an incomplete list is kept after the last letter that added an agent to it.
+    const INCOMPLETE: Duration = Duration::from_secs(60);
     /// Maximum number of agents in one letter, and maximum bytes of their texts.
     const BATCH: usize = 256;
     const BATCH_BYTES: usize = 192 * 1024;
@@ -617,7 +621,7 @@ impl Exchange {
 
     /// Removes neighbors that have been disconnected for too long, with all their entries. Their
     /// agents are lost. Renews the DF entries of this gateway. Requests lists again that were cut when
-    /// there is room for them.
+    /// there is room for them, and those that stayed incomplete.
     pub fn handle_timeout(&mut self, now: Instant) {
         for (gateway, neighbor) in &mut self.neighbors {
             let rested = |asked: Instant| now >= asked + Self::LONGEST_PAUSE;
@@ -625,6 +629,10 @@ impl Exchange {
                 && neighbor.ask.is_none()
                 && neighbor.asked.is_none_or(rested);
             if may_ask && self.directory.has_room(*gateway) {
+                neighbor.request_all(now);
+            }
+            if neighbor.incomplete_until().is_some_and(|end| end <= now) {
+                neighbor.staged = None;
                 neighbor.request_all(now);
             }
         }
@@ -690,9 +698,13 @@ impl Exchange {
             None if neighbor.under_way.is_some() => None,
             None => Some(neighbor.next_letter()),
         });
+        let incomplete = self
+            .neighbors
+            .values()
+            .filter_map(Neighbor::incomplete_until);
         let forgotten = self.lost.front().map(|lost| lost.until);
         let own = self.own.renew.into_iter().chain(forgotten);
-        times.flatten().chain(own).min()
+        times.flatten().chain(incomplete).chain(own).min()
     }
 
     /// Returns the next letter to send: the neighbor and the content. The caller reports its result
@@ -978,6 +990,12 @@ impl Neighbor {
         self.ask.map_or(self.due, |ask| ask.min(self.due))
     }
 
+    /// Time at which an incomplete list is dropped, if there is one.
+    fn incomplete_until(&self) -> Option<Instant> {
+        let staged = self.staged.as_ref();
+        staged.map(|staged| staged.grew + Exchange::INCOMPLETE)
+    }
+
     /// Schedules a request for all entries, because a received letter does not fit the stored
     /// state.
     fn request_all(&mut self, now: Instant) {
@@ -999,6 +1017,7 @@ impl Neighbor {
         let mut staged = match self.staged.take() {
             _ if full.first => Staged {
                 version: full.version,
+                grew: now,
                 list: AgentList::new(self.sender()),
                 df: BTreeMap::new(),
             },
@@ -1008,6 +1027,7 @@ impl Neighbor {
                 return;
             }
         };
+        let before = staged.list.charged();
         for agent in full.agents {
             let Some((entry, df)) = self.read(now, agent) else {
                 continue;
@@ -1022,6 +1042,9 @@ impl Neighbor {
             staged.list.insert(entry);
         }
         let cut = staged.list.cut(shares::MAX_OF_PEER);
+        if staged.list.charged() > before {
+            staged.grew = now;
+        }
         if let Some(first) = cut.last()
             && !std::mem::replace(&mut self.is_cut_reported, true)
         {
