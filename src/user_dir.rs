@@ -20,6 +20,10 @@ const DIGITS: usize = 16;
 /// Time to wait for another process that chooses the directory. Another user may hold the lock, too.
 const LOCK_TIMEOUT: Duration = Duration::from_secs(1);
 
+/// Maximum number of files in `/tmp` that are examined. Any user may create more; then no other name is chosen,
+/// because processes could choose different ones.
+const MAX_FILES: usize = 262_144;
+
 /// The directory of all domains of a user.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct UserDir {
@@ -40,25 +44,21 @@ impl UserDir {
             Ok(found) => Some(found.uid()),
             Err(_) => None,
         };
-        let other = match (other(temporary, user), name_held_by) {
-            (Some(other), _) => other,
-            (None, None) => return Self::free(first),
-            (None, Some(_)) => match create_other(temporary, user) {
-                Ok(other) => other,
-                Err(error) => {
-                    log_limit::error!(
-                        %error,
-                        "cannot create a directory for the domains of this user in {}",
-                        temporary.display()
-                    );
-                    first
-                }
-            },
+        let other = match (other(temporary, user, MAX_FILES), name_held_by) {
+            (Ok(Some(other)), _) => Ok(other),
+            (_, None) => return Self::free(first),
+            (Ok(None), Some(_)) => create_other(temporary, user),
+            (Err(error), Some(_)) => Err(error),
         };
-        Self {
-            path: other,
-            name_held_by,
-        }
+        let path = other.unwrap_or_else(|error| {
+            log_limit::error!(
+                %error,
+                "cannot find or create a directory for the domains of this user in {}",
+                temporary.display()
+            );
+            first
+        });
+        Self { path, name_held_by }
     }
 
     fn free(path: PathBuf) -> Self {
@@ -84,30 +84,43 @@ pub(crate) fn user_in(name: &str) -> Option<u32> {
 
 /// Returns the directory with another name. Of several, which processes have created at the same time, all
 /// choose the first in the order of names.
-fn other(temporary: &Path, user: u32) -> Option<PathBuf> {
-    let entries = fs::read_dir(temporary).ok()?.flatten();
-    let named = entries.filter(|entry| {
-        let name = entry.file_name();
-        name.to_str()
-            .is_some_and(|name| user_in(name) == Some(user) && name.contains('.'))
-    });
+///
+/// # Errors
+/// Fails when the directory cannot be read, or has more than `most` files.
+fn other(temporary: &Path, user: u32, most: usize) -> io::Result<Option<PathBuf>> {
     let is_private =
         |found: &Metadata| found.is_dir() && found.uid() == user && found.mode() & 0o077 == 0;
-    let own = named.filter(|entry| entry.metadata().is_ok_and(|found| is_private(&found)));
-    own.map(|entry| entry.path()).min()
+    let mut first: Option<PathBuf> = None;
+    for (index, entry) in fs::read_dir(temporary)?.enumerate() {
+        if index >= most {
+            let text =
+                format!("there are more than {most} files; remove files that are not needed");
+            return Err(io::Error::other(text));
+        }
+        let Ok(entry) = entry else { continue };
+        let name = entry.file_name();
+        let is_named = |name: &str| user_in(name) == Some(user) && name.contains('.');
+        if name.to_str().is_some_and(is_named)
+            && entry.metadata().is_ok_and(|found| is_private(&found))
+        {
+            let path = entry.path();
+            first = Some(first.map_or(path.clone(), |first| first.min(path)));
+        }
+    }
+    Ok(first)
 }
 
 fn create_other(temporary: &Path, user: u32) -> io::Result<PathBuf> {
     // Two processes that start at the same time create one directory. Without the lock, they may use
     // different ones until the next start.
     let _lock = lock(temporary);
-    if let Some(other) = other(temporary, user) {
+    if let Some(other) = other(temporary, user, MAX_FILES)? {
         return Ok(other);
     }
     let digits = getrandom::u64().map_err(io::Error::other)?;
     let path = temporary.join(format!("fipa-{user}.{digits:0DIGITS$x}"));
     DirBuilder::new().mode(0o700).create(&path)?;
-    Ok(other(temporary, user).unwrap_or(path))
+    Ok(other(temporary, user, MAX_FILES)?.unwrap_or(path))
 }
 
 /// Locks a directory until the result is dropped. `None` after the timeout.
@@ -178,6 +191,20 @@ mod tests {
         symlink("/", named(second)).unwrap();
         let own = temporary.join(format!("fipa-{user}"));
         assert_eq!(UserDir::find(temporary, user).path, own);
+    }
+
+    #[test]
+    fn the_number_of_files_that_are_examined_is_bounded() {
+        let temporary = tempfile::tempdir().unwrap();
+        let temporary = temporary.path();
+        let user = this_user();
+        let own = temporary.join(format!("fipa-{user}.0000000000000001"));
+        DirBuilder::new().mode(0o700).create(&own).unwrap();
+        for name in 0..4 {
+            fs::write(temporary.join(name.to_string()), "").unwrap();
+        }
+        assert_eq!(other(temporary, user, 5).unwrap(), Some(own));
+        other(temporary, user, 4).unwrap_err();
     }
 
     #[test]

@@ -6,6 +6,7 @@
 //! cleaning process first rings all doorbells and waits until every living process has polled.
 
 use std::collections::{HashMap, HashSet};
+use std::fs::DirEntry;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
@@ -22,9 +23,10 @@ use rustix::io::Errno;
 
 use crate::fork::Owner;
 use crate::layout::Svc;
-use crate::memory::{SHM, is_owned, lock};
+use crate::memory::{is_owned, lock};
 use crate::presence::{PeerProcess, ProcessPaths, wait_for_polls};
 use crate::secret::{self, Secret};
+use crate::shared_files::shared_files;
 use crate::{ShmConfig, ShmError};
 
 /// The result of [`cleanup_dead`].
@@ -215,7 +217,7 @@ impl DomainFiles {
     /// Removes the access of other users to files that iceoryx2 0.10 leaves open to them. The
     /// caller must hold the lock and have created a node.
     pub(crate) fn restrict_permissions(&self) -> Result<(), ShmError> {
-        for file in files_in(Path::new(SHM)) {
+        for file in shared_files() {
             let name = file.file_name();
             let name = name.to_string_lossy();
             if !name.starts_with(&self.prefix()) || !name.ends_with(".global_mgmt") {
@@ -314,13 +316,12 @@ impl DomainFiles {
             Err(error) if error.is_missing_file() => return Ok(cleaned),
             lock => lock?,
         };
-        for one in self.all()? {
-            if self.paths.is_alive(one) {
-                cleaned.alive += 1;
-            } else if self.is_current(&lock) {
-                self.paths.remove(one);
-                cleaned.removed += 1;
-            }
+        let all = self.all()?.into_iter();
+        let (alive, gone): (Vec<_>, Vec<_>) = all.partition(|one| self.paths.is_alive(*one));
+        self.paths.remove(&gone, || self.is_current(&lock));
+        cleaned.alive = alive.len();
+        if self.is_current(&lock) {
+            cleaned.removed = gone.len();
         }
         let nodes = self.nodes()?;
         let is_dead = |node: &NodeState<Svc>| matches!(node, NodeState::Dead(_));
@@ -405,7 +406,7 @@ impl DomainFiles {
             let tags = files_in(&directory.join(dead.id().value().to_string()));
             ports.extend(tags.filter_map(|tag| self.id_of(&tag, ".port_tag")));
         }
-        for file in files_in(Path::new(SHM)) {
+        for file in shared_files() {
             let name = file.file_name();
             let name = name.to_string_lossy();
             let is_empty = || file.metadata().is_ok_and(|metadata| metadata.len() == 0);
@@ -480,7 +481,7 @@ impl DomainFiles {
         if listed.is_err() {
             return;
         }
-        let shared = files_in(Path::new(SHM)).filter(|file| {
+        let shared = shared_files().filter(|file| {
             let id = self.id_of(file, ".dynamic");
             id.is_some_and(|id| ids.contains(&id))
         });
@@ -504,7 +505,7 @@ impl DomainFiles {
         let Ok(ports) = self.tagged(".port_tag") else {
             return;
         };
-        for file in files_in(Path::new(SHM)) {
+        for file in shared_files() {
             let name = file.file_name();
             let name = name.to_string_lossy();
             let ends = name
@@ -546,7 +547,7 @@ impl DomainFiles {
     }
 
     /// The identifier in the name of a file of this domain with this suffix.
-    fn id_of(&self, file: &std::fs::DirEntry, end: &str) -> Option<String> {
+    fn id_of(&self, file: &DirEntry, end: &str) -> Option<String> {
         let name = file.file_name();
         let name = name.to_str()?.strip_prefix(&self.prefix())?;
         let id = name.strip_suffix(end)?.rsplit('_').next()?;
@@ -576,8 +577,8 @@ impl DomainFiles {
         }
         let nodes = self.config.root.join("nodes");
         let name = format!("{}{id}.", self.prefix());
-        remove_files(&nodes, &name);
-        remove_files(&nodes.join(id), &self.prefix());
+        remove_files(files_in(&nodes), &name);
+        remove_files(files_in(&nodes.join(id)), &self.prefix());
         let _ = std::fs::remove_dir(nodes.join(id));
     }
 
@@ -590,15 +591,15 @@ impl DomainFiles {
             return;
         }
         let prefix = format!("{}_", self.config.prefix);
-        remove_files(Path::new(SHM), &prefix);
+        remove_files(shared_files(), &prefix);
         for directory in ["nodes", "services", "processes"] {
             let directory = self.config.root.join(directory);
             for node in files_in(&directory) {
-                remove_files(&node.path(), &prefix);
+                remove_files(files_in(&node.path()), &prefix);
                 // Fails for a file, and for a directory with files of another prefix.
                 let _ = std::fs::remove_dir(node.path());
             }
-            remove_files(&directory, &prefix);
+            remove_files(files_in(&directory), &prefix);
             let _ = std::fs::remove_dir(&directory);
         }
         secret::remove(&self.config.root);
@@ -621,6 +622,9 @@ impl DomainFiles {
     }
 }
 
+/// Maximum number of secrets whose processes are looked for.
+const MAX_SECRETS: usize = 32;
+
 /// Delay of a cleanup for each living process that comes before.
 const CLEANUP_STEP: Duration = Duration::from_millis(20);
 
@@ -641,14 +645,14 @@ const MAX_ENTER_ATTEMPTS: u32 = 20;
 const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Entries of a directory. Skips those that cannot be read.
-pub(crate) fn files_in(directory: &Path) -> impl Iterator<Item = std::fs::DirEntry> + use<> {
+pub(crate) fn files_in(directory: &Path) -> impl Iterator<Item = DirEntry> + use<> {
     let files = std::fs::read_dir(directory);
     files.into_iter().flatten().flatten()
 }
 
 /// Removes the files with this prefix. A failed removal is retried by the next cleanup.
-fn remove_files(directory: &Path, prefix: &str) {
-    for file in files_in(directory) {
+fn remove_files(files: impl Iterator<Item = DirEntry>, prefix: &str) {
+    for file in files {
         if file.file_name().to_string_lossy().starts_with(prefix) {
             let _ = std::fs::remove_file(file.path());
         }
@@ -678,7 +682,7 @@ fn secret_of(config: &ShmConfig) -> Result<Option<Secret>, ShmError> {
         return Ok(stored);
     }
     let mut examined = Vec::new();
-    for file in files_in(Path::new(SHM)) {
+    for file in shared_files() {
         let name = file.file_name();
         let Some(secret) = Secret::in_name(&config.prefix, &name.to_string_lossy()) else {
             continue;
@@ -695,6 +699,9 @@ fn secret_of(config: &ShmConfig) -> Result<Option<Secret>, ShmError> {
             return Ok(Some(secret));
         }
         examined.push(secret);
+        if examined.len() >= MAX_SECRETS {
+            break;
+        }
     }
     Ok(None)
 }

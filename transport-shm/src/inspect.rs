@@ -3,8 +3,9 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use crate::domain_files::{DomainFiles, file_error, files_in};
+use crate::domain_files::{DomainFiles, file_error};
 use crate::memory::{Budget, SHM};
+use crate::shared_files::shared_files;
 use crate::{ShmConfig, ShmError};
 
 /// Maximum number of exposed files in a report.
@@ -37,7 +38,7 @@ pub fn inspect(config: &ShmConfig) -> Result<Inspection, ShmError> {
         .map_err(|e| file_error("cannot read the size of", Path::new(SHM), e))?;
     let (alive, dead) = domain.count()?;
     let prefix = format!("{}_", config.prefix);
-    let exposed = files_in(Path::new(SHM))
+    let exposed = shared_files()
         .filter(|file| file.file_name().to_string_lossy().starts_with(&prefix))
         .filter(|file| file.metadata().is_ok_and(|found| found.mode() & 0o077 != 0))
         .map(|file| file.path());

@@ -68,6 +68,7 @@ mod presence;
 pub mod raw;
 mod secret;
 mod segment;
+mod shared_files;
 mod static_file;
 mod storage;
 mod sync;

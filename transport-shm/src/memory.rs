@@ -18,6 +18,7 @@ use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 use rustix::param::page_size;
 
 use crate::presence::ProcessPaths;
+use crate::shared_files::shared_files;
 use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 
@@ -147,11 +148,7 @@ impl Budget {
 
     /// Memory that the files of this domain use, in bytes.
     pub(crate) fn used(&self) -> u64 {
-        let Ok(files) = std::fs::read_dir(SHM) else {
-            return 0;
-        };
-        files
-            .flatten()
+        shared_files()
             .filter(|file| file.file_name().to_string_lossy().starts_with(&self.prefix))
             .filter_map(|file| file.metadata().ok())
             // Any user may create files here; those of other users do not count.

@@ -13,7 +13,7 @@
 //!
 //! A process that sends content to several receivers also has segments (see `segment`).
 
-use std::fs::File;
+use std::fs::{DirEntry, File};
 use std::io::{self, ErrorKind, Read, Write};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::os::unix::fs::OpenOptionsExt;
@@ -29,10 +29,10 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use crate::answer_words::{AnswerWords, LentWords, WordPlace};
-use crate::domain_files::files_in;
 use crate::fork::Owner;
 use crate::memory::{Mapping, PAGE, SHM, is_owned, open_owned};
 use crate::segment;
+use crate::shared_files::shared_files;
 use crate::wakeup::{RingState, StatusWords};
 
 /// Mode of a file that only its owner may access.
@@ -77,51 +77,61 @@ impl ProcessPaths {
         Path::new(SHM).join(format!("{}{of}.{number}.{CONTENT}", self.prefix))
     }
 
-    pub(crate) fn remove(&self, of: Incarnation) {
-        let contents = format!("{}{of}.", self.prefix);
-        for file in files_in(Path::new(SHM)) {
+    /// Removes the files of these processes, each after `may` has returned true for it.
+    pub(crate) fn remove(&self, of: &[Incarnation], may: impl Fn() -> bool) {
+        if of.is_empty() {
+            return;
+        }
+        // One pass for all processes, because other users may have many files here.
+        for file in shared_files() {
             let name = file.file_name();
-            let name = name.to_string_lossy();
-            if name.starts_with(&contents) && name.ends_with(CONTENT) {
+            if let Some((owner, kind)) = name.to_str().and_then(|name| self.parse(name))
+                && kind.ends_with(CONTENT)
+                && of.contains(&owner)
+                && may()
+            {
                 segment::remove(&file.path());
             }
         }
-        // The liveness FIFO goes last: as long as it exists, a later cleanup finds the process and
-        // removes the other files. A missing file is not an error.
-        for path in [
-            self.status_page(of),
-            self.doorbell(of),
-            self.liveness_fifo(of),
-        ] {
-            let _ = std::fs::remove_file(path);
+        for one in of {
+            // The liveness FIFO goes last: as long as it exists, a later cleanup finds the process and
+            // removes the other files. A missing file is not an error.
+            for path in [
+                self.status_page(*one),
+                self.doorbell(*one),
+                self.liveness_fifo(*one),
+            ] {
+                if may() {
+                    let _ = std::fs::remove_file(path);
+                }
+            }
         }
+    }
+
+    /// Splits the name of a file into the process and the kind of file.
+    fn parse<'a>(&self, name: &'a str) -> Option<(Incarnation, &'a str)> {
+        let (digits, kind) = name.strip_prefix(&self.prefix)?.split_once('.')?;
+        Some((digits.parse().ok()?, kind))
     }
 
     /// Incarnations of the processes that have files in the domain, sorted.
     pub(crate) fn all(&self) -> io::Result<Vec<Incarnation>> {
-        let mut found = Vec::new();
-        for directory in [self.directory.as_path(), Path::new(SHM)] {
-            let files = match std::fs::read_dir(directory) {
-                Ok(files) => files,
-                Err(e) if e.kind() == ErrorKind::NotFound => continue,
-                Err(e) => return Err(e),
-            };
-            for file in files {
-                let file = file?;
+        let private: io::Result<Vec<DirEntry>> = match std::fs::read_dir(&self.directory) {
+            Ok(files) => files.collect(),
+            Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+            Err(e) => Err(e),
+        };
+        let files = private?.into_iter().chain(shared_files());
+        let mut found: Vec<Incarnation> = files
+            .filter_map(|file| {
                 let name = file.file_name();
-                let incarnation: Option<Incarnation> = name
-                    .to_str()
-                    .and_then(|name| name.strip_prefix(&self.prefix))
-                    .and_then(|name| name.split_once('.'))
-                    .filter(|(_, kind)| {
-                        matches!(*kind, "live" | "bell" | "page") || kind.ends_with(CONTENT)
-                    })
-                    .and_then(|(digits, _)| digits.parse().ok());
+                let (incarnation, kind) = self.parse(name.to_str()?)?;
+                let is_ours = matches!(kind, "live" | "bell" | "page") || kind.ends_with(CONTENT);
                 // Any user may create files with such names.
                 let is_own = || file.metadata().is_ok_and(|metadata| is_owned(&metadata));
-                found.extend(incarnation.filter(|_| is_own()));
-            }
-        }
+                (is_ours && is_own()).then_some(incarnation)
+            })
+            .collect();
         found.sort_unstable();
         found.dedup();
         Ok(found)
@@ -180,7 +190,7 @@ impl Presence {
         mknodat(CWD, paths.liveness_fifo(own), FileType::Fifo, PRIVATE, 0)?;
         let created = Self::create_files(&paths, own);
         if created.is_err() {
-            paths.remove(own);
+            paths.remove(&[own], || true);
         }
         created
     }
@@ -245,7 +255,7 @@ const POLLS_PER_CLOCK_READ: usize = 16;
 impl Drop for Presence {
     fn drop(&mut self) {
         if self.owner.is_this() {
-            self.paths.remove(self.own);
+            self.paths.remove(&[self.own], || true);
         }
     }
 }
