@@ -42,7 +42,7 @@
 //! [security]
 //! keys = ""                           # directory of `fipa keys init`; empty: no encryption
 //! insecure = false                    # true: listen on the network without keys
-//! loopback = false                    # with keys: peers on loopback prove their identity, too
+//! loopback = false                    # with keys: legacy peers on loopback prove their identity, too
 //! legacy_peers = []                   # with keys: addresses of legacy peers, which have no keys
 //! [access]
 //! rate = 0                            # letters per second of one sender; 0: no limit
@@ -258,7 +258,8 @@ pub struct Security {
     pub keys: String,
     /// `insecure`: whether the gateway may listen on the network without keys.
     pub insecure: bool,
-    /// `loopback`: whether peers on loopback addresses must prove their identity, too.
+    /// `loopback`: whether legacy peers on loopback addresses must prove their identity, too. Others always must,
+    /// except over the ports of `transport.tcp.processes`.
     pub loopback: bool,
     /// `legacy_peers`: addresses of legacy peers, which cannot prove their identity. The gateway exchanges
     /// letters in their dialects with them despite its keys. At most 64.

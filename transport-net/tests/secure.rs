@@ -408,6 +408,41 @@ fn a_legacy_peer_may_be_an_exception_and_is_nothing_more() {
 }
 
 #[test]
+fn with_keys_only_legacy_peers_on_loopback_need_none() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    for listen in ["127.0.0.1:0", "[::1]:0"] {
+        let gateway = |loopback, processes| {
+            let rules = Rules {
+                loopback,
+                ..Rules::default()
+            };
+            let mut config = config(&[listen]);
+            config.security = Some(Security::new(crex.credentials(&[&rover]), rules).unwrap());
+            config.processes = processes;
+            Party::with(config)
+        };
+        let to = gateway(false, false);
+        assert_refused(&Party::new(), &to);
+        throw(&to);
+        until_some("the letter of a legacy peer", || {
+            (to.sink.record.lock().unframed.len() == 1).then_some(())
+        });
+        assert_eq!(to.arrivals(), 0);
+        let with_processes = gateway(false, true);
+        Party::new().assert_reaches(1, &with_processes);
+        let with_loopback = gateway(true, false);
+        assert_refused(&Party::new(), &with_loopback);
+        let mut stream = TcpStream::connect(with_loopback.location().address()).unwrap();
+        // The gateway may close the connection after the first bytes.
+        let _ = stream.write_all(&letter_from("cpp-sender").to_bytes());
+        until_some("the refusal", || {
+            (with_loopback.transport.counters().refused_unproved > 0).then_some(())
+        });
+        assert_eq!(with_loopback.sink.record.lock().unframed.len(), 0);
+    }
+}
+
+#[test]
 fn a_legacy_peer_beyond_its_rate_limit_is_read_later() {
     let to = TcpTransport::limited(with_an_exception(), |limits| limits.peer_letters = 2);
     let begun = Instant::now();

@@ -80,7 +80,8 @@ pub struct Security {
 /// The peers that must prove their identity.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Rules {
-    /// Whether peers at loopback addresses must prove their identity, too.
+    /// Whether legacy peers at loopback addresses must prove their identity, too. Peers that send frames always
+    /// must, unless processes of this host connect over loopback.
     pub loopback: bool,
     /// Addresses of legacy peers, which cannot prove their identity. Only letters in their dialects
     /// are exchanged with them.
