@@ -131,3 +131,54 @@ async fn a_revoked_host_ends_with_its_agents_its_services_and_the_letters_for_it
     assert_eq!(df.search(&lifting).await.unwrap(), []);
     assert!(near.neighbours().is_empty());
 }
+
+/// A platform such as JADE has no gateway whose certificate belongs to its agents.
+#[cfg(feature = "http")]
+#[tokio::test(flavor = "multi_thread")]
+async fn letters_for_a_revoked_platform_end_as_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let [near_keys, far_keys] = ["near", "far"].map(|name| Keys::at(dir.path().join(name)));
+    let over_https = [
+        r#"mts.transports=["shm", "unix", "https"]"#,
+        r#"transport.https.listen=["127.0.0.1:0"]"#,
+    ];
+    let platform = |keys: &Keys| {
+        let own = format!("security.keys={:?}", keys.dir());
+        with_keys(keys, &[&over_https[..], &[&own]].concat())
+    };
+    let far_config = platform(&far_keys);
+    let mut near_config = platform(&near_keys);
+    trust(&near_keys, &far_keys);
+    trust(&far_keys, &near_keys);
+    let far = Gateway::open(&far_config).await.unwrap();
+    let locations = far.locations();
+    let at = locations.iter().find(|it| it.kind() == Kind::Https);
+    let at = at.unwrap().address().to_owned();
+    let theirs = Domain::open(&far_config).await.unwrap();
+    let mark = mark();
+    let arm = theirs.register(&format!("arm-{mark}")).await.unwrap();
+    let platform = format!(
+        "discovery.static={{ \"{}\" = [\"https://{at}\"] }}",
+        arm.name()
+    );
+    near_config.discovery = config(&[&platform]).discovery;
+    let _near = Gateway::open(&near_config).await.unwrap();
+    let ours = Domain::open(&near_config).await.unwrap();
+    let rover = ours.register(&format!("rover-{mark}")).await.unwrap();
+    knows(&ours, arm.name()).await;
+    let send = || rover.send(inform(&rover, arm.name(), "down"));
+    let before = send().await.unwrap();
+    assert!(before.0[0].outcome.is_success(), "{before:?}");
+    near_keys.revoke(&far_config.mts.name).unwrap();
+    // The gateway reads its keys a moment later.
+    let refused = loop {
+        match &send().await.unwrap().0[0].outcome {
+            outcome if outcome.is_success() => {}
+            Outcome::Failed { reason, attempts } => break (*reason, format!("{attempts:?}")),
+            outcome => panic!("{outcome:?}"),
+        }
+    };
+    assert_eq!(refused.0, FailureReason::Refused);
+    let why = "the trust in the certificate of the platform was withdrawn";
+    assert!(refused.1.contains(why), "{}", refused.1);
+}

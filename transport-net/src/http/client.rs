@@ -13,7 +13,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::escape;
-use fipa_transport::{Conclusion, Kind, Location, Signature, TransportError, TransportErrorKind};
+use fipa_transport::{
+    Answer, Conclusion, FailureReason, Kind, Location, Signature, TransportError,
+    TransportErrorKind,
+};
 use socket2::SockRef;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
@@ -97,7 +100,8 @@ impl HttpSender {
             None => {
                 // No connection is opened for a letter that is not sent.
                 in_dialect(None)?;
-                self.open(&url).await.map_err(Conclusion::NotSent)?
+                let opened = self.open(&url).await;
+                opened.map_err(|error| self.not_opened(error))?
             }
         };
         let [envelope, message] = in_dialect(connection.here.as_deref())?;
@@ -135,6 +139,21 @@ impl HttpSender {
         }
         count(&endpoint.stream.tally().unframed_out);
         Ok(Conclusion::Handed)
+    }
+
+    /// Returns the conclusion of a letter for which no connection was opened. It is final if the platform has
+    /// proved an identity before that is no longer trusted, and proves no other one.
+    fn not_opened(&self, error: TransportError) -> Conclusion {
+        #[cfg(feature = "secure")]
+        if error.fault == TransportErrorKind::Refused && self.endpoint.proved.is_withdrawn(&self.to)
+        {
+            let detail = format!(
+                "the trust in the certificate of the platform was withdrawn: {}",
+                error.detail
+            );
+            return Conclusion::Answered(Answer::failed(FailureReason::Refused, detail));
+        }
+        Conclusion::NotSent(error)
     }
 
     /// Opens a connection to the platform.
@@ -177,6 +196,7 @@ impl HttpSender {
                 let detail = format!("{peer}: {what}");
                 TransportError::new(TransportErrorKind::Refused, detail)
             })?;
+            self.endpoint.proved.add(&self.to, stream.proof().clone());
             return Ok(Socket::Tls(Box::new(stream)));
         }
         endpoint.config.check_legacy_peer(peer)?;

@@ -27,6 +27,11 @@ impl<S> Guarded<S> {
         }
     }
 
+    /// Returns what the peer has proved.
+    pub(crate) fn proof(&self) -> &Proof {
+        &self.proof
+    }
+
     /// Returns the stream below.
     pub(crate) fn get_ref(&self) -> &S {
         &self.stream

@@ -6,8 +6,8 @@
 //! * [`letter`]: the letter of a body.
 //! * [`repeats`]: letters that a platform repeats on another connection.
 //! * [`connections`]: the accepted connections.
-//! * `socket`, `tls`, `guarded`: the sockets of connections, TLS over them for `https`, and streams that end with the
-//!   trust in their peer.
+//! * `socket`, `tls`, `guarded`, `proved`: the sockets of connections, TLS over them for `https`, streams that end with
+//!   the trust in their peer, and what platforms have proved.
 //!
 //! [`server`] and [`client`] do the I/O. A platform is a legacy peer: it proves no identity and
 //! confirms no delivery. [`crate::legacy`] has the parts that it shares with those over TCP.
@@ -22,6 +22,8 @@ mod guarded;
 mod head;
 mod letter;
 mod multipart;
+#[cfg(feature = "secure")]
+mod proved;
 mod repeats;
 mod request;
 mod response;
@@ -95,6 +97,8 @@ struct HttpEndpoint {
     /// The credentials of `https`.
     #[cfg(feature = "secure")]
     tls: Option<crate::secure::Security>,
+    #[cfg(feature = "secure")]
+    proved: proved::Proved,
 }
 
 impl HttpEndpoint {
@@ -185,6 +189,8 @@ impl HttpTransport {
             boundaries: AtomicU64::default(),
             #[cfg(feature = "secure")]
             tls,
+            #[cfg(feature = "secure")]
+            proved: proved::Proved::default(),
         });
         Self { listen, endpoint }
     }

@@ -99,6 +99,12 @@ impl Proof {
         Ok(())
     }
 
+    /// Whether the peer has proved an identity that is no longer trusted. One that has expired still is.
+    #[cfg(all(feature = "secure", feature = "http"))]
+    pub(crate) fn is_distrusted(&self) -> bool {
+        matches!(self.check(), Err(ConnectionEnd::Distrusted))
+    }
+
     /// Waits until what the peer has proved no longer counts.
     pub(crate) async fn withdrawn(&self) -> ConnectionEnd {
         #[cfg(feature = "secure")]
