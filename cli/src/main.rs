@@ -26,6 +26,7 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use anstyle::Style;
+use fipa::log_limit::Cut;
 use fipa_acl::{escape, is_unprintable};
 use tracing::field::Field;
 use tracing_subscriber::EnvFilter;
@@ -62,18 +63,11 @@ fn log_to_stderr(global: &options::Global) {
         .init();
 }
 
-/// Maximum length of a value in the log, in bytes. Peers can cause values of any length.
-const MAX_LOGGED: usize = 2_048;
-
 /// Writes one field of an event. A value can contain names and texts of peers, so a value with
 /// unprintable characters is escaped. Other values stay as they are: they may be escaped already.
 fn log_field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> fmt::Result {
-    let mut text = format!("{value:?}");
-    let len = text.len();
-    if len > MAX_LOGGED {
-        text.truncate(text.floor_char_boundary(MAX_LOGGED));
-        text.push_str(&format!("... ({len} bytes)"));
-    }
+    // Lines for debugging are not cut by the library.
+    let mut text = Cut(format_args!("{value:?}")).to_string();
     if text.contains(is_unprintable) {
         text = escape(&text).into_owned();
     }

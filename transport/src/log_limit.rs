@@ -1,4 +1,4 @@
-//! The rate limit of the log lines of this project. Other hosts cause many of the lines, so without a limit they
+//! The limits of the log lines of this project. Other hosts cause many of the lines, so without a limit they
 //! could fill the disk of a robot.
 //!
 //! [`error!`], [`warn!`] and [`info!`] take what the macros of `tracing` take. Before the fields, `of: KEY` names
@@ -9,10 +9,14 @@
 //!
 //! `clippy.toml` forbids the macros of `tracing` for these levels. Lines for debugging have no limit.
 //!
+//! A message, and a value that is written with `%` or `?`, is [cut](Cut) after 2,048 bytes. Other values are numbers
+//! and names.
+//!
 //! [`LogLimit`] does no I/O. The macros read the clock of the system, also in code that takes `now` as an argument,
 //! because a log grows in real time.
 
 use std::collections::HashMap;
+use std::fmt::{self, Display, Formatter, Write};
 use std::hash::{BuildHasher, Hash, RandomState};
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -39,6 +43,45 @@ const LINES_OF_KEY_PER_SECOND: f64 = 0.1;
 const MEMORY: Duration = Duration::from_secs(50);
 /// Maximum number of keys of one kind. Only admitted lines add keys, which are fewer within [`MEMORY`].
 const MAX_KEYS: usize = 128;
+
+/// Maximum length of a value in a log line, in bytes. Peers can cause values of any length.
+const MAX_VALUE: usize = 2_048;
+
+/// A value of a log line, of which at most 2,048 bytes are displayed, with the length of the whole value.
+#[derive(Debug, Clone, Copy)]
+pub struct Cut<T>(pub T);
+
+impl<T: Display> Display for Cut<T> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let mut writer = CutWriter { to: f, len: 0 };
+        write!(writer, "{}", self.0)?;
+        match writer.len {
+            0..=MAX_VALUE => Ok(()),
+            len => write!(f, "... ({len} bytes)"),
+        }
+    }
+}
+
+/// Passes on the first bytes and counts all.
+struct CutWriter<'a, 'b> {
+    to: &'a mut Formatter<'b>,
+    len: usize,
+}
+
+impl Write for CutWriter<'_, '_> {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        let room = MAX_VALUE.saturating_sub(self.len);
+        self.len = self.len.saturating_add(text.len());
+        if text.len() <= room {
+            return self.to.write_str(text);
+        }
+        // Nothing follows a part that was cut.
+        self.to.write_str(
+            text.get(..text.floor_char_boundary(room))
+                .unwrap_or_default(),
+        )
+    }
+}
 
 /// The rate limit of the lines of one kind.
 ///
@@ -214,7 +257,7 @@ macro_rules! __log_limited {
                 $crate::__log_text!($($line)+),
             );
             if let Some(omitted) = SITE.admit(&$key) {
-                tracing::event!(target: $target, tracing::Level::$level, omitted, $($line)+);
+                $crate::__log_cut!(($target, $level, omitted) () $($line)+);
             }
         }
     }};
@@ -223,6 +266,43 @@ macro_rules! __log_limited {
     };
     ($level:ident, $($line:tt)+) => {
         $crate::__log_limited!($level, target: module_path!(), of: (), $($line)+)
+    };
+}
+
+/// Writes a line with its values cut. The fields move from the third part to the second one.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! __log_cut {
+    (($target:expr, $level:ident, $omitted:ident) ($($done:tt)*) $text:literal $($arguments:tt)*) => {
+        $crate::log_limit::tracing::event!(
+            target: $target,
+            $crate::log_limit::tracing::Level::$level,
+            message = %$crate::log_limit::Cut(format_args!($text $($arguments)*)),
+            $omitted,
+            $($done)*
+        )
+    };
+    ($place:tt ($($done:tt)*) $($name:ident).+ = %$value:expr, $($rest:tt)+) => {
+        $crate::__log_cut!($place (
+            $($done)* $($name).+ = %$crate::log_limit::Cut(format_args!("{}", $value)),
+        ) $($rest)+)
+    };
+    ($place:tt ($($done:tt)*) $($name:ident).+ = ?$value:expr, $($rest:tt)+) => {
+        $crate::__log_cut!($place (
+            $($done)* $($name).+ = %$crate::log_limit::Cut(format_args!("{:?}", $value)),
+        ) $($rest)+)
+    };
+    ($place:tt ($($done:tt)*) $($name:ident).+ = $value:expr, $($rest:tt)+) => {
+        $crate::__log_cut!($place ($($done)* $($name).+ = $value,) $($rest)+)
+    };
+    ($place:tt $done:tt %$($name:ident).+, $($rest:tt)+) => {
+        $crate::__log_cut!($place $done $($name).+ = %$($name).+, $($rest)+)
+    };
+    ($place:tt $done:tt ?$($name:ident).+, $($rest:tt)+) => {
+        $crate::__log_cut!($place $done $($name).+ = ?$($name).+, $($rest)+)
+    };
+    ($place:tt ($($done:tt)*) $($name:ident).+, $($rest:tt)+) => {
+        $crate::__log_cut!($place ($($done)* $($name).+,) $($rest)+)
     };
 }
 
@@ -301,7 +381,7 @@ mod tests {
             }
         }
 
-        fn record_debug(&mut self, _: &Field, _: &dyn std::fmt::Debug) {}
+        fn record_debug(&mut self, _: &Field, _: &dyn fmt::Debug) {}
     }
 
     impl tracing::Subscriber for Log {
@@ -329,6 +409,93 @@ mod tests {
         fn enter(&self, _: &span::Id) {}
 
         fn exit(&self, _: &span::Id) {}
+    }
+
+    #[test]
+    fn a_value_is_cut_between_characters() {
+        let of = |text: &str| Cut(text).to_string();
+        let fits = "x".repeat(MAX_VALUE);
+        assert_eq!(of(&fits), fits);
+        assert_eq!(of(&format!("{fits}y")), format!("{fits}... (2049 bytes)"));
+        let wide = "ä".repeat(MAX_VALUE);
+        assert_eq!(
+            of(&format!("x{wide}")),
+            format!("x{}... (4097 bytes)", &wide[..2046])
+        );
+        // A value may be written in many parts.
+        let parts = Cut(format_args!("{fits}{}{}", "a", "b")).to_string();
+        assert_eq!(parts, format!("{fits}... (2050 bytes)"));
+    }
+
+    /// Keeps the values of the lines.
+    #[derive(Debug, Clone, Default)]
+    struct Values(Arc<Mutex<Vec<(&'static str, String)>>>);
+
+    impl Visit for Values {
+        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+            self.0.lock().push((field.name(), format!("{value:?}")));
+        }
+    }
+
+    impl tracing::Subscriber for Values {
+        fn enabled(&self, _: &tracing::Metadata<'_>) -> bool {
+            true
+        }
+
+        fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
+            span::Id::from_u64(1)
+        }
+
+        fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
+
+        fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
+
+        fn event(&self, event: &tracing::Event<'_>) {
+            event.record(&mut self.clone());
+        }
+
+        fn enter(&self, _: &span::Id) {}
+
+        fn exit(&self, _: &span::Id) {}
+    }
+
+    #[test]
+    fn long_values_of_peers_are_cut_in_the_log() {
+        struct Peer {
+            name: String,
+        }
+        let values = Values::default();
+        let (text, number) = ("t".repeat(100_000), 7);
+        let peer = Peer { name: text.clone() };
+        with_default(values.clone(), || {
+            warn!(of: 1, %text, ?text, %peer.name, why = %text, other = ?text, number, count = number, "says {text}");
+            info!("says {}, {number}", peer.name);
+            error!(number, "says {text}");
+        });
+        let values = values.0.lock();
+        let long = values.iter().filter(|(_, value)| value.len() > 100);
+        for (name, value) in long.clone() {
+            assert!(
+                value.len() < MAX_VALUE + 40,
+                "{name}: {} bytes",
+                value.len()
+            );
+            assert!(value.contains("... (1000"), "{name}: {value}");
+        }
+        assert_eq!(long.count(), 8);
+        let names: Vec<&str> = values.iter().take(8).map(|(name, _)| *name).collect();
+        let expected = [
+            "message",
+            "text",
+            "text",
+            "peer.name",
+            "why",
+            "other",
+            "number",
+            "count",
+        ];
+        assert_eq!(names, expected);
+        assert_eq!((&*values[6].1, &*values[7].1), ("7", "7"));
     }
 
     #[test]
