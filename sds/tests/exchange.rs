@@ -1243,6 +1243,25 @@ fn incomplete_lists_of_many_neighbors_are_bounded() {
     assert_eq!(count(&exchange, ""), 700);
 }
 
+/// Transports close a connection after 60 s without a letter.
+#[test]
+fn a_neighbor_gets_a_letter_every_15_seconds_without_changes() {
+    let start = Instant::now();
+    let mut exchange = Exchange::new(0);
+    exchange.handle_neighbours(start, &present([0]));
+    let (mut now, mut times) = (start, Vec::new());
+    while now < start + Duration::from_secs(120) {
+        now = exchange.poll_timeout().unwrap().max(now);
+        exchange.handle_timeout(now);
+        while let Some((to, _)) = exchange.poll_letter(now) {
+            times.push(now);
+            exchange.handle_sent(now, to, true);
+        }
+    }
+    let pauses = times.windows(2).map(|pair| pair[1] - pair[0]);
+    assert!(times.len() > 7 && pauses.max() <= Some(Duration::from_secs(15)));
+}
+
 #[test]
 fn an_incomplete_list_ends_unless_it_grows() {
     let start = Instant::now();
