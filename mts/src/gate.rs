@@ -4,7 +4,7 @@ use std::net::IpAddr;
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_transport::{Hop, Incarnation, Kind, Principal, quota_address};
+use fipa_transport::{Hop, Incarnation, Kind, Location, Principal, quota_address};
 
 /// The link on which a letter arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,14 +38,17 @@ impl Source {
         match hop.principal {
             Principal::Host => Self::Process(hop.location.incarnation()),
             Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
-            Principal::Unproved => {
-                let address = hop.location.address();
-                let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
-                let host = host.trim_matches(['[', ']']);
-                let host = host.split_once('%').map_or(host, |(host, _)| host);
-                Self::Address(host.parse().ok().map(quota_address))
-            }
+            Principal::Unproved => Self::unproved(&hop.location),
         }
+    }
+
+    /// Returns the source of unproved services at this location.
+    pub(crate) fn unproved(location: &Location) -> Self {
+        let address = location.address();
+        let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
+        let host = host.trim_matches(['[', ']']);
+        let host = host.split_once('%').map_or(host, |(host, _)| host);
+        Self::Address(host.parse().ok().map(quota_address))
     }
 
     /// Returns the source of unproved letters from this address.
@@ -101,7 +104,7 @@ mod tests {
     use super::*;
 
     fn source(location: &str, principal: Principal) -> Source {
-        let location: fipa_transport::Location = location.parse().unwrap();
+        let location: Location = location.parse().unwrap();
         let location = location.with_incarnation(Incarnation::from_u64(7));
         Source::of(&Hop {
             location,
