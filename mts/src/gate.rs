@@ -4,7 +4,7 @@ use std::net::IpAddr;
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_transport::{Hop, Incarnation, Kind, Principal, quota_address};
+use fipa_transport::{Hop, Incarnation, Kind, Location, Principal, quota_address};
 
 /// The link on which a letter arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,8 +38,13 @@ impl Source {
         match hop.principal {
             Principal::Host => Self::Process(hop.location.incarnation()),
             Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
-            Principal::Unproved => Self::Address(hop.location.quota_address()),
+            Principal::Unproved => Self::unproved(&hop.location),
         }
+    }
+
+    /// Returns the source of unproved services at this location.
+    pub(crate) fn unproved(location: &Location) -> Self {
+        Self::Address(location.quota_address())
     }
 
     /// Returns the source of unproved letters from this address.
@@ -95,7 +100,7 @@ mod tests {
     use super::*;
 
     fn source(location: &str, principal: Principal) -> Source {
-        let location: fipa_transport::Location = location.parse().unwrap();
+        let location: Location = location.parse().unwrap();
         let location = location.with_incarnation(Incarnation::from_u64(7));
         Source::of(&Hop {
             location,

@@ -86,3 +86,70 @@ fn only_an_attempt_that_ended_frees_room() {
     // One attempt for each receiver, and a second one for those that found no room.
     assert_eq!(tries, RECEIVERS + (RECEIVERS - WINDOW));
 }
+
+/// A lane without room holds letters back while others leave it, and refuses them when it stands still.
+#[test]
+fn a_full_lane_that_moves_holds_letters_back() {
+    let own = Incarnation::from_u64(1);
+    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let location = "shm://0000000000000009#0000000000000009".parse().unwrap();
+    let arm = Registration::new("arm", Incarnation::from_u64(100), vec![location]);
+    directory.register(arm).unwrap();
+    let config = CoreConfig::new("mts", own, vec![Kind::Shm]);
+    let lane = config.lane;
+    let mut core = Core::new(config, Arc::new(directory));
+    let rover = Incarnation::from_u64(2);
+    core.register("rover".into(), rover);
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .build()
+        .unwrap();
+    let start = Instant::now();
+    let at = |ms: u64| Now {
+        instant: start + Duration::from_millis(ms),
+        utc: SystemTime::UNIX_EPOCH,
+    };
+    let letter = letter_for(&message, SystemTime::UNIX_EPOCH).unwrap();
+    let send = |core: &mut Core, now: Now| {
+        let submission = Submission {
+            sender: rover,
+            letter: letter.clone(),
+            receivers: vec!["arm".into()],
+            deadline: Duration::from_secs(60),
+        };
+        core.send(now, submission);
+    };
+    // The letters that were dispatched, and whether a letter failed.
+    let look = |core: &mut Core| {
+        let (mut attempts, mut failed) = (Vec::new(), false);
+        while let Some(action) = core.poll_action() {
+            match action {
+                Action::Dispatch { attempt, .. } => attempts.push(attempt),
+                Action::Outcome { outcome, .. } => {
+                    failed |= matches!(outcome, Outcome::Failed { .. });
+                }
+                _ => {}
+            }
+        }
+        (attempts, failed)
+    };
+    for _ in 0..lane {
+        send(&mut core, at(0));
+    }
+    let (attempts, failed) = look(&mut core);
+    assert!(!failed);
+    send(&mut core, at(0));
+    assert!(look(&mut core).1, "the lane has not moved");
+    core.handle_conclusion(at(500), attempts[0], Conclusion::Answered(Answer::Accepted));
+    for _ in 0..3 * lane + 1 {
+        send(&mut core, at(600));
+    }
+    assert!(!look(&mut core).1);
+    // Its memory is bounded.
+    send(&mut core, at(600));
+    assert!(look(&mut core).1, "too many letters are held back");
+    core.handle_conclusion(at(600), attempts[1], Conclusion::Answered(Answer::Accepted));
+    send(&mut core, at(1700));
+    assert!(look(&mut core).1, "the lane stands still");
+}

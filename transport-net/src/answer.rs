@@ -98,6 +98,15 @@ pub(crate) fn decode(body: &[u8]) -> Option<Answer> {
     }
 }
 
+/// Returns the number of unanswered parcels at which another one is not queued. The last quarter is for parcels
+/// other than letters: their receivers need them to have letters answered.
+pub(crate) fn places(max_in_flight: usize, is_letter: bool) -> usize {
+    match is_letter {
+        true => (max_in_flight - max_in_flight / 4).max(1),
+        false => max_in_flight.max(1),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use fipa_transport::{FailureReason, Kind};

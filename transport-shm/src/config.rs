@@ -30,8 +30,9 @@ pub struct ShmConfig {
     pub max_clients: usize,
     /// Maximum number of other processes whose mailbox and doorbell are kept open. 1 to 4096.
     pub max_peers: usize,
-    /// Maximum number of unanswered parcels to one process, and of parcels of one sender that a
-    /// receiver holds. 2 to 128.
+    /// Maximum number of unanswered letters to one process, and of parcels of one sender that a
+    /// receiver holds. There are a quarter more places for other parcels, whose receivers need them to
+    /// have letters answered. 2 to 128.
     pub window: usize,
     /// Maximum number of loans for one process, each counted until the last [`bytes::Bytes`] of
     /// its content is dropped. At least 1 and less than `window`.
@@ -126,6 +127,11 @@ impl ShmConfig {
                     self.root
                 ))
             })
+    }
+
+    /// Maximum number of unanswered parcels to one process.
+    pub(crate) fn places(&self) -> usize {
+        self.window + self.window.div_ceil(4)
     }
 
     /// Checks the configuration and returns the one for iceoryx2, whose files have this prefix.

@@ -388,7 +388,8 @@ impl Endpoint {
         }
         let peer = self.peer_at(to)?;
         let limits = BacklogLimits {
-            parcels: self.config.window,
+            letters: self.config.window,
+            parcels: self.config.places(),
             bytes: self.config.max_letter,
         };
         match peer.post(attempt, parcel, limits)? {

@@ -39,10 +39,10 @@ pub(crate) fn allocating() -> TransportError {
     )
 }
 
-pub(crate) fn window_full(window: usize) -> TransportError {
+pub(crate) fn window_full(unanswered: usize) -> TransportError {
     TransportError::new(
         TransportErrorKind::Congested,
-        format_args!("{window} letters to this process are unanswered"),
+        format_args!("{unanswered} parcels to this process are unanswered"),
     )
 }
 

@@ -103,7 +103,7 @@ impl Inbox {
             .max_servers(1)
             .max_clients(config.max_clients)
             .max_nodes(config.max_clients + 1)
-            .max_active_requests_per_client(config.window)
+            .max_active_requests_per_client(config.places())
             .max_loaned_requests(config.max_loans + 1)
             .max_response_buffer_size(1)
             .max_borrowed_responses_per_pending_response(1)

@@ -65,7 +65,10 @@ static NO_CONTENT: Bytes = Bytes::new();
 pub(crate) struct Outbox {
     client: MailClient,
     own: Incarnation,
-    window: usize,
+    /// Maximum number of unanswered parcels.
+    places: usize,
+    /// Number of unanswered parcels at which no letter is sent.
+    letters: usize,
     max_loans: usize,
     chunks: usize,
     state: Mutex<State>,
@@ -206,7 +209,8 @@ impl Outbox {
             .open()
             .map_err(open_error)?;
         let settings = service.static_config();
-        let window = settings.max_active_requests_per_client();
+        let places = settings.max_active_requests_per_client();
+        let letters = places - places / 5;
         let most_loans = settings.max_loaned_requests();
         let builder = service
             .client_builder()
@@ -225,13 +229,14 @@ impl Outbox {
         let outbox = Self {
             client,
             own: opening.own,
-            window,
+            places,
+            letters,
             // One slot stays free for letters that were not loaned.
             max_loans: opening
                 .max_loans
                 .min(most_loans.saturating_sub(1))
-                .min(window - 1),
-            chunks: 2 * window + most_loans,
+                .min(letters - 1),
+            chunks: 2 * places + most_loans,
             state: Mutex::default(),
             waiting: UnansweredCount {
                 here: AtomicUsize::new(0),
@@ -301,7 +306,11 @@ impl Outbox {
             return Ok(Posted::Retired);
         }
         // iceoryx2 counts it as unanswered, and this parcel too.
-        if state.queue.len() + state.loans.len() + 2 > self.window {
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        if is_letter && state.queue.len() >= self.letters {
+            return Err(window_full(state.queue.len()));
+        }
+        if state.queue.len() + state.loans.len() + 2 > self.places {
             state.answered = None;
         }
         // Counted before it is sent: the answer may arrive before this returns, and the thread that
@@ -435,8 +444,8 @@ impl Outbox {
                 .is_some_and(|loan| loan.is_kept_after_sending())
         };
         let active = state.queue.len() + state.loans.iter().filter(|(_, loan)| kept(loan)).count();
-        if active >= self.window {
-            return Err(window_full(self.window));
+        if active >= self.letters {
+            return Err(window_full(active));
         }
         Ok(loan.take())
     }

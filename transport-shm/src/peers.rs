@@ -365,6 +365,8 @@ struct Backlog {
 /// The limits of a backlog.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BacklogLimits {
+    /// Maximum number of parcels at which another letter is queued, and another parcel.
+    pub(crate) letters: usize,
     pub(crate) parcels: usize,
     /// Maximum total length of the letters.
     pub(crate) bytes: usize,
@@ -378,7 +380,11 @@ impl Backlog {
         limits: BacklogLimits,
     ) -> Result<(), TransportError> {
         let bytes = self.bytes.saturating_add(letter_len(&parcel));
-        if self.parcels.len() >= limits.parcels || bytes > limits.bytes {
+        let most = match &parcel.body {
+            Body::Letter(_) => limits.letters,
+            _ => limits.parcels,
+        };
+        if self.parcels.len() >= most || bytes > limits.bytes {
             return Err(TransportError::new(
                 TransportErrorKind::Congested,
                 format_args!(

@@ -30,8 +30,8 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 /// 5. **No callback from a call.** The transport does not call a sink from within `dispatch`,
 ///    `abandon` or `answer`, because the caller may hold its own lock. It may call the sink from
 ///    within [`drive`](Self::drive) and `listen`.
-/// 6. **Bounded.** A parcel without room is returned as an error, and not queued without limit. No
-///    memory is allocated according to an unchecked length from outside.
+/// 6. **Bounded.** A parcel without room is returned as an error, and not queued without limit. Letters
+///    leave room for other parcels. No memory is allocated according to an unchecked length from outside.
 /// 7. **Lazy.** A connection to a location is opened only when a parcel needs it.
 /// 8. **Contradictions.** A transport with connections ends one whose peer gives
 ///    [`Answer::MAX_CONTRADICTIONS`] answers that [contradict](Answer::contradicts) their parcels. The

@@ -15,10 +15,11 @@ use smallvec::SmallVec;
 
 use super::departed::Departed;
 use super::lane::{Delivery, LaneId};
+use super::notes::{Note, Notes};
 use super::routes::Tallies;
 use super::{CoreConfig, News, Notice, SendId};
+use crate::Map;
 use crate::failure::Failed;
-use crate::{Map, Set};
 
 /// An action that the runtime performs for the delivery core.
 #[derive(Debug)]
@@ -179,35 +180,6 @@ pub(crate) enum Purpose {
     PeerCheck { peer: u64 },
 }
 
-/// A message about a letter: a report, a credit or a predecessor.
-#[derive(Debug)]
-pub(crate) struct Note {
-    pub(crate) location: Location,
-    pub(crate) parcel: Parcel,
-    pub(crate) tries: u32,
-    /// Time of the last transmission, if an acknowledgment is expected.
-    pub(crate) sent: Option<Instant>,
-    /// End of repetitions without an acknowledgment.
-    pub(crate) until: Option<Instant>,
-}
-
-impl Note {
-    fn is_report(&self) -> bool {
-        matches!(self.parcel.body, Body::Report(_))
-    }
-
-    /// The hand-over that the note is about: stream, sequence and transfer.
-    fn transfer(&self) -> (Stream, u64, u64) {
-        let Parcel {
-            stream,
-            sequence,
-            transfer,
-            ..
-        } = self.parcel;
-        (stream, sequence, transfer)
-    }
-}
-
 /// State that all lanes share.
 pub(crate) struct AttemptTable {
     pub(crate) config: CoreConfig,
@@ -215,8 +187,7 @@ pub(crate) struct AttemptTable {
     pub(crate) actions: VecDeque<Action>,
     pub(crate) attempts: Map<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
-    /// Notes that have been sent and are repeated unless they are acknowledged.
-    pub(crate) repeated: VecDeque<AttemptId>,
+    pub(super) notes: Notes,
     pub(crate) departed: Departed,
     /// Services whose certificate is no longer trusted.
     pub(crate) withdrawn: Map<Incarnation, Principal>,
@@ -230,10 +201,6 @@ pub(crate) struct AttemptTable {
     health: Map<Location, Health>,
     /// Smoothed time in which each service acknowledges reports.
     round_trips: Map<Incarnation, Duration>,
-    /// Hand-overs whose end was reported and neither acknowledged nor refused yet.
-    open_reports: Set<(Stream, u64, u64)>,
-    /// Lanes that found no room on the route to a location, in order.
-    waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
     /// Lanes that wait for a refresh of the directory, with its number.
     refreshing: VecDeque<(u64, LaneId)>,
@@ -267,7 +234,7 @@ impl AttemptTable {
             actions: VecDeque::new(),
             attempts: Map::default(),
             undelivered: VecDeque::new(),
-            repeated: VecDeque::new(),
+            notes: Notes::default(),
             departed: Departed::default(),
             withdrawn: Map::default(),
             held: 0,
@@ -276,8 +243,6 @@ impl AttemptTable {
             watched: false,
             health: Map::default(),
             round_trips: Map::default(),
-            open_reports: Set::default(),
-            waiting_for_room: Map::default(),
             next_attempt: 1,
             refreshing: VecDeque::new(),
             refreshes: 0,
@@ -371,41 +336,6 @@ impl AttemptTable {
         }
     }
 
-    /// Sends a note. A repetition goes to the next of the current locations of the service.
-    pub(crate) fn note(&mut self, mut note: Note) {
-        if note.tries > 0 {
-            note.location = self.present_location(&note);
-        }
-        if note.tries == 0 && note.is_report() {
-            self.open_reports.insert(note.transfer());
-        }
-        note.tries += 1;
-        let (location, parcel) = (note.location.clone(), note.parcel.clone());
-        let attempt = self.next_attempt();
-        if note.until.is_some() {
-            self.repeated.push_back(attempt);
-        }
-        self.dispatch(attempt, Purpose::Note(Box::new(note)), location, parcel);
-    }
-
-    /// Returns the current location of the service to which a note goes; its address may have
-    /// changed. The directory has the locations of the letter's sender, which is behind that
-    /// service.
-    fn present_location(&self, note: &Note) -> Location {
-        let service = note.location.incarnation();
-        let sender = self.view.registered(note.parcel.stream.sender);
-        let mut present: Vec<&Location> = Vec::new();
-        if let Some(entry) = &sender {
-            let locations = entry.locations.iter();
-            present.extend(locations.filter(|it| it.incarnation() == service));
-        }
-        let next = (note.tries as usize).checked_rem(present.len());
-        match next.and_then(|next| present.get(next)) {
-            Some(location) if service.is_known() => (*location).clone(),
-            _ => note.location.clone(),
-        }
-    }
-
     /// Counts the bytes of a letter that came into a lane.
     pub(crate) fn hold(&mut self, receiver: &Arc<str>, len: usize) {
         self.held += len;
@@ -441,13 +371,7 @@ impl AttemptTable {
 
     pub(crate) fn credit(&mut self, stream: Stream, receiver: Arc<str>, back: Location) {
         let parcel = note_parcel(stream, receiver, 0, Body::Credit);
-        self.note(Note {
-            location: back,
-            parcel,
-            tries: 0,
-            sent: None,
-            until: None,
-        });
+        self.note(Note::once(back, parcel));
     }
 
     /// Sends a service the current predecessor of a letter that was handed over in this transfer,
@@ -465,13 +389,7 @@ impl AttemptTable {
             transfer,
             ..note_parcel(stream, receiver, sequence, Body::Predecessor)
         };
-        self.note(Note {
-            location,
-            parcel,
-            tries: 0,
-            sent: None,
-            until: None,
-        });
+        self.note(Note::once(location, parcel));
     }
 
     /// Notifies the watcher, if there is one.
@@ -567,13 +485,7 @@ impl AttemptTable {
             transfer,
             ..note_parcel(stream, Arc::clone(receiver), sequence, body)
         };
-        self.note(Note {
-            location: back,
-            parcel,
-            tries: 0,
-            sent: None,
-            until: Some(deadline),
-        });
+        self.note(Note::until(deadline, back, parcel));
     }
 
     /// Resolves the receiver of a stream, if it is in the view of the directory. Another host may
@@ -623,54 +535,11 @@ impl AttemptTable {
         fallback.map(|(location, _)| location.clone())
     }
 
-    pub(crate) fn wait_for_room(&mut self, location: &Location, lane: LaneId) {
-        let waiting = self.waiting_for_room.entry(location.clone()).or_default();
-        if !waiting.contains(&lane) {
-            waiting.push_back(lane);
-        }
-    }
-
-    /// Whether lanes wait for room on a route.
-    pub(crate) fn has_lanes_without_room(&self) -> bool {
-        !self.waiting_for_room.is_empty()
-    }
-
-    /// Returns the lane that may use this location now that an attempt there has ended.
-    pub(crate) fn room_for(&mut self, location: &Location) -> Option<LaneId> {
-        if self.waiting_for_room.is_empty() {
-            return None;
-        }
-        let waiting = self.waiting_for_room.get_mut(location)?;
-        let lane = waiting.pop_front();
-        if waiting.is_empty() {
-            self.waiting_for_room.remove(location);
-        }
-        lane
-    }
-
     /// Number of consecutive failures of this route, and the end of its backoff, if it is in
     /// backoff.
     pub(super) fn failing(&self, now: Instant, location: &Location) -> Option<(u32, Instant)> {
         let health = self.health.get(location)?;
         (health.retry_at > now).then_some((health.failures, health.retry_at))
-    }
-
-    /// A note was answered, or is no longer repeated. A report that was refused may not be believed
-    /// when it is repeated.
-    pub(crate) fn note_ended(&mut self, note: &Note) {
-        if note.is_report() {
-            self.open_reports.remove(&note.transfer());
-        }
-    }
-
-    /// Whether the end of this hand-over of a letter is being reported and not acknowledged yet.
-    pub(crate) fn is_reporting(&self, stream: Stream, sequence: u64, transfer: u64) -> bool {
-        self.open_reports.contains(&(stream, sequence, transfer))
-    }
-
-    /// Whether the end of any hand-over is being reported and not acknowledged yet.
-    pub(super) fn has_open_reports(&self) -> bool {
-        !self.open_reports.is_empty()
     }
 
     /// Records the time in which a service acknowledged a report.

@@ -556,10 +556,10 @@ impl Core {
         true
     }
 
-    /// Whether this lane has room for another letter.
-    pub(super) fn has_room(&self, lane: LaneId, len: usize) -> bool {
+    /// Whether another letter of this process can wait in this lane.
+    pub(super) fn holds_back(&self, now: Now, lane: LaneId, len: usize) -> bool {
         let lane = self.lanes.get(&lane);
-        lane.is_some_and(|lane| lane.has_room(len, &self.table))
+        lane.is_some_and(|lane| lane.holds_back(now.instant, len, &self.table))
     }
 
     /// Whether this lane has room for a letter whose sender cannot be held back.

@@ -15,6 +15,7 @@
 //! * `peers`: services in the configuration, and the state of contact with them.
 //! * `routes`: reports of the routes of letters, and counters of each route.
 //! * `attempts`: state that lanes share: attempts, health of routes, pending actions.
+//! * `notes`: reports, credits and predecessors, which are repeated or wait for room.
 //! * `notice`: notifications for watchers.
 //! * `passes`: visits of all lanes, in portions.
 //! * `waiting`: letters that wait for a refresh of the directory.
@@ -36,6 +37,7 @@ mod forward;
 mod inbox;
 mod lane;
 mod limits;
+mod notes;
 mod notice;
 mod passes;
 mod peers;
@@ -58,12 +60,11 @@ use fipa_acl::Letter;
 use fipa_sds::{Entry, Pattern, Resolution, Role, View};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
-    Introduction, Kind, Location, Outcome, Parcel, Principal, Report, Stream, TransportError,
-    TransportErrorKind, Verdict,
+    Introduction, Kind, Location, Outcome, Parcel, Principal, Report, Stream, Verdict,
 };
 
 pub use attempts::Action;
-use attempts::{AttemptTable, FailureTarget, Note, Origin, Purpose, Undelivered};
+use attempts::{AttemptTable, FailureTarget, Origin, Purpose, Undelivered};
 pub use config::{CoreConfig, MAX_DEADLINE};
 pub use failures::Undecodable;
 pub use forward::Unframed;
@@ -71,6 +72,7 @@ use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey, PauseEnd};
 use limits::{FailureLimit, SenderLimit};
+use notes::Note;
 pub use notice::{News, Notice};
 use passes::{Concern, Passes, Step};
 pub use reading::{LetterReader, ReadLetter};
@@ -123,8 +125,6 @@ pub struct Submission {
 /// Maximum number of lanes that one call visits for one cause. Peers can have tens of thousands of lanes kept, and
 /// the service is locked during a call.
 const LANES_AT_ONCE: usize = 16;
-/// Maximum number of notes that one call repeats or ends.
-const NOTES_AT_ONCE: usize = 64;
 
 /// Empty lanes are dropped when there are more lanes than this.
 const IDLE_LANES: usize = 1024;
@@ -145,7 +145,6 @@ pub struct Core {
     lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
-    notes: BinaryHeap<Reverse<LateNote>>,
     waiting: WaitingLetters,
     peers: Peers,
     principals: Principals,
@@ -177,43 +176,6 @@ impl fmt::Debug for Core {
     }
 }
 
-/// A scheduled action for a note.
-struct LateNote(Instant, Late);
-
-enum Late {
-    /// Send it again.
-    Again(Box<Note>),
-    /// Check whether it was acknowledged.
-    Check(AttemptId),
-}
-
-/// Maximum number of notes that are repeated until they are acknowledged. Further notes are sent
-/// once.
-const MAX_LATE_NOTES: usize = 65_536;
-/// Backoff before a note that was not acknowledged is sent again.
-const FIRST_NOTE_PAUSE: Duration = Duration::from_millis(20);
-const LONGEST_NOTE_PAUSE: Duration = Duration::from_secs(1);
-
-impl Ord for LateNote {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        self.0.cmp(&other.0)
-    }
-}
-
-impl PartialOrd for LateNote {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for LateNote {
-    fn eq(&self, other: &Self) -> bool {
-        self.0 == other.0
-    }
-}
-
-impl Eq for LateNote {}
-
 impl Core {
     /// Creates a core that looks up receivers in this view of the directory.
     #[must_use]
@@ -227,7 +189,6 @@ impl Core {
             lane_ids: Map::default(),
             agents: Map::default(),
             timers: BinaryHeap::new(),
-            notes: BinaryHeap::new(),
             waiting: WaitingLetters::default(),
             peers: Peers::default(),
             principals: Principals::default(),
@@ -555,7 +516,7 @@ impl Core {
             return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
         }
         let lane = self.lane(now, own_lane(sender, entry), name);
-        if !self.has_room(lane, letter.len()) {
+        if !self.holds_back(now, lane, letter.len()) {
             let reason = FailureReason::QueueFull;
             return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
         }
@@ -688,16 +649,7 @@ impl Core {
             lane.scheduled = Some(due);
             self.timers.push(Reverse((due, id)));
         }
-        while let Some(attempt) = self.table.repeated.pop_front() {
-            if let Some(Purpose::Note(note)) = self.table.attempts.get_mut(&attempt) {
-                note.sent = Some(now.instant);
-            }
-            if self.notes.len() < MAX_LATE_NOTES {
-                let due = now.instant + self.table.config.attempt_timeout;
-                self.notes
-                    .push(Reverse(LateNote(due, Late::Check(attempt))));
-            }
-        }
+        self.await_answers(now);
     }
 
     /// Returns the view of the directory in which receivers are looked up.
@@ -839,7 +791,11 @@ impl Core {
                 let is_reported = self.table.is_reporting(parcel.stream, sequence, transfer);
                 Verdict::Now(match answer {
                     Some(answer) => answer,
-                    None if is_reported => Answer::Accepted,
+                    None if is_reported => {
+                        self.table.repeat_reports(now.instant, &from.location);
+                        self.await_answers(now);
+                        Answer::Accepted
+                    }
                     None => Answer::Returned { uncertain: true },
                 })
             }
@@ -866,21 +822,24 @@ impl Core {
     pub fn handle_conclusion(&mut self, now: Now, attempt: AttemptId, conclusion: Conclusion) {
         match self.table.attempts.remove(&attempt) {
             Some(Purpose::Letter { lane: id, sequence }) => {
-                let mut route = None;
                 // An attempt that failed for lack of room has freed none; waking a waiting lane
                 // here would make it retry and fail, until the route counts as broken.
                 let made_room = !matches!(
                     &conclusion,
                     Conclusion::NotSent(error) if error.fault.waits_for_room()
                 );
+                let mut next = None;
                 self.with_lane(now, id, |lane, table| {
-                    if made_room && table.has_lanes_without_room() {
-                        route = lane.route_of(sequence).cloned();
+                    if made_room
+                        && table.notes.wait_for_room()
+                        && let Some(route) = lane.route_of(sequence).cloned()
+                    {
+                        // A note goes before the next letter of the lane.
+                        next = table.made_room(now.instant, &route);
                     }
                     lane.concluded(now.instant, sequence, attempt, conclusion, table);
                 });
-                // The attempt that ended has made room.
-                if let Some(id) = route.and_then(|route| self.table.room_for(&route)) {
+                if let Some(id) = next {
                     self.with_lane(now, id, |lane, table| {
                         lane.resume(now.instant, PauseEnd::Room, table);
                     });
@@ -895,62 +854,6 @@ impl Core {
             None => {}
         }
         self.send_failures(now);
-    }
-
-    fn note_concluded(&mut self, now: Now, note: Note, conclusion: Conclusion) {
-        // A refused note has changed nothing.
-        let arrived = matches!(
-            conclusion,
-            Conclusion::Answered(Answer::Accepted | Answer::Busy | Answer::Returned { .. })
-                | Conclusion::Handed
-        );
-        if arrived && let Some(sent) = note.sent {
-            let took = now.instant.saturating_duration_since(sent);
-            self.table.acknowledged(note.location.incarnation(), took);
-        }
-        let again = note.until.is_some_and(|until| now.instant < until);
-        let again = again && !arrived && self.notes.len() < MAX_LATE_NOTES;
-        if !again || matches!(conclusion, Conclusion::Answered(_)) {
-            self.table.note_ended(&note);
-        }
-        let is_busy = matches!(conclusion, Conclusion::Answered(Answer::Busy));
-        if note.parcel.body == Body::Predecessor && (is_busy || is_denied(&conclusion)) {
-            let Parcel {
-                stream,
-                sequence,
-                transfer,
-                ..
-            } = note.parcel;
-            if let Some(lane) = self.lane_of(stream, &note.parcel.receiver) {
-                let letter = (stream.receiver, sequence, transfer);
-                self.with_lane(now, lane, |lane, table| match is_busy {
-                    true => lane.custodian_busy(now.instant, letter),
-                    false => lane.custodian_denied(now.instant, letter, table),
-                });
-            }
-            return;
-        }
-        // Other lost notes are compensated by the pauses of the lanes that they are for.
-        if again {
-            let pause = FIRST_NOTE_PAUSE.saturating_mul(1 << note.tries.min(10));
-            let due = now.instant + pause.min(LONGEST_NOTE_PAUSE);
-            self.notes
-                .push(Reverse(LateNote(due, Late::Again(Box::new(note)))));
-        }
-    }
-
-    fn handle_late_note(&mut self, now: Now, late: Late) {
-        match late {
-            Late::Again(note) => self.table.note(*note),
-            Late::Check(attempt) => {
-                if let Some(Purpose::Note(note)) = self.table.attempts.remove(&attempt) {
-                    let location = note.location.clone();
-                    let error = TransportError::new(TransportErrorKind::TimedOut, "");
-                    self.table.abandon(location, attempt, error.clone());
-                    self.note_concluded(now, *note, Conclusion::Unconfirmed(error));
-                }
-            }
-        }
     }
 
     /// Handles a change of the directory, after [`set_view`](Self::set_view). Of many lanes, this call
@@ -1047,16 +950,7 @@ impl Core {
                 self.fail_unresolved(letter, FailureReason::TimedOut);
             }
         }
-        let mut notes = Vec::new();
-        let is_due =
-            |late: Option<&Reverse<LateNote>>| late.is_some_and(|it| it.0.0 <= now.instant);
-        while notes.len() < NOTES_AT_ONCE && is_due(self.notes.peek()) {
-            work::steps(1);
-            notes.extend(self.notes.pop());
-        }
-        for Reverse(LateNote(_, late)) in notes {
-            self.handle_late_note(now, late);
-        }
+        self.handle_note_timers(now);
         self.peers.handle_timeout(now.instant, &mut self.table);
         self.send_failures(now);
         self.forget_idle_lanes(now);
@@ -1113,6 +1007,8 @@ impl Core {
         if withdrawn.is_some() && withdrawn != self.principals.of_service(service) {
             self.table.withdrawn.remove(&service);
         }
+        self.table.repeat_reports(now.instant, &peer.hop.location);
+        self.await_answers(now);
         if service.is_known() {
             self.handle_reachable(now, Some(service));
         }
@@ -1168,13 +1064,8 @@ impl Core {
                 sender: Incarnation::UNKNOWN,
                 receiver: Incarnation::UNKNOWN,
             };
-            self.table.note(Note {
-                location,
-                parcel: attempts::note_parcel(no_stream, name, 0, Body::Credit),
-                tries: 0,
-                sent: None,
-                until: None,
-            });
+            let parcel = attempts::note_parcel(no_stream, name, 0, Body::Credit);
+            self.table.note(Note::once(location, parcel));
         }
     }
 
@@ -1217,7 +1108,7 @@ impl Core {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
-        let notes = self.notes.peek().map(|Reverse(late)| late.0);
+        let notes = self.table.notes.due();
         let others = earlier(self.peers.due(), self.passes.due());
         earlier(earlier(lanes, notes), earlier(others, self.waiting.due()))
     }
@@ -1262,15 +1153,6 @@ impl Core {
 /// Whether this service is at the location; `None` stands for all services.
 fn is_at(service: Option<Incarnation>, location: &Location) -> bool {
     service.is_none_or(|it| it == location.incarnation())
-}
-
-/// Whether the custodian answered that it does not have the letter, or is gone.
-fn is_denied(conclusion: &Conclusion) -> bool {
-    match conclusion {
-        Conclusion::Answered(Answer::Returned { .. }) => true,
-        Conclusion::NotSent(error) => error.fault == TransportErrorKind::WrongIncarnation,
-        _ => false,
-    }
 }
 
 /// Key of the lane for letters that this process sends to this receiver.

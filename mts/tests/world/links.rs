@@ -27,6 +27,10 @@ const SOCKET: usize = 16 << 10;
 /// Largest letter in a datagram.
 pub(super) const MAX_DATAGRAM: usize = 8 << 10;
 
+/// Number of unanswered parcels from one process to another at which shared memory refuses a letter, and another
+/// parcel.
+const PLACES: (usize, usize) = (8, 10);
+
 /// Number of parcels of one sender that shared memory answers later.
 const LATE_ANSWERS: usize = 3;
 
@@ -45,6 +49,7 @@ pub(super) struct Link {
 pub(super) struct Flight {
     /// Its target; `usize::MAX` for none.
     to: usize,
+    kind: Kind,
     /// Time at which its first byte leaves; `None` if none ever does.
     leaves: Option<Instant>,
     /// Its arrival event.
@@ -115,11 +120,17 @@ impl World {
         let target = target.filter(|target| self.processes[*target].alive);
         let flight = Flight {
             to: target.unwrap_or(usize::MAX),
+            kind,
             leaves: None,
             event: None,
             queued: None,
         };
+        let has_room = kind != Kind::Shm || self.has_places(at, flight.to, &parcel);
         self.processes[at].open.insert(attempt, flight);
+        if !has_room {
+            let conclusion = Conclusion::NotSent(error(TransportErrorKind::Congested));
+            return self.conclude_within(0, at, attempt, conclusion);
+        }
         let remote = target.is_some_and(|p| self.processes[p].host != host);
         let size = size_of(&parcel);
         if kind == Kind::Udp && size > MAX_DATAGRAM {
@@ -190,6 +201,17 @@ impl World {
         if let Some(flight) = self.processes[at].open.get_mut(&attempt) {
             flight.queued = Some(((at, to, kind), done));
         }
+    }
+
+    /// Whether shared memory has a place for this parcel.
+    fn has_places(&self, at: usize, to: usize, parcel: &Parcel) -> bool {
+        let open = self.processes[at].open.values();
+        let open = open.filter(|flight| flight.kind == Kind::Shm && flight.to == to);
+        open.count()
+            < match parcel.body {
+                Body::Letter(_) => PLACES.0,
+                _ => PLACES.1,
+            }
     }
 
     /// The times at which a parcel leaves its process, is transmitted, and arrives.

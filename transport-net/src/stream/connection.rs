@@ -19,7 +19,7 @@ use super::config::Limits;
 use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
-use crate::answer::Contradictions;
+use crate::answer::{self, Contradictions};
 use crate::end::ConnectionEnd;
 use crate::hello::Hello;
 
@@ -278,7 +278,8 @@ impl Connection {
             max_queued_bytes,
             ..
         } = self.limits;
-        if self.sent.len() >= max_in_flight.max(1) {
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        if self.sent.len() >= answer::places(max_in_flight, is_letter) {
             let detail = format!(
                 "{max_in_flight} parcels of this connection wait for their answer; the limit is max_in_flight"
             );
@@ -297,7 +298,7 @@ impl Connection {
         };
         let queued = self.outbox.parcel_bytes();
         let len: usize = pieces.iter().map(bytes::Bytes::len).sum();
-        if queued > 0 && queued.saturating_add(len) > max_queued_bytes {
+        if is_letter && queued > 0 && queued.saturating_add(len) > max_queued_bytes {
             let detail = format!(
                 "{queued} bytes of this connection wait to be sent; the limit is {max_queued_bytes} (max_queued_bytes)"
             );

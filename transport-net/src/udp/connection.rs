@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use bytes::{Bytes, BytesMut};
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Conclusion, Incarnation, Location, Parcel, TransportError,
+    Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Location, Parcel, TransportError,
     TransportErrorKind,
 };
 
@@ -266,14 +266,15 @@ impl Connection {
             max_queued_bytes,
             ..
         } = self.limits;
-        if self.sent.len() + self.waiting.len() >= max_in_flight.max(1) {
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        if self.sent.len() + self.waiting.len() >= answer::places(max_in_flight, is_letter) {
             let detail = format!(
                 "{max_in_flight} parcels of this connection wait for their answer; the limit is max_in_flight"
             );
             return Err(TransportError::new(TransportErrorKind::Congested, detail));
         }
         let queued = self.waiting_bytes;
-        if queued > 0 && queued.saturating_add(size) > max_queued_bytes {
+        if is_letter && queued > 0 && queued.saturating_add(size) > max_queued_bytes {
             let detail = format!(
                 "{queued} bytes of this connection wait to be sent; the limit is {max_queued_bytes} (max_queued_bytes)"
             );

@@ -230,6 +230,33 @@ pub fn the_first_parcels_arrive_in_order(fixture: &dyn Fixture) {
     }
 }
 
+/// When letters find no room, there is room for a parcel of another kind, which may make room for them.
+pub fn letters_leave_room_for_other_parcels(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
+    let mut attempt = 0;
+    let mut send = |body: Body| {
+        attempt += 1;
+        let sent = a
+            .transport
+            .dispatch(AttemptId(attempt), &b.location, parcel(attempt, body));
+        match sent {
+            Ok(()) => Some(attempt),
+            Err(error) => {
+                assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
+                None
+            }
+        }
+    };
+    for _ in 0..20 {
+        let letters: Vec<u64> = std::iter::from_fn(|| send(letter("x"))).collect();
+        let credit = send(Body::Credit).expect("there is room for a credit");
+        for attempt in letters {
+            is_accepted(&[&a, &b], &a, attempt);
+        }
+        assert_eq!(concluded(&[&a, &b], &a, credit), accepted());
+    }
+}
+
 /// Loaned memory arrives with the content that was written to it and stays readable for the sender.
 /// A letter that was loaned for one location can also go to another.
 pub fn loaned_content_arrives(fixture: &dyn Fixture) {

@@ -46,6 +46,10 @@ use super::routes::Tally;
 use super::rules;
 use super::work;
 
+/// A lane from which a letter has left within this time moves. It holds back this many times the letters of a lane
+/// that does not.
+const MOVES_WITHIN: Duration = Duration::from_secs(1);
+const HELD_BACK: usize = 4;
 /// Number of consecutive attempts without room that count as a failure of the route.
 const CONGESTED_TRIES: u32 = 25;
 /// Minimum expected throughput, which extends the timeout of large letters, and limits repetitions of their content.
@@ -124,6 +128,8 @@ pub(crate) struct Lane {
     pauses: u32,
     /// Whether a letter was settled since a credit last ended a pause.
     has_settled: bool,
+    /// Time at which a letter left the lane last.
+    settled: Option<Instant>,
     /// Whether the receiver's queue was full at its last answer.
     busy: bool,
     /// Time at which it was last full.
@@ -181,6 +187,7 @@ impl Lane {
             pause: None,
             pauses: 0,
             has_settled: true,
+            settled: None,
             busy: false,
             was_busy: None,
             busy_at: None,
@@ -246,6 +253,16 @@ impl Lane {
         let config = &table.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
+    }
+
+    /// Whether another letter of this process with this many bytes can wait in the lane. While letters leave the
+    /// lane, more of them wait than otherwise.
+    pub(crate) fn holds_back(&self, now: Instant, len: usize, table: &AttemptTable) -> bool {
+        let config = &table.config;
+        self.has_room(len, table)
+            || (self.letters.len() < config.lane.saturating_mul(HELD_BACK)
+                && self.bytes.saturating_add(len) <= config.lane_bytes
+                && self.settled.is_some_and(|at| now < at + MOVES_WITHIN))
     }
 
     /// Whether the letters in custody leave room for another one with this many bytes in this lane.
@@ -789,6 +806,7 @@ impl Lane {
             Settlement::Outcome(Outcome::Delivered { .. } | Outcome::Sent { .. })
         );
         self.has_settled = true;
+        self.settled = Some(now);
         if delivered || is_last {
             self.busy = false;
             self.pauses = 0;
@@ -808,16 +826,19 @@ impl Lane {
     }
 
     /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
-    /// failed at the sender's process.
+    /// failed at the sender's process. A gateway may hold a letter before it answers.
     fn send_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
         let Some(delivery) = self.letters.get(index) else {
             return;
         };
-        let State::Custody {
-            attempt, location, ..
-        } = &delivery.progress.state
-        else {
-            return;
+        let (attempt, location) = match &delivery.progress.state {
+            State::Custody {
+                attempt, location, ..
+            } => (attempt, location),
+            State::UnderWay {
+                attempt, location, ..
+            } if self.is_abroad => (attempt, location),
+            _ => return,
         };
         let after = self.after(index);
         if after < delivery.after {
