@@ -1,11 +1,10 @@
-//! The files of a domain: their creation, and cleanup after dead processes.
+//! The files of a domain: their creation, and [cleanup] after dead processes.
 //!
 //! After a process was killed, another one removes its mailbox and its side of every connection.
 //! That must wait until the living processes have taken its last letters: iceoryx2 0.10 does not
 //! release memory of requests that a receiver finds after their sender has been cleaned up. So the
 //! cleaning process first rings all doorbells and waits until every living process has polled.
 
-use std::collections::{HashMap, HashSet};
 use std::fs::DirEntry;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
@@ -16,10 +15,11 @@ use std::time::Duration;
 use fipa_transport::Incarnation;
 use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
-use iceoryx2::service::Service;
 use parking_lot::Mutex;
-use rustix::fs::{FlockOperation, Mode, OFlags, Stat, fchmod, fstat, lstat, open};
+use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, fstat, open};
 use rustix::io::Errno;
+
+mod cleanup;
 
 use crate::fork::Owner;
 use crate::layout::Svc;
@@ -318,7 +318,8 @@ impl DomainFiles {
         };
         let all = self.all()?.into_iter();
         let (alive, gone): (Vec<_>, Vec<_>) = all.partition(|one| self.paths.is_alive(*one));
-        self.paths.remove(&gone, || self.is_current(&lock));
+        self.paths
+            .remove(&gone, |path| self.remove_file(path, &lock));
         cleaned.alive = alive.len();
         if self.is_current(&lock) {
             cleaned.removed = gone.len();
@@ -392,168 +393,6 @@ impl DomainFiles {
         Ok(nodes)
     }
 
-    /// Removes empty files of processes that were killed between creating a file and extending it.
-    /// iceoryx2 0.10 waits without limit for such a file to grow. The caller must hold the lock,
-    /// under which no other process creates connections or services.
-    fn remove_empty_files(&self, nodes: &[NodeState<Svc>], lock: &OwnedFd) {
-        let prefix = self.prefix();
-        let mut ports = Vec::new();
-        for node in nodes {
-            let NodeState::Dead(dead) = node else {
-                continue;
-            };
-            let directory = self.config.root.join("nodes");
-            let tags = files_in(&directory.join(dead.id().value().to_string()));
-            ports.extend(tags.filter_map(|tag| self.id_of(&tag, ".port_tag")));
-        }
-        for file in shared_files() {
-            let name = file.file_name();
-            let name = name.to_string_lossy();
-            let is_empty = || file.metadata().is_ok_and(|metadata| metadata.len() == 0);
-            let nobody_makes_it = [".connection", ".dynamic", ".global_mgmt"]
-                .iter()
-                .any(|end| name.ends_with(end))
-                || ports.iter().any(|port| name.contains(port));
-            if name.starts_with(&prefix) && nobody_makes_it && is_empty() && self.is_current(lock) {
-                // A failed removal is retried by the next cleanup.
-                let _ = std::fs::remove_file(file.path());
-            }
-        }
-    }
-
-    /// Removes the nodes whose process was killed while it created or removed them: iceoryx2 takes
-    /// them for nodes that are being created, or for invalid ones. The caller must hold the lock,
-    /// under which no process creates a node. A process that removes its node tolerates the help.
-    fn remove_partial_nodes(&self, nodes: &[NodeState<Svc>], lock: &OwnedFd) {
-        let whole: HashSet<String> = nodes
-            .iter()
-            .filter_map(|node| match node {
-                NodeState::Alive(node) => Some(node.id().value().to_string()),
-                NodeState::Dead(node) => Some(node.id().value().to_string()),
-                _ => None,
-            })
-            .collect();
-        let prefix = self.prefix();
-        for file in files_in(&self.config.root.join("nodes")) {
-            let name = file.file_name();
-            let name = name.to_string_lossy();
-            // A directory is named by the number alone; the files that show whether the node is
-            // alive are named by prefix, number and suffix.
-            let id = name.strip_prefix(&prefix).unwrap_or(&name);
-            let id = id.split('.').next().unwrap_or_default();
-            if !id.is_empty() && id.bytes().all(|b| b.is_ascii_digit()) && !whole.contains(id) {
-                self.remove_node(id, lock);
-            }
-        }
-    }
-
-    /// Removes the services that no node claims to use. A process leaves one if it is killed
-    /// between creating a service and tagging it, or while it removes one. The caller must hold the
-    /// lock, under which no process creates a service.
-    ///
-    /// iceoryx2 0.10 also leaves one if the process that removes the last node from a service is
-    /// killed before it locks the service: a later process finds no node to remove, and so does not
-    /// consider itself the last one.
-    fn remove_untagged_services(&self, lock: &OwnedFd) {
-        // Without the complete list of used services, unused ones cannot be told apart.
-        let Ok(used) = self.tagged(".service_tag") else {
-            return;
-        };
-        let untagged: HashMap<String, PathBuf> = files_in(&self.services())
-            .filter_map(|file| Some((self.id_of(&file, ".service")?, file.path())))
-            .filter(|(service, _)| !used.contains(service))
-            .collect();
-        if untagged.is_empty() {
-            return;
-        }
-        // Only the service's own file names its shared memory, so it is removed last.
-        let mut ids = HashSet::new();
-        let listed = Svc::list(&self.ice, |service| {
-            let details = service.static_details;
-            if untagged.contains_key(details.service_hash().as_str()) {
-                ids.insert(details.unique_service_id().value().to_string());
-            }
-            match ids.len() < untagged.len() {
-                true => CallbackProgression::Continue,
-                false => CallbackProgression::Stop,
-            }
-        });
-        if listed.is_err() {
-            return;
-        }
-        let shared = shared_files().filter(|file| {
-            let id = self.id_of(file, ".dynamic");
-            id.is_some_and(|id| ids.contains(&id))
-        });
-        for file in shared.map(|file| file.path()).chain(untagged.into_values()) {
-            if self.is_current(lock) {
-                // A failed removal is retried by the next cleanup.
-                let _ = std::fs::remove_file(file);
-            }
-        }
-    }
-
-    /// Removes connections of ports that no process has. iceoryx2 0.10 leaves one if a
-    /// process is killed between creating its file and recording its own end: then neither end is
-    /// the last to close. The caller must hold the lock, under which no process creates a port. A
-    /// port is tagged before it connects, and as long as it exists.
-    ///
-    /// A living process that still has such a connection open keeps its memory and does not need
-    /// the file.
-    fn remove_orphaned_connections(&self, lock: &OwnedFd) {
-        // Without the complete list of ports, missing ones cannot be told apart.
-        let Ok(ports) = self.tagged(".port_tag") else {
-            return;
-        };
-        for file in shared_files() {
-            let name = file.file_name();
-            let name = name.to_string_lossy();
-            let ends = name
-                .strip_prefix(&self.prefix())
-                .and_then(|name| name.strip_suffix(".connection"))
-                .map(|name| name.rsplitn(3, '_'));
-            let Some(mut ends) = ends else {
-                continue;
-            };
-            if let (Some(receiver), Some(sender)) = (ends.next(), ends.next())
-                && [sender, receiver].iter().any(|port| !ports.contains(*port))
-                && self.is_current(lock)
-            {
-                // A failed removal is retried by the next cleanup.
-                let _ = std::fs::remove_file(file.path());
-            }
-        }
-    }
-
-    /// Identifiers in the tags with this suffix, of all nodes including dead ones.
-    fn tagged(&self, end: &str) -> std::io::Result<HashSet<String>> {
-        let mut tagged = HashSet::new();
-        for node in std::fs::read_dir(self.config.root.join("nodes"))? {
-            let node = node?;
-            if !node.file_type()?.is_dir() {
-                continue;
-            }
-            let tags = match std::fs::read_dir(node.path()) {
-                Ok(tags) => tags,
-                // The node was just removed.
-                Err(e) if e.kind() == std::io::ErrorKind::NotFound => continue,
-                Err(e) => return Err(e),
-            };
-            for tag in tags {
-                tagged.extend(self.id_of(&tag?, end));
-            }
-        }
-        Ok(tagged)
-    }
-
-    /// The identifier in the name of a file of this domain with this suffix.
-    fn id_of(&self, file: &DirEntry, end: &str) -> Option<String> {
-        let name = file.file_name();
-        let name = name.to_str()?.strip_prefix(&self.prefix())?;
-        let id = name.strip_suffix(end)?.rsplit('_').next()?;
-        Some(id.to_owned())
-    }
-
     /// The files by which other processes find a process with this mailbox.
     pub(crate) fn files_of(&self, process: Incarnation, service_hash: &str) -> Vec<PathBuf> {
         let service = format!("{}{service_hash}.service", self.prefix());
@@ -568,53 +407,6 @@ impl DomainFiles {
 
     fn services(&self) -> PathBuf {
         self.config.root.join("services")
-    }
-
-    /// Removes the files of a node.
-    fn remove_node(&self, id: &str, lock: &OwnedFd) {
-        if !self.is_current(lock) {
-            return;
-        }
-        let nodes = self.config.root.join("nodes");
-        let name = format!("{}{id}.", self.prefix());
-        remove_files(files_in(&nodes), &name);
-        remove_files(files_in(&nodes.join(id)), &self.prefix());
-        let _ = std::fs::remove_dir(nodes.join(id));
-    }
-
-    /// Removes all files with the domain's prefix, whatever secret follows it: processes may have been
-    /// killed after another program had removed the secret. The caller holds the lock, and no process
-    /// of the domain runs. Also removes what iceoryx2 leaves for the next process, and structures that
-    /// it cannot interpret after a process was killed.
-    fn remove_all(&self, lock: &OwnedFd) {
-        if !self.is_current(lock) {
-            return;
-        }
-        let prefix = format!("{}_", self.config.prefix);
-        remove_files(shared_files(), &prefix);
-        for directory in ["nodes", "services", "processes"] {
-            let directory = self.config.root.join(directory);
-            for node in files_in(&directory) {
-                remove_files(files_in(&node.path()), &prefix);
-                // Fails for a file, and for a directory with files of another prefix.
-                let _ = std::fs::remove_dir(node.path());
-            }
-            remove_files(files_in(&directory), &prefix);
-            let _ = std::fs::remove_dir(&directory);
-        }
-        secret::remove(&self.config.root);
-    }
-
-    /// Whether the lock is that of the directory. If another program has removed the directory, other
-    /// processes may have created it again, and the lock of the removed one says nothing about their
-    /// files. Checked before each removal.
-    fn is_current(&self, lock: &OwnedFd) -> bool {
-        let is_same = |(held, found): (Stat, Stat)| {
-            (held.st_dev, held.st_ino) == (found.st_dev, found.st_ino)
-        };
-        let found = fstat(lock).and_then(|held| Ok((held, lstat(&self.config.root)?)));
-        found.is_ok_and(is_same)
-            && Secret::read(&self.config.root).is_ok_and(|secret| secret == self.secret)
     }
 
     fn prefix(&self) -> String {
@@ -648,15 +440,6 @@ const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
 pub(crate) fn files_in(directory: &Path) -> impl Iterator<Item = DirEntry> + use<> {
     let files = std::fs::read_dir(directory);
     files.into_iter().flatten().flatten()
-}
-
-/// Removes the files with this prefix. A failed removal is retried by the next cleanup.
-fn remove_files(files: impl Iterator<Item = DirEntry>, prefix: &str) {
-    for file in files {
-        if file.file_name().to_string_lossy().starts_with(prefix) {
-            let _ = std::fs::remove_file(file.path());
-        }
-    }
 }
 
 impl Drop for DomainFiles {

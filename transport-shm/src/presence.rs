@@ -77,8 +77,8 @@ impl ProcessPaths {
         Path::new(SHM).join(format!("{}{of}.{number}.{CONTENT}", self.prefix))
     }
 
-    /// Removes the files of these processes, each after `may` has returned true for it.
-    pub(crate) fn remove(&self, of: &[Incarnation], may: impl Fn() -> bool) {
+    /// Passes the files of these processes to `remove`.
+    pub(crate) fn remove(&self, of: &[Incarnation], remove: impl Fn(&Path)) {
         if of.is_empty() {
             return;
         }
@@ -88,9 +88,8 @@ impl ProcessPaths {
             if let Some((owner, kind)) = name.to_str().and_then(|name| self.parse(name))
                 && kind.ends_with(CONTENT)
                 && of.contains(&owner)
-                && may()
             {
-                segment::remove(&file.path());
+                remove(&file.path());
             }
         }
         for one in of {
@@ -101,9 +100,7 @@ impl ProcessPaths {
                 self.doorbell(*one),
                 self.liveness_fifo(*one),
             ] {
-                if may() {
-                    let _ = std::fs::remove_file(path);
-                }
+                remove(&path);
             }
         }
     }
@@ -168,6 +165,14 @@ impl ProcessPaths {
     }
 }
 
+/// Removes a file of a process. An error is that it is missing, or a later cleanup removes it.
+pub(crate) fn remove_file(path: &Path) {
+    match path.extension().is_some_and(|end| end == CONTENT) {
+        true => segment::remove(path),
+        false => drop(std::fs::remove_file(path)),
+    }
+}
+
 /// The files of this process.
 #[derive(Debug)]
 pub(crate) struct Presence {
@@ -190,7 +195,7 @@ impl Presence {
         mknodat(CWD, paths.liveness_fifo(own), FileType::Fifo, PRIVATE, 0)?;
         let created = Self::create_files(&paths, own);
         if created.is_err() {
-            paths.remove(&[own], || true);
+            paths.remove(&[own], remove_file);
         }
         created
     }
@@ -255,7 +260,7 @@ const POLLS_PER_CLOCK_READ: usize = 16;
 impl Drop for Presence {
     fn drop(&mut self) {
         if self.owner.is_this() {
-            self.paths.remove(&[self.own], || true);
+            self.paths.remove(&[self.own], remove_file);
         }
     }
 }
