@@ -950,13 +950,25 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
         }
         let mut state = shared.lock();
         let now = state.clocks.now();
+        let mut left: Vec<Location> = Vec::new();
         for change in changes.iter().flat_map(Change::single) {
             match change {
                 Change::Left(entry) => state.core.handle_departure(now, entry),
                 Change::Changed { before, after } if before.incarnation != after.incarnation => {
                     state.core.handle_departure(now, before);
                 }
+                Change::Changed { before, after } if before.locations != after.locations => {
+                    left.extend(state.core.handle_relocation(before, after));
+                }
                 _ => {}
+            }
+        }
+        left.sort_unstable();
+        left.dedup();
+        // Before the letters are sent again.
+        for location in &left {
+            if let Some(transport) = shared.transport(location.kind()) {
+                transport.left(location);
             }
         }
         state.core.handle_directory_change(now);

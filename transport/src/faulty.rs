@@ -180,6 +180,10 @@ impl Transport for Faulty {
         self.inner.abandon(attempt, to)
     }
 
+    fn left(&self, location: &Location) {
+        self.inner.left(location);
+    }
+
     fn answer(&self, ticket: Ticket, answer: Answer) {
         self.inner.answer(ticket, answer);
     }

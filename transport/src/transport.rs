@@ -72,6 +72,13 @@ pub trait Transport: Send + Sync + 'static {
     /// ignored, because the peer may have disconnected.
     fn answer(&self, ticket: Ticket, answer: Answer);
 
+    /// The service at this location has announced other locations and no longer this one. A transport with
+    /// connections takes another one for later parcels to this service, unless the peer gives a sign of life on
+    /// the connection with this location.
+    fn left(&self, location: &Location) {
+        let _ = location;
+    }
+
     /// Performs pending work on the calling thread without blocking. Returns whether there was any.
     /// A caller that waits for a letter or an outcome may call this in a short loop before it
     /// sleeps, but need not.

@@ -189,6 +189,8 @@ pub(crate) struct AttemptTable {
     pub(crate) undelivered: VecDeque<Undelivered>,
     pub(super) notes: Notes,
     pub(crate) departed: Departed,
+    /// The latest locations that their services have left for others.
+    left: VecDeque<Location>,
     /// Services whose certificate is no longer trusted.
     pub(crate) withdrawn: Map<Incarnation, Principal>,
     /// Total bytes of the letters in all lanes.
@@ -217,6 +219,8 @@ struct Health {
 /// Backoff of a failed route.
 const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 const FIRST_PENALTY: Duration = Duration::from_millis(100);
+/// Maximum number of locations that are remembered after their services have left them.
+const MAX_LEFT: usize = 64;
 /// Maximum number of failed routes that are remembered.
 const MAX_HEALTH: usize = 4096;
 
@@ -236,6 +240,7 @@ impl AttemptTable {
             undelivered: VecDeque::new(),
             notes: Notes::default(),
             departed: Departed::default(),
+            left: VecDeque::new(),
             withdrawn: Map::default(),
             held: 0,
             held_for: Map::default(),
@@ -247,6 +252,20 @@ impl AttemptTable {
             refreshing: VecDeque::new(),
             refreshes: 0,
         }
+    }
+
+    /// Records a location that its service has left for another one.
+    pub(super) fn service_left(&mut self, location: &Location) {
+        self.left.retain(|other| other != location);
+        if self.left.len() >= MAX_LEFT {
+            self.left.pop_front();
+        }
+        self.left.push_back(location.clone());
+    }
+
+    /// Whether the service at this location has recently left it for another one.
+    pub(crate) fn has_left(&self, location: &Location) -> bool {
+        self.left.contains(location)
     }
 
     /// The reason for which a letter to an agent fails that the directory does not list. For a [lost

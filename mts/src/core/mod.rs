@@ -57,7 +57,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Entry, Pattern, Resolution, Role, View};
+use fipa_sds::{Entry, Pattern, Resolution, Role, Source, View};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
     Introduction, Kind, Location, Outcome, Parcel, Principal, Report, Stream, Verdict,
@@ -916,6 +916,33 @@ impl Core {
             self.table.departed.left(now.instant, entry);
             self.principals.left(entry);
         }
+    }
+
+    /// Handles another entry of the same registration. Must be called before
+    /// [`handle_directory_change`](Self::handle_directory_change), which then ends the attempts at the locations
+    /// that its service has left. Returns these locations, for [`left`](fipa_transport::Transport::left). The
+    /// announcement of a service with a certificate counts only if it comes from the service itself.
+    pub fn handle_relocation(&mut self, before: &Entry, after: &Entry) -> Vec<Location> {
+        let is_there = |service: Incarnation| {
+            let mut locations = after.locations.iter();
+            service.is_known() && locations.any(|it| it.incarnation() == service)
+        };
+        let is_proved = |service: Incarnation| {
+            let principal = self.principals.of_service(service);
+            matches!(principal, Some(Principal::Certificate(_)))
+        };
+        let left: Vec<Location> = before
+            .locations
+            .iter()
+            .filter(|it| !it.kind().is_host_local() && !after.locations.contains(it))
+            .filter(|it| is_there(it.incarnation()))
+            .filter(|it| after.source == Source::Exchange || !is_proved(it.incarnation()))
+            .cloned()
+            .collect();
+        for location in &left {
+            self.table.service_left(location);
+        }
+        left
     }
 
     /// Handles elapsed time; call it at the time that [`poll_timeout`](Self::poll_timeout) returns.

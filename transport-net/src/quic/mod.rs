@@ -132,6 +132,10 @@ impl Transport for QuicTransport {
         self.endpoint.abandon(attempt, to)
     }
 
+    fn left(&self, location: &Location) {
+        self.endpoint.service_left(location);
+    }
+
     fn answer(&self, ticket: Ticket, answer: Answer) {
         self.endpoint.answer(ticket, &answer);
     }

@@ -54,6 +54,9 @@ use crate::rate_limit::PeerRateLimits;
 /// service.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(1);
 
+/// The same when the service has announced that it is elsewhere.
+const LEFT_TIMEOUT: Duration = Duration::from_millis(200);
+
 /// Maximum number of silent connections that are pinged before an unproved peer is refused.
 const MAX_ASKED: usize = 4;
 
@@ -636,6 +639,25 @@ impl Endpoint {
         end(&all).unwrap_or(Abandoned::Unconfirmed)
     }
 
+    /// Puts the connections with this location in doubt, because the service has announced that it is elsewhere.
+    #[cfg(feature = "ip")]
+    pub(crate) fn service_left(&self, location: &Location) {
+        let home = location.authority().parse::<SocketAddr>().ok();
+        let home = home.map(|address| Source::Address(address).home());
+        let registry = self.registry.lock();
+        let known = registry.known.get(&location.incarnation());
+        let mut links: Vec<_> = known.into_iter().flatten().cloned().collect();
+        links.retain(|link| {
+            let peer = registry.peers.get(&link.number);
+            peer.is_some_and(|peer| Some(peer.home) == home)
+        });
+        links.extend(registry.dialled.get(location).cloned());
+        drop(registry);
+        for link in links {
+            link.left();
+        }
+    }
+
     /// Creates a link for an accepted connection. Returns `None` when the endpoint is closed.
     pub(crate) fn accepted(&self) -> Option<(Arc<Link>, Arc<dyn Sink>)> {
         let mut registry = self.registry.lock();
@@ -728,7 +750,7 @@ impl Endpoint {
             let now = Instant::now();
             asked.iter().for_each(|other| other.ask());
             for other in asked {
-                if other.answers(now, RESPONSE_TIMEOUT).await {
+                if other.answers(now, RESPONSE_TIMEOUT, LEFT_TIMEOUT).await {
                     return Err(self.refuse_beside(&other, from));
                 }
                 silent.push(other.number);

@@ -308,16 +308,21 @@ async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
     let Route::New(link, _) = endpoint.route_to(to).unwrap() else {
         panic!("there is a connection already");
     };
+    greets(&link, to.incarnation().as_u64());
+    link
+}
+
+/// The peer of a link says hello.
+fn greets(link: &Link, peer: u64) {
     link.connected(Instant::now());
     link.greeted_by(Hello {
-        identity: identity(to.incarnation().as_u64()),
+        identity: identity(peer),
         max_letter: 1 << 20,
         max_in_flight: 8,
         serial: 0,
         dialled: String::new(),
         listening: Vec::new(),
     });
-    link
 }
 
 #[tokio::test]
@@ -347,4 +352,44 @@ async fn letters_take_another_connection_when_one_is_suspect() {
     assert!(Arc::ptr_eq(&second, &used));
     second.doubt();
     assert!(matches!(endpoint.route_to(&to).unwrap(), Route::New(..)));
+}
+
+#[tokio::test]
+async fn letters_take_another_connection_after_their_peer_has_announced_another_address() {
+    let endpoint = endpoint(Limits::default());
+    let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
+    let moved: Location = "tcp://10.0.0.8:7788#0000000000000007".parse().unwrap();
+    let dialled = dials(&endpoint, &to).await;
+    let elsewhere = comes(None, 7, "10.0.0.9:1", 1, Y);
+    let (elsewhere, _) = enters(&endpoint, elsewhere).await.unwrap();
+    let came = comes(None, 8, "10.0.0.7:1", 1, X);
+    let (other_peer, _) = enters(&endpoint, came).await.unwrap();
+    for (link, peer) in [(&elsewhere, 7), (&other_peer, 8)] {
+        greets(link, peer);
+    }
+    endpoint.service_left(&to);
+    assert!(dialled.is_suspect());
+    assert!(!elsewhere.is_suspect());
+    assert!(!other_peer.is_suspect());
+    endpoint.service_left(&"tcp://10.0.0.9:7788#0000000000000007".parse().unwrap());
+    assert!(elsewhere.is_suspect());
+    assert!(!other_peer.is_suspect());
+    assert!(matches!(endpoint.route_to(&moved).unwrap(), Route::New(..)));
+}
+
+/// A peer that has announced another address is not waited for as long as others.
+#[tokio::test]
+async fn a_question_ends_early_after_its_peer_has_announced_another_address() {
+    let endpoint = endpoint(Limits::default());
+    let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
+    let link = dials(&endpoint, &to).await;
+    let asked = link.clone();
+    let long = Duration::from_secs(3600);
+    let answer =
+        tokio::spawn(async move { asked.answers(Instant::now(), long, Duration::ZERO).await });
+    tokio::task::yield_now().await;
+    endpoint.service_left(&to);
+    let watchdog = Duration::from_secs(30);
+    let answered = tokio::time::timeout(watchdog, answer).await;
+    assert!(!answered.expect("the question ends").unwrap());
 }

@@ -74,6 +74,8 @@ struct State {
     ending: Option<ConnectionEnd>,
     /// The last location for which the connection was used and confirmed or put in doubt.
     leads_to: Option<Location>,
+    /// Time at which the peer announced that it is no longer at the location of this connection.
+    left: Option<Instant>,
 }
 
 /// The result of a flush.
@@ -95,6 +97,7 @@ impl Link {
                 together: false,
                 ending: None,
                 leads_to: None,
+                left: None,
             }),
             wake: Notify::new(),
             received: Notify::new(),
@@ -204,6 +207,14 @@ impl Link {
         self.wake.notify_one();
     }
 
+    /// Puts the connection in doubt because the peer has announced that it is no longer at this location.
+    #[cfg(feature = "ip")]
+    pub(crate) fn left(&self) {
+        self.state.lock().left = Some(Instant::now());
+        self.doubt();
+        self.received.notify_waiters();
+    }
+
     /// Sends a ping to the peer.
     pub(crate) fn ask(&self) {
         let mut state = self.state.lock();
@@ -211,16 +222,28 @@ impl Link {
         self.flush(&mut state);
     }
 
-    /// Returns whether a byte of the peer arrives within `patience` after the ping at `asked`.
-    pub(crate) async fn answers(&self, asked: Instant, patience: Duration) -> bool {
-        let due = tokio::time::Instant::from_std(asked + patience);
+    /// Returns whether a byte of the peer arrives within `patience` after the ping at `asked`. After the peer has
+    /// announced that it is elsewhere, within `after_left`.
+    pub(crate) async fn answers(
+        &self,
+        asked: Instant,
+        patience: Duration,
+        after_left: Duration,
+    ) -> bool {
         loop {
             let received = self.received.notified();
             tokio::pin!(received);
             received.as_mut().enable();
-            if self.state.lock().connection.received_since(asked) {
-                return true;
-            }
+            let left = {
+                let state = self.state.lock();
+                if state.connection.received_since(asked) {
+                    return true;
+                }
+                state.left
+            };
+            let left = left.map(|left| left.max(asked) + after_left);
+            let due = left.map_or(asked + patience, |left| left.min(asked + patience));
+            let due = tokio::time::Instant::from_std(due);
             tokio::select! {
                 () = received => {}
                 () = self.over() => return false,

@@ -150,6 +150,10 @@ impl Transport for TcpTransport {
         self.endpoint.abandon(attempt, to)
     }
 
+    fn left(&self, location: &Location) {
+        self.endpoint.service_left(location);
+    }
+
     fn answer(&self, ticket: Ticket, answer: Answer) {
         self.endpoint.answer(ticket, &answer);
     }

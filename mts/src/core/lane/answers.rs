@@ -526,7 +526,10 @@ impl Lane {
         };
         let service = location.incarnation();
         let stands = |route: &Location| route.incarnation() == service;
-        if !service.is_known() || entry.locations.iter().any(stands) {
+        let is_there = entry.locations.iter().any(stands);
+        let has_left = || table.has_left(location) && !entry.locations.contains(location);
+        let is_under_way = matches!(delivery.progress.state, State::UnderWay { .. });
+        if !service.is_known() || (is_there && !(is_under_way && has_left())) {
             return;
         }
         match &mut delivery.progress.state {
@@ -537,7 +540,10 @@ impl Lane {
                 ..
             } => {
                 if !std::mem::replace(abandoned, true) {
-                    let text = "the service at this location was replaced";
+                    let text = match is_there {
+                        true => "the service has left this location",
+                        false => "the service at this location was replaced",
+                    };
                     let error = TransportError::new(TransportErrorKind::Broken, text);
                     table.abandon(location.clone(), *attempt, error);
                 }
