@@ -5,9 +5,6 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::sync::Arc;
-
-use fipa_transport::{Location, Principal};
 
 use crate::{Entry, Role};
 
@@ -28,30 +25,6 @@ pub(crate) fn charge(entry: &Entry) -> usize {
     };
     let texts = entry.name.len() + entry.agent_type.len() + entry.description.len();
     PER_ENTRY + texts + members
-}
-
-/// A peer that has one share, however many gateways or connections it has.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(crate) enum Peer {
-    /// The holder of the key of this certificate.
-    Certificate([u8; 32]),
-    /// A host without a proved identity, by its address without the port.
-    Host(Arc<str>),
-}
-
-impl Peer {
-    /// Returns the peer whose links prove this identity, and that is reached at these locations. The first
-    /// location is that of an open connection.
-    pub(crate) fn of(principal: Principal, locations: &[Location]) -> Self {
-        match principal {
-            Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
-            Principal::Host | Principal::Unproved => {
-                let address = locations.first().map_or("", Location::address);
-                let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
-                Self::Host(host.into())
-            }
-        }
-    }
 }
 
 /// Returns the level at which to cut these sizes so that they fit `total` together: a size up to the level
@@ -154,17 +127,5 @@ mod tests {
             [40, 10, 50]
         );
         assert_eq!(allowances(&[(1, 500)], 100, 1000), [100]);
-    }
-
-    #[test]
-    fn a_host_is_one_peer_at_all_its_ports() {
-        let at = |text: &str| vec![text.parse().unwrap()];
-        let of = |text: &str| Peer::of(Principal::Unproved, &at(text));
-        let one = of("tcp://192.0.2.1:7788#0000000000000001");
-        assert_eq!(one, of("udp://192.0.2.1:9#0000000000000002"));
-        assert_ne!(one, of("tcp://192.0.2.2:7788#0000000000000001"));
-        assert_eq!(of("tcp://[fe80::1%eth0]:1"), of("tcp://[fe80::1%eth0]:2"));
-        let certified = Peer::of(Principal::Certificate([7; 32]), &at("tcp://192.0.2.1:7788"));
-        assert_eq!(certified, Peer::Certificate([7; 32]));
     }
 }
