@@ -155,6 +155,8 @@ mod lock_slot;
 pub mod locks;
 mod owner;
 #[cfg(feature = "protocols")]
+mod peer_shares;
+#[cfg(feature = "protocols")]
 pub mod platform;
 #[cfg(any(feature = "protocols", feature = "net"))]
 mod presence;

@@ -242,6 +242,7 @@ fn remote_agents(count: usize) -> Vec<Arc<Entry>> {
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Exchange,
             reach: Reach::Local,
+            peer: fipa_transport::PeerId::THIS_HOST,
             role: Role::Agent,
         })
     };

@@ -144,6 +144,7 @@ fn view(of: Incarnation) -> View {
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,
             reach,
+            peer: fipa_transport::PeerId::THIS_HOST,
             role: Role::Agent,
         })
     });

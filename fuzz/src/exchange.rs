@@ -38,6 +38,7 @@ fn agent(name: &str, incarnation: u64, gateway: Incarnation) -> Arc<Entry> {
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Host,
         reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     })
 }

@@ -73,6 +73,7 @@ fn entry(input: &mut Input<'_>) -> Entry {
         registered: SystemTime::UNIX_EPOCH + input.time().min(Duration::from_secs(10_000)),
         source: Source::Mdns,
         reach: Reach::Remote { gateway },
+        peer: fipa_transport::PeerId::THIS_HOST,
         role,
     }
 }

@@ -87,6 +87,7 @@ fn entry(role: Role) -> Entry {
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Mdns,
         reach: Reach::Remote { gateway },
+        peer: fipa_transport::PeerId::THIS_HOST,
         role,
     }
 }

@@ -55,6 +55,7 @@ fn entry(name: &str, incarnation: Incarnation, at: &str) -> Entry {
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Host,
         reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     }
 }

@@ -65,6 +65,7 @@ fn entry(mts: &Mts, host: u64, agent: u64) -> Arc<Entry> {
         registered: UNIX_EPOCH + Duration::from_millis(host),
         source: Source::Host,
         reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     })
 }

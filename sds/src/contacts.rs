@@ -8,11 +8,10 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_transport::{Incarnation, Location, Principal};
+use fipa_transport::{Incarnation, Location, PeerId, Principal};
 use parking_lot::Mutex;
 
 use crate::entry::{millis_of_time, time_of_millis};
-use crate::shares::Peer;
 use crate::table::Table;
 use crate::{Directory, Entry, EntryError, Mts, Reach, Role, Source, Subscriber};
 
@@ -59,6 +58,7 @@ impl ContactDirectory {
         location: Location,
     ) -> Result<bool, EntryError> {
         let gateway = location.incarnation();
+        let peer = PeerId::of(Principal::Unproved, std::slice::from_ref(&location));
         let entry = Entry {
             name: name.into(),
             agent_type: String::new(),
@@ -69,6 +69,7 @@ impl ContactDirectory {
             registered: time_of_millis(millis_of_time(SystemTime::now())),
             source: Source::Contact,
             reach: Reach::Remote { gateway },
+            peer,
             role: Role::Agent,
         };
         entry.check()?;
@@ -128,8 +129,8 @@ impl ContactDirectory {
 fn to_evict(contacts: &[(Arc<Entry>, Instant)]) -> Option<usize> {
     let hosts = contacts
         .iter()
-        .map(|(entry, _)| Peer::of(Principal::Unproved, &entry.locations));
-    let mut of_host: HashMap<Peer, (usize, usize)> = HashMap::new();
+        .map(|(entry, _)| PeerId::of(Principal::Unproved, &entry.locations));
+    let mut of_host: HashMap<PeerId, (usize, usize)> = HashMap::new();
     for (index, host) in hosts.enumerate() {
         let (count, _) = of_host.entry(host).or_insert((0, index));
         *count += 1;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, PeerId};
 use serde::{Deserialize, Serialize};
 
 use crate::{Members, NameError, check_name, reserved_for};
@@ -32,6 +32,8 @@ pub struct Entry {
     pub source: Source,
     /// Whether the agent is on this host.
     pub reach: Reach,
+    /// The party that announced it, which has one share of each bound.
+    pub peer: PeerId,
     /// Role: agent, gateway or coalition.
     pub role: Role,
 }
@@ -269,6 +271,7 @@ impl Registration {
             registered: time_of_millis(millis_of_time(self.registered)),
             source,
             reach: Reach::Local,
+            peer: PeerId::THIS_HOST,
             role: self.role,
         };
         entry.check()?;

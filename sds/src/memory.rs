@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use fipa_transport::{Incarnation, Location, Signature};
+use fipa_transport::{Incarnation, Location, PeerId, Principal, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
@@ -78,6 +78,7 @@ impl StaticDirectory {
             } else {
                 Role::Agent
             };
+            let peer = PeerId::of(Principal::Unproved, &locations);
             let entry = Entry {
                 name: name.clone(),
                 agent_type: String::new(),
@@ -90,6 +91,7 @@ impl StaticDirectory {
                 reach: Reach::Remote {
                     gateway: Incarnation::UNKNOWN,
                 },
+                peer,
                 role,
             };
             entry.check()?;

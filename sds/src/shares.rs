@@ -5,10 +5,6 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::net::IpAddr;
-use std::sync::Arc;
-
-use fipa_transport::{Location, Principal};
 
 use crate::{Entry, Role};
 
@@ -29,34 +25,6 @@ pub(crate) fn charge(entry: &Entry) -> usize {
     };
     let texts = entry.name.len() + entry.agent_type.len() + entry.description.len();
     PER_ENTRY + texts + members
-}
-
-/// A peer that has one share, however many gateways or connections it has.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(crate) enum Peer {
-    /// The holder of the key of this certificate.
-    Certificate([u8; 32]),
-    /// A host without a proved identity, by its [address](fipa_transport::quota_address).
-    Address(IpAddr),
-    /// A host whose location has another address, without the port.
-    Host(Arc<str>),
-}
-
-impl Peer {
-    /// Returns the peer whose links prove this identity, and that is reached at these locations. The first
-    /// location is that of an open connection.
-    pub(crate) fn of(principal: Principal, locations: &[Location]) -> Self {
-        match principal {
-            Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
-            Principal::Host | Principal::Unproved => {
-                let first = locations.first();
-                match first.and_then(Location::quota_address) {
-                    Some(address) => Self::Address(address),
-                    None => Self::Host(first.map_or("", Location::host).into()),
-                }
-            }
-        }
-    }
 }
 
 /// Returns the level at which to cut these sizes so that they fit `total` together: a size up to the level
@@ -159,35 +127,5 @@ mod tests {
             [40, 10, 50]
         );
         assert_eq!(allowances(&[(1, 500)], 100, 1000), [100]);
-    }
-
-    #[test]
-    fn a_host_is_one_peer_at_all_its_ports() {
-        let at = |text: &str| vec![text.parse().unwrap()];
-        let of = |text: &str| Peer::of(Principal::Unproved, &at(text));
-        let one = of("tcp://192.0.2.1:7788#0000000000000001");
-        assert_eq!(one, of("udp://192.0.2.1:9#0000000000000002"));
-        assert_ne!(one, of("tcp://192.0.2.2:7788#0000000000000001"));
-        assert_eq!(of("tcp://[fe80::1%2]:1"), of("tcp://[fe80::1%2]:2"));
-        assert_ne!(of("tcp://[fe80::1%2]:1"), of("tcp://[fe80::1%3]:1"));
-        assert_ne!(of("tcp://[fe80::1%2]:1"), of("tcp://[fe80::2%2]:1"));
-        assert_eq!(of("http://host:1/acc"), of("tcp://host:2"));
-    }
-
-    #[test]
-    fn an_ipv6_network_is_one_peer() {
-        let of = |text: &str| Peer::of(Principal::Unproved, &[text.parse().unwrap()]);
-        let one = of("tcp://[2001:db8::1]:7788");
-        assert_eq!(one, of("quic://[2001:db8::ffff:2]:9"));
-        assert_eq!(one, of("http://[2001:db8::3]:9/acc"));
-        assert_ne!(one, of("tcp://[2001:db8:0:1::1]:7788"));
-        assert_eq!(of("tcp://[::ffff:192.0.2.1]:1"), of("tcp://192.0.2.1:2"));
-    }
-
-    #[test]
-    fn a_certificate_is_one_peer_at_all_addresses() {
-        let at = ["tcp://192.0.2.1:7788".parse().unwrap()];
-        let certified = Peer::of(Principal::Certificate([7; 32]), &at);
-        assert_eq!(certified, Peer::Certificate([7; 32]));
     }
 }

@@ -12,7 +12,7 @@ use fipa_sds::{
     Change, ContactDirectory, Directory, Entry, Exchange, ExchangeError, MergedDirectory, Mts,
     OwnDfEntry, Present, Reach, Role, Source,
 };
-use fipa_transport::{Incarnation, Location, Mandate, Principal};
+use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 
 /// Time for which the simulated service tries to deliver a letter.
 const DEADLINE: Duration = Duration::from_secs(5);
@@ -125,6 +125,7 @@ impl World {
             registered: UNIX_EPOCH + Duration::from_millis(self.clocks[index] + self.next),
             source: Source::Host,
             reach: Reach::Local,
+            peer: PeerId::THIS_HOST,
             role: Role::Agent,
         };
         let gateway = &mut self.gateways[index];
@@ -294,6 +295,7 @@ impl World {
                 && known.iter().zip(expected.values()).all(|(known, entries)| {
                     entries.iter().any(|entry| {
                         let owner = usize::try_from(entry.mts.incarnation.as_u64() - 1).unwrap();
+                        let (principal, at) = (self.proofs[owner].1, [location(owner)]);
                         **known
                             == Entry {
                                 locations: vec![location(owner)],
@@ -301,6 +303,7 @@ impl World {
                                 reach: Reach::Remote {
                                     gateway: entry.mts.incarnation,
                                 },
+                                peer: PeerId::of(principal, &at),
                                 ..Entry::clone(entry)
                             }
                     })

@@ -593,6 +593,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         registered: std::time::UNIX_EPOCH,
         source: Source::Mdns,
         reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     };
     let denied = here.publish_remote(&[Arc::new(entry.clone())], &[]);
@@ -864,6 +865,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         registered: std::time::UNIX_EPOCH,
         source: Source::Contact,
         reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     };
     gateway.publish_remote(&[Arc::new(contact)], &[]).unwrap();
@@ -919,6 +921,7 @@ fn remote(gateway: u64, number: u64, description: &str) -> Arc<Entry> {
         registered: std::time::UNIX_EPOCH,
         source: Source::Exchange,
         reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     })
 }

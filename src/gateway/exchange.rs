@@ -579,6 +579,7 @@ mod tests {
             registered: SystemTime::UNIX_EPOCH,
             source: fipa_sds::Source::Exchange,
             reach: fipa_sds::Reach::Remote { gateway },
+            peer: fipa_transport::PeerId::THIS_HOST,
             role: fipa_sds::Role::Agent,
         })
     }

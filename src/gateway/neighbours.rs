@@ -17,7 +17,7 @@ use fipa_sds::{
     Role, Source, Subscriber, View as DirectoryView, Watch,
 };
 use fipa_transport::{
-    Incarnation, Introduction, Location, Mandate, Principal, TransportErrorKind, log_limit,
+    Incarnation, Introduction, Location, Mandate, PeerId, Principal, TransportErrorKind, log_limit,
 };
 use parking_lot::Mutex;
 use tokio::sync::Notify;
@@ -302,6 +302,7 @@ impl State {
             reach: Reach::Remote {
                 gateway: incarnation,
             },
+            peer: PeerId::of(peer.hop.principal, std::slice::from_ref(&peer.hop.location)),
             role: Role::Gateway,
         };
         let mut neighbour = before.cloned().unwrap_or_else(|| Neighbour {

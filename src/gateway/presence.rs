@@ -314,6 +314,7 @@ impl GatewayAgent {
             registered: agent.registered,
             source: Source::Contact,
             reach: Reach::Remote { gateway },
+            peer: agent.peer.clone(),
             role: Role::Gateway,
         }))
     }

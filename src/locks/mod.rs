@@ -39,6 +39,7 @@
 
 mod clock;
 mod error;
+mod greetings;
 mod lock;
 mod message;
 mod owned;

@@ -6,7 +6,7 @@
 use std::any::Any;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape};
 use fipa_locking::{
@@ -20,6 +20,7 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
 use super::clock::{Timer, millis, now};
+use super::greetings::Greetings;
 use super::owned::{Holding, OwnerEvent};
 use super::{LockError, LockOptions, report};
 use crate::DirectoryView;
@@ -105,8 +106,8 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         changes: Some(endpoint.domain.directory().watch()),
         partners: PartnerWatch::new(Arc::clone(core)),
         watched: HashSet::new(),
-        greeted: HashSet::new(),
-        legacy_peers: legacy_peers.then(HashSet::new),
+        greetings: Greetings::new(Instant::now()),
+        greets_legacy_peers: legacy_peers,
         core: Arc::clone(core),
         shared: Arc::clone(&shared),
         timer,
@@ -476,10 +477,8 @@ struct Task {
     partners: PartnerWatch,
     /// The members that `partners` watches.
     watched: HashSet<Peer>,
-    /// The registrations that were asked whether they use locks.
-    greeted: HashSet<Incarnation>,
-    /// The names of legacy peers that were asked, if they are asked.
-    legacy_peers: Option<HashSet<Arc<str>>>,
+    greetings: Greetings,
+    greets_legacy_peers: bool,
     timer: Timer,
 }
 
@@ -514,6 +513,7 @@ impl Task {
                 }
             }
             self.timer.set(armed)?;
+            let greets = self.greetings.poll_timeout();
             let (core, changes) = (&self.core, self.changes.as_mut());
             tokio::select! {
                 received = core.demultiplexer.next_served(&core.endpoint, &self.messages) => {
@@ -539,6 +539,7 @@ impl Task {
                     None => self.changes = None,
                 },
                 () = self.shared.changed.notified() => {}
+                () = until(greets) => self.greet_due(),
             }
         }
     }
@@ -649,56 +650,83 @@ impl Task {
                 Change::Joined(entry) => self.greet(entry),
                 Change::Changed { before, after } => {
                     if before.incarnation != after.incarnation {
-                        self.greeted.remove(&before.incarnation);
+                        self.left(before);
                     }
                     self.greet(after);
                 }
-                Change::Left(entry) => {
-                    self.greeted.remove(&entry.incarnation);
-                    if let (Some(legacy), false) =
-                        (&mut self.legacy_peers, entry.incarnation.is_known())
-                    {
-                        legacy.remove(&entry.name);
-                    }
-                }
+                Change::Left(entry) => self.left(entry),
                 _ => self.greet_all(),
             }
         }
     }
 
+    /// Greets the agents in the directory that were not greeted, and forgets those that are not in it.
     fn greet_all(&mut self) {
-        for entry in self.core.endpoint.domain.directory().entries().iter() {
+        let entries = self.core.endpoint.domain.directory().entries();
+        let present: HashSet<Peer> = entries.iter().filter_map(|it| peer_of(it)).collect();
+        self.greetings.retain(|agent| present.contains(agent));
+        for entry in entries.iter() {
             self.greet(entry);
         }
     }
 
-    /// Asks an agent for a sign of life. One that uses locks answers, and becomes a member.
+    /// Asks an agent for a sign of life, or has it wait. One that uses locks answers, and becomes a member.
     fn greet(&mut self, entry: &Entry) {
-        let endpoint = &self.core.endpoint;
         let may_use_locks = entry.role == Role::Agent
             && !entry.is_platform_agent()
-            && entry.incarnation != endpoint.incarnation;
-        let is_first = may_use_locks
-            && match (entry.incarnation.is_known(), &mut self.legacy_peers) {
-                (true, _) => self.greeted.insert(entry.incarnation),
-                (false, Some(legacy)) => legacy.insert(Arc::clone(&entry.name)),
-                (false, None) => false,
-            };
-        if !is_first {
-            return;
+            && entry.incarnation != self.core.endpoint.incarnation
+            && (entry.incarnation.is_known() || self.greets_legacy_peers);
+        if may_use_locks
+            && let Some(agent) = peer_of(entry)
+            && self
+                .greetings
+                .announced(Instant::now(), &entry.peer, &agent)
+        {
+            self.ask(agent);
         }
-        let Ok(peer) = Peer::new(&entry.name, entry.incarnation.as_u64()) else {
-            return;
-        };
-        let prefix = format!("{}_probe", endpoint.name);
+    }
+
+    fn left(&mut self, entry: &Entry) {
+        if let Some(agent) = peer_of(entry) {
+            self.greetings.left(&agent);
+        }
+    }
+
+    /// Greets the agents that have waited.
+    fn greet_due(&mut self) {
+        let now = Instant::now();
+        for agent in self.greetings.due(now) {
+            self.ask(agent);
+        }
+        if self.greetings.reads_again(now) {
+            self.greet_all();
+        }
+    }
+
+    /// Asks an agent for a sign of life.
+    fn ask(&self, agent: Peer) {
+        let prefix = format!("{}_probe", self.core.endpoint.name);
         let message = LockMessage {
             conversation: Conversation::new(prefix.into(), now()),
             dialect: Dialect::Own,
             content: Content::Probe,
         };
         self.shared.act(&self.core, |_, _, actions| {
-            actions.push(Action::Send { to: peer, message });
+            actions.push(Action::Send { to: agent, message });
         });
+    }
+}
+
+/// Returns an agent in its registration, which is unknown for a legacy peer.
+fn peer_of(entry: &Entry) -> Option<Peer> {
+    Peer::new(&entry.name, entry.incarnation.as_u64()).ok()
+}
+
+/// Waits until this time, without end if there is none.
+async fn until(time: Option<Instant>) {
+    match time {
+        Some(time) => tokio::time::sleep_until(time.into()).await,
+        None => std::future::pending().await,
     }
 }
 

@@ -370,6 +370,7 @@ mod tests {
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,
             reach,
+            peer: fipa_transport::PeerId::THIS_HOST,
             role: Role::Agent,
         })
     }

@@ -6,6 +6,7 @@ mod counter;
 #[path = "../../examples/lock.rs"]
 #[allow(dead_code, reason = "the test does not call `main`")]
 mod example;
+mod greetings;
 mod hosts;
 mod legacy;
 #[path = "../support/mod.rs"]

@@ -5,6 +5,7 @@
 //! * [`Outcome`] is the final result of a letter, one per receiver.
 //! * [`wire`] is the fixed layout of a parcel in mailboxes and network frames.
 //! * [`OwnerProcess`] tells a process from a forked child.
+//! * [`PeerId`] names the party that has one share of a bound.
 //! * [`TokenBucket`] limits the rate of a peer or a sender.
 //! * [`log_limit`] limits the rate of log lines.
 //! * `conformance` (feature of that name) is the suite that every implementation passes.
@@ -22,6 +23,7 @@ pub mod log_limit;
 mod outcome;
 mod owner;
 mod parcel;
+mod peer_id;
 mod quota_address;
 mod token_bucket;
 mod transport;
@@ -33,6 +35,7 @@ pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
+pub use peer_id::PeerId;
 pub use quota_address::{quota_address, scoped_quota_address};
 pub use token_bucket::TokenBucket;
 pub use transport::{

@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::{AgentId, Dialect, ErrorChain, Letter};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
 use fipa_transport::{
-    FailureReason, Incarnation, Kind, LegacySource, Location, Signature, Stream, log_limit,
+    FailureReason, Incarnation, Kind, LegacySource, Location, PeerId, Signature, Stream, log_limit,
     quota_address,
 };
 
@@ -271,6 +271,7 @@ fn stated_entry(agent: &AgentId, from: LegacySource) -> Option<Arc<Entry>> {
         reach: Reach::Remote {
             gateway: Incarnation::UNKNOWN,
         },
+        peer: PeerId::of_ip(from.address),
         role: Role::Agent,
     };
     entry.check().is_ok().then(|| Arc::new(entry))

@@ -184,6 +184,7 @@ impl View {
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,
             reach,
+            peer: fipa_transport::PeerId::THIS_HOST,
             role: registered.role.clone(),
         });
         registry.seen.insert(key, (reached, Arc::clone(&entry)));

@@ -4,13 +4,13 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
-use fipa_transport::{Incarnation, Location, Mandate, Principal};
+use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::Agents;
 use super::df::{DfEntries, DfEntry, ReceivedDf};
-use crate::shares::{self, Peer};
+use crate::shares;
 use crate::table::Table;
 use crate::{Directory, Entry, Role, Subscriber, View};
 
@@ -62,7 +62,7 @@ type Update = (Origin, Arc<str>, Option<Arc<Entry>>);
 pub(super) struct Sender {
     pub(super) gateway: Incarnation,
     pub(super) principal: Principal,
-    pub(super) peer: Peer,
+    pub(super) peer: PeerId,
 }
 
 /// The agents of one gateway. Its [share](shares) bounds them.
@@ -124,7 +124,7 @@ fn is_listed(lists: &HashMap<Incarnation, AgentList>, gateway: Incarnation, name
 
 /// Returns the bytes that each list may take.
 fn allowances<'a>(
-    lists: impl IntoIterator<Item = (&'a Incarnation, (&'a Peer, usize))>,
+    lists: impl IntoIterator<Item = (&'a Incarnation, (&'a PeerId, usize))>,
 ) -> HashMap<Incarnation, usize> {
     let (gateways, sizes): (Vec<Incarnation>, Vec<_>) = lists.into_iter().unzip();
     let allowed = shares::allowances(&sizes, shares::MAX_OF_PEER, shares::MAX_TOTAL);
@@ -331,6 +331,7 @@ impl ExchangeDirectory {
         for (name, entry) in &mut list.agents {
             *entry = Arc::new(Entry {
                 locations: locations.to_vec(),
+                peer: sender.peer.clone(),
                 ..Entry::clone(entry)
             });
             updates.push((origin, Arc::clone(name), Some(Arc::clone(entry))));

@@ -31,7 +31,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{ErrorChain, escape};
-use fipa_transport::{Incarnation, Location, Mandate, Principal, log_limit};
+use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal, log_limit};
 
 use df::DfEntries;
 pub use df::{DfEntry, OwnDfEntry};
@@ -40,7 +40,7 @@ use directory::{AgentList, Sender};
 use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
-use crate::shares::{self, Peer};
+use crate::shares;
 use crate::{Directory as _, Entry, Mts, Reach, Role, Source};
 
 /// Ontology of the letters of the exchange.
@@ -69,7 +69,7 @@ pub struct Exchange {
 #[derive(Debug)]
 struct LostGateway {
     mts: Mts,
-    peer: Peer,
+    peer: PeerId,
     agents: Vec<Arc<Entry>>,
     /// Time at which they are forgotten.
     until: Instant,
@@ -370,7 +370,7 @@ impl Exchange {
                 }
                 continue;
             }
-            let peer = Peer::of(*principal, locations);
+            let peer = PeerId::of(*principal, locations);
             if !mts.incarnation.is_known() || !self.make_room(&peer) {
                 continue;
             }
@@ -390,11 +390,11 @@ impl Exchange {
 
     /// Makes room for another neighbor of this peer: ends one of the peer with most neighbors if there are
     /// too many. Returns whether there is room.
-    fn make_room(&mut self, peer: &Peer) -> bool {
+    fn make_room(&mut self, peer: &PeerId) -> bool {
         if self.neighbors.len() < Self::MAX_NEIGHBOURS {
             return true;
         }
-        let mut neighbors: HashMap<Peer, Vec<Incarnation>> = HashMap::new();
+        let mut neighbors: HashMap<PeerId, Vec<Incarnation>> = HashMap::new();
         for neighbor in self.neighbors.values() {
             let of_peer = neighbors.entry(neighbor.sender().peer).or_default();
             of_peer.push(neighbor.mts.incarnation);
@@ -1009,7 +1009,7 @@ impl Neighbor {
         Sender {
             gateway: self.mts.incarnation,
             principal: self.principal,
-            peer: Peer::of(self.principal, &self.locations),
+            peer: PeerId::of(self.principal, &self.locations),
         }
     }
 
@@ -1112,6 +1112,7 @@ impl Neighbor {
             reach: Reach::Remote {
                 gateway: self.mts.incarnation,
             },
+            peer: PeerId::of(self.principal, &self.locations),
             role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {

@@ -14,7 +14,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, PeerId};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{millis_of_time, time_of_millis};
@@ -132,6 +132,7 @@ impl WrittenEntry {
             registered: time_of_millis(self.registered),
             source: Source::Host,
             reach: Reach::Local,
+            peer: PeerId::THIS_HOST,
             role: self.role,
         };
         match entry.check() {

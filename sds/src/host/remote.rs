@@ -8,7 +8,7 @@
 //! The first line is a header in JSON, with the gateway and the locations that most agents have:
 //!
 //! ```json
-//! {"format":"fipa-remote","version":1,"gateway":{"name":"arm-mts","incarnation":"00ab…"},
+//! {"format":"fipa-remote","version":2,"gateway":{"name":"arm-mts","incarnation":"00ab…"},
 //!  "locations":["shm://…#00ab…"]}
 //! ```
 //!
@@ -36,7 +36,7 @@ use std::os::unix::fs::FileExt;
 use std::sync::Arc;
 
 use fipa_acl::{ErrorChain, escape};
-use fipa_transport::{Incarnation, Location, log_limit};
+use fipa_transport::{Incarnation, Location, PeerId, log_limit};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{millis_of_time, time_of_millis};
@@ -44,7 +44,7 @@ use crate::view::KeptEntries;
 use crate::{Entry, EntryError, MAX_NAME, Mts, Reach, Role, Source, View, shares};
 
 const FORMAT: &str = "fipa-remote";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Largest file, in bytes. The exchange, mDNS and contacts bound their agents to less.
 pub(super) const MAX_SIZE: usize = 64 * 1024 * 1024;
@@ -89,6 +89,7 @@ struct Fields {
     description: String,
     registered: u64,
     source: Source,
+    peer: PeerId,
     role: Role,
 }
 
@@ -182,6 +183,7 @@ fn record(entry: &Entry, flags: u8, locations: &[Location]) -> Option<Vec<u8>> {
         description: entry.description.clone(),
         registered: millis_of_time(entry.registered),
         source: entry.source,
+        peer: entry.peer.clone(),
         role: entry.role.clone(),
     };
     let fields = serde_json::to_vec(&fields).ok()?;
@@ -397,6 +399,7 @@ impl<F: ReadAt> RemoteAgents<F> {
                 reach: Reach::Remote {
                     gateway: self.gateway,
                 },
+                peer: fields.peer,
                 role: fields.role,
             };
             entry.check()?;
@@ -693,6 +696,7 @@ mod tests {
             reach: Reach::Remote {
                 gateway: Incarnation::from_u64(1),
             },
+            peer: PeerId::of_ip(std::net::Ipv4Addr::from(gateway as u32).into()),
             role: Role::Agent,
         })
     }

@@ -98,6 +98,8 @@ pub(super) struct Origin {
 pub(super) struct Found {
     pub(super) fullname: Arc<str>,
     pub(super) properties: Properties,
+    /// The address that introduced it.
+    pub(super) from: IpAddr,
     /// The interfaces on which it was received, the latest first.
     pub(super) interfaces: Vec<u32>,
 }
@@ -306,6 +308,7 @@ impl Browser {
                 received.found.push(Found {
                     fullname: Arc::clone(&known.fullname),
                     properties: news,
+                    from: known.from,
                     interfaces: known.interfaces.clone(),
                 });
             }

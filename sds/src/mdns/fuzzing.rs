@@ -6,7 +6,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, PeerId};
 
 use super::beacon::{self, Beacons};
 use super::browse::{Browser, Found, Origin, label_of};
@@ -71,6 +71,7 @@ impl Listener {
             let Found {
                 fullname,
                 properties,
+                from,
                 interfaces,
             } = found;
             self.found.insert(fullname.to_string());
@@ -89,7 +90,12 @@ impl Listener {
                 survives(&entry, at);
             }
             let locations = record::on_interfaces(entry.locations.clone(), &interfaces);
-            let entry = Entry { locations, ..entry };
+            let peer = PeerId::of_ip(from);
+            let entry = Entry {
+                locations,
+                peer,
+                ..entry
+            };
             self.browser.belongs(&fullname, entry.mts.incarnation);
             self.peer_records.put(now, &fullname, Some(&entry));
             let _ = self

@@ -215,6 +215,7 @@ mod tests {
             registered: std::time::UNIX_EPOCH,
             source: Source::Mdns,
             reach: Reach::Remote { gateway },
+            peer: fipa_transport::PeerId::THIS_HOST,
             role: Role::Agent,
         }
     }

@@ -36,7 +36,7 @@
 use std::collections::HashSet;
 use std::time::SystemTime;
 
-use fipa_transport::{Incarnation, Kind, Location, LocationError, Signature};
+use fipa_transport::{Incarnation, Kind, Location, LocationError, PeerId, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::{Entry, EntryError, Members, Mts, Reach, Role, Source};
@@ -239,6 +239,7 @@ impl Record<'_> {
     }
 }
 
+/// Its peer is not in the record.
 fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
     let key = "fipa-locations";
     let locations = record.text(key)?.ok_or(RecordError::Missing(key))?;
@@ -278,6 +279,7 @@ fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
         registered: time_of_millis(record.parsed("fipa-time")?),
         source: Source::Mdns,
         reach: Reach::Remote { gateway: mts },
+        peer: PeerId::default(),
         role,
     })
 }
@@ -311,6 +313,7 @@ fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
         reach: Reach::Remote {
             gateway: Incarnation::UNKNOWN,
         },
+        peer: PeerId::default(),
         role: Role::Agent,
     }
 }
@@ -445,6 +448,7 @@ mod tests {
             registered: UNIX_EPOCH + Duration::from_millis(1_795_172_400_123),
             source: Source::Mdns,
             reach: Reach::Remote { gateway },
+            peer: PeerId::THIS_HOST,
             role: Role::Agent,
         }
     }
@@ -755,6 +759,7 @@ mod tests {
                 description,
                 registered: time_of_millis(millis),
                 source: Source::Mdns,
+                peer: PeerId::THIS_HOST,
                 role: match Members::new(
                     members.iter().map(String::as_str),
                     members.first().filter(|_| led).map(|name| name.as_str().into()),

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::ErrorChain;
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, PeerId};
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
 use super::alarm::Alarm;
@@ -152,12 +152,14 @@ fn found(shared: &Shared, found: &Found) -> Option<Incarnation> {
     let Found {
         fullname,
         properties,
+        from,
         interfaces,
     } = found;
     let label = label_of(fullname);
     let entry = match record::decode(label, properties, SystemTime::now()) {
         Ok(entry) => Arc::new(Entry {
             locations: record::on_interfaces(entry.locations, interfaces),
+            peer: PeerId::of_ip(*from),
             ..entry
         }),
         Err(error) => {
