@@ -14,6 +14,7 @@ mod neighbours;
 mod platform_agents;
 mod presence;
 mod publisher;
+mod state;
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -47,6 +48,9 @@ use self::platform_agents::PlatformAgents;
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::presence::play as play_presence;
 use self::publisher::{PublishTask, Publisher};
+#[cfg(feature = "fuzzing")]
+pub(crate) use self::state::play as play_state;
+use self::state::{Predecessor, StateFile, Trust};
 use crate::config::ConfigError;
 use crate::directory_view::DirectoryView;
 use crate::error::OpenError;
@@ -65,6 +69,7 @@ pub struct Gateway {
     view: Arc<dyn Directory>,
     neighbours: Arc<Neighbours>,
     exchange: Arc<Exchanging>,
+    state: Arc<StateFile>,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -134,6 +139,17 @@ impl Gateway {
         let Some((network, known, view)) = made.into_inner() else {
             return Err(OpenError::NoRuntime);
         };
+        #[cfg(feature = "secure")]
+        let trust = Trust::new(guard.as_ref().map(Guard::security));
+        #[cfg(not(feature = "secure"))]
+        let trust = Trust::default();
+        let state = Arc::new(StateFile::new(
+            &service.dir,
+            trust,
+            Arc::clone(&view),
+            Arc::clone(&contacts.directory),
+            Arc::clone(&contacts.neighbours),
+        ));
         let mut gateway = Self {
             config: config.clone(),
             configuration: Arc::new(Mutex::new(config.values())),
@@ -143,6 +159,7 @@ impl Gateway {
             view,
             neighbours: Arc::clone(&contacts.neighbours),
             exchange,
+            state,
             tasks: Vec::new(),
         };
         // The queue is created first, because letters arrive as soon as the name is registered.
@@ -153,6 +170,8 @@ impl Gateway {
             gateway.abort();
             return Err(error);
         }
+        // Only the gateway of the domain uses the file, and it does so before it answers letters.
+        let predecessor = Arc::new(gateway.state.take_over());
         let publisher = Arc::new(Publisher {
             host: Arc::clone(&gateway.service.host),
             network: gateway.network.clone().map(Network::directory),
@@ -174,7 +193,7 @@ impl Gateway {
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
         let contacted = Arc::clone(&contacts.directory);
-        gateway.open_for_letters(config, known, contacts, refusals)?;
+        gateway.open_for_letters(config, known, contacts, refusals, predecessor)?;
         #[cfg(feature = "secure")]
         gateway.tasks.extend(guard.map(|guard| {
             let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));
@@ -193,6 +212,7 @@ impl Gateway {
         known: Arc<MergedDirectory>,
         contacts: Arc<KnownPeers>,
         refusals: Refusals,
+        predecessor: Arc<Predecessor>,
     ) -> Result<(), OpenError> {
         let means = self.means()?;
         let gateway_agent = GatewayAgent {
@@ -214,8 +234,11 @@ impl Gateway {
             known: Arc::clone(&known),
             exchange: Arc::clone(&self.exchange),
             has_keys: !config.security.keys.is_empty(),
+            state: Arc::clone(&self.state),
+            predecessor,
         };
         self.tasks.extend(platform_agents.start(&config.platform));
+        self.tasks.push(tokio::spawn(Arc::clone(&self.state).run()));
         let exchange = Arc::clone(&self.exchange);
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);
@@ -367,6 +390,13 @@ impl Gateway {
                 log_limit::warn!(%error, "the directory of the network was not closed properly");
             }
         }
+        // Before the domain is left: the last process removes the file.
+        let state = Arc::clone(&self.state);
+        let _ = tokio::task::spawn_blocking(move || {
+            state.write();
+            state.close();
+        })
+        .await;
         self.service.close().await;
     }
 
@@ -379,6 +409,7 @@ impl Gateway {
         for task in self.tasks.drain(..) {
             task.abort();
         }
+        self.state.close();
         if let Some(network) = self.network.take() {
             network.close();
         }
