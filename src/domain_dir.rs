@@ -8,6 +8,7 @@
 //! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which
 //! systemd-tmpfiles respects, and renews the timestamps once a day for other cleaners.
 
+use std::ffi::OsStr;
 use std::fs::{self, DirBuilder};
 use std::io;
 use std::io::Write as _;
@@ -44,6 +45,10 @@ const STALE: Duration = Duration::from_secs(12 * 60 * 60);
 
 /// File with the host identifier from before the directory was removed and created again.
 const HOST: &str = "host";
+
+/// Files that end with the last process of the domain: that with the host identifier, and the state of
+/// the gateway with its next version.
+const FILES: [&str; 3] = [HOST, DomainDir::STATE, DomainDir::NEXT_STATE];
 
 /// Maximum length of a host identifier, in bytes.
 const MAX_HOST: usize = 128;
@@ -93,6 +98,11 @@ pub enum DomainDirError {
 }
 
 impl DomainDir {
+    /// File with what a gateway keeps for its successor.
+    pub(crate) const STATE: &str = "gateway.state";
+    /// The file that replaces it.
+    pub(crate) const NEXT_STATE: &str = "gateway.state.new";
+
     /// Creates the directory of a domain, and checks that it is private.
     pub(crate) fn prepare(domain: &str) -> Result<Self, DomainDirError> {
         let mut dir = Self::of(domain);
@@ -279,10 +289,11 @@ impl DomainDir {
         (is_plain && (1..=MAX_HOST).contains(&text.len())).then_some(text)
     }
 
-    /// Whether the directory contains at most the file with the host identifier.
-    fn is_empty_but_for_host(&self) -> bool {
+    /// Whether the directory contains at most the files that end with the last process.
+    fn is_empty_but_for_files(&self) -> bool {
         let mut names = fs::read_dir(self.path()).into_iter().flatten();
-        names.all(|entry| entry.is_ok_and(|entry| entry.file_name() == HOST))
+        let is_file = |name: &OsStr| FILES.iter().any(|file| name == *file);
+        names.all(|entry| entry.is_ok_and(|entry| is_file(&entry.file_name())))
     }
 
     /// Removes the empty directories of the domain. Those that other processes use are not empty and stay.
@@ -292,8 +303,10 @@ impl DomainDir {
         remove(self.part("directory"));
         remove(self.part("shm"));
         remove(self.part("unix"));
-        if self.is_empty_but_for_host() {
-            let _ = fs::remove_file(self.path().join(HOST));
+        if self.is_empty_but_for_files() {
+            for file in FILES {
+                let _ = fs::remove_file(self.path().join(file));
+            }
         }
         remove(self.path());
     }

@@ -26,6 +26,12 @@ pub fn presence(bytes: &[u8]) {
     crate::gateway::play_presence(bytes);
 }
 
+/// Reads the bytes as the file that a gateway leaves to its successor. Panics if a rule is broken.
+#[cfg(feature = "net")]
+pub fn gateway_state(bytes: &[u8]) {
+    crate::gateway::play_state(bytes);
+}
+
 /// The access rules, and the rates of senders.
 #[derive(Debug)]
 pub struct Access(access::Access);

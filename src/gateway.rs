@@ -15,6 +15,7 @@ mod platform_agents;
 mod presence;
 mod publish_pace;
 mod publisher;
+mod state;
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -48,6 +49,9 @@ use self::platform_agents::PlatformAgents;
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::presence::play as play_presence;
 use self::publisher::{PublishTask, Publisher};
+#[cfg(feature = "fuzzing")]
+pub(crate) use self::state::play as play_state;
+use self::state::{Predecessor, StateFile, Trust};
 use crate::config::ConfigError;
 use crate::directory_view::DirectoryView;
 use crate::error::OpenError;
@@ -66,6 +70,7 @@ pub struct Gateway {
     view: Arc<dyn Directory>,
     neighbours: Arc<Neighbours>,
     exchange: Arc<Exchanging>,
+    state: Arc<StateFile>,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -135,6 +140,17 @@ impl Gateway {
         let Some((network, known, view)) = made.into_inner() else {
             return Err(OpenError::NoRuntime);
         };
+        #[cfg(feature = "secure")]
+        let trust = Trust::new(guard.as_ref().map(Guard::security));
+        #[cfg(not(feature = "secure"))]
+        let trust = Trust::default();
+        let state = Arc::new(StateFile::new(
+            &service.dir,
+            trust,
+            Arc::clone(&view),
+            Arc::clone(&contacts.directory),
+            Arc::clone(&contacts.neighbours),
+        ));
         let mut gateway = Self {
             config: config.clone(),
             configuration: Arc::new(Mutex::new(config.values())),
@@ -144,6 +160,7 @@ impl Gateway {
             view,
             neighbours: Arc::clone(&contacts.neighbours),
             exchange,
+            state,
             tasks: Vec::new(),
         };
         // The queue is created first, because letters arrive as soon as the name is registered.
@@ -154,6 +171,8 @@ impl Gateway {
             gateway.abort();
             return Err(error);
         }
+        // Only the gateway of the domain uses the file, and it does so before it answers letters.
+        let predecessor = Arc::new(gateway.state.take_over());
         let publisher = Arc::new(Publisher {
             host: Arc::clone(&gateway.service.host),
             network: gateway.network.clone().map(Network::directory),
@@ -176,7 +195,7 @@ impl Gateway {
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
         let contacted = Arc::clone(&contacts.directory);
-        gateway.open_for_letters(config, known, contacts, refusals)?;
+        gateway.open_for_letters(config, known, contacts, refusals, predecessor)?;
         #[cfg(feature = "secure")]
         gateway.tasks.extend(guard.map(|guard| {
             let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));
@@ -195,6 +214,7 @@ impl Gateway {
         known: Arc<MergedDirectory>,
         contacts: Arc<KnownPeers>,
         refusals: Refusals,
+        predecessor: Arc<Predecessor>,
     ) -> Result<(), OpenError> {
         let means = self.means()?;
         let gateway_agent = GatewayAgent {
@@ -216,8 +236,11 @@ impl Gateway {
             known: Arc::clone(&known),
             exchange: Arc::clone(&self.exchange),
             has_keys: !config.security.keys.is_empty(),
+            state: Arc::clone(&self.state),
+            predecessor,
         };
         self.tasks.extend(platform_agents.start(&config.platform));
+        self.tasks.push(tokio::spawn(Arc::clone(&self.state).run()));
         let exchange = Arc::clone(&self.exchange);
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);
@@ -369,6 +392,13 @@ impl Gateway {
                 log_limit::warn!(%error, "the directory of the network was not closed properly");
             }
         }
+        // Before the domain is left: the last process removes the file.
+        let state = Arc::clone(&self.state);
+        let _ = tokio::task::spawn_blocking(move || {
+            state.write();
+            state.close();
+        })
+        .await;
         self.service.close().await;
     }
 
@@ -381,6 +411,7 @@ impl Gateway {
         for task in self.tasks.drain(..) {
             task.abort();
         }
+        self.state.close();
         if let Some(network) = self.network.take() {
             network.close();
         }

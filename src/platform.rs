@@ -34,6 +34,9 @@
 //!
 //! Not in this module: the agents themselves (`fipa-platform`, and the gateway).
 
+mod notifications;
+
+use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
@@ -42,11 +45,13 @@ pub use fipa_platform::{
     AgentDescription, AmsDescription, AnswerError, ApDescription, Constraints, Exception, ONTOLOGY,
     Property, ServiceDescription, State, limits,
 };
-use fipa_platform::{Function, found, notified, registered, subscription};
+use fipa_platform::{Function, found, registered, subscription};
 use fipa_sds::{Entry, Reach};
 
-use crate::agent::Agent;
-use crate::protocol::{DialogueError, Subscription};
+pub use self::notifications::Notifications;
+use crate::agent::{Agent, AgentCore};
+use crate::directory_view::DirectoryView;
+use crate::protocol::{DialogueError, Request, Subscription};
 
 /// The error of a call to a directory facilitator or an agent management system.
 #[derive(Debug, thiserror::Error)]
@@ -250,11 +255,7 @@ impl<'a> Df<'a> {
         &self,
         template: &AgentDescription,
     ) -> Result<Notifications, PlatformError> {
-        let client = &self.0;
-        let content = subscription(&client.server, template)?;
-        let message = client.message(Performative::Subscribe, "fipa-sl2", content);
-        let subscription = client.agent.subscribe(message, client.patience()).await?;
-        Ok(Notifications(subscription))
+        Notifications::begin(self.0.server(), template).await
     }
 
     fn own_name(&self) -> AgentId {
@@ -266,32 +267,6 @@ impl<'a> Df<'a> {
             name: description.name.or_else(|| Some(self.own_name())),
             ..description
         }
-    }
-}
-
-/// A subscription to a directory facilitator. Dropping it does not cancel it; further notifications go
-/// to [`Agent::receive`].
-#[derive(Debug)]
-#[must_use = "next() returns the notifications"]
-pub struct Notifications(Subscription);
-
-impl Notifications {
-    /// Waits for the next notification, without a time limit, and returns the descriptions that have
-    /// changed. A description with a name only is that of an agent that has deregistered.
-    ///
-    /// # Errors
-    /// If the directory facilitator ends the subscription.
-    pub async fn next(&mut self) -> Result<Vec<AgentDescription>, PlatformError> {
-        let message = self.0.next().await?;
-        Ok(notified(&message)?)
-    }
-
-    /// Cancels the subscription.
-    ///
-    /// # Errors
-    /// If the directory facilitator does not confirm within `patience`.
-    pub async fn cancel(self, patience: Duration) -> Result<(), PlatformError> {
-        Ok(self.0.cancel(patience).await?)
     }
 }
 
@@ -369,9 +344,33 @@ struct Client<'a> {
 }
 
 impl Client<'_> {
+    fn server(&self) -> Server {
+        Server {
+            core: Arc::clone(&self.agent.core),
+            id: self.server.clone(),
+        }
+    }
+
+    async fn request(&self, function: &Function) -> Result<Message, PlatformError> {
+        self.server().request(function).await
+    }
+}
+
+/// An agent of a platform, and the agent of this process that asks it. It is no handle of that agent.
+#[derive(Clone)]
+struct Server {
+    core: Arc<AgentCore>,
+    id: AgentId,
+}
+
+impl Server {
+    fn directory(&self) -> DirectoryView<'_> {
+        self.core.endpoint.domain.directory()
+    }
+
     /// Returns the time for an answer: the deadlines of the request and of the answer.
     fn patience(&self) -> Duration {
-        self.agent.domain().inner.deadline * 2
+        self.core.endpoint.domain.inner.deadline * 2
     }
 
     fn message(
@@ -380,18 +379,24 @@ impl Client<'_> {
         language: &str,
         content: Vec<u8>,
     ) -> MessageBuilder {
-        self.agent
+        self.core
             .message(performative)
-            .receiver(self.server.clone())
+            .receiver(self.id.clone())
             .ontology(ONTOLOGY)
             .language(language)
             .content(content)
     }
 
     async fn request(&self, function: &Function) -> Result<Message, PlatformError> {
-        let content = function.content(&self.server)?;
+        let content = function.content(&self.id)?;
         let request = self.message(Performative::Request, "fipa-sl0", content);
-        let request = self.agent.request(request, self.patience()).await?;
-        Ok(request.result().await?)
+        let begun = Request::begin(&self.core, "fipa-request", request, self.patience());
+        Ok(begun.await?.result().await?)
+    }
+
+    async fn subscribe(&self, template: &AgentDescription) -> Result<Subscription, PlatformError> {
+        let content = subscription(&self.id, template)?;
+        let message = self.message(Performative::Subscribe, "fipa-sl2", content);
+        Ok(Subscription::begin(&self.core, message, self.patience()).await?)
     }
 }

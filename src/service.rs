@@ -40,7 +40,7 @@ pub(crate) struct Service {
     pub(crate) name: Arc<str>,
     /// The service in the directory.
     pub(crate) own: fipa_sds::Mts,
-    dir: DomainDir,
+    pub(crate) dir: DomainDir,
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
     maintenance: JoinHandle<()>,

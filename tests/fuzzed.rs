@@ -160,4 +160,9 @@ mod bodies {
     fn presence() {
         plays("presence", fuzzing::presence);
     }
+
+    #[test]
+    fn gateway_state() {
+        plays("gateway_state", fuzzing::gateway_state);
+    }
 }

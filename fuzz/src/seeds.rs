@@ -42,6 +42,7 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
         }
         "http" => crate::http::seeds(),
         "recording" => crate::recording::seeds(),
+        "gateway_state" => vec![GATEWAY_STATE.to_vec()],
         "presence" => {
             let mut seeds = drawn(24, 200);
             let texts: [&[u8]; 2] = [
@@ -71,6 +72,9 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
         _ => drawn(48, 400),
     }
 }
+
+/// The file of a gateway with each kind of item.
+const GATEWAY_STATE: &[u8] = include_bytes!("../../src/gateway/state/example.txt");
 
 /// An entries file in the format that a process writes.
 const HOST: &[u8] = br#"{"format":"fipa-directory","version":1,"mts":{"name":"arm-mts","incarnation":"00000000000000ab"},"entries":[{"name":"arm_left","type":"gripper","incarnation":"00000000000000cd","locations":["shm://00000000000000ab#00000000000000ab"],"description":"left","registered":1795172400000,"role":"agent"},{"name":"rover","incarnation":"00000000000000ce","locations":["tcp://192.0.2.7:7788#00000000000000ac"],"registered":1795172400000,"role":"agent","remote":{"name":"rover-mts","incarnation":"00000000000000ac"},"source":"mdns"}]}"#;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_content::{Content, Dialect, Term, Wff};
@@ -11,6 +11,7 @@ use fipa_content::{Content, Dialect, Term, Wff};
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
 use crate::df::{authorize, result};
 use crate::exception::Exception;
+use crate::kept::{KeptDescription, Text, left, read_object};
 use crate::request::{self, Rejection, Request};
 use crate::search::max_results;
 use crate::{AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, limits};
@@ -30,6 +31,7 @@ pub struct Ams {
     /// The agents that platforms of other hosts have registered.
     foreign: BTreeMap<(Platform, Arc<str>), Foreign>,
     answers: VecDeque<Answer>,
+    revision: u64,
 }
 
 impl fmt::Debug for Ams {
@@ -69,6 +71,7 @@ impl Ams {
             residents: BTreeMap::new(),
             foreign: BTreeMap::new(),
             answers: VecDeque::new(),
+            revision: 0,
         }
     }
 
@@ -115,6 +118,75 @@ impl Ams {
     /// Returns the next message to be sent.
     pub fn poll_answer(&mut self) -> Option<Answer> {
         self.answers.pop_front()
+    }
+
+    /// Returns what a successor takes over: the owners and states that agents of this host have set, and
+    /// the agents that platforms of other hosts have registered.
+    #[must_use]
+    pub fn keep(&self, now: Instant) -> Vec<KeptDescription> {
+        let residents = self.residents.iter().map(|(name, (registration, set))| {
+            let owner = (Platform::Host, name, *registration);
+            (owner, set, None)
+        });
+        let foreign = self.foreign.iter().map(|((platform, name), agent)| {
+            let owner = (*platform, name, 0);
+            (owner, &agent.description, Some(agent.ends))
+        });
+        let all = residents.chain(foreign);
+        let all = all.filter_map(|((platform, name, registration), description, ends)| {
+            Some(KeptDescription {
+                name: Arc::clone(name),
+                registration,
+                platform,
+                left: left(now, ends),
+                text: Text::of_term(&description.to_term())?,
+            })
+        });
+        all.collect()
+    }
+
+    /// Returns a number that differs from an earlier one if [`keep`](Self::keep) may return something
+    /// else than it did then.
+    #[must_use]
+    pub fn revision(&self) -> u64 {
+        self.revision
+    }
+
+    /// Takes over what a predecessor kept, `elapsed` before now. Left out are descriptions that are not
+    /// valid, of agents of this host that are not among the `residents`, and of platforms that do not
+    /// `stay`.
+    pub fn take_over(
+        &mut self,
+        now: Instant,
+        elapsed: Duration,
+        kept: &[KeptDescription],
+        residents: &[Resident],
+        stays: impl Fn(Platform) -> bool,
+    ) {
+        for kept in kept.iter().filter(|kept| stays(kept.platform)) {
+            let read = |term: &Term<'_>| AmsDescription::from_term(term).ok();
+            let Some(description) = read_object(kept.text.as_bytes(), read) else {
+                continue;
+            };
+            let name = description.name.as_ref();
+            let is_own = name.is_some_and(|name| *name.name() == *kept.name);
+            if !is_own || is_too_large(&description) {
+                continue;
+            }
+            let name = Arc::clone(&kept.name);
+            if kept.platform == Platform::Host {
+                if registration_of(residents, &name) == Some(kept.registration) {
+                    self.residents
+                        .insert(name, (kept.registration, description));
+                }
+            } else if let Some(ends) = kept.ends(now, elapsed)
+                && ends > now
+                && self.has_room(kept.platform)
+            {
+                let key = (kept.platform, name);
+                self.foreign.insert(key, Foreign { description, ends });
+            }
+        }
     }
 
     /// Returns the agents that platforms of other hosts have registered.
@@ -197,16 +269,21 @@ impl Ams {
             let words = "an agent of this host registers with the directory of the host";
             return Err(Exception::InternalError(words.to_owned()));
         }
-        let same = self.foreign.keys().filter(|(of, _)| *of == asker.platform);
-        if self.foreign.len() >= limits::FOREIGN_AGENTS
-            || same.count() >= limits::FOREIGN_AGENTS_OF_PLATFORM
-        {
+        if !self.has_room(asker.platform) {
             let words = "no room for a further agent of this platform";
             return Err(Exception::InternalError(words.to_owned()));
         }
         let ends = now.at + limits::LEASE;
         self.foreign.insert(key, Foreign { description, ends });
+        self.revision += 1;
         Ok(())
+    }
+
+    /// Whether a further agent of this platform may register.
+    fn has_room(&self, platform: Platform) -> bool {
+        let same = self.foreign.keys().filter(|(of, _)| *of == platform);
+        self.foreign.len() < limits::FOREIGN_AGENTS
+            && same.count() < limits::FOREIGN_AGENTS_OF_PLATFORM
     }
 
     fn modify(
@@ -217,6 +294,7 @@ impl Ams {
         residents: &[Resident],
     ) -> Result<(), Exception> {
         let key = key(asker);
+        self.revision += 1;
         if asker.platform == Platform::Host && is_resident(residents, &key.1) {
             // Of agents that have ended, nothing is kept.
             self.residents.retain(|name, (registration, _)| {
@@ -239,6 +317,7 @@ impl Ams {
     fn deregister(&mut self, asker: &Asker, residents: &[Resident]) -> Result<(), Exception> {
         let key = key(asker);
         if self.foreign.remove(&key).is_some() {
+            self.revision += 1;
             return Ok(());
         }
         if asker.platform == Platform::Host && is_resident(residents, &key.1) {
@@ -306,6 +385,11 @@ fn registration_of(residents: &[Resident], name: &str) -> Option<u64> {
     Some(resident.registration)
 }
 
+fn is_too_large(description: &AmsDescription) -> bool {
+    let size = description.size();
+    size.parts > limits::TEMPLATE_PARTS || size.bytes > limits::DESCRIPTION_BYTES
+}
+
 /// Returns the description in the request, which is the asker's own.
 fn own_description(asker: &Asker, request: &Request<'_>) -> Result<AmsDescription, Exception> {
     authorize(asker, request)?;
@@ -314,8 +398,7 @@ fn own_description(asker: &Asker, request: &Request<'_>) -> Result<AmsDescriptio
     if description.name.is_none() {
         return Err(Exception::missing(AMS_DESCRIPTION, "name"));
     }
-    let size = description.size();
-    if size.parts > limits::TEMPLATE_PARTS || size.bytes > limits::DESCRIPTION_BYTES {
+    if is_too_large(&description) {
         let words = "the description is too large";
         return Err(Exception::InternalError(words.to_owned()));
     }

@@ -3,13 +3,14 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative, Time};
 use fipa_content::{Content, Dialect, Term, Wff};
 
 use crate::description::{Constraints, described};
 use crate::exception::Exception;
+use crate::kept::{KeptDescription, KeptSubscription, Text, left, read_object};
 use crate::remote::{self, LocalEntry, RemoteEntry};
 use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
@@ -45,6 +46,7 @@ pub struct Df {
     search_ids: VecDeque<Arc<str>>,
     known_search_ids: HashSet<Arc<str>>,
     answers: VecDeque<Answer>,
+    revision: u64,
 }
 
 impl fmt::Debug for Df {
@@ -65,6 +67,32 @@ struct Entry {
     position: u64,
     /// The text for other hosts, of an agent of this host.
     text: Option<Arc<str>>,
+    /// The text for a successor.
+    kept: Option<Text>,
+}
+
+impl Entry {
+    fn new(
+        platform: Platform,
+        registration: u64,
+        description: AgentDescription,
+        ends: Option<Instant>,
+        position: u64,
+    ) -> Self {
+        let text = match platform {
+            Platform::Host => remote::text(&description),
+            _ => None,
+        };
+        Self {
+            platform,
+            registration,
+            ends,
+            position,
+            text,
+            kept: Text::of_term(&description.to_term()),
+            description,
+        }
+    }
 }
 
 struct Remote {
@@ -95,6 +123,7 @@ impl Df {
             search_ids: VecDeque::new(),
             known_search_ids: HashSet::new(),
             answers: VecDeque::new(),
+            revision: 0,
         }
     }
 
@@ -239,13 +268,112 @@ impl Df {
         }
     }
 
+    /// Returns what a successor takes over: the descriptions, the earliest registration first, and the
+    /// subscriptions of agents without a registration.
+    #[must_use]
+    pub fn keep(&self, now: Instant) -> (Vec<KeptDescription>, Vec<KeptSubscription>) {
+        let mut entries: Vec<_> = self.entries.iter().collect();
+        entries.sort_unstable_by_key(|(_, entry)| entry.position);
+        let entries = entries.into_iter().filter_map(|(name, entry)| {
+            Some(KeptDescription {
+                name: Arc::clone(name),
+                registration: entry.registration,
+                platform: entry.platform,
+                left: left(now, entry.ends),
+                text: entry.kept.clone()?,
+            })
+        });
+        let subscriptions = self.subscriptions.values();
+        let subscriptions = subscriptions.filter_map(Subscription::keep);
+        (entries.collect(), subscriptions.collect())
+    }
+
+    /// Returns a number that differs from an earlier one if [`keep`](Self::keep) may return something
+    /// else than it did then.
+    #[must_use]
+    pub fn revision(&self) -> u64 {
+        self.revision
+    }
+
+    /// Takes over what a predecessor kept, `elapsed` before now. Descriptions and subscriptions that are
+    /// not valid are left out. Those of platforms that do not `stay` end, which subscribers are told.
+    pub fn take_over(
+        &mut self,
+        now: Now,
+        elapsed: Duration,
+        (entries, subscriptions): (&[KeptDescription], &[KeptSubscription]),
+        stays: impl Fn(Platform) -> bool,
+    ) {
+        for kept in entries {
+            let entry = self.kept_entry(now, elapsed, kept);
+            if let Some(entry) = entry {
+                self.registered += 1;
+                self.insert(Arc::clone(&kept.name), entry);
+            }
+        }
+        for kept in subscriptions.iter().filter(|kept| stays(kept.platform)) {
+            self.take_over_subscription(now, kept);
+        }
+        let gone = self.entries.iter().filter(|(_, it)| !stays(it.platform));
+        let gone: Vec<Arc<str>> = gone.map(|(name, _)| Arc::clone(name)).collect();
+        for name in gone {
+            self.remove(&name);
+        }
+        self.expire(now.at);
+    }
+
+    fn kept_entry(&self, now: Now, elapsed: Duration, kept: &KeptDescription) -> Option<Entry> {
+        if self.entries.contains_key(&kept.name) || self.is_full(kept.platform) {
+            return None;
+        }
+        let read = |term: &Term<'_>| AgentDescription::from_term(term).ok();
+        let description = read_object(kept.text.as_bytes(), read)?;
+        description.check().ok()?;
+        let name = description.name.as_ref()?;
+        if *name.name() != *kept.name || is_too_large(&description) {
+            return None;
+        }
+        let ends = kept.ends(now.at, elapsed);
+        let (platform, registration) = (kept.platform, kept.registration);
+        let position = self.registered;
+        Some(Entry::new(
+            platform,
+            registration,
+            description,
+            ends,
+            position,
+        ))
+    }
+
+    fn take_over_subscription(&mut self, now: Now, kept: &KeptSubscription) {
+        let Some((asker, message)) = kept.read() else {
+            return;
+        };
+        let Ok((mut subscription, _)) = Subscription::read(&message, &asker, &self.id, now.at)
+        else {
+            return;
+        };
+        if self.make_room(&asker).is_err() {
+            return;
+        }
+        match &kept.changed {
+            Some(changed) => {
+                let changed = changed.iter().take(limits::CHANGES);
+                changed.for_each(|name| subscription.changed.insert(name));
+            }
+            None => self.all_changed(&mut subscription),
+        }
+        self.add(subscription);
+    }
+
     /// Handles the outcome of a notification. A subscription whose notification was not delivered ends.
     pub fn handle_sent(&mut self, now: Instant, id: SubscriptionId, is_delivered: bool) {
         if !is_delivered {
             self.subscriptions.remove(&id);
         } else if let Some(subscription) = self.subscriptions.get_mut(&id) {
-            subscription.is_under_way = false;
+            subscription.arrived();
         }
+        self.revision += 1;
         self.notify(now);
     }
 
@@ -324,18 +452,14 @@ impl Df {
                             .map_err(|_| Exception::InternalError("cannot answer".to_owned()))?
                     }
                 };
-                let text = match asker.platform {
-                    Platform::Host => remote::text(&description),
-                    _ => None,
-                };
-                let entry = Entry {
-                    platform: asker.platform,
-                    registration: asker.registration,
+                let position = self.registered;
+                let entry = Entry::new(
+                    asker.platform,
+                    asker.registration,
                     description,
                     ends,
-                    position: self.registered,
-                    text,
-                };
+                    position,
+                );
                 match &*request.function {
                     "register" => self.register(asker, entry)?,
                     _ => self.modify(asker, entry)?,
@@ -369,13 +493,7 @@ impl Df {
         if self.entries.contains_key(asker.id.name()) {
             return Err(Exception::AlreadyRegistered);
         }
-        let count = |platform| self.platforms.get(&platform).copied().unwrap_or(0);
-        let foreign = self.entries.len() - count(Platform::Host);
-        let is_full = self.entries.len() >= limits::DESCRIPTIONS
-            || entry.platform != Platform::Host
-                && (foreign >= limits::FOREIGN_DESCRIPTIONS
-                    || count(entry.platform) >= limits::DESCRIPTIONS_OF_PLATFORM);
-        if is_full {
+        if self.is_full(entry.platform) {
             let words = "the directory has no room for a further description of this platform";
             return Err(Exception::InternalError(words.to_owned()));
         }
@@ -385,6 +503,16 @@ impl Df {
         self.registered += 1;
         self.insert(name, entry);
         Ok(())
+    }
+
+    /// Whether there is no room for a further description of this platform.
+    fn is_full(&self, platform: Platform) -> bool {
+        let count = |platform| self.platforms.get(&platform).copied().unwrap_or(0);
+        let foreign = self.entries.len() - count(Platform::Host);
+        self.entries.len() >= limits::DESCRIPTIONS
+            || platform != Platform::Host
+                && (foreign >= limits::FOREIGN_DESCRIPTIONS
+                    || count(platform) >= limits::DESCRIPTIONS_OF_PLATFORM)
     }
 
     fn modify(&mut self, asker: &Asker, mut entry: Entry) -> Result<(), Exception> {
@@ -423,6 +551,7 @@ impl Df {
 
     /// Adds an entry under a free name.
     fn insert(&mut self, name: Arc<str>, entry: Entry) {
+        self.revision += 1;
         let lease = entry.ends.map(|ends| (ends, Arc::clone(&name)));
         self.leases.extend(lease);
         *self.platforms.entry(entry.platform).or_default() += 1;
@@ -433,6 +562,7 @@ impl Df {
     /// Removes an entry, without a notification.
     fn take(&mut self, name: &str) -> Option<(Arc<str>, Entry)> {
         let (name, entry) = self.entries.remove_entry(name)?;
+        self.revision += 1;
         self.is_local_changed |= entry.platform == Platform::Host;
         if let Some(ends) = entry.ends {
             self.leases.remove(&(ends, Arc::clone(&name)));
@@ -548,6 +678,7 @@ impl Df {
                 .retain(|_, other| !other.is_of(asker, conversation));
             self.make_room(asker).map(|()| read)
         });
+        self.revision += 1;
         let (mut subscription, agreed) = match admitted {
             Ok(read) => read,
             Err(reason) => {
@@ -556,6 +687,18 @@ impl Df {
             }
         };
         self.answer(asker, message, Performative::Agree, agreed);
+        self.all_changed(&mut subscription);
+        self.add(subscription);
+    }
+
+    fn add(&mut self, subscription: Subscription) {
+        let id = SubscriptionId(self.next_subscription);
+        self.next_subscription += 1;
+        self.subscriptions.insert(id, subscription);
+    }
+
+    /// Marks all descriptions that match as changed.
+    fn all_changed(&self, subscription: &mut Subscription) {
         let mut comparisons = Comparisons::default();
         for (name, entry) in &self.entries {
             match comparisons.agent(&subscription.template, &entry.description) {
@@ -573,9 +716,6 @@ impl Df {
                 subscription.changed.insert(name);
             }
         }
-        let id = SubscriptionId(self.next_subscription);
-        self.next_subscription += 1;
-        self.subscriptions.insert(id, subscription);
     }
 
     /// Checks that the asker may have a further subscription. The oldest one of a platform of another
@@ -618,6 +758,7 @@ impl Df {
     /// Ends a subscription with a `failure`.
     fn end(&mut self, id: SubscriptionId, words: &str) {
         if let Some(subscription) = self.subscriptions.remove(&id) {
+            self.revision += 1;
             let reason = Exception::InternalError(words.to_owned());
             let (asker, message) = (&subscription.asker, &subscription.message);
             let (act, content) = request::rejected(message, asker, reason.into());
@@ -637,6 +778,7 @@ impl Df {
         let (act, content) = match found.map(|(id, _)| *id) {
             Some(id) => {
                 self.subscriptions.remove(&id);
+                self.revision += 1;
                 let done = Content::from(Wff::done(cancel));
                 let done = request::print(asker.dialect, &done);
                 (Performative::Inform, done.unwrap_or_default())
@@ -669,6 +811,7 @@ impl Df {
             };
             if matches(before) || matches(after) {
                 subscription.changed.insert(name);
+                self.revision += u64::from(subscription.is_kept());
                 if subscription.changed.len() > limits::CHANGES {
                     overrun.insert(*id);
                 }
@@ -692,6 +835,7 @@ impl Df {
             while found.texts.len() < limits::RESULTS
                 && let Some(name) = subscription.changed.pop_first()
             {
+                subscription.leaves(&name);
                 let dialect = subscription.dialect();
                 let own = self.entries.get(&name).map(|entry| &entry.description);
                 let remote = || self.remote.get(&name)?.description.as_ref();
@@ -710,7 +854,7 @@ impl Df {
                     },
                 };
                 if !has_room {
-                    subscription.changed.put_back(name);
+                    subscription.stays(name);
                     break;
                 }
             }
@@ -792,6 +936,11 @@ pub(crate) fn authorize(asker: &Asker, request: &Request<'_>) -> Result<(), Exce
     }
 }
 
+fn is_too_large(description: &AgentDescription) -> bool {
+    let size = description.size();
+    size.parts > limits::DESCRIPTION_PARTS || size.bytes > limits::DESCRIPTION_BYTES
+}
+
 /// Checks a description that is to be stored. Returns it with the granted lease, and the end of the
 /// lease.
 fn granted(
@@ -800,8 +949,7 @@ fn granted(
     mut description: AgentDescription,
 ) -> Result<(AgentDescription, Option<Instant>), Exception> {
     description.check()?;
-    let size = description.size();
-    if size.parts > limits::DESCRIPTION_PARTS || size.bytes > limits::DESCRIPTION_BYTES {
+    if is_too_large(&description) {
         return Err(Exception::InternalError(format!(
             "the description is too large: at most {} parts and {} bytes of text",
             limits::DESCRIPTION_PARTS,

@@ -59,6 +59,13 @@
 //! ([`Df::poll_local`], [`Df::handle_remote`]), so that searches there find them. The caller decides which
 //! gateway may speak for an agent.
 //!
+//! # Successors
+//!
+//! [`Df::keep`] and [`Ams::keep`] return what a successor takes over with [`Df::take_over`] and
+//! [`Ams::take_over`]: the descriptions with their remaining leases, and the subscriptions of agents
+//! without a registration, such as those of JADE. Other subscribers see the end of the agent and subscribe
+//! again.
+//!
 //! # Bounds
 //!
 //! | | in all | of a platform of another host |
@@ -81,6 +88,7 @@ mod client;
 mod description;
 mod df;
 mod exception;
+mod kept;
 pub mod limits;
 mod remote;
 mod request;
@@ -93,6 +101,7 @@ use std::time::{Instant, SystemTime};
 
 use fipa_acl::{AgentId, Message};
 use fipa_content::Dialect;
+use serde::{Deserialize, Serialize};
 
 pub use ams::{Ams, Resident};
 pub use client::{AnswerError, Function, found, notified, registered, subscription};
@@ -102,6 +111,7 @@ pub use description::{
 };
 pub use df::Df;
 pub use exception::Exception;
+pub use kept::{KeptDescription, KeptSubscription};
 pub use remote::{LocalEntry, RemoteEntry};
 pub use subscription::SubscriptionId;
 
@@ -127,7 +137,8 @@ pub struct Now {
 pub struct Asker {
     /// The identifier of the agent, with which answers name their receiver.
     pub id: AgentId,
-    /// A number of the caller that identifies this registration of the agent. Answers carry it.
+    /// A number of the caller that identifies this registration of the agent; 0 if it has none, because its
+    /// platform tells no registrations. Answers carry it.
     pub registration: u64,
     /// The platform of the agent.
     pub platform: Platform,
@@ -166,7 +177,8 @@ impl Asker {
 }
 
 /// The platform of an agent, which owns the bounds that the agent uses up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 #[allow(clippy::exhaustive_enums, reason = "callers decide by it")]
 pub enum Platform {
     /// This host.

@@ -7,8 +7,9 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::Time;
-use fipa_content::{Content, Dialect, Wff};
+use fipa_content::{Dialect, Term};
 
+use crate::kept::read_object;
 use crate::{AgentDescription, Now, limits, request};
 
 /// The description of an agent of this host, for the directory facilitators of other hosts.
@@ -73,16 +74,8 @@ pub(crate) fn read(now: Now, entry: &RemoteEntry) -> Option<AgentDescription> {
     if entry.text.len() > limits::REMOTE_BYTES {
         return None;
     }
-    // The terms around it are those of answers, so that what is read here can be printed there.
-    let text = ["((= x (sequence ", &entry.text, ")))"].concat();
-    let content = Content::parse(text.as_bytes()).ok()?;
-    let Ok(Wff::Equal(_, list)) = content.wff() else {
-        return None;
-    };
-    let [term] = list.elements()? else {
-        return None;
-    };
-    let mut description = AgentDescription::from_term(term).ok()?;
+    let read = |term: &Term<'_>| AgentDescription::from_term(term).ok();
+    let mut description = read_object(entry.text.as_bytes(), read)?;
     description.check().ok()?;
     let is_agents = description
         .name

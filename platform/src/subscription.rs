@@ -9,8 +9,8 @@ use fipa_content::{Content, ContentExpression, Dialect, IdentifyingExpression, T
 
 use crate::description::searched;
 use crate::exception::Exception;
-use crate::request;
-use crate::{AgentDescription, Asker, limits};
+use crate::kept::{CHANGES, KeptSubscription};
+use crate::{AgentDescription, Asker, limits, request};
 
 /// The number of a subscription to a [`Df`](crate::Df).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -19,6 +19,8 @@ pub struct SubscriptionId(pub(crate) u64);
 /// A subscription.
 pub(crate) struct Subscription {
     pub(crate) asker: Asker,
+    /// For a successor, of an agent without a registration.
+    kept: Option<KeptSubscription>,
     /// The message of the subscriber, without its content. Each notification answers it.
     pub(crate) message: Message,
     /// The text of the query, which each notification repeats.
@@ -28,6 +30,8 @@ pub(crate) struct Subscription {
     pub(crate) changed: Changed,
     /// Whether the outcome of a notification is awaited.
     pub(crate) is_under_way: bool,
+    /// The agents in that notification, if there is a copy for a successor.
+    under_way: Vec<Arc<str>>,
     /// Earliest time of the next notification.
     pub(crate) not_before: Instant,
 }
@@ -97,13 +101,21 @@ impl Subscription {
         let agreed = request::print(asker.dialect, &agreed).map_err(unprintable)?;
         let equal = Wff::Equal(Box::new(query.into()), Box::new(Term::Boolean(true)));
         request::print(asker.dialect, &Content::from(equal)).map_err(unprintable)?;
+        let kept = match asker.registration {
+            1.. => None,
+            0 => KeptSubscription::new(asker, without_content(message), &text),
+        };
         let subscription = Self {
             asker: asker.clone(),
-            message: without_content(message)?,
+            kept,
+            message: without_content(message)
+                .build()
+                .map_err(|_| request::unrecognised_content())?,
             query: text,
             template,
             changed: Changed::default(),
             is_under_way: false,
+            under_way: Vec::new(),
             not_before: now,
         };
         Ok((subscription, agreed))
@@ -120,6 +132,38 @@ impl Subscription {
         }
         text.extend_from_slice(b")))");
         text
+    }
+
+    /// Returns the copy for a successor.
+    pub(crate) fn keep(&self) -> Option<KeptSubscription> {
+        let mut kept = self.kept.clone()?;
+        let changed = self.under_way.len() + self.changed.len();
+        let all = self.under_way.iter().chain(&self.changed.order);
+        kept.changed = (changed <= CHANGES).then(|| all.cloned().collect());
+        Some(kept)
+    }
+
+    pub(crate) fn is_kept(&self) -> bool {
+        self.kept.is_some()
+    }
+
+    /// Records that a notification about this agent leaves.
+    pub(crate) fn leaves(&mut self, name: &Arc<str>) {
+        if self.kept.is_some() {
+            self.under_way.push(Arc::clone(name));
+        }
+    }
+
+    /// Puts back the agent that was recorded last.
+    pub(crate) fn stays(&mut self, name: Arc<str>) {
+        self.under_way.pop();
+        self.changed.put_back(name);
+    }
+
+    /// Records that the notification has arrived.
+    pub(crate) fn arrived(&mut self) {
+        self.is_under_way = false;
+        self.under_way.clear();
     }
 
     pub(crate) fn dialect(&self) -> Dialect {
@@ -191,7 +235,7 @@ fn parameters(message: &Message) -> usize {
 }
 
 /// Returns a message with the parameters that answers repeat.
-fn without_content(message: &Message) -> Result<Message, Exception> {
+fn without_content(message: &Message) -> MessageBuilder {
     let mut copy = Message::builder(Performative::Subscribe);
     for (text, set) in [
         (
@@ -207,5 +251,5 @@ fn without_content(message: &Message) -> Result<Message, Exception> {
             copy = set(copy, text);
         }
     }
-    copy.build().map_err(|_| request::unrecognised_content())
+    copy
 }

@@ -26,6 +26,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use super::exchange::Exchanging;
 use super::names::other_claim;
 use super::neighbours::Neighbours;
+use super::state::{Predecessor, StateFile};
 use crate::config;
 use crate::service::Service;
 
@@ -35,6 +36,10 @@ const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 /// Time for which an agent of another host must have the name before this one gets a second name. The
 /// updates of a directory may arrive in the wrong order.
 const CONTESTED: Duration = Duration::from_secs(1);
+
+/// Minimum time between two copies of the state for a successor, which take time in proportion to the
+/// number of descriptions.
+const KEEP_PAUSE: Duration = Duration::from_millis(50);
 
 // The exchange carries what the directory facilitator accepts.
 const _: () = assert!(Exchange::MAX_DF_ENTRY == limits::REMOTE_BYTES);
@@ -52,6 +57,10 @@ pub(super) struct PlatformAgents {
     pub(super) exchange: Arc<Exchanging>,
     /// Whether `security.keys` is set.
     pub(super) has_keys: bool,
+    /// What the agents keep for their successors.
+    pub(super) state: Arc<StateFile>,
+    /// What the last gateway of this domain kept.
+    pub(super) predecessor: Arc<Predecessor>,
 }
 
 impl PlatformAgents {
@@ -298,6 +307,8 @@ struct Task {
     /// Time of the last and of the next reading of the entries of other gateways.
     remote_read: Option<Instant>,
     remote_due: Option<Instant>,
+    /// The revision of the core that was kept last, and when.
+    kept: Option<(u64, Instant)>,
 }
 
 impl Task {
@@ -309,7 +320,7 @@ impl Task {
             Kind::Ams => Core::Ams(Ams::new(id, means.description())),
             Kind::Df => Core::Df(Df::new(id)),
         };
-        Some(Self {
+        let mut task = Self {
             means,
             kind,
             core,
@@ -320,7 +331,59 @@ impl Task {
             staying: HashSet::new(),
             remote_read: None,
             remote_due: None,
-        })
+            kept: None,
+        };
+        task.take_over();
+        Some(task)
+    }
+
+    /// Takes over what the last gateway kept. The descriptions of agents that have ended since end.
+    fn take_over(&mut self) {
+        let means = &self.means;
+        let from = &*means.predecessor;
+        let now = now();
+        let stays = |platform| means.state.stays(from, platform);
+        match &mut self.core {
+            Core::Ams(ams) => {
+                ams.take_over(
+                    now.at,
+                    from.elapsed,
+                    &from.agents,
+                    &means.residents(),
+                    stays,
+                );
+            }
+            Core::Df(df) => {
+                let kept = (&from.descriptions[..], &from.subscriptions[..]);
+                df.take_over(now, from.elapsed, kept, stays);
+            }
+        }
+        self.handle_departures();
+    }
+
+    /// Keeps the state for a successor after a change, at most every [`KEEP_PAUSE`]. Returns the time at
+    /// which to call this again.
+    fn keep(&mut self) -> Option<Instant> {
+        let revision = match &self.core {
+            Core::Ams(ams) => ams.revision(),
+            Core::Df(df) => df.revision(),
+        };
+        let now = Instant::now();
+        if let Some((kept, at)) = self.kept {
+            if kept == revision {
+                return None;
+            }
+            if now < at + KEEP_PAUSE {
+                return Some(at + KEEP_PAUSE);
+            }
+        }
+        self.kept = Some((revision, now));
+        let state = &self.means.state;
+        match &self.core {
+            Core::Ams(ams) => state.set_agents(now, ams.keep(now)),
+            Core::Df(df) => state.set_services(now, df.keep(now)),
+        }
+        None
     }
 
     /// Reads and answers letters until the service ends.
@@ -333,8 +396,9 @@ impl Task {
         loop {
             self.send_answers();
             self.send_df();
+            let keep = self.keep();
             let contested = self.contested.map(|since| since + CONTESTED);
-            let due = [self.poll_timeout(), contested, self.remote_due];
+            let due = [self.poll_timeout(), contested, self.remote_due, keep];
             let due = due.into_iter().flatten().min();
             let due = due.map(tokio::time::Instant::from_std);
             let second = self.second().map(|second| second.incarnation);
@@ -407,10 +471,7 @@ impl Task {
             return;
         };
         asker.asked = asked;
-        let now = Now {
-            at: Instant::now(),
-            wall: SystemTime::now(),
-        };
+        let now = now();
         match &mut self.core {
             Core::Ams(ams) => {
                 ams.handle_message(now, &asker, &message, &self.means.residents());
@@ -460,10 +521,7 @@ impl Task {
     }
 
     fn read_remote(&mut self) {
-        let now = Now {
-            at: Instant::now(),
-            wall: SystemTime::now(),
-        };
+        let now = now();
         (self.remote_read, self.remote_due) = (Some(now.at), None);
         if let Core::Df(df) = &mut self.core
             && df.handle_remote(now, &self.means.remote_entries())
@@ -584,6 +642,13 @@ impl Task {
             sender.is_some_and(|sender| sender.name() == second.name())
         });
         second.unwrap_or(&self.own).incarnation
+    }
+}
+
+fn now() -> Now {
+    Now {
+        at: Instant::now(),
+        wall: SystemTime::now(),
     }
 }
 

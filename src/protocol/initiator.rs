@@ -123,7 +123,7 @@ pub struct Request {
 }
 
 impl Request {
-    async fn begin(
+    pub(crate) async fn begin(
         core: &Arc<AgentCore>,
         protocol: &str,
         request: MessageBuilder,

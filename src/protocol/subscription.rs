@@ -13,7 +13,7 @@ use tokio::sync::Mutex;
 use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
 use super::reachability::Reachability;
 use super::receivers::single;
-use crate::agent::Agent;
+use crate::agent::{Agent, AgentCore};
 
 impl Agent {
     /// Subscribes to the notifications of an agent (`subscribe`, FIPA00035). Waits until the agent
@@ -49,27 +49,7 @@ impl Agent {
         subscribe: MessageBuilder,
         patience: Duration,
     ) -> Result<Subscription, DialogueError> {
-        let due = after(patience);
-        let (subscribe, receivers) = single(&self.core, subscribe)?;
-        let opened = Dialogue::open(&self.core, "fipa-subscribe", subscribe, due);
-        let (mut dialogue, sent) = opened.await?;
-        only_delivered(&sent)?;
-        let first = dialogue.receive(due).await?.message;
-        let early = match first.performative() {
-            Performative::Agree => None,
-            Performative::Refuse => return Err(DialogueError::Refused(Box::new(first))),
-            Performative::Failure => return Err(DialogueError::Failed(Box::new(first))),
-            _ => Some(first),
-        };
-        Ok(Subscription {
-            id: dialogue.id().to_owned(),
-            reachability: dialogue.reachability(),
-            dialogue: Arc::new(Mutex::new(dialogue)),
-            waiting: None,
-            is_over: false,
-            receivers,
-            early,
-        })
+        Subscription::begin(&self.core, subscribe, patience).await
     }
 }
 
@@ -93,6 +73,34 @@ pub struct Subscription {
 type Waiting = Pin<Box<dyn Future<Output = Result<Message, DialogueError>> + Send>>;
 
 impl Subscription {
+    pub(crate) async fn begin(
+        core: &Arc<AgentCore>,
+        subscribe: MessageBuilder,
+        patience: Duration,
+    ) -> Result<Self, DialogueError> {
+        let due = after(patience);
+        let (subscribe, receivers) = single(core, subscribe)?;
+        let opened = Dialogue::open(core, "fipa-subscribe", subscribe, due);
+        let (mut dialogue, sent) = opened.await?;
+        only_delivered(&sent)?;
+        let first = dialogue.receive(due).await?.message;
+        let early = match first.performative() {
+            Performative::Agree => None,
+            Performative::Refuse => return Err(DialogueError::Refused(Box::new(first))),
+            Performative::Failure => return Err(DialogueError::Failed(Box::new(first))),
+            _ => Some(first),
+        };
+        Ok(Self {
+            id: dialogue.id().to_owned(),
+            reachability: dialogue.reachability(),
+            dialogue: Arc::new(Mutex::new(dialogue)),
+            waiting: None,
+            is_over: false,
+            receivers,
+            early,
+        })
+    }
+
     /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
