@@ -17,6 +17,7 @@
 //! deadline = "5s"                     # per letter, unless the call sets another one
 //! queue = 256                         # waiting letters per agent before senders have to wait
 //! queue_bytes = "64MiB"               # the same in bytes; also per sender and receiver at gateways
+//! raise_open_files = false            # true: raise the soft limit of open files to the hard one
 //! [routes]                            # transports by receiver name or pattern; first match counts
 //! "camera_.*" = ["shm"]               # (none by default)
 //! [transport.shm]
@@ -138,6 +139,9 @@ pub struct Mts {
     /// letters from one sender to one receiver that wait in a process or gateway, 64 KiB to 1 TiB.
     /// Beyond it their senders wait. An empty queue accepts a letter of any size.
     pub queue_bytes: u64,
+    /// `raise_open_files`: whether a process that joins a domain raises its soft limit of open files to the hard one;
+    /// see [`open_files`](crate::open_files). Programs that use `select` do not work with more than 1,024 open files.
+    pub raise_open_files: bool,
 }
 
 /// One line of `[routes]`.
@@ -446,6 +450,7 @@ impl Config {
                 deadline: Duration::from_secs(5),
                 queue: 256,
                 queue_bytes: 64 << 20,
+                raise_open_files: false,
             },
             routes: Vec::new(),
             transport: Transports {

@@ -153,6 +153,7 @@ mod lock_slot;
 mod lock_slot;
 #[cfg(feature = "locks")]
 pub mod locks;
+pub mod open_files;
 mod owner;
 #[cfg(feature = "protocols")]
 mod peer_shares;

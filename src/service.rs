@@ -20,6 +20,7 @@ use crate::dir_maintenance::DirMaintenance;
 use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
 use crate::host_directory::{self, Membership};
+use crate::open_files;
 use crate::routes::Report;
 use crate::watch::Watchers;
 
@@ -100,6 +101,11 @@ impl Service {
         role: Role<'_>,
         cancellation: &Cancellation,
     ) -> Result<Self, OpenError> {
+        if config.mts.raise_open_files
+            && let Err(error) = open_files::raise()
+        {
+            log_limit::warn!(%error, "cannot raise the limit of open files");
+        }
         config.check()?;
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let incarnation = Incarnation::random();

@@ -93,6 +93,7 @@ transports = [\"shm\", \"unix\", \"tcp\"]  # default
 deadline = \"9s\"                      # --set
 queue = 256                          # default
 queue_bytes = \"64MiB\"                # default
+raise_open_files = false             # default
 
 [transport.shm]
 capacity = \"256MiB\"                  # default
@@ -247,7 +248,7 @@ fn errors_are_reported_with_place_and_help() {
     let errors = "\
 error: unknown key `mts.deadlin`
 where: fipa.toml:2
- help: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes)
+ help: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes, raise_open_files)
 error: `mts.queue` is invalid: \"x\": a string is not allowed here
 where: fipa.toml:3
  help: expected a number of letters such as 256
@@ -262,7 +263,7 @@ where: fipa.toml:3
         json!({ "ok": false, "mistakes": [
             { "what": "unknown key `mts.deadlin`",
               "help": "did you mean `mts.deadline`? \
-                       (known in [mts]: name, transports, deadline, queue, queue_bytes)",
+                       (known in [mts]: name, transports, deadline, queue, queue_bytes, raise_open_files)",
               "place": { "from": "file", "path": "fipa.toml", "line": 2 } },
             { "what": "`mts.queue` is invalid: \"x\": a string is not allowed here",
               "help": "expected a number of letters such as 256",

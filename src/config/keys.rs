@@ -115,6 +115,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| size_text(config.mts.queue_bytes),
     },
     Key {
+        path: &["mts", "raise_open_files"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|raise| config.mts.raise_open_files = raise),
+        read: |config| Value::Truth(config.mts.raise_open_files),
+    },
+    Key {
         path: &["transport", "shm", "capacity"],
         shape: Shape::Text,
         expected: SIZE,

@@ -319,6 +319,7 @@ transports = ["shm", "tcp"]          # fipa.toml:4
 deadline = "1m 30s"                  # --set
 queue = 256                          # default
 queue_bytes = "64MiB"                # default
+raise_open_files = false             # default
 
 [transport.shm]
 capacity = "256MiB"                  # default
@@ -434,6 +435,7 @@ prop_compose! {
         config.mts.deadline = Duration::from_nanos(deadline);
         config.mts.queue = queue;
         config.mts.queue_bytes = queue_bytes;
+        config.mts.raise_open_files = answer;
         config.routes = routes
             .into_iter()
             .map(|(receiver, transports)| Route { receiver, transports })

@@ -7,11 +7,12 @@ use fipa_acl::ErrorChain;
 use fipa_transport::Incarnation;
 use fipa_transport_shm::{Inspection, ShmConfig, inspect};
 use rustix::fs::inotify;
-use rustix::process::{Resource, geteuid, getrlimit};
+use rustix::process::geteuid;
 
 use super::{Area, Check, Verdict};
 use crate::Config;
 use crate::domain_dir::DomainDir;
+use crate::open_files;
 
 const AREA: Area = Area("shared memory");
 
@@ -113,12 +114,13 @@ fn exposed(found: &Inspection) -> Check {
 
 fn descriptors() -> Check {
     const CHECK: &str = "limit of open files";
-    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    // That of other programs: a command that examines has raised its own.
+    let limit = open_files::inherited().unwrap_or(u64::MAX);
     let peers = limit.saturating_sub(OWN_DESCRIPTORS) / DESCRIPTORS_PER_PEER;
     let text = format!("{limit}: enough to exchange letters with {peers} processes");
     let advice = format!(
-        "raise it (ulimit -n, or LimitNOFILE= of the service): a process needs {OWN_DESCRIPTORS}, and \
-         {DESCRIPTORS_PER_PEER} more for each process that it exchanges letters with"
+        "set mts.raise_open_files, or raise it (ulimit -n, or LimitNOFILE= of the service): a process needs \
+         {OWN_DESCRIPTORS}, and {DESCRIPTORS_PER_PEER} more for each process that it exchanges letters with"
     );
     match peers {
         0 => AREA.problem(CHECK, Verdict::Bad, text, advice),

@@ -22,7 +22,7 @@ use crate::combiner::Combiner;
 use crate::counters::{Tally, count};
 use crate::deferred::LateAnswers;
 use crate::domain_files::{DomainFiles, file_error};
-use crate::errors::{closed, opening};
+use crate::errors::{self, closed, opening};
 use crate::fork::Owner;
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
@@ -126,8 +126,7 @@ impl Endpoint {
                 .signal_handling_mode(SignalHandlingMode::Disabled)
                 .create::<Svc>()
         });
-        let node =
-            node.map_err(|e| failed("cannot create a node", crate::errors::words(&e), shortage))?;
+        let node = node.map_err(|e| failed("cannot create a node", errors::words(&e), shortage))?;
         domain.restrict_permissions()?;
         let peer_segments = Arc::new(PeerSegments::new(domain.clone()));
         let deferred = Arc::<LateAnswers>::default();
@@ -541,10 +540,10 @@ impl Endpoint {
         let service = ServiceName::new(&name).map_err(|e| {
             TransportError::new(
                 TransportErrorKind::Unreachable,
-                format_args!("{}", crate::errors::words(&e)),
+                format_args!("{}", errors::words(&e)),
             )
         })?;
-        peer.opened(Outbox::open(Opening {
+        let opened = Outbox::open(Opening {
             node,
             service: &service,
             own: self.config.incarnation,
@@ -558,7 +557,21 @@ impl Endpoint {
             domain: self.domain.clone(),
             lock,
             memory,
-        })?)
+        });
+        peer.opened(opened.map_err(|error| self.short_of_descriptors(error))?)
+    }
+
+    /// Returns the error of a mailbox that could not be opened. iceoryx2 has no text for a lack of descriptors. Then
+    /// idle connections are given up, so that a later attempt finds descriptors.
+    fn short_of_descriptors(&self, error: TransportError) -> TransportError {
+        let Some(limit) = errors::reached_limit() else {
+            return error;
+        };
+        if let Some(mut peers) = self.peers.try_write() {
+            let _ = (0..GIVEN_UP).all(|_| give_up_idle(&mut peers));
+        }
+        let detail = format_args!("{}: {}", error.detail, errors::limit_text(limit));
+        TransportError::new(TransportErrorKind::Congested, detail)
     }
 
     fn peer_at(self: &Arc<Self>, to: &Location) -> Result<Arc<Peer>, TransportError> {
@@ -592,9 +605,7 @@ impl Endpoint {
             return Ok(peer.clone());
         }
         if peers.len() >= self.config.max_peers {
-            let idle = peers.values().filter(|peer| peer.is_idle());
-            let oldest = idle.min_by_key(|peer| peer.last_used());
-            let oldest = oldest.map(|peer| peer.incarnation()).ok_or_else(|| {
+            give_up_idle(&mut peers).then_some(()).ok_or_else(|| {
                 TransportError::new(
                     TransportErrorKind::Congested,
                     format_args!(
@@ -603,12 +614,14 @@ impl Endpoint {
                     ),
                 )
             })?;
-            if let Some(oldest) = peers.remove(&oldest) {
-                oldest.end();
-            }
         }
         let paths = self.domain.paths();
-        let process = PeerProcess::open(paths, incarnation).map_err(|e| match e.kind() {
+        let mut opened = PeerProcess::open(paths, incarnation);
+        // The descriptors of a connection become free when its last user has dropped it; the next attempt finds them.
+        if opened.as_ref().is_err_and(errors::lacks_descriptors) && give_up_idle(&mut peers) {
+            opened = PeerProcess::open(paths, incarnation);
+        }
+        let process = opened.map_err(|e| match e.kind() {
             ErrorKind::NotFound => TransportError::new(
                 TransportErrorKind::Unreachable,
                 format_args!(
@@ -618,7 +631,10 @@ impl Endpoint {
             ),
             _ => TransportError::new(
                 TransportErrorKind::Congested,
-                format_args!("cannot open the files of process {incarnation}: {e}"),
+                format_args!(
+                    "cannot open the files of process {incarnation}: {}",
+                    errors::with_limit(&e)
+                ),
             ),
         })?;
         let peer = Arc::new(Peer::new(incarnation, process));
@@ -631,7 +647,10 @@ impl Endpoint {
         peer.watch(&self.runtime, ended).map_err(|e| {
             TransportError::new(
                 TransportErrorKind::Congested,
-                format_args!("cannot watch process {incarnation}: {e}"),
+                format_args!(
+                    "cannot watch process {incarnation}: {}",
+                    errors::with_limit(&e)
+                ),
             )
         })?;
         peer.mark_used(now);
@@ -741,6 +760,21 @@ impl Endpoint {
         // The error has no receiver; the next process that starts removes what is left.
         let _ = self.domain.leave();
     }
+}
+
+/// Number of idle connections that are given up when descriptors are short: their descriptors suffice for another one.
+const GIVEN_UP: usize = 2;
+
+/// Ends the connection that has been idle for the longest time. Returns whether there was one.
+fn give_up_idle(peers: &mut BTreeMap<Incarnation, Arc<Peer>>) -> bool {
+    let idle = peers.values().filter(|peer| peer.is_idle());
+    let oldest = idle.min_by_key(|peer| peer.last_used());
+    let oldest = oldest.map(|peer| peer.incarnation());
+    let oldest = oldest.and_then(|oldest| peers.remove(&oldest));
+    oldest.is_some_and(|oldest| {
+        oldest.end();
+        true
+    })
 }
 
 /// Number of polls in one round of [`Endpoint::drive`]; they take one to two microseconds.

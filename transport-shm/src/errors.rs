@@ -1,11 +1,15 @@
 //! Mapping of iceoryx2 errors to transport errors.
 
+use std::io;
+
 use fipa_transport::wire::WireError;
 use fipa_transport::{TransportError, TransportErrorKind};
 use iceoryx2::port::LoanError;
 use iceoryx2::port::client::RequestSendError;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::client::ClientCreateError;
+use rustix::io::Errno;
+use rustix::process::{Resource, getrlimit};
 
 const MAILBOX_TAKEN: &str =
     ": too many processes have it open; raise max_clients of the other process";
@@ -53,6 +57,39 @@ pub(crate) fn wire_error(error: WireError) -> TransportError {
     };
     TransportError::new(fault, error)
 }
+
+/// Whether a file cannot be opened because of a limit of open files, of the process or of the system.
+pub(crate) fn lacks_descriptors(error: &io::Error) -> bool {
+    let errno = Errno::from_io_error(error);
+    matches!(errno, Some(Errno::MFILE | Errno::NFILE))
+}
+
+/// Returns the text of an error, with the limit of open files if that is the cause.
+pub(crate) fn with_limit(error: &io::Error) -> String {
+    if Errno::from_io_error(error) != Some(Errno::MFILE) {
+        return error.to_string();
+    }
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    format!("{error}: {}", limit_text(limit))
+}
+
+/// Returns the limit of open files of this process if it has nearly reached it.
+pub(crate) fn reached_limit() -> Option<u64> {
+    let limit = getrlimit(Resource::Nofile).current?;
+    match std::fs::read_dir("/proc/self/fd") {
+        Ok(open) => (open.count() as u64 + CONNECTION >= limit).then_some(limit),
+        Err(error) => lacks_descriptors(&error).then_some(limit),
+    }
+}
+
+pub(crate) fn limit_text(limit: u64) -> String {
+    format!(
+        "this process may have {limit} open files; raise the limit (`ulimit -n`, or mts.raise_open_files)"
+    )
+}
+
+/// Number of descriptors that the connection with another process needs at most.
+const CONNECTION: u64 = 12;
 
 /// Maximum number of names in [`words`].
 const MAX_NAMES: usize = 4;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use clap::Args;
 use fipa::locks::{Lock, LockError};
-use fipa::{Agent, AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
+use fipa::{Agent, AgentId, Config, ErrorChain, Incarnation, RegisterOptions, open_files};
 use rustix::process::{Pid, Signal, kill_process_group, test_kill_process_group};
 use tokio::process::{Child, Command};
 
@@ -164,7 +164,8 @@ async fn hold(lock: &Lock, arguments: &Arguments, signals: &mut Signals) -> Resu
     if let Some(fence) = lock.fence() {
         command.env("FIPA_FENCE", fence.to_string());
     }
-    let mut child = command.spawn().map_err(|error| not_run(&error, program))?;
+    let spawned = open_files::with_inherited(|| command.spawn()).flatten();
+    let mut child = spawned.map_err(|error| not_run(&error, program))?;
     let group = child.id().and_then(|id| Pid::from_raw(id.cast_signed()));
     let mut is_lost = false;
     loop {

@@ -15,7 +15,7 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "domain = \"a\"\n[mts]\ndeadlin = \"5s\"\n",
             "fipa.toml:3: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
-             (known in [mts]: name, transports, deadline, queue, queue_bytes)",
+             (known in [mts]: name, transports, deadline, queue, queue_bytes, raise_open_files)",
         ),
         (
             "deadline = \"5s\"\n",
@@ -51,7 +51,8 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "\nmts = 5\n",
             "fipa.toml:2: `mts` is a section, not a value; \
-             write [mts] and below it some of its keys: name, transports, deadline, queue, queue_bytes",
+             write [mts] and below it some of its keys: \
+             name, transports, deadline, queue, queue_bytes, raise_open_files",
         ),
         (
             "routes = \"x\"\n",
@@ -385,7 +386,7 @@ fn mistakes_in_set_arguments_name_the_argument() {
     assert_eq!(
         error("", &["mts.deadlin=5s"]),
         "--set mts.deadlin=5s: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
-         (known in [mts]: name, transports, deadline, queue, queue_bytes)"
+         (known in [mts]: name, transports, deadline, queue, queue_bytes, raise_open_files)"
     );
     assert_eq!(
         error("", &["mts.transports=shm,quic"]),
@@ -395,7 +396,8 @@ fn mistakes_in_set_arguments_name_the_argument() {
     assert_eq!(
         error("", &["mts=5"]),
         "--set mts=5: `mts` is a section, not a value; \
-         write [mts] and below it some of its keys: name, transports, deadline, queue, queue_bytes"
+         write [mts] and below it some of its keys: \
+             name, transports, deadline, queue, queue_bytes, raise_open_files"
     );
     assert_eq!(
         error("", &["mts.queue=x\u{1b}[31m"]),
