@@ -4,7 +4,8 @@
 //! parcels in flight 4, serial number of this connection 8), then texts, each preceded by its
 //! length in two bytes: name, domain, host, the location that was dialled (empty from the side that
 //! accepted), and then, after their number in one byte, the addresses that the endpoint listens on.
-//! Later versions may append bytes, which are ignored.
+//! On a connection for [large letters](Load::Large), a byte 1 follows. Later versions may append bytes, which are
+//! ignored.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use fipa_transport::{Incarnation, Location};
@@ -31,6 +32,20 @@ struct Fixed {
     serial: U64,
 }
 
+/// The letters that a connection is for.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+pub(crate) enum Load {
+    /// All parcels, as far as there is no connection for large letters.
+    #[default]
+    Any,
+    /// Large letters, and those that follow them in their stream. They do not delay the parcels of the connection
+    /// for all.
+    Large,
+}
+
+/// The last byte of a hello for [`Load::Large`].
+const LARGE: u8 = 1;
+
 /// The introduction that each side sends when a connection begins.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Hello {
@@ -45,6 +60,8 @@ pub(crate) struct Hello {
     pub(crate) dialled: String,
     /// Addresses the endpoint listens on, best first.
     pub(crate) listening: Vec<String>,
+    /// The letters that the dialling side opened this connection for.
+    pub(crate) load: Load,
 }
 
 impl Hello {
@@ -66,6 +83,9 @@ impl Hello {
         let told = self.listening.iter().take(MAX_LISTENING);
         out.put_u8(told.len() as u8);
         told.for_each(|text| put_text(&mut out, text));
+        if self.load == Load::Large {
+            out.put_u8(LARGE);
+        }
         out.freeze()
     }
 
@@ -90,6 +110,10 @@ impl Hello {
         let listening = (0..count)
             .map(|_| text(&mut rest, Location::MAX_ADDRESS))
             .collect::<Option<_>>()?;
+        let load = match rest.first() {
+            Some(&LARGE) => Load::Large,
+            _ => Load::Any,
+        };
         Some(Self {
             identity,
             max_letter: fixed.max_letter.get(),
@@ -97,6 +121,7 @@ impl Hello {
             serial: fixed.serial.get(),
             dialled,
             listening,
+            load,
         })
     }
 }
@@ -135,6 +160,7 @@ pub(crate) mod tests {
             serial: 3,
             dialled: "tcp://10.0.0.2:7788".into(),
             listening: vec!["10.0.0.1:7788".into(), "[::1]:7788".into()],
+            load: Load::Any,
         }
     }
 
@@ -145,6 +171,11 @@ pub(crate) mod tests {
         assert_eq!(Hello::decode(&body), Some(hello.clone()));
         body.extend_from_slice(b"from a later version");
         assert_eq!(Hello::decode(&body), Some(hello));
+        let large = Hello {
+            load: Load::Large,
+            ..sample(7)
+        };
+        assert_eq!(Hello::decode(&large.encode()), Some(large));
     }
 
     #[test]

@@ -25,8 +25,8 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 ///    sink has returned it; the transport acknowledges nothing on its behalf. The sink gets the
 ///    parcel of an attempt once. If a copy reaches it all the same, its verdict does not answer the
 ///    attempt.
-/// 4. **Order.** Parcels dispatched to one location arrive in the order of the calls, or do not
-///    arrive.
+/// 4. **Order.** Letters of one stream that are dispatched to one location arrive in the order of the calls, or do
+///    not arrive.
 /// 5. **No callback from a call.** The transport does not call a sink from within `dispatch`,
 ///    `abandon` or `answer`, because the caller may hold its own lock. It may call the sink from
 ///    within [`drive`](Self::drive) and `listen`.

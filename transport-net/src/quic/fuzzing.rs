@@ -471,7 +471,7 @@ impl QuicStreams {
     /// Sends a parcel.
     pub fn send(&mut self, parcel: &Parcel) {
         let attempt = AttemptId(self.dispatched);
-        if self.link.send(attempt, parcel).is_ok() {
+        if self.link.send(attempt, parcel, None).is_ok() {
             self.dispatched += 1;
         }
         self.poll();

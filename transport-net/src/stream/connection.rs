@@ -6,13 +6,13 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::IoSlice;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Mandate, Parcel, Principal,
-    TransportError, TransportErrorKind,
+    Stream, TransportError, TransportErrorKind,
 };
 
 use super::config::Limits;
@@ -21,7 +21,7 @@ use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
 use crate::answer::{self, Contradictions};
 use crate::end::ConnectionEnd;
-use crate::hello::Hello;
+use crate::hello::{Hello, Load};
 
 /// Upper bound of parcel numbers, so that a ticket also holds the number of the connection.
 pub(crate) const MAX_ID: u64 = 1 << 40;
@@ -94,6 +94,8 @@ pub(crate) struct Connection {
     sent: BTreeMap<u64, Sent>,
     attempts: HashMap<AttemptId, u64>,
     last_sent: u64,
+    /// Parcels that may not begin yet; see [`Connection::hold`].
+    held: VecDeque<(u64, Weak<Predecessors>)>,
     /// Number of parcels in `sent` that have begun.
     begun: usize,
     /// Parcels that arrived and are not answered yet.
@@ -113,10 +115,39 @@ struct Sent {
     /// `None` when the attempt was abandoned.
     attempt: Option<AttemptId>,
     receiver: Arc<str>,
+    stream: Stream,
+    /// Holds large letters of the stream back, on the connection for them.
+    predecessors: Vec<Arc<Predecessors>>,
     after: u64,
     letter_len: u64,
     /// Time at which the kernel began to take it.
     begun: Option<Instant>,
+}
+
+/// The unanswered letters of a stream on one connection. The next letter of the stream is large and begins on another
+/// connection when all of them are answered.
+pub(crate) struct Predecessors {
+    answered: Box<dyn Fn() + Send + Sync>,
+}
+
+impl Predecessors {
+    /// Creates the set; `answered` is called when nothing holds it any more.
+    pub(crate) fn new(answered: impl Fn() + Send + Sync + 'static) -> Arc<Self> {
+        let answered = Box::new(answered);
+        Arc::new(Self { answered })
+    }
+}
+
+impl Drop for Predecessors {
+    fn drop(&mut self) {
+        (self.answered)();
+    }
+}
+
+impl std::fmt::Debug for Predecessors {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Predecessors").finish_non_exhaustive()
+    }
 }
 
 /// The times that the timers are based on.
@@ -157,6 +188,7 @@ impl Connection {
             sent: BTreeMap::new(),
             attempts: HashMap::new(),
             last_sent: 0,
+            held: VecDeque::new(),
             begun: 0,
             arrivals: HashSet::new(),
             last_arrival: 0,
@@ -312,12 +344,49 @@ impl Connection {
             Sent {
                 attempt: Some(attempt),
                 receiver: Arc::clone(&parcel.receiver),
+                stream: parcel.stream,
+                predecessors: Vec::new(),
                 after: parcel.after,
                 letter_len,
                 begun: None,
             },
         );
         Ok(())
+    }
+
+    /// Returns the letters this side was asked to carry with the hello of the side that opened the connection.
+    pub(crate) fn load(&self) -> Load {
+        match (self.role, &self.peer) {
+            (Role::Acceptor, Some(peer)) => peer.load,
+            _ => self.hello.load,
+        }
+    }
+
+    /// Whether a parcel of this stream is not answered yet.
+    pub(crate) fn carries(&self, stream: Stream) -> bool {
+        self.sent.values().any(|sent| sent.stream == stream)
+    }
+
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn has_attempt(&self, attempt: AttemptId) -> bool {
+        self.attempts.contains_key(&attempt)
+    }
+
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn may_begin(&self) -> usize {
+        self.outbox.parcels_before(MAX_ID).min(self.window())
+    }
+
+    /// Adds the unanswered parcels of a stream to `predecessors`.
+    pub(crate) fn note_predecessors(&mut self, stream: Stream, predecessors: &Arc<Predecessors>) {
+        let of_stream = self.sent.values_mut().filter(|sent| sent.stream == stream);
+        of_stream.for_each(|sent| sent.predecessors.push(Arc::clone(predecessors)));
+    }
+
+    /// Lets the parcel that was queued last begin only when all `predecessors` are answered.
+    pub(crate) fn hold(&mut self, predecessors: Weak<Predecessors>) {
+        self.held.retain(|(_, it)| !is_answered(it));
+        self.held.push_back((self.last_sent, predecessors));
     }
 
     /// Ends an attempt. The parcel is not sent if the kernel has taken no byte of it. An attempt
@@ -670,7 +739,11 @@ impl Connection {
         let Some(peer) = self.peer.as_ref().filter(|_| self.open) else {
             return 0;
         };
-        (peer.max_in_flight as usize).saturating_sub(self.begun)
+        let window = (peer.max_in_flight as usize).saturating_sub(self.begun);
+        let held = self.held.iter().find(|(_, it)| !is_answered(it));
+        held.map_or(window, |(id, _)| {
+            window.min(self.outbox.parcels_before(*id))
+        })
     }
 
     fn is_idle(&self) -> bool {
@@ -808,6 +881,11 @@ impl Connection {
             )),
         }
     }
+}
+
+/// Whether the last of these letters has been answered, or its connection has ended.
+fn is_answered(predecessors: &Weak<Predecessors>) -> bool {
+    predecessors.strong_count() == 0
 }
 
 /// Returns the length of the letter in a parcel; 0 for other parcels.

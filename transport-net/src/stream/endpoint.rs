@@ -6,6 +6,11 @@
 //! other at the same time both connections are kept, and the unused one closes after the idle
 //! timeout.
 //!
+//! Between hosts, large letters take a connection of their own, so that they do not delay the other parcels in
+//! either direction. So do the small letters that follow a large one in its stream, until it is answered; a large one
+//! begins when those before it in its stream are answered. Without such a connection, for example because
+//! the peer cannot be dialled, large letters take the one for all parcels.
+//!
 //! A connection is *suspect* after an attempt on it got no answer and no other byte arrived either:
 //! the system retransmits lost packets with growing pauses, and a peer that moved never answers.
 //! Later dispatches take another connection with the same peer, which is opened if there is none.
@@ -23,8 +28,8 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Principal,
-    Sink, Ticket, TransportError, TransportErrorKind, log_limit,
+    Abandoned, Answer, AttemptId, Body, Hop, Incarnation, Kind, ListenError, Location, Parcel,
+    Principal, Sink, Ticket, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -43,7 +48,7 @@ use crate::Identity;
 #[cfg(feature = "ip")]
 use crate::address::{self, Listening};
 use crate::end::ConnectionEnd;
-use crate::hello::Hello;
+use crate::hello::{Hello, Load};
 #[cfg(feature = "ip")]
 use crate::interfaces::Changes;
 use crate::rate_limit::PeerRateLimit;
@@ -62,6 +67,9 @@ const MAX_ASKED: usize = 4;
 
 /// Maximum number of times that the pause between retries beside suspect connections doubles.
 const MAX_DOUBLINGS: u32 = 4;
+
+/// Maximum length of a small letter: 64 KiB of content and the rest of the letter. At 10 Mbit/s, it takes 56 ms.
+const MAX_SMALL: u64 = 68 << 10;
 
 /// Pause of accepting after a failure, for example when the process has no descriptors left.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(100);
@@ -93,12 +101,10 @@ struct Registry {
     listeners: Vec<AbortHandle>,
     /// Connections that were dialled, or whose peer has said hello.
     links: HashMap<u32, Arc<Link>>,
-    /// Connections opened by this side, by location.
-    dialled: HashMap<Location, Arc<Link>>,
-    /// Locations for which connections were opened beside suspect ones.
-    suspect_retries: HashMap<Location, SuspectRetries>,
-    /// All connections with the service of an incarnation, in the order of introduction.
-    known: HashMap<Incarnation, Vec<Arc<Link>>>,
+    /// The connections for all parcels.
+    any: Connections,
+    /// The connections for large letters.
+    large: Connections,
     /// The latest connection of each peer for each location that the peer dialled, with the peer's
     /// serial number.
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
@@ -113,14 +119,25 @@ struct Registry {
     last_serial: u64,
 }
 
-/// Number and time of the connections that were opened beside suspect ones.
+/// The connections of one [`Load`].
+#[derive(Default)]
+struct Connections {
+    /// Those opened by this side, by location.
+    dialled: HashMap<Location, Arc<Link>>,
+    /// Those with the service of an incarnation, in the order of introduction.
+    known: HashMap<Incarnation, Vec<Arc<Link>>>,
+    /// Locations for which connections were opened beside suspect ones or, for large letters, could not be opened.
+    retries: HashMap<Location, Retries>,
+}
+
+/// Number and time of the connections that were opened beside suspect ones, or could not be opened.
 #[derive(Debug, Clone, Copy)]
-struct SuspectRetries {
+struct Retries {
     last: Instant,
     times: u32,
 }
 
-impl SuspectRetries {
+impl Retries {
     /// Whether the pause since the last one has not passed. The pause doubles each time.
     fn is_soon(self, now: Instant, pause: Duration) -> bool {
         now < self.last + pause.saturating_mul(1 << self.times.min(MAX_DOUBLINGS))
@@ -174,6 +191,8 @@ struct Peer {
     /// The location that the peer dialled and the serial number of that dialling, if the peer
     /// opened the connection.
     dialled: Option<(String, u64)>,
+    /// The letters that the connection is for.
+    load: Load,
     /// The listening addresses in its hello.
     #[cfg_attr(not(feature = "ip"), expect(dead_code, reason = "only IP peers move"))]
     listening: Vec<String>,
@@ -197,6 +216,7 @@ struct Inbound {
     incarnation: Incarnation,
     home: Home,
     dialled: String,
+    load: Load,
 }
 
 impl Peer {
@@ -221,7 +241,8 @@ impl Peer {
         }
         match (&self.dialled, &before.dialled) {
             (Some((this, serial)), Some((that, earlier))) => {
-                serial >= earlier && (self.home != before.home || this == that)
+                let is_for_same = this == that && self.load == before.load;
+                serial >= earlier && (self.home != before.home || is_for_same)
             }
             // An unproved peer at another address may or may not be the service.
             (Some(_), None) => self.proved.is_none() && self.home != before.home,
@@ -533,11 +554,26 @@ impl Endpoint {
         dial: impl Fn(Arc<Link>, Arc<dyn Sink>) -> JoinHandle<()>,
     ) -> Result<(), TransportError> {
         loop {
-            let (link, fresh) = match self.route_to(to)? {
+            let load = self.load_for(to, parcel);
+            let (link, fresh) = match self.route_to(to, load)? {
                 Route::Open(link) => (link, None),
                 Route::New(link, sink) => (link, Some(sink)),
             };
-            let sent = link.send(attempt, parcel);
+            let predecessors = (load == Load::Large).then(|| {
+                let others = self
+                    .registry
+                    .lock()
+                    .any
+                    .open(to)
+                    .cloned()
+                    .collect::<Vec<_>>();
+                let others: Vec<_> = others
+                    .into_iter()
+                    .filter(|it| !Arc::ptr_eq(it, &link))
+                    .collect();
+                link.predecessors(parcel.stream, &others)
+            });
+            let sent = link.send(attempt, parcel, predecessors);
             if let Some(sink) = fresh {
                 let task = dial(link.clone(), sink);
                 if task.is_finished() && !link.has_begun() {
@@ -559,8 +595,23 @@ impl Endpoint {
         }
     }
 
+    /// Returns the connections that a parcel takes to a location.
+    fn load_for(&self, to: &Location, parcel: &Parcel) -> Load {
+        if self.kind.is_host_local() || !matches!(parcel.body, Body::Letter(_)) {
+            return Load::Any;
+        }
+        if letter_len(parcel) > MAX_SMALL {
+            return Load::Large;
+        }
+        let large: Vec<_> = self.registry.lock().large.open(to).cloned().collect();
+        match large.iter().any(|link| link.carries(parcel.stream)) {
+            true => Load::Large,
+            false => Load::Any,
+        }
+    }
+
     /// Returns a connection to a location; creates a link when there is none.
-    fn route_to(&self, to: &Location) -> Result<Route, TransportError> {
+    fn route_to(&self, to: &Location, load: Load) -> Result<Route, TransportError> {
         let mut registry = self.registry.lock();
         let sink = match (registry.phase, &registry.sink) {
             (Phase::Open, Some(sink)) => sink.clone(),
@@ -572,9 +623,8 @@ impl Endpoint {
             }
             _ => return Err(ConnectionEnd::Closed.after()),
         };
-        let dialled = registry.dialled.get(to);
-        let known = registry.known.get(&to.incarnation());
-        let open = || dialled.into_iter().chain(known.into_iter().flatten());
+        let connections = registry.of(load);
+        let open = || connections.open(to);
         let is_full = registry.links.len() >= self.limits().max_connections;
         let healthy = open().find(|link| !link.is_suspect());
         // Another connection is opened beside suspect ones if `max_connections` allows it, with
@@ -582,13 +632,16 @@ impl Endpoint {
         let now = Instant::now();
         let spare = self.limits().connect_timeout;
         let is_soon = || {
-            registry
-                .suspect_retries
+            connections
+                .retries
                 .get(to)
                 .is_some_and(|it| it.is_soon(now, spare))
         };
-        let link = healthy.or_else(|| open().next().filter(|_| is_full || is_soon()));
+        let for_all = || registry.any.open(to).filter(|_| load == Load::Large);
+        let without_new = || open().chain(for_all()).next();
+        let link = healthy.or_else(|| without_new().filter(|_| is_full || is_soon()));
         if let Some(link) = link.cloned() {
+            let dialled = connections.dialled.get(to);
             if dialled.is_none_or(|dialled| !Arc::ptr_eq(dialled, &link)) {
                 drop(registry);
                 link.is_used_for(to);
@@ -604,13 +657,14 @@ impl Endpoint {
         let role = Role::Dialler {
             expected: to.incarnation(),
         };
-        let link = self.make_link(&mut registry, role, serial, to.to_string());
+        let link = self.make_link(&mut registry, role, load, serial, to.to_string());
         if !suspect.is_empty() {
-            registry.note_retry(to, now, spare);
+            registry.of_mut(load).note_retry(to, now, spare);
         }
         link.opened_beside(suspect);
         registry.links.insert(link.number, link.clone());
-        registry.dialled.insert(to.clone(), link.clone());
+        let dialled = &mut registry.of_mut(load).dialled;
+        dialled.insert(to.clone(), link.clone());
         Ok(Route::New(link, sink))
     }
 
@@ -626,9 +680,12 @@ impl Endpoint {
     /// Ends an attempt to this location.
     pub(crate) fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {
         let registry = self.registry.lock();
-        let dialled = registry.dialled.get(to).into_iter();
-        let known = registry.known.get(&to.incarnation()).into_iter().flatten();
-        let present: Vec<_> = dialled.chain(known).cloned().collect();
+        let present: Vec<_> = registry
+            .any
+            .open(to)
+            .chain(registry.large.open(to))
+            .cloned()
+            .collect();
         drop(registry);
         let end = |links: &[Arc<Link>]| links.iter().find_map(|link| link.abandon(attempt));
         if let Some(end) = end(&present) {
@@ -645,13 +702,15 @@ impl Endpoint {
         let home = location.authority().parse::<SocketAddr>().ok();
         let home = home.map(|address| Source::Address(address).home());
         let registry = self.registry.lock();
-        let known = registry.known.get(&location.incarnation());
-        let mut links: Vec<_> = known.into_iter().flatten().cloned().collect();
-        links.retain(|link| {
+        let is_there = |link: &&Arc<Link>| {
             let peer = registry.peers.get(&link.number);
             peer.is_some_and(|peer| Some(peer.home) == home)
+        };
+        let links = [&registry.any, &registry.large].into_iter().flat_map(|it| {
+            let known = it.known_of(location).filter(is_there);
+            known.chain(it.dialled.get(location)).cloned()
         });
-        links.extend(registry.dialled.get(location).cloned());
+        let links: Vec<_> = links.collect();
         drop(registry);
         for link in links {
             link.left();
@@ -662,7 +721,7 @@ impl Endpoint {
     pub(crate) fn accepted(&self) -> Option<(Arc<Link>, Arc<dyn Sink>)> {
         let mut registry = self.registry.lock();
         let sink = registry.sink.clone()?;
-        let link = self.make_link(&mut registry, Role::Acceptor, 0, String::new());
+        let link = self.make_link(&mut registry, Role::Acceptor, Load::Any, 0, String::new());
         Some((link, sink))
     }
 
@@ -670,6 +729,7 @@ impl Endpoint {
         &self,
         registry: &mut Registry,
         role: Role,
+        load: Load,
         serial: u64,
         dialled: String,
     ) -> Arc<Link> {
@@ -680,6 +740,7 @@ impl Endpoint {
             serial,
             dialled,
             listening: registry.listening.texts(),
+            load,
         };
         loop {
             registry.last_number = (registry.last_number + 1) % MAX_LINKS;
@@ -707,16 +768,19 @@ impl Endpoint {
             return Err(ConnectionEnd::NotSought);
         }
         let incarnation = peer.identity.incarnation;
+        let load = link.load();
         let inbound = Inbound {
             incarnation,
             home: from.home(),
             dialled: peer.dialled.clone(),
+            load,
         };
         let this = Peer {
             identity: peer.identity.clone(),
             proved,
             home: from.home(),
             dialled: (!peer.dialled.is_empty()).then(|| (peer.dialled.clone(), peer.serial)),
+            load,
             listening: peer.listening.clone(),
         };
         let mut silent: Vec<u32> = Vec::new();
@@ -869,6 +933,23 @@ impl Endpoint {
         self.forget(link);
     }
 
+    /// Whether the large letters of a connection that could not be opened may take another one. From then on, they do
+    /// so without delay, for a pause that grows with each failure.
+    pub(crate) fn has_detour(&self, link: &Arc<Link>) -> bool {
+        let mut registry = self.registry.lock();
+        let mut dialled = registry.large.dialled.iter();
+        let Some((to, _)) = dialled.find(|(_, it)| Arc::ptr_eq(it, link)) else {
+            return false;
+        };
+        let to = to.clone();
+        let has_detour = registry.phase == Phase::Open && registry.any.open(&to).next().is_some();
+        if has_detour {
+            let pause = self.limits().connect_timeout;
+            registry.large.note_retry(&to, Instant::now(), pause);
+        }
+        has_detour
+    }
+
     /// Removes a connection from every table.
     pub(crate) fn forget(&self, link: &Arc<Link>) {
         let mut registry = self.registry.lock();
@@ -882,15 +963,18 @@ impl Endpoint {
             registry.peers.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
-        registry.dialled.retain(|_, other| is_other(other));
         registry.inbound.retain(|_, (_, other)| is_other(other));
         let mut was_known = false;
-        registry.known.retain(|_, links| {
-            let before = links.len();
-            links.retain(is_other);
-            was_known |= links.len() < before;
-            !links.is_empty()
-        });
+        for load in [Load::Any, Load::Large] {
+            let connections = registry.of_mut(load);
+            connections.dialled.retain(|_, other| is_other(other));
+            connections.known.retain(|_, links| {
+                let before = links.len();
+                links.retain(is_other);
+                was_known |= links.len() < before;
+                !links.is_empty()
+            });
+        }
         if was_known {
             self.tally.connections.fetch_sub(1, Ordering::Relaxed);
         }
@@ -953,7 +1037,45 @@ impl Endpoint {
     }
 }
 
+impl Connections {
+    /// Returns the connections that lead to a location, the one opened for it first.
+    fn open(&self, to: &Location) -> impl Iterator<Item = &Arc<Link>> {
+        self.dialled.get(to).into_iter().chain(self.known_of(to))
+    }
+
+    fn known_of(&self, to: &Location) -> impl Iterator<Item = &Arc<Link>> {
+        self.known.get(&to.incarnation()).into_iter().flatten()
+    }
+
+    /// Records that a connection is opened beside suspect ones, or could not be opened. The number of records is
+    /// bounded by the connections that an endpoint may have within the longest pause.
+    fn note_retry(&mut self, to: &Location, now: Instant, pause: Duration) {
+        self.retries.retain(|_, it| !it.is_over(now, pause));
+        let known = self.retries.entry(to.clone());
+        let retries = known.or_insert(Retries {
+            last: now,
+            times: 0,
+        });
+        retries.times += 1;
+        retries.last = now;
+    }
+}
+
 impl Registry {
+    fn of(&self, load: Load) -> &Connections {
+        match load {
+            Load::Any => &self.any,
+            Load::Large => &self.large,
+        }
+    }
+
+    fn of_mut(&mut self, load: Load) -> &mut Connections {
+        match load {
+            Load::Any => &mut self.any,
+            Load::Large => &mut self.large,
+        }
+    }
+
     /// Returns the effect on other connections when this peer introduces itself on this link.
     ///
     /// # Errors
@@ -1019,23 +1141,14 @@ impl Registry {
                 _ => self.inbound.insert(inbound, (*serial, link.clone())),
             };
         }
-        let known = self.known.entry(peer.identity.incarnation).or_default();
+        let connections = self.of_mut(peer.load);
+        let known = connections
+            .known
+            .entry(peer.identity.incarnation)
+            .or_default();
         known.push(link.clone());
         self.peers.insert(link.number, peer);
         Ok(())
-    }
-
-    /// Records that a connection is opened beside suspect ones. The number of records is bounded by
-    /// the connections that an endpoint may have within the longest pause.
-    fn note_retry(&mut self, to: &Location, now: Instant, pause: Duration) {
-        self.suspect_retries.retain(|_, it| !it.is_over(now, pause));
-        let known = self.suspect_retries.entry(to.clone());
-        let retries = known.or_insert(SuspectRetries {
-            last: now,
-            times: 0,
-        });
-        retries.times += 1;
-        retries.last = now;
     }
 
     /// Selects the connection to evict when another one comes from `coming`: the oldest of the

@@ -3,7 +3,8 @@
 
 use std::net::SocketAddr;
 
-use fipa_transport::{Answer, Arrival, Conclusion, Verdict};
+use fipa_acl::Letter;
+use fipa_transport::{Answer, Arrival, Conclusion, Stream, Verdict};
 
 use super::*;
 use crate::Identity;
@@ -15,7 +16,7 @@ impl Sink for Ignores {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: fipa_transport::LegacySource) {}
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: fipa_transport::LegacySource) {}
 
     fn concluded(&self, _: AttemptId, _: Conclusion) {}
 }
@@ -63,6 +64,7 @@ struct Greeting {
     proved: Option<Principal>,
     from: Source,
     listening: &'static [&'static str],
+    load: Load,
 }
 
 fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting {
@@ -73,6 +75,7 @@ fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting
         proved,
         from: at(from),
         listening: &[],
+        load: Load::Any,
     }
 }
 
@@ -88,7 +91,9 @@ async fn enters(
         serial: greeting.serial,
         dialled: greeting.dialled.into(),
         listening: greeting.listening.iter().map(|it| (*it).into()).collect(),
+        load: greeting.load,
     };
+    link.hears(peer.clone());
     let entered = endpoint.enter(&link, &peer, greeting.proved, greeting.from);
     Ok((link.clone(), entered.await?))
 }
@@ -305,7 +310,7 @@ async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this
 
 /// A link that was dialled for this location and whose peer has introduced itself.
 async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
-    let Route::New(link, _) = endpoint.route_to(to).unwrap() else {
+    let Route::New(link, _) = endpoint.route_to(to, Load::Any).unwrap() else {
         panic!("there is a connection already");
     };
     greets(&link, to.incarnation().as_u64());
@@ -322,7 +327,141 @@ fn greets(link: &Link, peer: u64) {
         serial: 0,
         dialled: String::new(),
         listening: Vec::new(),
+        load: Load::Any,
     });
+}
+
+fn letter_of(len: usize, sender: u64) -> Parcel {
+    let payload = fipa_acl::Payload {
+        head: "head".into(),
+        content: vec![b'x'; len].into(),
+        tail: "tail".into(),
+    };
+    Parcel {
+        receiver: "arm".into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(sender),
+            receiver: Incarnation::from_u64(2),
+        },
+        sequence: 1,
+        after: 0,
+        transfer: 1,
+        remaining: Duration::from_secs(1),
+        body: Body::Letter(Letter::new("envelope".into(), payload)),
+    }
+}
+
+/// Dispatches letters through links that do not send. Returns the link that took the last one.
+struct Dispatcher<'a> {
+    endpoint: &'a Endpoint,
+    to: Location,
+    links: Mutex<Vec<Arc<Link>>>,
+    attempts: u64,
+}
+
+impl<'a> Dispatcher<'a> {
+    fn new(endpoint: &'a Endpoint) -> Self {
+        Self {
+            endpoint,
+            to: "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap(),
+            links: Mutex::default(),
+            attempts: 0,
+        }
+    }
+
+    /// Returns the place of the link among the dialled ones.
+    fn dispatch(&mut self, parcel: &Parcel) -> usize {
+        self.attempts += 1;
+        let attempt = AttemptId(self.attempts);
+        let dial = |link: Arc<Link>, _| {
+            greets(&link, self.to.incarnation().as_u64());
+            self.links.lock().push(link);
+            tokio::spawn(std::future::pending())
+        };
+        self.endpoint
+            .dispatch(attempt, &self.to, parcel, dial)
+            .unwrap();
+        let links = self.links.lock();
+        let place = links.iter().position(|link| link.has_attempt(attempt));
+        place.unwrap()
+    }
+
+    fn link(&self, place: usize) -> Arc<Link> {
+        Arc::clone(&self.links.lock()[place])
+    }
+}
+
+#[tokio::test]
+async fn large_letters_take_a_connection_of_their_own() {
+    let endpoint = endpoint(Limits::default());
+    let mut to_arm = Dispatcher::new(&endpoint);
+    let (small, large) = (letter_of(64 << 10, 1), letter_of(70_000, 1));
+    assert_eq!(to_arm.dispatch(&small), 0);
+    assert_eq!(to_arm.dispatch(&large), 1);
+    assert_eq!(to_arm.dispatch(&small), 1, "it follows the large one");
+    assert_eq!(to_arm.dispatch(&letter_of(10, 9)), 0, "another stream");
+    let report = Parcel {
+        body: Body::Credit,
+        ..small.clone()
+    };
+    assert_eq!(to_arm.dispatch(&report), 0);
+    assert_eq!(to_arm.link(1).load(), Load::Large);
+    // The large one does not begin before the small one is answered.
+    assert_eq!(to_arm.link(1).may_begin(), 0);
+    to_arm.link(0).answered(1);
+    assert_eq!(to_arm.link(1).may_begin(), 2);
+    for id in 1..=2 {
+        to_arm.link(1).begins();
+        to_arm.link(1).answered(id);
+    }
+    assert_eq!(to_arm.dispatch(&small), 0, "the large one has arrived");
+}
+
+#[tokio::test]
+async fn without_a_connection_of_their_own_large_letters_take_the_other_one() {
+    let endpoint = endpoint(Limits::default());
+    let mut to_arm = Dispatcher::new(&endpoint);
+    let (small, large) = (letter_of(10, 1), letter_of(70_000, 2));
+    assert_eq!(to_arm.dispatch(&large), 0);
+    let alone = to_arm.link(0);
+    assert!(!endpoint.has_detour(&alone), "there is no other one");
+    assert_eq!(to_arm.dispatch(&small), 1);
+    assert!(endpoint.has_detour(&alone));
+    endpoint.forget(&alone);
+    assert_eq!(to_arm.dispatch(&large), 1);
+}
+
+#[tokio::test]
+async fn a_peer_has_a_connection_of_each_load() {
+    let endpoint = endpoint(Limits::default());
+    let proved = certificate(1);
+    let enter = async |serial, load| {
+        let greeting = Greeting {
+            serial,
+            load,
+            ..greeting(7, proved, "10.0.0.7:1")
+        };
+        enters(&endpoint, greeting).await.unwrap().0
+    };
+    let any = enter(1, Load::Any).await;
+    let large = enter(2, Load::Large).await;
+    assert_eq!((any.ending(), large.ending()), (None, None));
+    tokio::spawn(ends_when_asked_to(large.clone()));
+    let again = enter(3, Load::Large).await;
+    assert_eq!(large.ending(), Some(ConnectionEnd::Superseded));
+    assert_eq!((any.ending(), again.ending()), (None, None));
+    // After a move, the peer has one connection from its new address.
+    for link in [&any, &again] {
+        tokio::spawn(ends_when_asked_to(link.clone()));
+    }
+    let moved = Greeting {
+        serial: 4,
+        ..greeting(7, proved, "10.0.0.8:1")
+    };
+    let moved = enters(&endpoint, moved).await.unwrap().0;
+    assert_eq!(any.ending(), Some(ConnectionEnd::Superseded));
+    assert_eq!(again.ending(), Some(ConnectionEnd::Superseded));
+    assert_eq!(moved.ending(), None);
 }
 
 #[tokio::test]
@@ -334,7 +473,7 @@ async fn letters_take_another_connection_when_one_is_suspect() {
     });
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let first = dials(&endpoint, &to).await;
-    let Route::Open(same) = endpoint.route_to(&to).unwrap() else {
+    let Route::Open(same) = endpoint.route_to(&to, Load::Any).unwrap() else {
         panic!("a healthy connection is kept");
     };
     assert!(Arc::ptr_eq(&first, &same));
@@ -346,12 +485,15 @@ async fn letters_take_another_connection_when_one_is_suspect() {
         Some(ConnectionEnd::Silent),
         "the other one is open"
     );
-    let Route::Open(used) = endpoint.route_to(&to).unwrap() else {
+    let Route::Open(used) = endpoint.route_to(&to, Load::Any).unwrap() else {
         panic!("it is used");
     };
     assert!(Arc::ptr_eq(&second, &used));
     second.doubt();
-    assert!(matches!(endpoint.route_to(&to).unwrap(), Route::New(..)));
+    assert!(matches!(
+        endpoint.route_to(&to, Load::Any).unwrap(),
+        Route::New(..)
+    ));
 }
 
 #[tokio::test]
@@ -374,7 +516,10 @@ async fn letters_take_another_connection_after_their_peer_has_announced_another_
     endpoint.service_left(&"tcp://10.0.0.9:7788#0000000000000007".parse().unwrap());
     assert!(elsewhere.is_suspect());
     assert!(!other_peer.is_suspect());
-    assert!(matches!(endpoint.route_to(&moved).unwrap(), Route::New(..)));
+    assert!(matches!(
+        endpoint.route_to(&moved, Load::Any).unwrap(),
+        Route::New(..)
+    ));
 }
 
 /// A peer that has announced another address is not waited for as long as others.

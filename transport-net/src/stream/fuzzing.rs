@@ -16,7 +16,7 @@ use super::connection::{Connection, Event, Reader, Role};
 use super::frame::{self, FrameReader, Space};
 use crate::Identity;
 use crate::end::ConnectionEnd;
-use crate::hello::Hello;
+use crate::hello::{Hello, Load};
 
 const MAX_LETTER: usize = 100_000;
 const MAX_IN_FLIGHT: usize = 8;
@@ -64,6 +64,7 @@ fn hello(incarnation: u64) -> Hello {
         serial: 1,
         dialled: String::new(),
         listening: vec!["192.0.2.1:7788".into()],
+        load: Load::Any,
     }
 }
 

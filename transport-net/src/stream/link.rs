@@ -10,13 +10,13 @@
 use std::io::{self, IoSlice};
 #[cfg(feature = "ip")]
 use std::net::IpAddr;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Abandoned, Answer, Arriving, AttemptId, Body, FailureReason, Introduction, Location, Parcel,
-    Sink, Ticket, log_limit,
+    Abandoned, Answer, Arriving, AttemptId, Body, Conclusion, FailureReason, Introduction,
+    Location, Parcel, Sink, Stream, Ticket, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -24,7 +24,7 @@ use tokio::sync::{Notify, watch};
 use tokio::time::{sleep_until, timeout};
 
 use super::budget::ContentBuffer;
-use super::connection::{Connection, Event, MAX_ID, Reader, SendError};
+use super::connection::{Connection, Event, MAX_ID, Predecessors, Reader, SendError};
 use super::counters::count;
 use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
@@ -32,6 +32,7 @@ use super::proof::Proof;
 use super::source::{QuotaKey, Source};
 use super::wire::{ExtraStreams, Reading, Writing};
 use crate::end::ConnectionEnd;
+use crate::hello::Load;
 use crate::rate_limit::PeerRateLimit;
 
 /// Maximum number of buffers handed to the kernel in one call.
@@ -149,13 +150,52 @@ impl Link {
         self.state.lock().connection.proved(proof.clone());
     }
 
-    /// Queues a parcel for sending, and writes as many bytes as the kernel takes.
-    pub(crate) fn send(&self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
+    /// Queues a parcel for sending, and writes as many bytes as the kernel takes. The parcel does not begin before
+    /// its `predecessors` are answered.
+    pub(crate) fn send(
+        &self,
+        attempt: AttemptId,
+        parcel: &Parcel,
+        predecessors: Option<Weak<Predecessors>>,
+    ) -> Result<(), SendError> {
         let mut state = self.state.lock();
         let is_busy = state.connection.is_busy();
         state.connection.send(attempt, parcel)?;
+        if let Some(predecessors) = predecessors {
+            state.connection.hold(predecessors);
+        }
         self.flush_together(&mut state, is_busy);
         Ok(())
+    }
+
+    /// Returns the letters that the connection is for.
+    pub(crate) fn load(&self) -> Load {
+        self.state.lock().connection.load()
+    }
+
+    /// Whether a parcel of this stream is not answered yet.
+    pub(crate) fn carries(&self, stream: Stream) -> bool {
+        self.state.lock().connection.carries(stream)
+    }
+
+    /// Returns the unanswered parcels of a stream on these connections. The task of this link is woken when the last
+    /// one is answered.
+    pub(crate) fn predecessors(
+        self: &Arc<Self>,
+        stream: Stream,
+        on: &[Arc<Self>],
+    ) -> Weak<Predecessors> {
+        let link = Arc::downgrade(self);
+        let all = Predecessors::new(move || {
+            if let Some(link) = link.upgrade() {
+                link.wake.notify_one();
+            }
+        });
+        for other in on {
+            let connection = &mut other.state.lock().connection;
+            connection.note_predecessors(stream, &all);
+        }
+        Arc::downgrade(&all)
     }
 
     /// Ends an attempt. A peer that has not answered in time gets a ping. `None` if the attempt is not here.
@@ -282,16 +322,55 @@ impl Link {
 
     /// Handles a hello of the peer.
     #[cfg(all(test, feature = "ip"))]
-    pub(crate) fn greeted_by(&self, hello: crate::hello::Hello) {
-        use super::frame::Frame;
+    pub(crate) fn hears(&self, hello: crate::hello::Hello) {
+        self.takes(super::frame::Frame::Hello(hello));
+    }
+
+    #[cfg(all(test, feature = "ip"))]
+    fn takes(&self, frame: super::frame::Frame) {
         let mut state = self.state.lock();
-        let greeted = state
-            .connection
-            .handle_frame(Frame::Hello(hello), Instant::now());
-        assert_eq!(greeted, Ok(()));
-        state.connection.welcome();
-        drop(state);
+        let taken = state.connection.handle_frame(frame, Instant::now());
+        assert_eq!(taken, Ok(()));
+    }
+
+    /// Handles and welcomes a hello of the peer.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn greeted_by(&self, hello: crate::hello::Hello) {
+        self.hears(hello);
+        self.state.lock().connection.welcome();
         self.replace_suspects();
+    }
+
+    /// Whether this attempt is on this connection.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn has_attempt(&self, attempt: AttemptId) -> bool {
+        self.state.lock().connection.has_attempt(attempt)
+    }
+
+    /// Returns the number of waiting parcels that may begin.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn may_begin(&self) -> usize {
+        self.state.lock().connection.may_begin()
+    }
+
+    /// Sends all bytes of the parcels that may begin.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn begins(&self) {
+        let connection = &mut self.state.lock().connection;
+        while !connection.is_flushed() {
+            let mut slices = [IoSlice::new(&[]); MAX_SLICES];
+            let count = connection.gather(&mut slices);
+            let len = slices[..count].iter().map(|slice| slice.len()).sum();
+            connection.written(len, Instant::now());
+        }
+    }
+
+    /// Sends all bytes, and handles an answer of the peer.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn answered(&self, id: u64) {
+        self.begins();
+        let answer = Answer::Accepted;
+        self.takes(super::frame::Frame::Answer { id, answer });
     }
 
     /// Marks the task as ended.
@@ -773,8 +852,13 @@ impl Drop for LinkTask {
             }
             state.connection.end(&self.end)
         };
+        let detour = self.peer.is_none() && self.endpoint.has_detour(&self.link);
         self.endpoint.left(&self.link, &self.end);
         for (attempt, conclusion) in concluded {
+            let conclusion = match conclusion {
+                Conclusion::NotSent(error) if detour => Conclusion::NotSent(again(&error)),
+                other => other,
+            };
             self.sink.concluded(attempt, conclusion);
         }
         if let Some(peer) = &self.peer {
@@ -782,6 +866,12 @@ impl Drop for LinkTask {
         }
         self.link.over.send_replace(true);
     }
+}
+
+/// Returns the error of a large letter that is to be dispatched again and takes the connection for all parcels.
+fn again(error: &TransportError) -> TransportError {
+    let detail = format!("no connection for large letters: {}", error.detail);
+    TransportError::new(TransportErrorKind::Congested, detail)
 }
 
 /// Writes the remaining bytes, closes this direction, and waits until the peer closes the other:

@@ -83,6 +83,12 @@ impl Outbox {
         removed.is_some()
     }
 
+    /// Returns the number of parcels that the kernel has not begun to take, before the one with this number.
+    pub(crate) fn parcels_before(&self, id: u64) -> usize {
+        let is_before = |waiting: &Waiting| matches!(waiting.about, About::Parcel(it) if it < id);
+        self.parcels.partition_point(is_before)
+    }
+
     /// Drops every parcel that the kernel has not begun to take.
     pub(crate) fn drop_parcels(&mut self) {
         self.parcels.clear();

@@ -13,7 +13,7 @@ use super::core::{Core, CoreEvent};
 use super::packet::{self, Datagram, NO_COOKIE};
 use crate::Identity;
 use crate::datagrams::Path;
-use crate::hello::Hello;
+use crate::hello::{Hello, Load};
 
 /// Maximum number of datagrams sent in response to one.
 const MOST: usize = 4096;
@@ -101,6 +101,7 @@ fn hello(service: u64, serial: u64) -> Hello {
         serial,
         dialled: "0123456789abcdef".into(),
         listening: vec![address(0).to_string()],
+        load: Load::Any,
     }
 }
 

@@ -405,6 +405,7 @@ mod tests {
             serial: 1,
             dialled: "0123456789abcdef".into(),
             listening: vec!["[fe80::1234:5678:9abc:def0%12]:65535".into(); listening],
+            load: Default::default(),
         }
     }
 

@@ -471,6 +471,7 @@ fn unproved_peers_leave_no_state_and_get_fewer_bytes_than_they_sent() {
         serial: 1,
         dialled: "x".into(),
         listening: Vec::new(),
+        load: crate::hello::Load::Any,
     };
     let spoofed = |n: u32| SocketAddr::from((n.to_be_bytes(), 99));
     let mut told = 0;
@@ -558,6 +559,7 @@ fn connections_of_one_address_are_bounded() {
             serial: 1,
             dialled: "x".into(),
             listening: Vec::new(),
+            load: crate::hello::Load::Any,
         };
         let from = match n {
             0..10 => "198.51.100.7".to_owned(),

@@ -230,6 +230,38 @@ pub fn the_first_parcels_arrive_in_order(fixture: &dyn Fixture) {
     }
 }
 
+/// Small and large letters of one stream arrive in the order of the calls, each once.
+pub fn letters_of_all_lengths_arrive_in_order(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
+    let large = 200_000.min(a.transport.max_letter() / 2);
+    let mut taken = Vec::new();
+    for attempt in 1..=40 {
+        let len = match attempt % 5 {
+            0 | 3 => large,
+            _ => 10,
+        };
+        let content = vec![attempt as u8; len];
+        loop {
+            let one = parcel(attempt, letter(content.clone()));
+            match a.transport.dispatch(AttemptId(attempt), &b.location, one) {
+                Ok(()) => break taken.push(attempt),
+                Err(error) => assert_eq!(error.fault, TransportErrorKind::Congested, "{error}"),
+            }
+            a.transport.drive();
+            b.transport.drive();
+        }
+        // Once in a while, the stream is idle.
+        if attempt % 11 == 0 {
+            concluded(&[&a, &b], &a, attempt);
+        }
+    }
+    for attempt in &taken {
+        assert_eq!(concluded(&[&a, &b], &a, *attempt), accepted());
+    }
+    let arrived: Vec<u64> = (0..b.arrivals()).map(|it| b.arrived(it).sequence).collect();
+    assert_eq!(arrived, taken);
+}
+
 /// When letters find no room, there is room for a parcel of another kind, which may make room for them.
 pub fn letters_leave_room_for_other_parcels(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));

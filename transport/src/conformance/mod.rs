@@ -71,6 +71,7 @@ macro_rules! conformance_tests {
             a_closed_transport_refuses_parcels
             no_call_waits_for_another_process
             the_first_parcels_arrive_in_order
+            letters_of_all_lengths_arrive_in_order
             letters_leave_room_for_other_parcels
             loaned_content_arrives
             shared_content_arrives_at_all_receivers

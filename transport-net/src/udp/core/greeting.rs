@@ -12,7 +12,7 @@ use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::datagrams::Path;
 use crate::end::ConnectionEnd;
-use crate::hello::Hello;
+use crate::hello::{Hello, Load};
 
 /// Time in which a connected service must respond to a ping when an unproved peer claims to be that
 /// service.
@@ -272,6 +272,7 @@ impl Core {
             serial,
             dialled,
             listening: self.listening.clone(),
+            load: Load::Any,
         }
     }
 
