@@ -377,9 +377,10 @@ impl Connection {
         self.outbox.parcels_before(MAX_ID).min(self.window())
     }
 
-    /// Adds the unanswered parcels of a stream to `predecessors`.
+    /// Adds the unanswered parcels of a stream to `predecessors`. An attempt that ends holds nothing back.
     pub(crate) fn note_predecessors(&mut self, stream: Stream, predecessors: &Arc<Predecessors>) {
-        let of_stream = self.sent.values_mut().filter(|sent| sent.stream == stream);
+        let is_open = |sent: &&mut Sent| sent.stream == stream && sent.attempt.is_some();
+        let of_stream = self.sent.values_mut().filter(is_open);
         of_stream.for_each(|sent| sent.predecessors.push(Arc::clone(predecessors)));
     }
 
@@ -413,6 +414,7 @@ impl Connection {
             // The peer counts the parcel until it has answered, so the parcel still occupies the
             // window.
             sent.attempt = None;
+            sent.predecessors.clear();
         }
         Some(Abandoned::Unconfirmed)
     }

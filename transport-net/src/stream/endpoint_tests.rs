@@ -418,6 +418,19 @@ async fn large_letters_take_a_connection_of_their_own() {
 }
 
 #[tokio::test]
+async fn a_large_letter_does_not_wait_for_an_attempt_that_has_ended() {
+    let endpoint = endpoint(Limits::default());
+    let mut to_arm = Dispatcher::new(&endpoint);
+    assert_eq!(to_arm.dispatch(&letter_of(10, 1)), 0);
+    to_arm.link(0).begins();
+    assert_eq!(to_arm.dispatch(&letter_of(70_000, 1)), 1);
+    assert_eq!(to_arm.link(1).may_begin(), 0);
+    let ended = endpoint.abandon(AttemptId(1), &to_arm.to);
+    assert_eq!(ended, Abandoned::Unconfirmed);
+    assert_eq!(to_arm.link(1).may_begin(), 1);
+}
+
+#[tokio::test]
 async fn without_a_connection_of_their_own_large_letters_take_the_other_one() {
     let endpoint = endpoint(Limits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
@@ -506,9 +519,6 @@ async fn letters_take_another_connection_after_their_peer_has_announced_another_
     let (elsewhere, _) = enters(&endpoint, elsewhere).await.unwrap();
     let came = comes(None, 8, "10.0.0.7:1", 1, X);
     let (other_peer, _) = enters(&endpoint, came).await.unwrap();
-    for (link, peer) in [(&elsewhere, 7), (&other_peer, 8)] {
-        greets(link, peer);
-    }
     endpoint.service_left(&to);
     assert!(dialled.is_suspect());
     assert!(!elsewhere.is_suspect());
