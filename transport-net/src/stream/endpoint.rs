@@ -699,7 +699,7 @@ impl Endpoint {
     /// Puts the connections with this location in doubt, because the service has announced that it is elsewhere.
     #[cfg(feature = "ip")]
     pub(crate) fn service_left(&self, location: &Location) {
-        let home = location.authority().parse::<SocketAddr>().ok();
+        let home = address::numeric(location.authority()).ok();
         let home = home.map(|address| Source::Address(address).home());
         let registry = self.registry.lock();
         let is_there = |link: &&Arc<Link>| {

@@ -36,6 +36,9 @@ use crate::stream::budget::{Meter, ReservedBytes};
 /// Upper bound of parcel numbers, so that a ticket also holds the number of the connection.
 pub(crate) const MAX_ID: u64 = 1 << 40;
 
+/// Time that a peer has to respond after it has announced that it is elsewhere.
+const LEFT_TIMEOUT: Duration = Duration::from_millis(200);
+
 /// Number of losses of a large packet after which the path is assumed to have a smaller MTU.
 const LOSSES_OF_LARGE: u8 = 6;
 
@@ -103,6 +106,8 @@ pub(crate) struct Connection {
     heard: Option<Instant>,
     /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
+    /// Whether it is in doubt because the peer has announced that it is elsewhere.
+    left: bool,
     /// The last location for which the connection was used and confirmed or put in doubt.
     leads_to: Option<Location>,
     spoken: Instant,
@@ -205,6 +210,7 @@ impl Connection {
             events: VecDeque::new(),
             heard: None,
             doubted: None,
+            left: false,
             leads_to: None,
             spoken: now,
             busy: now,
@@ -373,6 +379,11 @@ impl Connection {
         true
     }
 
+    /// Puts the connection in doubt because the peer has announced that it is elsewhere.
+    pub(crate) fn left(&mut self, now: Instant) {
+        self.left = self.doubt(now, Duration::ZERO);
+    }
+
     /// Sends a ping to the peer.
     pub(crate) fn ask(&mut self) {
         if !self
@@ -404,7 +415,11 @@ impl Connection {
 
     /// Returns the time that a peer in doubt has to respond.
     fn doubt_patience(&self) -> Duration {
-        self.limits.silence / 4
+        let patience = self.limits.silence / 4;
+        match self.left {
+            true => patience.min(LEFT_TIMEOUT),
+            false => patience,
+        }
     }
 
     fn doubt_due(&self) -> Option<Instant> {

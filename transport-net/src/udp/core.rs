@@ -27,6 +27,7 @@ use super::connection::{Connection, Event, MAX_ID};
 use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
+use crate::address;
 use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
 use crate::datagrams::{Outbound, Path, Random, Transmit};
@@ -211,6 +212,22 @@ impl Core {
         for (number, ip) in numbers {
             let what = format!("this host no longer has the address {ip}");
             self.end(number, &ConnectionEnd::Broken(what));
+        }
+    }
+
+    /// Puts the connections with this location in doubt, because the service has announced that it is elsewhere.
+    pub(crate) fn left(&mut self, now: Instant, location: &Location) {
+        let home = address::numeric(location.authority()).ok();
+        let home = home.map(|address| address.ip());
+        let known = self.known.get(&location.incarnation());
+        for number in known.cloned().unwrap_or_default() {
+            self.with(number, |connection, _| {
+                let path = connection.path().map(|path| path.remote.ip());
+                if path.is_some() && path == home {
+                    connection.left(now);
+                }
+                Ok(())
+            });
         }
     }
 

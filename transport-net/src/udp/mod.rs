@@ -154,6 +154,10 @@ impl Transport for UdpTransport {
         abandoned.unwrap_or(Abandoned::Unconfirmed)
     }
 
+    fn left(&self, location: &Location) {
+        self.endpoint.call(|core, now| core.left(now, location));
+    }
+
     fn answer(&self, ticket: Ticket, answer: Answer) {
         self.endpoint
             .call(|core, now| core.answer(now, ticket, &answer));

@@ -791,6 +791,33 @@ fn a_peer_used_at_another_location_is_pinged_at_the_old_one() {
 }
 
 #[test]
+fn a_connection_ends_soon_after_its_peer_has_announced_another_address() {
+    for gone in [false, true] {
+        let limits = UdpLimits::default();
+        let mut simulation = Simulation::new(1, FAIR, &limits);
+        simulation.send(A, 1, 10).unwrap();
+        simulation.until_concluded(A, &BTreeSet::from([1]));
+        simulation.cut = gone;
+        let begun = simulation.now;
+        simulation.send(A, 2, 10).unwrap();
+        let incarnation = simulation.cores[B].own_hello(0, String::new()).identity;
+        let incarnation = incarnation.incarnation;
+        let elsewhere = Location::new(Kind::Udp, "192.0.2.99:7788").unwrap();
+        // It was never at the first of these.
+        for location in [elsewhere, to(B)] {
+            let location = location.with_incarnation(incarnation);
+            simulation.cores[A].left(simulation.now, &location);
+        }
+        simulation.flush();
+        simulation.until_concluded(A, &BTreeSet::from([1, 2]));
+        let took = simulation.now - begun;
+        assert!(took <= Duration::from_millis(250), "{took:?}");
+        let connections = simulation.cores[A].counters().connections;
+        assert_eq!(connections, u64::from(!gone));
+    }
+}
+
+#[test]
 fn connections_of_a_removed_address_end() {
     let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
     simulation.send(A, 1, 10).unwrap();

@@ -28,7 +28,7 @@ impl Connection {
             return Ok(());
         }
         self.heard = Some(now);
-        self.doubted = None;
+        (self.doubted, self.left) = (None, false);
         if !self.received.is_new(number) {
             counters.duplicates += 1;
             self.received.wants_ack(now, true);
