@@ -295,7 +295,7 @@ impl Lane {
     }
 }
 
-/// Letters that left a lane without being delivered, and may come again.
+/// Letters that left a lane without being delivered, or after repetitions, and may come again.
 #[derive(Debug, Default)]
 pub(super) struct LettersLeft {
     /// Sequences, and paces as they were when the letters left.
@@ -311,8 +311,8 @@ impl LettersLeft {
         self.latest.is_empty()
     }
 
-    /// Records a letter that leaves.
-    pub(super) fn push(&mut self, now: Instant, delivery: &Delivery) {
+    /// Records a letter that leaves. The hand-over that has delivered it did not come back, and counts, too.
+    pub(super) fn push(&mut self, now: Instant, delivery: &Delivery, delivered: bool) {
         if self.latest.len() >= MAX_LEFT
             && let Some((sequence, pace)) = self.latest.pop_front()
         {
@@ -321,7 +321,10 @@ impl LettersLeft {
                 None => (sequence, pace),
             });
         }
-        let pace = delivery.progress.hand_overs.pace().leaked(now);
+        let mut pace = delivery.progress.hand_overs.pace().leaked(now);
+        if delivered {
+            pace.count(now, delivery.letter.len());
+        }
         self.latest.push_back((delivery.sequence, pace));
         self.highest = self.highest.max(delivery.sequence);
     }

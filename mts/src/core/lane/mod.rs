@@ -817,9 +817,12 @@ impl Lane {
             false => self.end_pause_behind(delivery.sequence),
         }
         match self.is_custody() {
-            _ if delivered => {}
-            true => self.left.push(now, &delivery),
-            false => self.send_predecessor(index, table),
+            // A copy of a letter that was repeated may come although it was delivered.
+            true if !delivered || delivery.progress.hand_overs.pace().has_repeated() => {
+                self.left.push(now, &delivery, delivered);
+            }
+            false if !delivered => self.send_predecessor(index, table),
+            _ => {}
         }
         let stream = self.stream_of(&delivery);
         table.settle(delivery, stream, Arc::clone(&self.receiver), settlement);

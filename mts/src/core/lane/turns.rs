@@ -125,6 +125,11 @@ impl Pace {
         self.at
     }
 
+    /// Whether a hand-over has ended without an outcome.
+    pub(super) fn has_repeated(&self) -> bool {
+        self.letters > 0
+    }
+
     /// Returns the pace as it is at a later time.
     pub(super) fn leaked(self, now: Instant) -> Self {
         let leaks = micros(now.saturating_duration_since(self.at));
@@ -147,7 +152,7 @@ impl Pace {
     }
 
     /// Counts a hand-over.
-    fn count(&mut self, now: Instant, len: usize) {
+    pub(super) fn count(&mut self, now: Instant, len: usize) {
         *self = self.leaked(now);
         self.letters = self.letters.saturating_add(micros(INTERVAL));
         self.content = self.content.saturating_add(micros(transfer_time(len)));
