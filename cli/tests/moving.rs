@@ -1,8 +1,8 @@
 //! Tests hosts whose addresses change. A gateway that listens on all addresses stays reachable at
 //! its current address, also for peers whose configuration has another address.
 //!
-//! The hosts are network namespaces of the test; see `fipa-testbed`. IPv6 is off, so that a host
-//! without an IPv4 address cannot send at all.
+//! The hosts are network namespaces of the test; see `fipa-testbed`. Each has one address, so that a host without
+//! it cannot send at all.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 #![allow(
@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use fipa::config::Sources;
 use fipa::keys::{Keys, VALID};
 use fipa::{Agent, AgentId, Config, Deliveries, Domain, Entry, Incarnation, Outcome, Performative};
-use fipa_testbed::{ChildGuard, Host, Network, enter, isolated};
+use fipa_testbed::{ChildGuard, Family, Host, Network, enter, isolated};
 use serde_json::Value;
 use tempfile::TempDir;
 use tokio::runtime::Runtime;
@@ -30,21 +30,36 @@ const BOUND: Duration = Duration::from_secs(3);
 const WATCHDOG: Duration = Duration::from_secs(60);
 const PORT: u16 = 7788;
 
-/// Defines a test for the harness, and the ignored test that it runs in separate namespaces.
-macro_rules! on_a_network {
-    ($(#[$doc:meta])* $name:ident, $inside:ident, $work:expr) => {
-        $(#[$doc])*
+/// Defines a test of one family of addresses for the harness, and the ignored test that it runs in separate
+/// namespaces.
+macro_rules! in_family {
+    ($name:ident, $outer:ident, $inside:ident, $family:expr) => {
         #[test]
-        fn $name() {
-            isolated(stringify!($inside), &["nft"]);
+        fn $outer() {
+            let inside = concat!(stringify!($name), "::", stringify!($inside));
+            isolated(inside, &["nft"]);
         }
 
         #[test]
         #[ignore = "is run by the other test in namespaces of its own"]
         fn $inside() {
             enter();
-            let work: fn() = $work;
-            work();
+            WORK($family);
+        }
+    };
+}
+
+/// Defines the tests of this name, with IPv4, with unique local IPv6 addresses, and with link-local ones.
+macro_rules! on_a_network {
+    ($(#[$doc:meta])* $name:ident, $work:expr) => {
+        $(#[$doc])*
+        mod $name {
+            use super::*;
+
+            const WORK: fn(Family) = $work;
+            in_family!($name, over_ipv4, inside_over_ipv4, Family::V4);
+            in_family!($name, over_ipv6, inside_over_ipv6, Family::UniqueLocal);
+            in_family!($name, on_one_link, inside_on_one_link, Family::LinkLocal);
         }
     };
 }
@@ -52,26 +67,21 @@ macro_rules! on_a_network {
 on_a_network!(
     /// The moving host only receives, so none of its letters reveals its new address.
     a_receiver_moves_five_times_by_tcp,
-    inside_a_receiver_moves_five_times_by_tcp,
-    || a_receiver_moves_five_times(&["tcp"])
+    |family| a_receiver_moves_five_times(family, &["tcp"])
 );
 
-on_a_network!(
-    a_receiver_moves_five_times_by_udp,
-    inside_a_receiver_moves_five_times_by_udp,
-    || a_receiver_moves_five_times(&["udp"])
-);
+on_a_network!(a_receiver_moves_five_times_by_udp, |family| {
+    a_receiver_moves_five_times(family, &["udp"])
+});
 
-on_a_network!(
-    a_receiver_moves_five_times_by_quic,
-    inside_a_receiver_moves_five_times_by_quic,
-    || a_receiver_moves_five_times(&["quic"])
-);
+on_a_network!(a_receiver_moves_five_times_by_quic, |family| {
+    a_receiver_moves_five_times(family, &["quic"])
+});
 
-fn a_receiver_moves_five_times(transports: &[&str]) {
-    let (network, robots) = two_hosts(transports, &Discovery::Mdns);
-    for address in 51..56 {
-        move_to(network.host(1), &format!("10.99.0.{address}"));
+fn a_receiver_moves_five_times(family: Family, transports: &[&str]) {
+    let (network, robots) = two_hosts(family, transports, &Discovery::Mdns);
+    for number in 51..56 {
+        network.host(1).move_to(number);
         robots[0].reaches(&robots[1]);
     }
 }
@@ -79,11 +89,10 @@ fn a_receiver_moves_five_times(transports: &[&str]) {
 on_a_network!(
     /// The sending host moves. Letters in both directions still arrive.
     a_sender_moves_five_times,
-    inside_a_sender_moves_five_times,
-    || {
-        let (network, robots) = two_hosts(&["tcp"], &Discovery::Mdns);
-        for address in 51..56 {
-            move_to(network.host(0), &format!("10.99.0.{address}"));
+    |family| {
+        let (network, robots) = two_hosts(family, &["tcp"], &Discovery::Mdns);
+        for number in 51..56 {
+            network.host(0).move_to(number);
             robots[0].reaches(&robots[1]);
             robots[1].reaches(&robots[0]);
         }
@@ -94,9 +103,8 @@ on_a_network!(
     /// The moving host cannot connect from its new address, so only multicast announces that
     /// address.
     a_receiver_that_cannot_dial_moves_five_times,
-    inside_a_receiver_that_cannot_dial_moves_five_times,
-    || {
-        let (network, robots) = two_hosts(&["tcp"], &Discovery::Mdns);
+    |family| {
+        let (network, robots) = two_hosts(family, &["tcp"], &Discovery::Mdns);
         for rule in [
             "add table inet wall",
             "add chain inet wall in { type filter hook input priority 0; }",
@@ -105,8 +113,8 @@ on_a_network!(
             let nft = network.host(0).command("nft").arg(rule).status();
             assert!(nft.unwrap().success(), "nft {rule}");
         }
-        for address in 51..56 {
-            move_to(network.host(1), &format!("10.99.0.{address}"));
+        for number in 51..56 {
+            network.host(1).move_to(number);
             robots[0].reaches(&robots[1]);
         }
     }
@@ -116,16 +124,15 @@ on_a_network!(
     /// A host has no address until the other host removes its agents, and then gets another
     /// address.
     a_receiver_is_away_and_comes_back_elsewhere,
-    inside_a_receiver_is_away_and_comes_back_elsewhere,
-    || {
-        let (network, robots) = two_hosts(&["tcp"], &Discovery::Mdns);
+    |family| {
+        let (network, robots) = two_hosts(family, &["tcp"], &Discovery::Mdns);
         let ([here, there], host) = (&robots[..], network.host(1)) else {
             panic!("two robots")
         };
-        flush(host);
+        host.flush();
         here.misses(&there.name);
-        host.ip("addr add 10.99.0.52/24 dev eth0");
-        here.finds_after_announcement(there, "10.99.0.52");
+        host.come_up(52);
+        here.finds_after_announcement(there, &address(host, 52));
         here.reaches(there);
     }
 );
@@ -134,12 +141,10 @@ on_a_network!(
     /// A gateway that starts on a host without an address announces no loopback location. It
     /// announces its location once the host has an address.
     a_gateway_starts_before_its_interface,
-    inside_a_gateway_starts_before_its_interface,
-    || {
-        let network = Network::new(2);
-        prepare(&network);
+    |family| {
+        let network = Network::of(family, 2);
         let host = network.host(1);
-        flush(host);
+        host.flush();
         let all = robots_on(&network, &["tcp"], &Discovery::Mdns);
         let [here, there] = &all[..] else {
             panic!("two robots")
@@ -147,11 +152,13 @@ on_a_network!(
         let own = there.own_gateway();
         assert!(own.contains("127.0.0.1"), "no loopback location for processes of the host: {own}");
         // The announcement reaches every interface that passes multicast.
-        host.ip("addr add 10.99.0.2/24 dev eth0");
-        here.finds_after_announcement(there, "10.99.0.2");
+        host.come_up(2);
+        here.finds_after_announcement(there, &address(host, 2));
         let routes = here.fipa(network.host(0), &["routes", "--json", &there.name]);
         let ways = routes["gateway"]["routes"].to_string();
-        assert!(ways.contains("10.99.0.2:7788"), "{routes}");
+        // A link-local location has the interface of the reader.
+        let there_now = address(host, 2);
+        assert!(ways.contains(there_now.trim_end_matches("]:7788")), "{routes}");
         assert!(!ways.contains("127.0.0.1"), "{routes}");
         here.reaches(there);
     }
@@ -161,18 +168,17 @@ on_a_network!(
     /// The static peer has another address than the configured one. It connects, and letters return
     /// on that connection, including letters that were sent while it was away.
     a_static_peer_moves_and_dials,
-    inside_a_static_peer_moves_and_dials,
-    || {
-        let (network, robots) = two_hosts(&["tcp"], &Discovery::Both);
+    |family| {
+        let (network, robots) = two_hosts(family, &["tcp"], &Discovery::Both);
         let host = network.host(1);
-        flush(host);
+        host.flush();
         let waiting = robots[0].sends(&robots[1], Duration::from_secs(30));
         std::thread::sleep(Duration::from_secs(6));
-        host.ip("addr add 10.99.0.52/24 dev eth0");
+        host.come_up(52);
         robots[0].reaches(&robots[1]);
         robots[0].was_delivered(waiting);
-        for address in 53..57 {
-            move_to(host, &format!("10.99.0.{address}"));
+        for number in 53..57 {
+            host.move_to(number);
             robots[0].reaches(&robots[1]);
         }
     }
@@ -182,49 +188,41 @@ on_a_network!(
     /// The moving host has no static peers. It reconnects to the gateways of its former
     /// connections.
     a_dialled_static_peer_moves,
-    inside_a_dialled_static_peer_moves,
-    || {
-        let (network, robots) = two_hosts(&["tcp"], &Discovery::FirstDials);
-        for address in 51..56 {
-            move_to(network.host(1), &format!("10.99.0.{address}"));
+    |family| {
+        let (network, robots) = two_hosts(family, &["tcp"], &Discovery::FirstDials);
+        for number in 51..56 {
+            network.host(1).move_to(number);
             robots[0].reaches(&robots[1]);
         }
     }
 );
 
-on_a_network!(
-    a_dialled_static_peer_moves_by_udp,
-    inside_a_dialled_static_peer_moves_by_udp,
-    || {
-        let (network, robots) = two_hosts(&["udp"], &Discovery::FirstDials);
-        for address in 51..56 {
-            move_to(network.host(1), &format!("10.99.0.{address}"));
-            robots[0].reaches(&robots[1]);
-        }
+on_a_network!(a_dialled_static_peer_moves_by_udp, |family| {
+    let (network, robots) = two_hosts(family, &["udp"], &Discovery::FirstDials);
+    for number in 51..56 {
+        network.host(1).move_to(number);
+        robots[0].reaches(&robots[1]);
     }
-);
+});
 
-on_a_network!(
-    commands_show_where_a_gateway_is_now,
-    inside_commands_show_where_a_gateway_is_now,
-    || {
-        let (network, robots) = two_hosts(&["tcp"], &Discovery::Both);
-        let host = network.host(1);
-        move_to(host, "10.99.0.52");
-        let now = robots[1].gateway_has("10.99.0.52:7788");
-        assert!(!now.contains("10.99.0.2:"), "{now}");
-        let report = robots[1].fipa(host, &["routes", "--json"]);
-        let told = report["gateway"]["locations"].to_string();
-        assert!(told.contains("tcp://10.99.0.52:7788"), "{report}");
-        assert!(!told.contains("10.99.0.2:"), "{report}");
-        let report = robots[1].fipa(host, &["doctor", "--json"]);
-        let checks = report["checks"].as_array().unwrap();
-        let listens = checks.iter().find(|it| it["check"] == "locations").unwrap();
-        let found = listens["found"].as_str().unwrap();
-        assert!(found.contains("10.99.0.52"), "{found}");
-        assert!(!found.contains("10.99.0.2:"), "{found}");
-    }
-);
+on_a_network!(commands_show_where_a_gateway_is_now, |family| {
+    let (network, robots) = two_hosts(family, &["tcp"], &Discovery::Both);
+    let host = network.host(1);
+    let (before, after) = (address(host, 2), address(host, 52));
+    host.move_to(52);
+    let now = robots[1].gateway_has(&after);
+    assert!(!now.contains(&before), "{now}");
+    let report = robots[1].fipa(host, &["routes", "--json"]);
+    let told = report["gateway"]["locations"].to_string();
+    assert!(told.contains(&format!("tcp://{after}")), "{report}");
+    assert!(!told.contains(&before), "{report}");
+    let report = robots[1].fipa(host, &["doctor", "--json"]);
+    let checks = report["checks"].as_array().unwrap();
+    let listens = checks.iter().find(|it| it["check"] == "locations").unwrap();
+    let found = listens["found"].as_str().unwrap();
+    assert!(found.contains(&after), "{found}");
+    assert!(!found.contains(&before), "{found}");
+});
 
 /// Method by which gateways find each other.
 #[derive(Debug, PartialEq, Eq)]
@@ -250,22 +248,14 @@ struct Robot {
 type Waiting = tokio::task::JoinHandle<Deliveries>;
 
 /// Starts two hosts and waits until their agents have exchanged letters.
-fn two_hosts(transports: &[&str], discovery: &Discovery) -> (Network, Vec<Robot>) {
-    let network = Network::new(2);
-    prepare(&network);
+fn two_hosts(family: Family, transports: &[&str], discovery: &Discovery) -> (Network, Vec<Robot>) {
+    let network = Network::of(family, 2);
     let robots = robots_on(&network, transports, discovery);
     for (robot, other) in [(&robots[0], &robots[1]), (&robots[1], &robots[0])] {
         robot.waits_for(&other.name);
         robot.reaches(other);
     }
     (network, robots)
-}
-
-fn prepare(network: &Network) {
-    for host in network.hosts() {
-        let ipv6_off = || std::fs::write("/proc/sys/net/ipv6/conf/all/disable_ipv6", "1");
-        host.enter(ipv6_off).unwrap();
-    }
 }
 
 fn robots_on(network: &Network, transports: &[&str], discovery: &Discovery) -> Vec<Robot> {
@@ -314,7 +304,7 @@ impl Robot {
             security,
         ];
         for transport in transports {
-            settings.push(format!("transport.{transport}.listen=[\"0.0.0.0:{PORT}\"]"));
+            settings.push(format!("transport.{transport}.listen=*:{PORT}"));
         }
         let dials = match discovery {
             Discovery::Mdns => false,
@@ -324,8 +314,9 @@ impl Robot {
         if dials {
             let other = 1 - at;
             let ways = transports.iter();
+            let at = &network.host(other).addresses()[0];
             let ways: Vec<String> = ways
-                .map(|kind| format!("\"{kind}://10.99.0.{}:{PORT}\"", other + 1))
+                .map(|kind| format!("\"{kind}://{at}:{PORT}\""))
                 .collect();
             let line = format!("gateway{other} = [{}]", ways.join(", "));
             settings.push(format!("discovery.static={{ {line} }}"));
@@ -483,13 +474,8 @@ fn places(entry: &Entry) -> String {
     places.join(" ")
 }
 
-/// Removes all addresses of the host.
-fn flush(host: &Host) {
-    host.ip("addr flush dev eth0");
-}
-
-/// Replaces the address of the host at once.
-fn move_to(host: &Host, address: &str) {
-    flush(host);
-    host.ip(&format!("addr add {address}/24 dev eth0"));
+/// Returns the address and port of a host with this number, without the scope that its gateway leaves out.
+fn address(host: &Host, number: u8) -> String {
+    let address = host.addresses_with(number).remove(0);
+    format!("{}:{PORT}", address.replace("%eth0", ""))
 }

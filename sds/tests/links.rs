@@ -14,24 +14,57 @@ use std::time::{Duration, Instant};
 
 use common::registration;
 use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts};
-use fipa_testbed::{Host, Network, until};
+use fipa_testbed::{Family, Host, Network, until};
 use fipa_transport::Incarnation;
 use tokio::runtime::Runtime;
 
-#[test]
-fn views_agree_after_every_healing() {
-    fipa_testbed::isolated("inside_views_agree_after_every_healing", &[]);
+/// Defines a test for the harness, and the ignored test that it runs in separate namespaces.
+macro_rules! in_family {
+    ($name:ident, $inside:ident, $family:expr) => {
+        #[test]
+        fn $name() {
+            fipa_testbed::isolated(stringify!($inside), &[]);
+        }
+
+        #[test]
+        #[ignore = "is run by the other test in namespaces of its own"]
+        fn $inside() {
+            fipa_testbed::enter();
+            views_agree_after_every_healing($family);
+        }
+    };
 }
 
-#[test]
-#[ignore = "is run by the other test in namespaces of its own"]
-fn inside_views_agree_after_every_healing() {
-    fipa_testbed::enter();
+in_family!(
+    views_agree_after_every_healing_over_ipv4,
+    inside_views_agree_over_ipv4,
+    Family::V4
+);
+
+in_family!(
+    views_agree_after_every_healing_over_ipv6,
+    inside_views_agree_over_ipv6,
+    Family::UniqueLocal
+);
+
+in_family!(
+    views_agree_after_every_healing_on_one_link,
+    inside_views_agree_on_one_link,
+    Family::LinkLocal
+);
+
+in_family!(
+    views_agree_after_every_healing_over_all_addresses,
+    inside_views_agree_over_all_addresses,
+    Family::Both
+);
+
+fn views_agree_after_every_healing(family: Family) {
     let seed = std::env::var("FIPA_LINKS_SEED").ok();
     let seed = seed.map_or(4, |seed| seed.parse().unwrap());
     println!("FIPA_LINKS_SEED={seed}");
     let mut random = fastrand::Rng::with_seed(seed);
-    let network = Network::new(3);
+    let network = Network::of(family, 3);
     let mut members: Vec<Member> = network.hosts().iter().map(Member::new).collect();
     for round in 0..4 {
         let mut cut = Vec::new();
@@ -84,11 +117,10 @@ fn inside_views_agree_after_every_healing() {
 
     // Its interface goes down and comes back with another address.
     network.host(0).ip("link set eth0 down");
-    network.host(0).ip("addr flush dev eth0");
+    network.host(0).flush();
     members[0].change("meanwhile", true);
     std::thread::sleep(Duration::from_secs(1));
-    network.host(0).ip("addr add 10.99.0.77/24 dev eth0");
-    network.host(0).ip("link set eth0 up");
+    network.host(0).come_up(77);
     let healed = Instant::now();
     agree(&mut members);
     println!(

@@ -104,25 +104,7 @@ impl Host {
         host.ip("link set lo up");
         // The kernel adds no link-local address of its own.
         host.ip("link set eth0 addrgenmode none");
-        let addresses = match family {
-            Family::V4 => vec![format!("{}/24", host.ipv4())],
-            Family::UniqueLocal => vec![format!("{}/64 nodad", host.ipv6())],
-            Family::LinkLocal => vec![format!("{}/64 nodad", host.link_local())],
-            Family::Both => vec![
-                format!("{}/24", host.ipv4()),
-                format!("{}/64 nodad", host.ipv6()),
-                format!("{}/64 nodad", host.link_local()),
-            ],
-        };
-        for address in addresses {
-            // `nodad` skips duplicate address detection, which delays the use of the address.
-            host.ip(&format!("addr add dev eth0 {address}"));
-        }
-        host.ip("link set eth0 up");
-        if family != Family::V4 {
-            // Multicast over IPv6 needs its route also where no address is link-local.
-            host.ip("-6 route replace multicast ff00::/8 dev eth0 table local");
-        }
+        host.come_up(number);
         host
     }
 
@@ -136,9 +118,15 @@ impl Host {
     /// `[fe80::1%eth0]`.
     #[must_use]
     pub fn addresses(&self) -> Vec<String> {
-        let v4 = || self.ipv4().to_string();
-        let unique_local = || format!("[{}]", self.ipv6());
-        let link_local = || format!("[{}%eth0]", self.link_local());
+        self.addresses_with(self.number)
+    }
+
+    /// The same for another number: those that [`move_to`](Self::move_to) gives it.
+    #[must_use]
+    pub fn addresses_with(&self, number: u8) -> Vec<String> {
+        let v4 = || ipv4(number).to_string();
+        let unique_local = || format!("[{}]", ipv6(0xfd99, number));
+        let link_local = || format!("[{}%eth0]", ipv6(0xfe80, number));
         match self.family {
             Family::V4 => vec![v4()],
             Family::UniqueLocal => vec![unique_local()],
@@ -147,22 +135,69 @@ impl Host {
         }
     }
 
+    /// The addresses of a number, as `ip addr` takes them.
+    fn assigned(&self, number: u8) -> Vec<String> {
+        // `nodad` skips duplicate address detection, which delays the use of the address.
+        let v4 = || format!("{}/24", ipv4(number));
+        let v6 = |prefix| format!("{}/64 nodad", ipv6(prefix, number));
+        match self.family {
+            Family::V4 => vec![v4()],
+            Family::UniqueLocal => vec![v6(0xfd99)],
+            Family::LinkLocal => vec![v6(0xfe80)],
+            Family::Both => vec![v4(), v6(0xfd99), v6(0xfe80)],
+        }
+    }
+
+    /// Sets the interface up, with the addresses of this number beside those that it has. An interface that
+    /// goes down loses its IPv6 addresses.
+    ///
+    /// # Panics
+    /// If a command fails.
+    pub fn come_up(&self, number: u8) {
+        let addresses = self.assigned(number);
+        for address in &addresses {
+            self.ip(&format!("addr replace dev eth0 {address}"));
+        }
+        self.ip("link set eth0 up");
+        if self.family != Family::V4 {
+            // Multicast over IPv6 needs its route also where no address is link-local.
+            self.ip("-6 route replace multicast ff00::/8 dev eth0 table local");
+        }
+    }
+
+    /// Removes all addresses of the host.
+    ///
+    /// # Panics
+    /// If the command fails.
+    pub fn flush(&self) {
+        self.ip("addr flush dev eth0");
+    }
+
+    /// Replaces the addresses of the host by those of this number at once.
+    ///
+    /// # Panics
+    /// If a command fails.
+    pub fn move_to(&self, number: u8) {
+        self.flush();
+        self.come_up(number);
+    }
+
     /// Its IPv4 address, if the network has such addresses.
     #[must_use]
     pub fn ipv4(&self) -> Ipv4Addr {
-        Ipv4Addr::new(10, 99, 0, self.number)
+        ipv4(self.number)
     }
 
     /// Its unique local IPv6 address, if the network has such addresses.
     #[must_use]
     pub fn ipv6(&self) -> Ipv6Addr {
-        Ipv6Addr::new(0xfd99, 0, 0, 0, 0, 0, 0, self.number.into())
+        ipv6(0xfd99, self.number)
     }
 
     /// Its link-local IPv6 address, if the network has such addresses.
     #[must_use]
     pub fn link_local(&self) -> Ipv6Addr {
-        Ipv6Addr::new(0xfe80, 0, 0, 0, 0, 0, 0, self.number.into())
+        ipv6(0xfe80, self.number)
     }
 
     /// The name of its port at the switch.
@@ -225,4 +260,12 @@ impl Host {
             "ip link set {port} type bridge_slave mcast_flood {flood}"
         ));
     }
+}
+
+fn ipv4(number: u8) -> Ipv4Addr {
+    Ipv4Addr::new(10, 99, 0, number)
+}
+
+fn ipv6(prefix: u16, number: u8) -> Ipv6Addr {
+    Ipv6Addr::new(prefix, 0, 0, 0, 0, 0, 0, number.into())
 }

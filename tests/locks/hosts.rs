@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use fastrand::Rng;
 use fipa::locks::OwnOptions;
 use fipa::{Domain, Gateway};
-use fipa_testbed::{Host, Network, enter, isolated, until};
+use fipa_testbed::{Family, Host, Network, enter, isolated, until};
 
 use super::counter::{LEASE, Worker, hurried, keep, number};
 use super::support::load;
@@ -64,10 +64,10 @@ impl GatewayProcess {
     fn start(host: &Host, domain: &str, peer: &Host) -> Self {
         let mut set = settings(domain);
         set.push(format!("mts.name=gateway-{domain}"));
-        set.push(format!("transport.tcp.listen=[\"{}:7788\"]", host.ipv4()));
+        set.push(format!("transport.tcp.listen=[\"{}:7788\"]", address(host)));
         set.push(format!(
             "discovery.static={{ peer = [\"tcp://{}:7788\"] }}",
-            peer.ipv4()
+            address(peer)
         ));
         let mut command = host.command(std::env::current_exe().unwrap());
         command
@@ -91,11 +91,17 @@ impl Drop for GatewayProcess {
     }
 }
 
-/// Drops all packets that arrive at the host. It can still send.
+fn address(host: &Host) -> String {
+    host.addresses().remove(0)
+}
+
+/// Drops all packets that arrive at the host, except those by which hosts find each other's interfaces: these
+/// are no IP packets with IPv4. It can still send.
 fn cut(host: &Host) {
     for rule in [
-        "add table ip cut",
-        "add chain ip cut in { type filter hook input priority 0; policy drop; }",
+        "add table inet cut",
+        "add chain inet cut in { type filter hook input priority 0; policy drop; }",
+        "add rule inet cut in icmpv6 type { nd-neighbor-solicit, nd-neighbor-advert } accept",
     ] {
         let nft = host.command("nft").arg(rule).status();
         assert!(nft.unwrap().success(), "nft {rule}");
@@ -103,13 +109,18 @@ fn cut(host: &Host) {
 }
 
 fn heal(host: &Host) {
-    let nft = host.command("nft").arg("delete table ip cut").status();
+    let nft = host.command("nft").arg("delete table inet cut").status();
     assert!(nft.unwrap().success(), "nft delete");
 }
 
 #[test]
 fn a_guarded_counter_loses_no_increment_across_hosts() {
     isolated("hosts::inside_two_hosts", &["nft", "kill"]);
+}
+
+#[test]
+fn a_guarded_counter_loses_no_increment_across_hosts_with_ipv6() {
+    isolated("hosts::inside_two_hosts_with_ipv6", &["nft", "kill"]);
 }
 
 #[derive(Debug, Default)]
@@ -124,7 +135,18 @@ struct Faults {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_two_hosts() {
     enter();
-    let network = Network::new(2);
+    two_hosts(Family::V4);
+}
+
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_two_hosts_with_ipv6() {
+    enter();
+    two_hosts(Family::UniqueLocal);
+}
+
+fn two_hosts(family: Family) {
+    let network = Network::of(family, 2);
     let seed = number("FIPA_LOCKS_SEED").unwrap_or_else(|| fastrand::u64(..));
     println!("FIPA_LOCKS_SEED={seed}");
     let mut random = Rng::with_seed(seed);
