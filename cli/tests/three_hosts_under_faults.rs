@@ -1,8 +1,8 @@
 //! Tests the promises of delivery on three hosts with real gateways and processes. Meanwhile, the
-//! test kills and stops processes and gateways, cuts links, filters packets, changes addresses, and
-//! moves agents between hosts. Letters have deadlines from 10 ms to 60 s. Some letters are large,
+//! test kills and stops processes and gateways, cuts links, filters packets, changes addresses, moves
+//! agents between hosts, and makes them send 200 letters at once. Letters have deadlines from 10 ms to 60 s. Some letters are large,
 //! and gateways refuse some. Every process logs the letters that it sends, their outcomes, and the
-//! letters that it takes.
+//! letters that it takes. The link of one host drops what exceeds 10 Mbit/s.
 //!
 //! Afterwards a checker (`soak/checker.rs`) reads all logs and checks these promises:
 //!
@@ -16,7 +16,9 @@
 //!
 //! `FIPA_SOAK_SECONDS` is the length of a run (default: 15). `FIPA_SOAK_SEED` repeats the random
 //! decisions of a run, but not the timing. `FIPA_SOAK_FAULTS` limits the faults to a list (`kill`,
-//! `restart`, `kill-gateway`, `stop`, `stop-gateway`, `cut`, `filter`, `address`, `move`). A run
+//! `restart`, `kill-gateway`, `stop`, `stop-gateway`, `cut`, `filter`, `address`, `move`, `burst`).
+//! `FIPA_SOAK_FAMILY` (`ipv4`, `ipv6`, `link` or `both`) chooses the addresses, and `FIPA_SOAK_MBITS` the
+//! rate of the slow link, 0 for none. A run
 //! that fails or recovers slowly copies its logs to the directory `FIPA_SOAK_LOGS`. The soak
 //! repeats runs of two minutes. Each run draws its own transports and discovery:
 //!
@@ -30,6 +32,7 @@
 mod hosts;
 mod soak;
 
+use std::io::Write as _;
 use std::time::{Duration, Instant};
 
 use fipa_testbed::{enter, isolated};
@@ -43,6 +46,8 @@ const SECONDS: u64 = 15;
 const EPISODE: u64 = 120;
 /// Recovery time above which the logs are kept, in microseconds.
 const SLOW: u64 = 2_000_000;
+/// The recovery times of the runs of a soak.
+const RECOVERIES: &str = concat!(env!("CARGO_TARGET_TMPDIR"), "/soak-recoveries");
 /// Maximum number of printed breaches.
 const SHOWN: usize = 20;
 
@@ -56,10 +61,45 @@ fn promises_hold_on_three_hosts_under_faults() {
 #[ignore = "takes half an hour; see CONTRIBUTING"]
 fn soak() {
     let (began, length) = (Instant::now(), number("FIPA_SOAK_SECONDS").unwrap_or(1800));
+    let _ = std::fs::remove_file(RECOVERIES);
+    let (mut runs, mut failed) = (0, 0);
     while began.elapsed() < Duration::from_secs(length) {
-        isolated("inside_a_run", &["nft", "kill"]);
+        let run = || isolated("inside_a_run", &["nft", "kill"]);
+        runs += 1;
+        // The soak goes on, and fails at its end.
+        failed += usize::from(std::panic::catch_unwind(run).is_err());
         println!("{:.0?} of {length} s", began.elapsed());
     }
+    let recoveries = std::fs::read_to_string(RECOVERIES).unwrap_or_default();
+    let recoveries = recoveries.lines().map(|line| line.parse().unwrap());
+    println!(
+        "{runs} runs, {failed} with breaches or other failures; {}",
+        summary(recoveries.collect())
+    );
+    assert_eq!(failed, 0, "promises were broken; see above");
+}
+
+/// Returns the middle and the worst of recovery times in milliseconds.
+fn summary(mut recoveries: Vec<u64>) -> String {
+    recoveries.sort_unstable();
+    let middle = recoveries.get(recoveries.len() / 2).copied().unwrap_or(0);
+    let worst = recoveries.last().copied().unwrap_or(0);
+    format!(
+        "{} recoveries, median {middle} ms, worst {worst} ms",
+        recoveries.len()
+    )
+}
+
+/// Appends the recovery times of a run, in milliseconds, for the summary of the soak.
+fn keep_recoveries(stage: &Stage) {
+    let quiet = stage.quiet.iter();
+    let lines = quiet.map(|quiet| format!("{}\n", (quiet.proved - quiet.healed) / 1000));
+    let file = std::fs::File::options()
+        .create(true)
+        .append(true)
+        .open(RECOVERIES);
+    let written = file.and_then(|mut file| file.write_all(lines.collect::<String>().as_bytes()));
+    written.unwrap();
 }
 
 #[test]
@@ -79,6 +119,7 @@ fn inside_a_run() {
     stage.close();
     let report = checker::check(&stage.lives, &stage.quiet);
     print(&stage, &report);
+    keep_recoveries(&stage);
     let is_slow = |quiet: &Quiet| quiet.proved - quiet.healed > SLOW;
     logs.keep = stage.quiet.iter().any(is_slow);
     let breaches = report.breaches.len();

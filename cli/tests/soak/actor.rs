@@ -1,7 +1,7 @@
 //! A process of the soak: agents that send letters to all others and receive, and log both.
 //!
 //! Lines in: `register NAME`, `leave NAME`, `prove TOKEN` (every agent of the process sends letters
-//! to every other until one to each is delivered), `rest` (no more new letters), `quit`. Lines out:
+//! to every other until one to each is delivered), `burst` (one agent sends many letters at once), `rest` (no more new letters), `quit`. Lines out:
 //! `registered NAME`, `left NAME`, `proved TOKEN`, `idle` (after `rest`, once every letter has its
 //! outcomes), `bye`. The process ends when its input ends.
 
@@ -32,6 +32,8 @@ pub(crate) const PART: &str = "FIPA_SOAK_PART";
 const UNDER_WAY: usize = 24;
 /// Pause of a sender between two letters, in milliseconds.
 const PAUSE: std::ops::Range<u64> = 4..40;
+/// Number of letters of a burst.
+const BURST: usize = 200;
 /// Gateways refuse letters with this performative.
 pub(crate) const FORBIDDEN: Performative = Performative::Cancel;
 
@@ -155,6 +157,15 @@ async fn perform(part: Part, mut queue: UnboundedReceiver<String>) {
                     proofs.join_all().await;
                     say(&format!("proved {token}"));
                 });
+            }
+            ["burst"] => {
+                let senders = present.values().filter_map(|it| it.sender.lock().clone());
+                let senders: Vec<Arc<Sender>> = senders.collect();
+                if let Some(sender) = random.choice(&senders)
+                    && !shared.rests.load(Ordering::SeqCst)
+                {
+                    sender.burst(random.choice(&shared.names).unwrap());
+                }
             }
             ["rest"] => {
                 shared.rests.store(true, Ordering::SeqCst);
@@ -313,6 +324,23 @@ impl Sender {
             tokio::spawn(async move {
                 outcomes.await;
                 drop(held);
+            });
+        }
+    }
+
+    /// Sends many letters to one agent at once.
+    fn burst(&self, to: &str) {
+        for _ in 0..BURST {
+            let outcomes = self.send(Draft {
+                to: vec![to.to_owned()],
+                size: 100,
+                deadline: Duration::from_secs(5),
+                forbidden: false,
+            });
+            tokio::spawn(async move {
+                if let Some(outcomes) = outcomes {
+                    outcomes.await;
+                }
             });
         }
     }

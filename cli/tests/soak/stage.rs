@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use fipa_testbed::{ChildGuard, Network};
+use fipa_testbed::{ChildGuard, Family, Network};
 use parking_lot::Mutex;
 
 use super::actor::{PART, Part};
@@ -28,7 +28,7 @@ const ORDERS: [&[&str]; 3] = [&["tcp"], &["udp", "tcp"], &["quic", "tcp"]];
 type Fault = (&'static str, fn(&mut Stage));
 
 /// All faults. A repeated entry makes its fault more frequent.
-const FAULTS: [Fault; 13] = [
+const FAULTS: [Fault; 15] = [
     ("kill", Stage::kill_process),
     ("kill", Stage::kill_process),
     ("restart", Stage::restart_process),
@@ -42,6 +42,8 @@ const FAULTS: [Fault; 13] = [
     ("address", Stage::change_address),
     ("move", Stage::move_agent),
     ("move", Stage::move_agent),
+    ("burst", Stage::burst),
+    ("burst", Stage::burst),
 ];
 
 /// Returns the faults of this run: those that `FIPA_SOAK_FAULTS` names, or all.
@@ -61,9 +63,52 @@ fn faults() -> Vec<Fault> {
     faults
 }
 
-/// Returns the last octets of the addresses that a host can have.
-fn addresses(at: usize) -> [usize; 3] {
+/// Returns the numbers of the addresses that a host can have.
+fn numbers(at: usize) -> [u8; 3] {
+    let at = at as u8;
     [at + 1, at + 51, at + 101]
+}
+
+/// The host with the policed link.
+const POLICED: usize = HOSTS - 1;
+
+/// Bits a second of that link, in millions, by default.
+const MBITS: u64 = 10;
+
+/// Returns the addresses of this run: those that `FIPA_SOAK_FAMILY` names, or any.
+fn family(random: &mut Rng) -> Family {
+    let drawn = Family::ALL[random.usize(..Family::ALL.len())];
+    match std::env::var("FIPA_SOAK_FAMILY").as_deref() {
+        Err(_) => drawn,
+        Ok("ipv4") => Family::V4,
+        Ok("ipv6") => Family::UniqueLocal,
+        Ok("link") => Family::LinkLocal,
+        Ok("both") => Family::Both,
+        Ok(other) => panic!("FIPA_SOAK_FAMILY is ipv4, ipv6, link or both, not {other}"),
+    }
+}
+
+/// Drops the packets of a host beyond `FIPA_SOAK_MBITS` in each direction; 0 for none. Returns the rate.
+fn police(network: &Network) -> u64 {
+    let rate = std::env::var("FIPA_SOAK_MBITS").map(|rate| rate.parse().unwrap());
+    let rate = rate.unwrap_or(MBITS);
+    let host = network.host(POLICED);
+    if rate > 0 {
+        nft(host, "add table inet police");
+        let limit = format!(
+            "limit rate over {} kbytes/second burst 128 kbytes drop",
+            rate * 125
+        );
+        for (hook, name) in [("input", "iifname"), ("output", "oifname")] {
+            let chain = format!("{{ type filter hook {hook} priority 0; }}");
+            nft(host, &format!("add chain inet police {hook} {chain}"));
+            nft(
+                host,
+                &format!("add rule inet police {hook} {name} eth0 {limit}"),
+            );
+        }
+    }
+    rate
 }
 
 /// State of a process.
@@ -176,9 +221,11 @@ impl Stage {
         if order.contains(&"quic") {
             make_keys(HOSTS);
         }
-        let network = Network::new(HOSTS as u8);
+        let family = family(&mut random);
+        let network = Network::of(family, HOSTS as u8);
+        let mbits = police(&network);
         let hosts = (0..HOSTS).map(|at| Host {
-            settings: settings(at, order, mdns),
+            settings: settings(&network, at, order, mdns),
             gateway: State::Down,
             starting: None,
             address: 0,
@@ -210,7 +257,7 @@ impl Stage {
             quiet: Vec::new(),
             counts: BTreeMap::new(),
             setup: format!(
-                "{}, {}",
+                "{}, {}, {family:?}, a link of {mbits} Mbit/s",
                 order.join("+"),
                 if mdns { "mDNS" } else { "static peers" }
             ),
@@ -555,21 +602,13 @@ impl Stage {
     fn change_address(&mut self) {
         let at = self.any_host();
         let host = &mut self.hosts[at];
-        let all = addresses(at);
-        let next = (host.address + self.random.usize(1..all.len())) % all.len();
-        let old = all[std::mem::replace(&mut host.address, next)];
-        let network = self.network.host(at);
-        network.ip(&format!("addr add 10.99.0.{}/24 dev eth0", all[next]));
-        network.ip(&format!("addr del 10.99.0.{old}/24 dev eth0"));
-        // Deleting the primary address may delete the secondary ones.
-        let promoted = network
-            .command("ip")
-            .args(["-4", "addr", "show", "dev", "eth0"])
-            .output();
-        let has = String::from_utf8(promoted.unwrap().stdout).unwrap();
-        if !has.contains(&format!("10.99.0.{}/", all[next])) {
-            network.ip(&format!("addr add 10.99.0.{}/24 dev eth0", all[next]));
+        if host.disturbed {
+            return;
         }
+        let all = numbers(at);
+        let next = (host.address + self.random.usize(1..all.len())) % all.len();
+        host.address = next;
+        self.network.host(at).move_to(all[next]);
         self.count("address changes");
     }
 
@@ -594,6 +633,15 @@ impl Stage {
                 to,
             });
             self.count("moves");
+        }
+    }
+
+    /// An agent sends many letters at once.
+    fn burst(&mut self) {
+        let seat = self.any_seat();
+        if let State::Runs(process) = &mut self.seats[seat].process {
+            process.tell("burst");
+            self.count("bursts");
         }
     }
 
@@ -625,8 +673,9 @@ impl Stage {
                 self.hosts[at].disturbed = false;
                 let host = self.network.host(at);
                 host.plug();
-                host.ip("link set eth0 up");
-                nft(host, "flush ruleset");
+                host.come_up(numbers(at)[self.hosts[at].address]);
+                nft(host, "add table inet weather");
+                nft(host, "delete table inet weather");
             }
         }
     }
@@ -697,7 +746,7 @@ fn waited_for_processors() -> u64 {
     total.and_then(|it| it.parse().ok()).unwrap_or(0)
 }
 
-fn settings(at: usize, order: &[&str], mdns: bool) -> Vec<String> {
+fn settings(network: &Network, at: usize, order: &[&str], mdns: bool) -> Vec<String> {
     let mut settings = vec![
         format!("domain=host{at}"),
         format!("mts.name=gateway{at}"),
@@ -706,7 +755,7 @@ fn settings(at: usize, order: &[&str], mdns: bool) -> Vec<String> {
         "access.deny={ \".*\" = [\".* performative=cancel\"] }".to_owned(),
     ];
     for kind in order {
-        settings.push(format!("transport.{kind}.listen=[\"0.0.0.0:{PORT}\"]"));
+        settings.push(format!("transport.{kind}.listen=*:{PORT}"));
     }
     settings.push(match order.contains(&"quic") {
         true => format!("security.keys={}", keys(at).dir().display()),
@@ -714,9 +763,12 @@ fn settings(at: usize, order: &[&str], mdns: bool) -> Vec<String> {
     });
     if !mdns {
         let peers = (0..HOSTS).filter(|other| *other != at).map(|other| {
+            let host = network.host(other);
+            let all = numbers(other).map(|number| host.addresses_with(number));
             let ways = order.iter().flat_map(|kind| {
-                let all = addresses(other).into_iter();
-                all.map(move |address| format!("\"{kind}://10.99.0.{address}:{PORT}\""))
+                // An entry has few locations.
+                let all = all.iter().filter_map(|of_number| of_number.first());
+                all.map(move |address| format!("\"{kind}://{address}:{PORT}\""))
             });
             format!("gateway{other} = [{}]", ways.collect::<Vec<_>>().join(", "))
         });
