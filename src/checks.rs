@@ -346,7 +346,7 @@ impl Origin {
         }
     }
 
-    /// Returns the peer that is charged with a conversation that the letter begins: the service of an
+    /// Returns the peer that is charged with a conversation that the letter begins: the one that announced an
     /// agent on another host, otherwise the process that handed the letter over. `sender` is the entry of
     /// the sender.
     fn peer(&self, sender: Option<&Entry>) -> Option<String> {
@@ -354,11 +354,7 @@ impl Origin {
             return None;
         }
         Some(match sender {
-            Some(entry) if entry.reach != Reach::Local => match &entry.mts.name {
-                Some(name) => name.to_string(),
-                None if entry.mts.incarnation.is_known() => entry.mts.incarnation.to_string(),
-                None => entry.name.to_string(),
-            },
+            Some(entry) if entry.reach != Reach::Local => entry.peer.to_string(),
             _ => self.service.to_string(),
         })
     }
@@ -442,7 +438,7 @@ mod tests {
     use fipa_acl::{AgentId, Time};
     use fipa_mts::letter_for;
     use fipa_sds::{MemoryDirectory, Mts, Registration};
-    use fipa_transport::Kind;
+    use fipa_transport::{Kind, PeerId};
 
     use super::*;
     use crate::Config;
@@ -478,6 +474,7 @@ mod tests {
             sender,
             via,
             service: PROCESS,
+            peer: PeerId::THIS_HOST,
             remote: false,
         }
     }
@@ -558,15 +555,15 @@ mod tests {
     }
 
     #[test]
-    fn a_conversation_is_charged_to_a_process_of_this_host_or_to_the_service_of_another() {
+    fn a_conversation_is_charged_to_a_process_of_this_host_or_to_another_host() {
         let message = message(Performative::Request, "fipa-request", Some("c"));
         let registration = Registration::new("leg", ARM, Vec::new());
         let here = directory().register(registration).unwrap();
         let mut there = (*here).clone();
         there.reach = Reach::Remote { gateway: PROCESS };
-        there.mts = Mts::new("there", Incarnation::from_u64(9));
+        there.peer = PeerId::of_ip([192, 0, 2, 1].into());
         let origin = Origin::of(&received(&message, ARM, Some(Kind::Shm)));
-        assert_eq!(origin.peer(Some(&there)).as_deref(), Some("there"));
+        assert_eq!(origin.peer(Some(&there)).as_deref(), Some("192.0.2.1"));
         assert_eq!(origin.peer(Some(&here)), Some(PROCESS.to_string()));
         let unknown = Origin::of(&received(&message, Incarnation::UNKNOWN, Some(Kind::Tcp)));
         assert_eq!(unknown.peer(None), Some(PROCESS.to_string()));

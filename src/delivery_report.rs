@@ -80,6 +80,7 @@ mod tests {
             sender: from,
             via,
             service: from,
+            peer: fipa_transport::PeerId::THIS_HOST,
             remote: false,
         })
         .unwrap()

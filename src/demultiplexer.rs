@@ -550,6 +550,7 @@ mod tests {
             sender: from,
             via: Some(Kind::Shm),
             service: Incarnation::from_u64(1),
+            peer: fipa_transport::PeerId::THIS_HOST,
             remote: false,
         };
         Incoming::new(received).unwrap()

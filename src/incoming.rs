@@ -9,7 +9,8 @@ use fipa_acl::{Envelope, Performative, Text, Time};
 #[cfg(feature = "protocols")]
 use fipa_monitor::{Header, Violation};
 use fipa_mts::core::Received;
-use fipa_transport::{Incarnation, Kind};
+use fipa_mts::stamped_peer;
+use fipa_transport::{Incarnation, Kind, PeerId};
 
 /// A received message.
 #[derive(Debug, Clone)]
@@ -25,6 +26,10 @@ pub struct Incoming {
     /// The registration of the sending agent, as far as the service that handed the letter over proves
     /// it; unknown for an agent of a legacy peer, and for letters of this process itself.
     pub(crate) sender: Incarnation,
+    /// The service that handed the letter over.
+    service: Incarnation,
+    /// The peer that handed the letter over.
+    handed_over_by: PeerId,
     /// The agent that did not get a letter, if this is the proved report of a service about it: see
     /// [`crate::delivery_report`].
     #[cfg(feature = "protocols")]
@@ -65,6 +70,8 @@ impl Incoming {
                 message: OnceLock::new(),
             }),
             sender: received.sender,
+            service: received.service,
+            handed_over_by: received.peer,
             via: received.via,
             #[cfg(feature = "protocols")]
             violation: None,
@@ -114,6 +121,19 @@ impl Incoming {
     #[must_use]
     pub fn content(&self) -> Option<Bytes> {
         self.parts.index.content(self.parts.letter.payload())
+    }
+
+    /// Returns the peer that sent the letter to this host, as far as the service that received it proves it. The agents
+    /// of legacy peers count as one, if the gateway of this host has handed the letter over.
+    pub(crate) fn peer(&self) -> PeerId {
+        if self.via.is_none() || !self.handed_over_by.is_this_host() {
+            return self.handed_over_by.clone();
+        }
+        if self.sender == self.service {
+            return PeerId::unknown();
+        }
+        // A letter of an agent of this host has no stamp of the process that hands it over.
+        stamped_peer(&self.parts.letter, self.service).unwrap_or_default()
     }
 
     /// Returns the number of bytes of the letter.
@@ -244,6 +264,7 @@ mod tests {
             sender: Incarnation::from_u64(1),
             via: Some(Kind::Shm),
             service: Incarnation::from_u64(2),
+            peer: PeerId::THIS_HOST,
             remote: false,
         }
     }

@@ -1,8 +1,10 @@
 //! Shares of the peers in a bounded number of places. No I/O, no clock.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use fipa_transport::PeerId;
+use parking_lot::Mutex;
 
 /// Number of places that each peer gets while any are free.
 const OF_SMALL: usize = 4;
@@ -52,9 +54,46 @@ impl PeerShares {
     }
 
     /// Number of taken places.
-    #[cfg(test)]
     pub(crate) fn taken(&self) -> usize {
         self.taken
+    }
+}
+
+/// Places that several tasks share.
+#[derive(Debug, Clone)]
+pub(crate) struct PeerPlaces(Arc<Mutex<PeerShares>>);
+
+impl PeerPlaces {
+    /// This number of free places.
+    pub(crate) fn new(most: usize) -> Self {
+        Self(Arc::new(Mutex::new(PeerShares::new(most))))
+    }
+
+    /// Takes a place for this peer, until it is dropped; `None` if the peer has its share.
+    pub(crate) fn take(&self, peer: PeerId) -> Option<PeerPlace> {
+        let is_taken = self.0.lock().take(&peer);
+        is_taken.then(|| PeerPlace {
+            places: self.clone(),
+            peer,
+        })
+    }
+
+    /// Number of taken places.
+    pub(crate) fn taken(&self) -> usize {
+        self.0.lock().taken()
+    }
+}
+
+/// A place of a peer.
+#[derive(Debug)]
+pub(crate) struct PeerPlace {
+    places: PeerPlaces,
+    peer: PeerId,
+}
+
+impl Drop for PeerPlace {
+    fn drop(&mut self) {
+        self.places.0.lock().release(&self.peer);
     }
 }
 

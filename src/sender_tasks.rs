@@ -5,7 +5,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, PeerId};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
@@ -28,9 +28,9 @@ const STALLED_AFTER: Duration = Duration::from_millis(50);
 /// the other, those of different senders at the same time. An agent that waits for the outcome of each answer in its
 /// own loop reads nothing meanwhile, so one sender that takes no answers would delay those to all others.
 ///
-/// At most 64 senders have a task. One more, or more than 64 MiB of messages, ends the task whose present work runs
-/// longest. If it sends a letter, the letter stays on its way. A sender is the agent as far as the connection proves
-/// it, otherwise a name.
+/// At most 64 senders have a task. One more, or more than 64 MiB of messages, ends a task of the host with most tasks or
+/// bytes: the one whose present work runs longest. If it sends a letter, the letter stays on its way. A sender is the
+/// agent as far as the connection proves it, otherwise a name, of one host or certificate.
 ///
 /// ```no_run
 /// # async fn example(echo: fipa::Agent) -> fipa::Result<()> {
@@ -55,7 +55,13 @@ pub struct SenderTasks(HashMap<Sender, SenderTask>);
 
 /// A sender of messages.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-enum Sender {
+struct Sender {
+    peer: PeerId,
+    agent: Agent,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+enum Agent {
     Registration(Incarnation),
     Name(Option<Box<str>>),
 }
@@ -105,16 +111,17 @@ impl SenderTasks {
 
     async fn run_of(&mut self, sender: Sender, bytes: usize, work: Work) -> bool {
         self.0.retain(|_, it| !it.queue.state.lock().is_over);
-        let work = match self.0.get(&sender) {
-            None => work,
-            Some(known) => match known.queue.push(bytes, work).await {
+        self.make_room(&sender, bytes);
+        let mut work = work;
+        if let Some(known) = self.0.get(&sender) {
+            let room = MAX_BYTES.saturating_sub(self.bytes() - known.queue.state.lock().bytes);
+            match known.queue.push(bytes, room, work).await {
                 Pushed::Done => return true,
                 Pushed::Full => return false,
-                Pushed::Over(work) => work,
-            },
-        };
-        self.0.remove(&sender);
-        self.make_room(bytes);
+                Pushed::Over(it) => work = it,
+            }
+            self.0.remove(&sender);
+        }
         let queue = Arc::new(WorkQueue {
             state: Mutex::new(QueueState {
                 waiting: VecDeque::from([(bytes, work)]),
@@ -137,20 +144,46 @@ impl SenderTasks {
         }
     }
 
-    /// Ends tasks until another one with a message of so many bytes has room.
-    fn make_room(&mut self, bytes: usize) {
-        while !self.0.is_empty()
-            && (self.0.len() >= MAX_SENDERS || self.bytes() + bytes > MAX_BYTES)
-        {
-            let longest = self
-                .0
-                .iter()
-                .min_by_key(|(_, it)| it.queue.state.lock().began);
-            let Some(longest) = longest.map(|(sender, _)| sender.clone()) else {
+    /// Ends tasks until another message of this sender has room. Only tasks of the peer with most end, so another peer
+    /// always has room for one message. A sender with a task waits for its own peer.
+    fn make_room(&mut self, sender: &Sender, bytes: usize) {
+        let is_known = self.0.contains_key(sender);
+        loop {
+            let used = self.used(sender, bytes);
+            let senders: usize = used.values().map(|(senders, _)| senders).sum();
+            let all_bytes: usize = used.values().map(|(_, bytes)| bytes).sum();
+            let of_most = if senders > MAX_SENDERS {
+                used.iter().max_by_key(|(_, (senders, _))| *senders)
+            } else if all_bytes > MAX_BYTES {
+                used.iter().max_by_key(|(_, (_, bytes))| *bytes)
+            } else {
+                return;
+            };
+            let of_most = of_most.filter(|(peer, _)| !is_known || **peer != sender.peer);
+            let Some(longest) = of_most.and_then(|(peer, _)| self.longest_of(peer)) else {
                 return;
             };
             self.0.remove(&longest);
         }
+    }
+
+    /// Returns the number of tasks and bytes of each peer, with another message of this sender.
+    fn used(&self, sender: &Sender, bytes: usize) -> HashMap<PeerId, (usize, usize)> {
+        let new = usize::from(!self.0.contains_key(sender));
+        let mut used = HashMap::from([(sender.peer.clone(), (new, bytes))]);
+        for (sender, it) in &self.0 {
+            let (senders, bytes) = used.entry(sender.peer.clone()).or_default();
+            *senders += 1;
+            *bytes += it.queue.state.lock().bytes;
+        }
+        used
+    }
+
+    /// Returns the sender of this peer whose present work runs longest.
+    fn longest_of(&self, peer: &PeerId) -> Option<Sender> {
+        let of_peer = self.0.iter().filter(|(sender, _)| sender.peer == *peer);
+        let longest = of_peer.min_by_key(|(_, it)| it.queue.state.lock().began);
+        longest.map(|(sender, _)| sender.clone())
     }
 
     fn bytes(&self) -> usize {
@@ -160,9 +193,13 @@ impl SenderTasks {
 
 impl Sender {
     fn of(incoming: &Incoming) -> Self {
-        match incoming.sender {
-            proved if proved.is_known() => Self::Registration(proved),
-            _ => Self::Name(incoming.message().sender().map(|it| it.name().into())),
+        let agent = match incoming.sender {
+            proved if proved.is_known() => Agent::Registration(proved),
+            _ => Agent::Name(incoming.message().sender().map(|it| it.name().into())),
+        };
+        Self {
+            peer: incoming.peer(),
+            agent,
         }
     }
 }
@@ -182,7 +219,8 @@ enum Pushed {
 }
 
 impl WorkQueue {
-    async fn push(&self, bytes: usize, work: Work) -> Pushed {
+    /// Adds a work if it fits this number of bytes, with those that wait.
+    async fn push(&self, bytes: usize, room: usize, work: Work) -> Pushed {
         loop {
             // Before the check, so that no notification is missed.
             let ended = self.ended.notified();
@@ -192,7 +230,7 @@ impl WorkQueue {
                     return Pushed::Over(work);
                 }
                 let has_room = state.waiting.len() < MAX_WAITING
-                    && (state.waiting.is_empty() || state.bytes + bytes <= MAX_BYTES);
+                    && (state.waiting.is_empty() || state.bytes + bytes <= room);
                 if has_room {
                     state.bytes += bytes;
                     state.waiting.push_back((bytes, work));
@@ -250,7 +288,14 @@ mod tests {
     use super::*;
 
     fn sender(number: usize) -> Sender {
-        Sender::Registration(Incarnation::from_u64(number as u64 + 1))
+        sender_of(PeerId::THIS_HOST, number)
+    }
+
+    fn sender_of(peer: PeerId, number: usize) -> Sender {
+        Sender {
+            peer,
+            agent: Agent::Registration(Incarnation::from_u64(number as u64 + 1)),
+        }
     }
 
     fn done(number: usize, log: &mpsc::UnboundedSender<usize>) -> Work {
@@ -312,5 +357,24 @@ mod tests {
         let work = Box::pin(pending());
         assert!(tasks.run_of(sender(99), 2 * MAX_BYTES, work).await);
         assert_eq!(tasks.0.len(), 1);
+    }
+
+    #[tokio::test]
+    async fn a_peer_with_many_senders_ends_its_own_tasks_only() {
+        let mut tasks = SenderTasks::default();
+        let honest = sender_of(PeerId::of_ip([192, 0, 2, 1].into()), 1);
+        assert!(tasks.run_of(honest.clone(), 100, Box::pin(pending())).await);
+        for number in 0..3 * MAX_SENDERS {
+            tokio::task::yield_now().await;
+            let greedy = sender_of(PeerId::of_ip([192, 0, 2, 2].into()), number);
+            let bytes = MAX_BYTES / 8;
+            assert!(tasks.run_of(greedy, bytes, Box::pin(pending())).await);
+            assert!(tasks.0.len() <= MAX_SENDERS && tasks.bytes() <= MAX_BYTES);
+        }
+        assert!(tasks.0.contains_key(&honest));
+        let newcomer = sender_of(PeerId::of_ip([192, 0, 2, 3].into()), 1);
+        let (log, mut finished) = mpsc::unbounded_channel();
+        assert!(tasks.run_of(newcomer, 100, done(7, &log)).await);
+        assert_eq!(finished.recv().await, Some(7));
     }
 }

@@ -24,3 +24,4 @@ pub use failure::DeliveryFailure;
 pub use gate::{AccessGate, LetterParts, Link, Source};
 pub use post::{LetterDraft, PostError, letter_by, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};
+pub use stamp::stamped_peer;

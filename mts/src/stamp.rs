@@ -10,7 +10,7 @@ use fipa_acl::{
     DecodeError, EncodeError, Envelope, EnvelopeParams, EnvelopeView, Letter, Received, Time,
     TimeError,
 };
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, PeerId};
 
 /// Error of [`put`].
 #[derive(Debug, thiserror::Error)]
@@ -58,17 +58,18 @@ pub(crate) fn read(
     })
 }
 
-/// Adds the stamp of this service in front of the letter.
+/// Adds the stamp of this service in front of the letter, which came from this peer.
 pub(crate) fn put(
     letter: Letter,
     name: &str,
     incarnation: Incarnation,
+    from: &PeerId,
     utc: SystemTime,
 ) -> Result<Letter, StampError> {
     let received = Received {
         by: name.to_owned(),
         date: Time::from_system_time(utc)?,
-        from: None,
+        from: (!from.is_this_host()).then(|| from.as_str().to_owned()),
         id: Some(incarnation.to_string()),
         via: None,
         user_defined: Vec::new(),
@@ -81,10 +82,26 @@ pub(crate) fn put(
     Ok(letter.stamped(stamp))
 }
 
+/// Returns the peer from which the service with this incarnation received the letter, by the stamp that it added.
+/// `None` without such a stamp.
+#[must_use]
+pub fn stamped_peer(letter: &Letter, service: Incarnation) -> Option<PeerId> {
+    let envelope = letter.envelope();
+    let id = service.to_string();
+    let view = EnvelopeView::parse(&envelope).ok()?;
+    let own = view
+        .stamps()
+        .find(|stamp| stamp.id().is_some_and(|it| it.as_str() == id))?;
+    match own.from() {
+        Some(from) => PeerId::from_text(&from.as_str()),
+        None => Some(PeerId::THIS_HOST),
+    }
+}
+
 /// Maximum length in bytes of the stamp of a service with this name.
 pub(crate) fn max_len(name: &str) -> usize {
     // The other parts are markers, lengths, date and incarnation.
-    name.len().saturating_add(64)
+    name.len().saturating_add(64 + PeerId::MAX_LEN)
 }
 
 /// Returns the names in the letter's effective intended-receiver parameter, or in `to` without one.
@@ -109,7 +126,26 @@ pub(crate) fn sender(letter: &Letter) -> Option<String> {
 mod tests {
     use std::time::{Duration, UNIX_EPOCH};
 
+    use fipa_acl::{AgentId, Message, Performative};
+
     use super::*;
+
+    #[test]
+    fn the_peer_is_that_of_the_own_stamp() {
+        let own = Incarnation::from_u64(7);
+        let peer = |text| PeerId::from_text(text).unwrap();
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap());
+        let letter = crate::letter_for(&message.build().unwrap(), UNIX_EPOCH).unwrap();
+        let forged = put(letter.clone(), "other", own, &peer("192.0.2.1"), UNIX_EPOCH).unwrap();
+        let arrived = put(forged.clone(), "own", own, &peer("192.0.2.66"), UNIX_EPOCH).unwrap();
+        assert_eq!(stamped_peer(&arrived, own), Some(peer("192.0.2.66")));
+        let of_this_host = put(forged, "own", own, &PeerId::THIS_HOST, UNIX_EPOCH).unwrap();
+        assert_eq!(stamped_peer(&of_this_host, own), Some(PeerId::THIS_HOST));
+        assert_eq!(stamped_peer(&arrived, Incarnation::from_u64(8)), None);
+        assert_eq!(stamped_peer(&letter, own), None);
+    }
 
     #[test]
     fn a_stamp_fits_the_predicted_length() {
@@ -118,7 +154,8 @@ mod tests {
         for name in ["m", "gateway-of-a-robot", &"long".repeat(200)] {
             for utc in [UNIX_EPOCH, far] {
                 let incarnation = Incarnation::from_u64(u64::MAX);
-                let stamped = put(Letter::default(), name, incarnation, utc).unwrap();
+                let from = PeerId::from_text(&"f".repeat(PeerId::MAX_LEN)).unwrap();
+                let stamped = put(Letter::default(), name, incarnation, &from, utc).unwrap();
                 assert!(
                     stamped.len() <= max_len(name),
                     "{} {}",

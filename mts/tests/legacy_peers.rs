@@ -459,6 +459,7 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_gets_a_failure_message()
         sender,
         via: Some(Kind::Shm),
         service: Incarnation::UNKNOWN,
+        peer: fipa_transport::PeerId::THIS_HOST,
         remote: false,
     };
     let read = |received: &Received| Undecodable::read(received, &"for a test").unwrap();

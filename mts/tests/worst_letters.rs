@@ -365,6 +365,7 @@ fn a_long_letter_that_cannot_be_decoded() {
         sender: sender.incarnation,
         via: Some(Kind::Shm),
         service: PROCESS,
+        peer: fipa_transport::PeerId::THIS_HOST,
         remote: false,
     };
     let bytes = received.letter.len();

@@ -12,15 +12,17 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 
 use super::dialogue::{Dialogue, DialogueError, name_of};
-use super::serving::{ServedQueue, opening};
+use super::serving::{ServedQueue, opening, refuse};
 use crate::agent::{Agent, AgentCore};
 use crate::incoming::Incoming;
+use crate::peer_shares::PeerPlaces;
 
 /// Maximum number of notifications that wait for one subscriber. Beyond it, `publish` waits.
 const MAX_WAITING: usize = 64;
 
-/// Maximum number of subscribers of one publisher. Further ones are refused.
-const MAX_SUBSCRIBERS: usize = 1_024;
+/// Maximum number of subscribers of one publisher. One host alone gets a quarter of them. Further ones of a host that has
+/// its share are refused.
+const MAX_SUBSCRIBERS: usize = 4_096;
 
 impl Agent {
     /// Accepts the subscriptions (`subscribe`, FIPA00035) whose content is this topic. One call of
@@ -151,29 +153,23 @@ impl Drop for Publisher {
 
 /// Accepts subscriptions until the agent ends.
 async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
+    let places = PeerPlaces::new(MAX_SUBSCRIBERS);
     while let Some(first) = queue.next().await {
         let core = Arc::clone(queue.agent());
-        let is_full = subscribers.0.lock().all.len() >= MAX_SUBSCRIBERS;
+        let Some(place) = places.take(first.peer()) else {
+            refuse(&core, &first, "too many subscribers");
+            continue;
+        };
         let subscribers = Arc::downgrade(&subscribers);
         tokio::spawn(async move {
             let name = name_of(first.message());
-            let served = match is_full {
-                true => refuse(&core, &first).await,
-                false => serve(&core, &first, &subscribers).await,
-            };
+            let served = serve(&core, &first, &subscribers).await;
+            drop(place);
             if let Err(error) = served {
                 log_limit::info!(of: &*name, subscriber = %escape(&name), error = %ErrorChain(&error), "a subscription has ended");
             }
         });
     }
-}
-
-async fn refuse(core: &Arc<AgentCore>, first: &Incoming) -> Result<(), DialogueError> {
-    let mut dialogue = Dialogue::join(core, first)?;
-    let refuse = Performative::Refuse;
-    dialogue
-        .answer(first.message(), refuse, "too many subscribers", None)
-        .await
 }
 
 /// Serves one subscription until its end.

@@ -2,7 +2,6 @@
 
 use std::fmt::Display;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use fipa_acl::{ErrorChain, Message, escape};
 use fipa_transport::log_limit;
@@ -15,9 +14,11 @@ use super::participant::{Farewell, Home, Reply, Task};
 use crate::agent::{Agent, AgentCore};
 use crate::demultiplexer::{Opens, ReaderKey};
 use crate::incoming::Incoming;
+use crate::peer_shares::PeerPlaces;
 
-/// Maximum number of handlers of one server that run at the same time. Further initiators are refused.
-const MAX_HANDLERS: usize = 1_024;
+/// Maximum number of handlers of one server that run at the same time. One host alone gets a quarter of them. Further
+/// initiators of a host that has its share are refused.
+const MAX_HANDLERS: usize = 4_096;
 
 impl Agent {
     /// Serves a protocol: each message that begins a conversation of it runs the handler, in a task of
@@ -71,9 +72,9 @@ where
 {
     let opens = opening(core, protocol, also)?;
     let runtime = Handle::try_current().map_err(|_| DialogueError::NoRuntime)?;
-    let running = Arc::new(AtomicUsize::new(0));
+    let running = PeerPlaces::new(MAX_HANDLERS);
     let queue = ServedQueue::new(core, opens);
-    let run = run(queue, handler, Arc::clone(&running));
+    let run = run(queue, handler, running.clone());
     Ok(Server {
         task: runtime.spawn(run),
         running,
@@ -86,14 +87,14 @@ where
 #[must_use = "dropping the server ends it"]
 pub struct Server {
     task: JoinHandle<()>,
-    running: Arc<AtomicUsize>,
+    running: PeerPlaces,
 }
 
 impl Server {
     /// Returns the number of running handlers.
     #[must_use]
     pub fn running(&self) -> usize {
-        self.running.load(Ordering::Relaxed)
+        self.running.taken()
     }
 
     /// Waits until the agent is deregistered or the domain is closed.
@@ -162,13 +163,17 @@ pub(super) fn opening(
     }))
 }
 
-async fn run<H, F, E>(queue: ServedQueue, handler: H, running: Arc<AtomicUsize>)
+async fn run<H, F, E>(queue: ServedQueue, handler: H, places: PeerPlaces)
 where
     H: Fn(Task) -> F + Send + Sync + 'static,
     F: Future<Output = Result<Reply, E>> + Send + 'static,
     E: Display + Send + 'static,
 {
     while let Some(first) = queue.next().await {
+        let Some(place) = places.take(first.peer()) else {
+            refuse(queue.agent(), &first, "busy");
+            continue;
+        };
         let home: Home = Arc::new(Mutex::new(None));
         let task = match Task::join(queue.agent(), &first, Some(Arc::clone(&home))) {
             Ok(task) => task,
@@ -177,22 +182,27 @@ where
                 continue;
             }
         };
-        let running = Running::new(&running);
-        if running.before >= MAX_HANDLERS {
-            drop(task);
-            if let Some(farewell) = home.lock().take() {
-                farewell.refuse("busy");
-            }
-            continue;
-        }
         let handled = tokio::spawn(handler(task));
         tokio::spawn(async move {
             let handled = handled.await;
             // The handler may have sent the last message by itself.
             let farewell = home.lock().take();
             finish(farewell, handled).await;
-            drop(running);
+            drop(place);
         });
+    }
+}
+
+/// Refuses a conversation that this message begins.
+pub(super) fn refuse(core: &Arc<AgentCore>, first: &Incoming, reason: &str) {
+    let home: Home = Arc::new(Mutex::new(None));
+    match Task::join(core, first, Some(Arc::clone(&home))) {
+        Ok(task) => drop(task),
+        Err(error) => tracing::debug!(error = %ErrorChain(&error), "cannot refuse a conversation"),
+    }
+    let farewell = home.lock().take();
+    if let Some(farewell) = farewell {
+        farewell.refuse(reason);
     }
 }
 
@@ -222,26 +232,5 @@ async fn finish<E: Display>(
     };
     if let Some(error) = failed {
         log_limit::warn!(error = %escape(&error), "the handler of a conversation failed");
-    }
-}
-
-/// Counts a running handler.
-struct Running {
-    all: Arc<AtomicUsize>,
-    before: usize,
-}
-
-impl Running {
-    fn new(all: &Arc<AtomicUsize>) -> Self {
-        Self {
-            before: all.fetch_add(1, Ordering::Relaxed),
-            all: Arc::clone(all),
-        }
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        self.all.fetch_sub(1, Ordering::Relaxed);
     }
 }

@@ -35,7 +35,8 @@ async fn a_host_with_many_agents_is_greeted_slowly(many: &str, other: &str) {
     for number in 0..AGENTS {
         write!(peers, "a{number} = [\"tcp://{at};fipa-services\"], ").unwrap();
     }
-    let at = other.local_addr().unwrap();
+    // An address of the loopback interface is one host with all others. A host name is another host.
+    let at = format!("localhost:{}", other.local_addr().unwrap().port());
     // The last one in the order of the directory.
     let peers = format!("discovery.static={{ {peers} z = [\"tcp://{at};fipa-services\"] }}");
     let config = config(&[
@@ -58,18 +59,27 @@ async fn a_host_with_many_agents_is_greeted_slowly(many: &str, other: &str) {
     // Starts the locks.
     let _ = agent.try_lock("nothing").await;
     // The agent of another host does not wait until the others were greeted.
-    receive(&other, 1).await;
-    receive(&many, COUNTED).await;
+    let (to_other, to_many) = tokio::join!(
+        async {
+            receive(&other, 1).await;
+            begun.elapsed()
+        },
+        async {
+            receive(&many, COUNTED).await;
+            begun.elapsed()
+        }
+    );
+    assert!(to_other < to_many, "{to_other:?} {to_many:?}");
     let rest = (COUNTED - AT_ONCE) as f64 - 1.0;
     let least = Duration::from_secs_f64(rest / RATE);
-    assert!(begun.elapsed() >= least, "{:?}", begun.elapsed());
+    assert!(to_many >= least, "{to_many:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_host_with_many_agents_is_greeted_slowly_and_delays_no_other_over_ipv4() {
     watched(a_host_with_many_agents_is_greeted_slowly(
         "127.0.0.1:0",
-        "127.0.0.2:0",
+        "127.0.0.1:0",
     ))
     .await;
 }

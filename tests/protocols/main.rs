@@ -12,6 +12,7 @@ mod moved;
 mod openings;
 mod proxies;
 mod selling;
+mod shares;
 #[path = "../support/mod.rs"]
 mod support;
 mod unknown;

@@ -18,7 +18,7 @@ pub struct PeerId(Option<Arc<str>>);
 
 impl PeerId {
     /// Maximum length of the text, in bytes.
-    pub const MAX_LEN: usize = 255;
+    pub const MAX_LEN: usize = 64;
 
     /// The processes of this host.
     pub const THIS_HOST: Self = Self(None);
@@ -48,7 +48,9 @@ impl PeerId {
         }
     }
 
-    fn unknown() -> Self {
+    /// Returns all peers without a known address together.
+    #[must_use]
+    pub fn unknown() -> Self {
         Self(Some("unknown".into()))
     }
 

@@ -133,6 +133,7 @@ impl<'a> Iterator for ReceiverNames<'a> {
 #[derive(Debug, Clone, Copy)]
 pub struct StampView<'a> {
     by: Text<'a>,
+    from: Option<Text<'a>>,
     id: Option<Text<'a>>,
 }
 
@@ -141,6 +142,12 @@ impl<'a> StampView<'a> {
     #[must_use]
     pub fn by(&self) -> Text<'a> {
         self.by
+    }
+
+    /// The service that sent the letter.
+    #[must_use]
+    pub fn from(&self) -> Option<Text<'a>> {
+        self.from
     }
 
     /// Identifier of the letter at the service that sent it.
@@ -182,6 +189,7 @@ impl<'a> Iterator for Stamps<'a> {
             if !received.by.is_empty() {
                 return Some(StampView {
                     by: received.by,
+                    from: received.from,
                     id: received.id,
                 });
             }

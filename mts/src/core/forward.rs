@@ -9,7 +9,7 @@ use bytes::Bytes;
 use fipa_acl::{AclRepresentation, DecodeError, EncodeError, Letter, Message};
 use fipa_sds::{Entry, Reach, Resolution, Role, Source, View};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel,
+    Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel, PeerId,
     Signature, Stream, Ticket, Verdict, log_limit, quota_address,
 };
 
@@ -470,7 +470,8 @@ impl Core {
         if envelope.is_loop {
             return Err(Answer::failed(FailureReason::Loop, &*config.name));
         }
-        let stamped = stamp::put(letter, &config.name, config.incarnation, now.utc)
+        let peer = PeerId::of(from.principal, std::slice::from_ref(&from.location));
+        let stamped = stamp::put(letter, &config.name, config.incarnation, &peer, now.utc)
             .map_err(|error| refused(error.to_string()))?;
         Ok((entry, stamped, envelope))
     }
@@ -645,7 +646,7 @@ impl Core {
         };
         let sequence = self.sequence_of(stream_sender);
         if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
-            && inbox.push_unframed(letter.clone(), via)
+            && inbox.push_unframed(letter.clone(), via, from.address)
         {
             self.table
                 .notice(stream, sequence, &entry.name, || News::Taken {

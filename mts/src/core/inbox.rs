@@ -2,11 +2,14 @@
 //! once and in order.
 
 use std::collections::{HashMap, VecDeque};
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
-use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Stream};
+use fipa_transport::{
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, PeerId, Stream,
+};
 
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE, work};
@@ -26,6 +29,8 @@ pub struct Received {
     /// The service that handed it over, as it introduced itself; unknown for letters of this
     /// process itself and of a legacy peer.
     pub service: Incarnation,
+    /// The peer that handed it over, as far as the link proves it.
+    pub peer: PeerId,
     /// Whether that service is on another host, as far as its link proves; see [`Hop::is_remote`].
     pub remote: bool,
 }
@@ -140,6 +145,7 @@ impl Inbox {
             sender: stream.sender,
             via: Some(via),
             service: from.location.incarnation(),
+            peer: PeerId::of(from.principal, std::slice::from_ref(&from.location)),
             remote: from.is_remote(),
         });
         Answer::Accepted
@@ -153,7 +159,7 @@ impl Inbox {
     }
 
     /// Puts a letter without a stream, whose sender cannot wait, into the queue if there is room.
-    pub(crate) fn push_unframed(&mut self, letter: Letter, via: Kind) -> bool {
+    pub(crate) fn push_unframed(&mut self, letter: Letter, via: Kind, from: IpAddr) -> bool {
         if !self.has_room(letter.len()) {
             return false;
         }
@@ -163,6 +169,7 @@ impl Inbox {
             sender: Incarnation::UNKNOWN,
             via: Some(via),
             service: Incarnation::UNKNOWN,
+            peer: PeerId::of_ip(from),
             remote: true,
         });
         true
@@ -180,6 +187,7 @@ impl Inbox {
             sender: Incarnation::UNKNOWN,
             via: None,
             service: Incarnation::UNKNOWN,
+            peer: PeerId::THIS_HOST,
             remote: false,
         });
         true
