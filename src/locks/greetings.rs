@@ -1,6 +1,7 @@
 //! The rate and the order in which an agent asks others for a sign of life. No I/O, no clock.
 
 use std::collections::{HashMap, HashSet, VecDeque};
+use std::net::{IpAddr, Ipv4Addr};
 use std::time::{Duration, Instant};
 
 use fipa_locking::Peer;
@@ -16,8 +17,9 @@ const OF_ALL: (f64, f64) = (100.0, 512.0);
 const PAUSE: Duration = Duration::from_millis(50);
 /// Maximum number of agents that wait. One peer alone gets a quarter of it.
 const MAX_WAITING: usize = 16_384;
-/// Maximum number of peers whose rate is remembered.
-const MAX_PEERS: usize = 1_024;
+/// Maximum number of peers that are known by their address only and whose rate is remembered. Beyond it, they have one
+/// rate together. As many others have a rate of their own: this host, and peers that have proved a key.
+const MAX_PEERS: usize = 256;
 /// Time between two readings of the directory for agents that found no place among those that wait.
 const READ_AGAIN: Duration = Duration::from_secs(30);
 
@@ -69,7 +71,8 @@ impl Greetings {
         if self.known.contains(agent) {
             return false;
         }
-        let is_first = match self.peer(now, by) {
+        let by = &self.remember(now, by);
+        let is_first = match self.peers.get(by) {
             Some(of_peer) => of_peer.queue.is_empty(),
             None => {
                 self.incomplete(now);
@@ -191,23 +194,31 @@ impl Greetings {
             && of_peer.bucket.take_of(1.0, rate, burst, now)
     }
 
-    /// Returns what is known of a peer; `None` if too many others are known.
-    fn peer(&mut self, now: Instant, by: &PeerId) -> Option<&mut OfPeer> {
-        if !self.peers.contains_key(by) && self.peers.len() >= MAX_PEERS {
+    /// Remembers a peer, if there is room. Returns the one whose rate its agents take.
+    fn remember(&mut self, now: Instant, by: &PeerId) -> PeerId {
+        if self.peers.contains_key(by) {
+            return by.clone();
+        }
+        let is_address = |peer: &PeerId| peer.as_str().parse::<IpAddr>().is_ok();
+        let kind = is_address(by);
+        let count = |it: &Self| it.peers.keys().filter(|it| is_address(it) == kind).count();
+        if count(self) >= MAX_PEERS {
             let (rate, burst) = OF_PEER;
             let full = Duration::from_secs_f64(burst / rate);
             // The bucket of a peer that is forgotten is as full as that of a new one.
             self.peers.retain(|_, it| {
                 !it.queue.is_empty() || now.saturating_duration_since(it.bucket.asked()) < full
             });
-            if self.peers.len() >= MAX_PEERS {
-                return None;
-            }
         }
-        Some(self.peers.entry(by.clone()).or_insert_with(|| OfPeer {
+        let by = match count(self) < MAX_PEERS {
+            true => by.clone(),
+            false => PeerId::of_ip(Ipv4Addr::UNSPECIFIED.into()),
+        };
+        self.peers.entry(by.clone()).or_insert_with(|| OfPeer {
             bucket: TokenBucket::new(OF_PEER.1, now),
             queue: VecDeque::new(),
-        }))
+        });
+        by
     }
 }
 
@@ -342,11 +353,35 @@ mod tests {
         for number in 0..3_000_u32 {
             let by = PeerId::of_ip(std::net::Ipv4Addr::from(number).into());
             greetings.announced(now, &by, &agent("a", number.into()));
-            assert!(greetings.peers.len() <= MAX_PEERS);
+            // The peers beyond the bound have one entry together.
+            assert!(greetings.peers.len() <= MAX_PEERS + 1);
         }
         assert!(greetings.poll_timeout().is_some());
         run(&mut greetings, now + 60 * SECOND);
         let later = now + 60 * SECOND;
         assert!(greetings.announced(later, &PeerId::THIS_HOST, &agent("b", 0)));
+    }
+
+    #[test]
+    fn a_flood_of_addresses_delays_this_host_and_peers_with_keys_for_seconds_only() {
+        let now = Instant::now();
+        let mut greetings = Greetings::new(now);
+        for number in 1..5_000_u32 {
+            let by = PeerId::of_ip(Ipv4Addr::from(number).into());
+            for agents in 0..3 {
+                let one = agent("flood", u64::from(number * 3 + agents));
+                greetings.announced(now, &by, &one);
+            }
+        }
+        let key = PeerId::of(fipa_transport::Principal::Certificate([7; 32]), &[]);
+        let honest = [(PeerId::THIS_HOST, 0), (key, 1)];
+        for (by, number) in &honest {
+            greetings.announced(now, by, &agent("honest", *number));
+        }
+        let greeted = run(&mut greetings, now + 6 * SECOND);
+        for (by, number) in honest {
+            let is_it = |(_, it): &(Instant, Peer)| *it == agent("honest", number);
+            assert!(greeted.iter().any(is_it), "{by}");
+        }
     }
 }

@@ -362,6 +362,11 @@ impl Connection {
         }
     }
 
+    /// Whether the other side opened the connection.
+    pub(crate) fn was_accepted(&self) -> bool {
+        self.role == Role::Acceptor
+    }
+
     /// Whether a parcel of this stream is not answered yet.
     pub(crate) fn carries(&self, stream: Stream) -> bool {
         self.sent.values().any(|sent| sent.stream == stream)

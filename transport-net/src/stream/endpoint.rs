@@ -240,13 +240,13 @@ impl Peer {
                 == (&that.name, &that.domain, &that.host);
         }
         match (&self.dialled, &before.dialled) {
+            // An unproved peer at another address may or may not be the service, whatever its hello says.
+            (Some(_), _) if self.proved.is_none() && self.home != before.home => true,
             (Some((this, serial)), Some((that, earlier))) => {
                 let is_for_same = this == that && self.load == before.load;
                 serial >= earlier && (self.home != before.home || is_for_same)
             }
-            // An unproved peer at another address may or may not be the service.
-            (Some(_), None) => self.proved.is_none() && self.home != before.home,
-            (None, _) => false,
+            (Some(_), None) | (None, _) => false,
         }
     }
 }
@@ -779,7 +779,9 @@ impl Endpoint {
             identity: peer.identity.clone(),
             proved,
             home: from.home(),
-            dialled: (!peer.dialled.is_empty()).then(|| (peer.dialled.clone(), peer.serial)),
+            // Without a key, an accepted connection counts as one, whatever its hello says.
+            dialled: (!peer.dialled.is_empty() || proved.is_none() && link.was_accepted())
+                .then(|| (peer.dialled.clone(), peer.serial)),
             load,
             listening: peer.listening.clone(),
         };

@@ -308,6 +308,37 @@ async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this
     assert_eq!(good.ending(), None);
 }
 
+/// Whatever its hello says, an unproved peer at another address takes no letters of a service that is alive.
+#[tokio::test]
+async fn an_unproved_peer_elsewhere_is_refused_beside_a_service_that_is_alive() {
+    for load in [Load::Any, Load::Large] {
+        for (serial, dialled) in [(2, X), (2, Y), (0, X), (0, ""), (2, "")] {
+            let endpoint = endpoint(Limits::default());
+            let honest = comes(None, 7, "10.0.0.7:1", 1, X);
+            let (honest, _) = enters(&endpoint, honest).await.unwrap();
+            let thief = Greeting {
+                load,
+                ..comes(None, 7, "10.0.0.9:1", serial, dialled)
+            };
+            let answers = async {
+                loop {
+                    honest.hears_pong();
+                    tokio::task::yield_now().await;
+                }
+            };
+            let entered = tokio::select! {
+                entered = enters(&endpoint, thief) => entered,
+                () = answers => unreachable!("it does not end"),
+            };
+            let refused = matches!(entered, Err(ConnectionEnd::IdentityConflict(_)));
+            assert!(refused, "{load:?}, {serial}, {dialled}");
+            let to = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
+            let route = endpoint.route_to(&to, load).unwrap();
+            assert_eq!(matches!(route, Route::New(..)), load == Load::Large);
+        }
+    }
+}
+
 /// A link that was dialled for this location and whose peer has introduced itself.
 async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
     let Route::New(link, _) = endpoint.route_to(to, Load::Any).unwrap() else {

@@ -173,6 +173,11 @@ impl Link {
         self.state.lock().connection.load()
     }
 
+    /// Whether the other side opened the connection.
+    pub(crate) fn was_accepted(&self) -> bool {
+        self.state.lock().connection.was_accepted()
+    }
+
     /// Whether a parcel of this stream is not answered yet.
     pub(crate) fn carries(&self, stream: Stream) -> bool {
         self.state.lock().connection.carries(stream)
@@ -331,6 +336,17 @@ impl Link {
         let mut state = self.state.lock();
         let taken = state.connection.handle_frame(frame, Instant::now());
         assert_eq!(taken, Ok(()));
+    }
+
+    /// A sign of life of the peer arrives.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn hears_pong(&self) {
+        self.takes(super::frame::Frame::Pong);
+        let mut state = self.state.lock();
+        let now = Instant::now();
+        state.connection.received(Reader::Main, 1, false, now);
+        drop(state);
+        self.received.notify_waiters();
     }
 
     /// Handles and welcomes a hello of the peer.
