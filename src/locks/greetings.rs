@@ -351,7 +351,7 @@ mod tests {
         let now = Instant::now();
         let mut greetings = Greetings::new(now);
         for number in 0..3_000_u32 {
-            let by = PeerId::of_ip(std::net::Ipv4Addr::from(number).into());
+            let by = PeerId::of_ip(Ipv4Addr::from(number).into());
             greetings.announced(now, &by, &agent("a", number.into()));
             // The peers beyond the bound have one entry together.
             assert!(greetings.peers.len() <= MAX_PEERS + 1);
