@@ -149,15 +149,14 @@ impl SenderTasks {
     fn make_room(&mut self, sender: &Sender, bytes: usize) {
         let is_known = self.0.contains_key(sender);
         loop {
-            let used = self.used(sender, bytes);
-            let senders: usize = used.values().map(|(senders, _)| senders).sum();
-            let all_bytes: usize = used.values().map(|(_, bytes)| bytes).sum();
-            let of_most = if senders > MAX_SENDERS {
-                used.iter().max_by_key(|(_, (senders, _))| *senders)
-            } else if all_bytes > MAX_BYTES {
-                used.iter().max_by_key(|(_, (_, bytes))| *bytes)
-            } else {
+            let too_many = self.0.len() + usize::from(!is_known) > MAX_SENDERS;
+            if !too_many && self.bytes() + bytes <= MAX_BYTES {
                 return;
+            }
+            let used = self.used(sender, bytes);
+            let of_most = match too_many {
+                true => used.iter().max_by_key(|(_, (senders, _))| *senders),
+                false => used.iter().max_by_key(|(_, (_, bytes))| *bytes),
             };
             let of_most = of_most.filter(|(peer, _)| !is_known || **peer != sender.peer);
             let Some(longest) = of_most.and_then(|(peer, _)| self.longest_of(peer)) else {

@@ -174,7 +174,7 @@ fn an_attempt_continues_while_its_location_is_announced() {
     assert_eq!(gateway.abandoned(), None);
 }
 
-/// Everybody in the network can announce by mDNS.
+/// Each host of the network can announce by mDNS.
 #[test]
 fn the_announcement_of_a_peer_with_a_certificate_counts_only_from_itself() {
     let mut gateway = Gateway::new(vec![tcp(1)]);

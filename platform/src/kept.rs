@@ -1,4 +1,4 @@
-//! What a successor of an agent of this crate takes over: descriptions, and subscriptions of agents without a
+//! The state that a successor of an agent takes over: descriptions, and subscriptions of agents without a
 //! registration.
 //!
 //! The values are serialized by the caller. What is read again is checked like the request that it came

@@ -127,7 +127,7 @@ fn descriptions_come_back_with_their_leases() {
         next.register(&local("zebra")),
         Err(Exception::AlreadyRegistered)
     );
-    // What ended while there was no facilitator ends with the first call.
+    // Agents that ended while there was no facilitator end with the first call.
     let late = successor(&file, 3600.0, |_| true);
     assert_eq!(late.df.descriptions().count(), 2);
 }
@@ -166,7 +166,7 @@ fn subscriptions_of_other_hosts_go_on_and_miss_nothing() {
         assert!(found[1].services.is_empty());
     }
     assert!(notification(&mut next, 1.0).is_none());
-    // What has been delivered is not repeated by the next successor.
+    // The next successor does not repeat delivered notifications.
     let file = kept(&next, 1.0);
     let mut next = successor(&file, 1.0, |_| true);
     assert!(notification(&mut next, 0.0).is_none());

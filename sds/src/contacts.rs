@@ -58,7 +58,7 @@ impl ContactDirectory {
         location: Location,
     ) -> Result<bool, EntryError> {
         let gateway = location.incarnation();
-        let peer = PeerId::of(Principal::Unproved, std::slice::from_ref(&location));
+        let peer = PeerId::of(Principal::Unproved, Some(&location));
         let entry = Entry {
             name: name.into(),
             agent_type: String::new(),
@@ -129,7 +129,7 @@ impl ContactDirectory {
 fn to_evict(contacts: &[(Arc<Entry>, Instant)]) -> Option<usize> {
     let hosts = contacts
         .iter()
-        .map(|(entry, _)| PeerId::of(Principal::Unproved, &entry.locations));
+        .map(|(entry, _)| PeerId::of(Principal::Unproved, entry.locations.first()));
     let mut of_host: HashMap<PeerId, (usize, usize)> = HashMap::new();
     for (index, host) in hosts.enumerate() {
         let (count, _) = of_host.entry(host).or_insert((0, index));

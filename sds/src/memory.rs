@@ -78,7 +78,7 @@ impl StaticDirectory {
             } else {
                 Role::Agent
             };
-            let peer = PeerId::of(Principal::Unproved, &locations);
+            let peer = PeerId::of(Principal::Unproved, locations.first());
             let entry = Entry {
                 name: name.clone(),
                 agent_type: String::new(),

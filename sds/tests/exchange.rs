@@ -303,7 +303,7 @@ impl World {
                                 reach: Reach::Remote {
                                     gateway: entry.mts.incarnation,
                                 },
-                                peer: PeerId::of(principal, &at),
+                                peer: PeerId::of(principal, at.first()),
                                 ..Entry::clone(entry)
                             }
                     })

@@ -302,7 +302,7 @@ impl State {
             reach: Reach::Remote {
                 gateway: incarnation,
             },
-            peer: PeerId::of(peer.hop.principal, std::slice::from_ref(&peer.hop.location)),
+            peer: PeerId::of(peer.hop.principal, Some(&peer.hop.location)),
             role: Role::Gateway,
         };
         let mut neighbour = before.cloned().unwrap_or_else(|| Neighbour {
@@ -354,12 +354,9 @@ impl Neighbour {
     }
 }
 
-/// Returns what log lines count by: the source at an IP address, or the host.
-fn source(location: &Location) -> String {
-    match location.quota_address() {
-        Some(address) => address.to_string(),
-        None => location.host().to_owned(),
-    }
+/// Returns the host at this location, by which log lines are counted.
+fn source(location: &Location) -> PeerId {
+    PeerId::of(Principal::Unproved, Some(location))
 }
 
 /// The directory in which the gateway looks up receivers: all directories, and the neighbors by

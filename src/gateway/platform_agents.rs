@@ -57,9 +57,9 @@ pub(super) struct PlatformAgents {
     pub(super) exchange: Arc<Exchanging>,
     /// Whether `security.keys` is set.
     pub(super) has_keys: bool,
-    /// What the agents keep for their successors.
+    /// The state that the agents keep for their successors.
     pub(super) state: Arc<StateFile>,
-    /// What the last gateway of this domain kept.
+    /// The state that the last gateway of this domain kept.
     pub(super) predecessor: Arc<Predecessor>,
 }
 

@@ -281,7 +281,7 @@ impl Trust {
     }
 }
 
-/// What the agents of this gateway keep at present.
+/// The state that the agents of this gateway keep at present.
 #[derive(Debug, Clone, Default)]
 struct Kept {
     agents: Arc<[KeptDescription]>,

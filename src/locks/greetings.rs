@@ -49,6 +49,8 @@ struct OfPeer {
     bucket: TokenBucket,
     /// Agents that wait, and some that have left.
     queue: VecDeque<Peer>,
+    /// Whether the peer is known by its address only.
+    is_address: bool,
 }
 
 impl Greetings {
@@ -185,7 +187,7 @@ impl Greetings {
             return false;
         };
         let (rate, burst) = OF_PEER;
-        // What a peer does not get now, it gets when its turn comes again.
+        // A greeting without its rate waits for the next turn of its peer.
         if !of_peer.bucket.clone().take_of(1.0, rate, burst, now) {
             return false;
         }
@@ -199,9 +201,11 @@ impl Greetings {
         if self.peers.contains_key(by) {
             return by.clone();
         }
-        let is_address = |peer: &PeerId| peer.as_str().parse::<IpAddr>().is_ok();
-        let kind = is_address(by);
-        let count = |it: &Self| it.peers.keys().filter(|it| is_address(it) == kind).count();
+        let is_address = by.as_str().parse::<IpAddr>().is_ok();
+        let count = |it: &Self| {
+            let peers = it.peers.values();
+            peers.filter(|it| it.is_address == is_address).count()
+        };
         if count(self) >= MAX_PEERS {
             let (rate, burst) = OF_PEER;
             let full = Duration::from_secs_f64(burst / rate);
@@ -217,6 +221,7 @@ impl Greetings {
         self.peers.entry(by.clone()).or_insert_with(|| OfPeer {
             bucket: TokenBucket::new(OF_PEER.1, now),
             queue: VecDeque::new(),
+            is_address,
         });
         by
     }
@@ -373,7 +378,7 @@ mod tests {
                 greetings.announced(now, &by, &one);
             }
         }
-        let key = PeerId::of(fipa_transport::Principal::Certificate([7; 32]), &[]);
+        let key = PeerId::of(fipa_transport::Principal::Certificate([7; 32]), None);
         let honest = [(PeerId::THIS_HOST, 0), (key, 1)];
         for (by, number) in &honest {
             greetings.announced(now, by, &agent("honest", *number));

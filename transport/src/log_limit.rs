@@ -366,11 +366,12 @@ mod tests {
         assert_eq!(lines + omitted + limit.take_omitted(), 100_000);
     }
 
-    /// Counts the lines and adds up their fields `omitted`.
+    /// Counts the lines, adds up their fields `omitted`, and keeps the values of the others.
     #[derive(Debug, Clone, Default)]
     struct Log {
         lines: Arc<AtomicUsize>,
         omitted: Arc<AtomicUsize>,
+        values: Arc<Mutex<Vec<(&'static str, String)>>>,
     }
 
     impl Visit for Log {
@@ -381,7 +382,10 @@ mod tests {
             }
         }
 
-        fn record_debug(&mut self, _: &Field, _: &dyn fmt::Debug) {}
+        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+            let value = format!("{value:?}");
+            self.values.lock().push((field.name(), value));
+        }
     }
 
     impl tracing::Subscriber for Log {
@@ -427,52 +431,20 @@ mod tests {
         assert_eq!(parts, format!("{fits}... (2050 bytes)"));
     }
 
-    /// Keeps the values of the lines.
-    #[derive(Debug, Clone, Default)]
-    struct Values(Arc<Mutex<Vec<(&'static str, String)>>>);
-
-    impl Visit for Values {
-        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-            self.0.lock().push((field.name(), format!("{value:?}")));
-        }
-    }
-
-    impl tracing::Subscriber for Values {
-        fn enabled(&self, _: &tracing::Metadata<'_>) -> bool {
-            true
-        }
-
-        fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
-            span::Id::from_u64(1)
-        }
-
-        fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
-
-        fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
-
-        fn event(&self, event: &tracing::Event<'_>) {
-            event.record(&mut self.clone());
-        }
-
-        fn enter(&self, _: &span::Id) {}
-
-        fn exit(&self, _: &span::Id) {}
-    }
-
     #[test]
     fn long_values_of_peers_are_cut_in_the_log() {
         struct Peer {
             name: String,
         }
-        let values = Values::default();
+        let log = Log::default();
         let (text, number) = ("t".repeat(100_000), 7);
         let peer = Peer { name: text.clone() };
-        with_default(values.clone(), || {
+        with_default(log.clone(), || {
             warn!(of: 1, %text, ?text, %peer.name, why = %text, other = ?text, number, count = number, "says {text}");
             info!("says {}, {number}", peer.name);
             error!(number, "says {text}");
         });
-        let values = values.0.lock();
+        let values = log.values.lock();
         let long = values.iter().filter(|(_, value)| value.len() > 100);
         for (name, value) in long.clone() {
             assert!(

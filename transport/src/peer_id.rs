@@ -23,13 +23,13 @@ impl PeerId {
     /// The processes of this host.
     pub const THIS_HOST: Self = Self(None);
 
-    /// Returns the peer whose link proves this identity, and that is reached at the first of these locations.
+    /// Returns the peer whose link proves this identity, and that is reached at this location.
     #[must_use]
-    pub fn of(principal: Principal, locations: &[Location]) -> Self {
+    pub fn of(principal: Principal, location: Option<&Location>) -> Self {
         match principal {
             Principal::Host => Self::THIS_HOST,
             Principal::Certificate(fingerprint) => Self(Some(hex(&fingerprint).into())),
-            Principal::Unproved => locations.first().map_or_else(Self::unknown, Self::at),
+            Principal::Unproved => location.map_or_else(Self::unknown, Self::at),
         }
     }
 
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     fn of(principal: Principal, text: &str) -> PeerId {
-        PeerId::of(principal, &[text.parse().unwrap()])
+        PeerId::of(principal, Some(&text.parse().unwrap()))
     }
 
     #[test]
@@ -128,7 +128,7 @@ mod tests {
         assert_ne!(at("tcp://[fe80::1%2]:1"), at("tcp://[fe80::1%3]:1"));
         assert_ne!(at("tcp://[fe80::1%2]:1"), at("tcp://[fe80::2%2]:1"));
         assert_eq!(at("tcp://arm.local:1"), at("tcp://arm.local:2"));
-        assert!(!PeerId::of(Principal::Unproved, &[]).is_this_host());
+        assert!(!PeerId::of(Principal::Unproved, None).is_this_host());
     }
 
     #[test]

@@ -470,7 +470,7 @@ impl Core {
         if envelope.is_loop {
             return Err(Answer::failed(FailureReason::Loop, &*config.name));
         }
-        let peer = PeerId::of(from.principal, std::slice::from_ref(&from.location));
+        let peer = PeerId::of(from.principal, Some(&from.location));
         let stamped = stamp::put(letter, &config.name, config.incarnation, &peer, now.utc)
             .map_err(|error| refused(error.to_string()))?;
         Ok((entry, stamped, envelope))

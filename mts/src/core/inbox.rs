@@ -145,7 +145,7 @@ impl Inbox {
             sender: stream.sender,
             via: Some(via),
             service: from.location.incarnation(),
-            peer: PeerId::of(from.principal, std::slice::from_ref(&from.location)),
+            peer: PeerId::of(from.principal, Some(&from.location)),
             remote: from.is_remote(),
         });
         Answer::Accepted

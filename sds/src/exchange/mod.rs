@@ -370,7 +370,7 @@ impl Exchange {
                 }
                 continue;
             }
-            let peer = PeerId::of(*principal, locations);
+            let peer = PeerId::of(*principal, locations.first());
             if !mts.incarnation.is_known() || !self.make_room(&peer) {
                 continue;
             }
@@ -1009,7 +1009,7 @@ impl Neighbor {
         Sender {
             gateway: self.mts.incarnation,
             principal: self.principal,
-            peer: PeerId::of(self.principal, &self.locations),
+            peer: PeerId::of(self.principal, self.locations.first()),
         }
     }
 
@@ -1112,7 +1112,7 @@ impl Neighbor {
             reach: Reach::Remote {
                 gateway: self.mts.incarnation,
             },
-            peer: PeerId::of(self.principal, &self.locations),
+            peer: PeerId::of(self.principal, self.locations.first()),
             role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {

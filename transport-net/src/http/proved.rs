@@ -1,4 +1,4 @@
-//! What platforms have proved, beyond the end of their connections.
+//! The identities that platforms have proved, kept beyond the end of their connections.
 //!
 //! A platform whose certificate is no longer trusted is refused at its next connection. Letters for it would be sent
 //! again until their deadline, as for a platform that was never trusted and may be trusted soon.

@@ -560,17 +560,13 @@ impl Endpoint {
                 Route::New(link, sink) => (link, Some(sink)),
             };
             let predecessors = (load == Load::Large).then(|| {
-                let others = self
-                    .registry
-                    .lock()
-                    .any
-                    .open(to)
-                    .cloned()
-                    .collect::<Vec<_>>();
+                let registry = self.registry.lock();
+                let others = registry.any.open(to);
                 let others: Vec<_> = others
-                    .into_iter()
                     .filter(|it| !Arc::ptr_eq(it, &link))
+                    .cloned()
                     .collect();
+                drop(registry);
                 link.predecessors(parcel.stream, &others)
             });
             let sent = link.send(attempt, parcel, predecessors);
