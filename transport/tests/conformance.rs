@@ -92,7 +92,11 @@ impl Transport for TableTransport {
         let Some(peer) = self.0.table.0.lock().get(to).cloned() else {
             return refused(TransportErrorKind::Unreachable);
         };
-        if peer.state.lock().inbox.len() >= WINDOW {
+        let room = match parcel.body {
+            fipa_transport::Body::Letter(_) => WINDOW - WINDOW / 4,
+            _ => WINDOW,
+        };
+        if peer.state.lock().inbox.len() >= room {
             return refused(TransportErrorKind::Congested);
         }
         self.0.state.lock().open.insert(attempt);
