@@ -7,6 +7,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use fipa_acl::Message;
 use fipa_sds::{Entry, Reach, Role};
@@ -27,10 +28,14 @@ const MAX_SET_ASIDE: usize = 1_024;
 const MAX_SET_ASIDE_BYTES: usize = 64 << 20;
 
 /// The messages that one reader received for another.
+///
+/// Each reader waits for its own queue, so an arrival wakes two readers at most: the one that receives it,
+/// and the one to which it belongs.
 #[derive(Default)]
 pub(crate) struct Demultiplexer {
     state: Mutex<State>,
-    changed: Notify,
+    /// Notified when a queue becomes full, and when none is full any longer.
+    room: Notify,
 }
 
 #[derive(Default)]
@@ -42,7 +47,11 @@ struct State {
     /// Whether the application has ever read the other messages.
     is_read: bool,
     readers: u64,
+    full: FullQueues,
 }
+
+/// Number of full queues of conversations and servers.
+type FullQueues = Arc<AtomicUsize>;
 
 struct Conversation {
     number: u64,
@@ -64,26 +73,60 @@ struct SetAside {
     messages: VecDeque<Incoming>,
     /// Bytes of their letters.
     bytes: usize,
+    /// Whether the queue reached its bound and has not had room for an eighth of it since. So a reader that is
+    /// slow wakes the others once for many messages.
+    is_full: bool,
+    /// Counts this queue while it is full.
+    full: FullQueues,
+    /// Notified when a message is added.
+    arrived: Arc<Notify>,
 }
 
 impl SetAside {
+    fn new(full: &FullQueues) -> Self {
+        let mut queue = Self::default();
+        queue.full = Arc::clone(full);
+        queue
+    }
+
     fn push_back(&mut self, message: Incoming) {
         self.bytes = self.bytes.saturating_add(message.bytes());
         self.messages.push_back(message);
+        self.arrived.notify_one();
+        if self.is_at_bound() {
+            self.set_full(true);
+        }
     }
 
     fn pop_front(&mut self) -> Option<Incoming> {
         let message = self.messages.pop_front()?;
         self.bytes = self.bytes.saturating_sub(message.bytes());
+        if self.messages.len() <= MAX_SET_ASIDE / 8 * 7 && self.bytes <= MAX_SET_ASIDE_BYTES / 8 * 7
+        {
+            self.set_full(false);
+        }
+        if !self.messages.is_empty() {
+            // Several callers may read one queue, and each notification wakes one.
+            self.arrived.notify_one();
+        }
         Some(message)
+    }
+
+    fn is_at_bound(&self) -> bool {
+        self.messages.len() >= MAX_SET_ASIDE || self.bytes >= MAX_SET_ASIDE_BYTES
+    }
+
+    fn set_full(&mut self, is_full: bool) {
+        match (self.is_full, is_full) {
+            (false, true) => self.full.fetch_add(1, Ordering::Relaxed),
+            (true, false) => self.full.fetch_sub(1, Ordering::Relaxed),
+            _ => return,
+        };
+        self.is_full = is_full;
     }
 
     fn is_empty(&self) -> bool {
         self.messages.is_empty()
-    }
-
-    fn is_full(&self) -> bool {
-        self.messages.len() >= MAX_SET_ASIDE || self.bytes >= MAX_SET_ASIDE_BYTES
     }
 
     /// Adds the messages of another queue.
@@ -93,7 +136,15 @@ impl SetAside {
 
     /// Removes all messages.
     fn take(&mut self) -> VecDeque<Incoming> {
-        std::mem::take(self).messages
+        self.bytes = 0;
+        self.set_full(false);
+        std::mem::take(&mut self.messages)
+    }
+}
+
+impl Drop for SetAside {
+    fn drop(&mut self) {
+        self.set_full(false);
     }
 }
 
@@ -156,12 +207,13 @@ impl Demultiplexer {
     fn lead(&self, id: &str, from: Admitted, is_internal: bool) -> ReaderKey {
         let mut state = self.state.lock();
         let key = state.key(id);
+        let queue = SetAside::new(&state.full);
         let conversations = state.led.entry(Arc::clone(&key.id)).or_default();
         conversations.push(Conversation {
             number: key.number,
             from,
             is_internal,
-            queue: SetAside::default(),
+            queue,
         });
         key
     }
@@ -185,20 +237,19 @@ impl Demultiplexer {
 
     /// Ends a conversation. Its unread messages go to `receive`.
     pub(crate) fn end(&self, key: &ReaderKey) {
-        let mut state = self.state.lock();
-        let Some(conversations) = state.led.get_mut(&key.id) else {
-            return;
-        };
-        let at = conversations.iter().position(|it| it.number == key.number);
-        let ended = at.map(|at| conversations.remove(at));
-        if conversations.is_empty() {
-            state.led.remove(&key.id);
-        }
-        if let Some(ended) = ended.filter(|ended| !ended.is_internal) {
-            state.others.extend(ended.queue.messages);
-        }
-        drop(state);
-        self.changed.notify_waiters();
+        self.change(|state| {
+            let Some(conversations) = state.led.get_mut(&key.id) else {
+                return;
+            };
+            let at = conversations.iter().position(|it| it.number == key.number);
+            let ended = at.map(|at| conversations.remove(at));
+            if conversations.is_empty() {
+                state.led.remove(&key.id);
+            }
+            if let Some(mut ended) = ended.filter(|ended| !ended.is_internal) {
+                state.others.extend(ended.queue.take());
+            }
+        });
     }
 
     /// Starts a queue for the messages that a server handles: those for which `opens` returns true and
@@ -207,24 +258,24 @@ impl Demultiplexer {
         let mut state = self.state.lock();
         let key = state.key("");
         let number = key.number;
+        let queue = SetAside::new(&state.full);
         state.served.push(Served {
             number,
             opens,
-            queue: SetAside::default(),
+            queue,
         });
         key
     }
 
     /// Ends a server. Its unread messages go to `receive`.
     pub(crate) fn end_serving(&self, key: &ReaderKey) {
-        let mut state = self.state.lock();
-        if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
-            let left = state.served.remove(at).queue.messages;
-            let is_other = |left: &Incoming| !lock_slot::is_for_locks(left);
-            state.others.extend(left.into_iter().filter(is_other));
-        }
-        drop(state);
-        self.changed.notify_waiters();
+        self.change(|state| {
+            if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
+                let left = state.served.remove(at).queue.take();
+                let is_other = |left: &Incoming| !lock_slot::is_for_locks(left);
+                state.others.extend(left.into_iter().filter(is_other));
+            }
+        });
     }
 
     /// Waits for the next message of a conversation.
@@ -239,14 +290,12 @@ impl Demultiplexer {
     /// Returns the next message of a conversation, if one is available now.
     pub(crate) fn now_of(&self, endpoint: &Endpoint, key: &ReaderKey) -> Option<Incoming> {
         loop {
-            let room = {
-                let mut state = self.state.lock();
-                if let Some(set_aside) = state.take(Reader::Conversation(key)) {
-                    return Some(set_aside);
-                }
-                state.has_room()
-            };
-            let received = room.then(|| endpoint.letter_now())??;
+            let (set_aside, has_room) =
+                self.change(|state| (state.take(Reader::Conversation(key)), state.has_room()));
+            if set_aside.is_some() {
+                return set_aside;
+            }
+            let received = has_room.then(|| endpoint.letter_now())??;
             let own = self.put(endpoint, received, Reader::Conversation(key));
             if own.is_some() {
                 return own;
@@ -265,15 +314,15 @@ impl Demultiplexer {
 
     /// Waits for the next message of no led conversation.
     pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {
-        self.state.lock().is_read = true;
+        self.change(|state| state.is_read = true);
         self.next(endpoint, Reader::Others).await
     }
 
     /// Returns the next message of no led conversation, if one is available now.
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
-        self.state.lock().is_read = true;
+        self.change(|state| state.is_read = true);
         loop {
-            if let Some(set_aside) = self.state.lock().take(Reader::Others) {
+            if let Some(set_aside) = self.change(|state| state.take(Reader::Others)) {
                 return Ok(Some(set_aside));
             }
             match endpoint.letter_now() {
@@ -290,17 +339,32 @@ impl Demultiplexer {
 
     /// Removes and returns all messages that were set aside.
     pub(crate) fn drain(&self) -> Vec<Incoming> {
+        self.change(|state| {
+            let mut all: Vec<Incoming> = state.others.take().into();
+            let led = state
+                .led
+                .drain()
+                .flat_map(|(_, conversations)| conversations);
+            let led = led.filter(|conversation| !conversation.is_internal);
+            all.extend(led.flat_map(|mut conversation| conversation.queue.take()));
+            let served = state.served.iter_mut();
+            all.extend(served.flat_map(|server| server.queue.take()));
+            all
+        })
+    }
+
+    /// Changes the queues. Wakes the readers that wait for room, or that receive, if this changes whether there is
+    /// room.
+    fn change<T>(&self, change: impl FnOnce(&mut State) -> T) -> T {
         let mut state = self.state.lock();
-        let mut all: Vec<Incoming> = state.others.take().into();
-        let led = state
-            .led
-            .drain()
-            .flat_map(|(_, conversations)| conversations);
-        let led = led.filter(|conversation| !conversation.is_internal);
-        all.extend(led.flat_map(|conversation| conversation.queue.messages));
-        let served = state.served.iter_mut();
-        all.extend(served.flat_map(|server| server.queue.take()));
-        all
+        let had_room = state.has_room();
+        let result = change(&mut state);
+        let is_same = state.has_room() == had_room;
+        drop(state);
+        if !is_same {
+            self.room.notify_waiters();
+        }
+        result
     }
 
     async fn next(
@@ -310,26 +374,24 @@ impl Demultiplexer {
     ) -> Result<Incoming, ReceiveError> {
         loop {
             // Created before the check, so that no change after the check is missed.
-            let changed = self.changed.notified();
-            let room = {
-                let mut state = self.state.lock();
-                if let Some(set_aside) = state.take(reader) {
-                    drop(state);
-                    // Readers that wait for room may receive again.
-                    self.changed.notify_waiters();
-                    return Ok(set_aside);
-                }
-                state.has_room()
-            };
+            let room = self.room.notified();
+            let (set_aside, arrived, has_room) = self.change(|state| {
+                let set_aside = state.take(reader);
+                (set_aside, state.arrived(reader), state.has_room())
+            });
+            if let Some(set_aside) = set_aside {
+                return Ok(set_aside);
+            }
             tokio::select! {
                 biased;
-                () = changed => {}
-                received = endpoint.next_letter(), if room => {
+                () = arrived.notified() => {}
+                () = room => {}
+                received = endpoint.next_letter(), if has_room => {
                     if let Some(own) = self.put(endpoint, received?, reader) {
                         return Ok(own);
                     }
                 }
-                () = endpoint.closed(), if !room => return Err(ReceiveError::Closed),
+                () = endpoint.closed(), if !has_room => return Err(ReceiveError::Closed),
             }
         }
     }
@@ -337,20 +399,11 @@ impl Demultiplexer {
     /// Hands a message to its reader: returns it if that is the caller, and otherwise sets it aside.
     fn put(&self, endpoint: &Endpoint, received: Incoming, caller: Reader<'_>) -> Option<Incoming> {
         let sender = received.sender;
-        let mut state = self.state.lock();
-        let mut registered = None;
-        if sender.is_known() && state.leads(&received) {
-            // Outside of the lock, because a miss reads the files of the directory.
-            drop(state);
-            registered = endpoint.domain.directory().by_incarnation(sender);
-            state = self.state.lock();
-        }
-        let own = state.put(received, registered.as_deref(), caller);
-        drop(state);
-        if own.is_none() {
-            self.changed.notify_waiters();
-        }
-        own
+        let leads = sender.is_known() && self.state.lock().leads(&received);
+        // Outside of the lock, because a miss reads the files of the directory.
+        let registered = leads.then(|| endpoint.domain.directory().by_incarnation(sender));
+        let registered = registered.flatten();
+        self.change(|state| state.put(received, registered.as_deref(), caller))
     }
 }
 
@@ -368,16 +421,26 @@ impl State {
         conversations.find(|conversation| conversation.number == key.number)
     }
 
-    fn take(&mut self, reader: Reader<'_>) -> Option<Incoming> {
+    fn queue(&mut self, reader: Reader<'_>) -> Option<&mut SetAside> {
         match reader {
-            Reader::Conversation(key) => self.conversation(key)?.queue.pop_front(),
+            Reader::Conversation(key) => Some(&mut self.conversation(key)?.queue),
             Reader::Server(key) => {
                 let mut served = self.served.iter_mut();
                 let server = served.find(|server| server.number == key.number)?;
-                server.queue.pop_front()
+                Some(&mut server.queue)
             }
-            Reader::Others => self.others.pop_front(),
+            Reader::Others => Some(&mut self.others),
         }
+    }
+
+    fn take(&mut self, reader: Reader<'_>) -> Option<Incoming> {
+        self.queue(reader)?.pop_front()
+    }
+
+    /// Returns what is notified when a message is added to the reader's queue.
+    fn arrived(&mut self, reader: Reader<'_>) -> Arc<Notify> {
+        let queue = self.queue(reader);
+        queue.map_or_else(Arc::default, |queue| Arc::clone(&queue.arrived))
     }
 
     /// Whether calls lead conversations with the message's id.
@@ -406,12 +469,9 @@ impl State {
     }
 
     fn has_room(&self) -> bool {
-        let led = self.led.values().flatten().map(|it| &it.queue);
-        let served = self.served.iter().map(|server| &server.queue);
         // An application that only serves reads no other messages.
         let are_read = self.is_read || self.served.is_empty();
-        let mut queues = led.chain(served).chain(are_read.then_some(&self.others));
-        !queues.any(SetAside::is_full)
+        self.full.load(Ordering::Relaxed) == 0 && !(are_read && self.others.is_full)
     }
 
     /// Adds a message to the queue of its reader, or returns it if the reader is the caller, for which no
@@ -440,7 +500,7 @@ impl State {
         if lock_slot::is_for_locks(&received) {
             return None;
         }
-        while !self.is_read && !self.served.is_empty() && self.others.is_full() {
+        while !self.is_read && !self.served.is_empty() && self.others.is_at_bound() {
             let dropped = self.others.pop_front();
             let sender = dropped.as_ref().and_then(|it| it.message().sender());
             log_limit::warn!(
@@ -750,6 +810,58 @@ mod tests {
         assert_eq!(state.others.bytes, 0);
         drop(state);
         demultiplexer.end_serving(&never);
+    }
+
+    #[test]
+    fn an_arrival_wakes_its_own_reader_only() {
+        let (demultiplexer, key) = state();
+        let another = demultiplexer.begin("d", Admitted::All);
+        let mut state = demultiplexer.state.lock();
+        let readers = [
+            Reader::Conversation(&key),
+            Reader::Conversation(&another),
+            Reader::Others,
+        ];
+        let arrived = readers.map(|reader| state.arrived(reader));
+        let mut waiting = arrived.each_ref().map(|it| Box::pin(it.notified()));
+        let arm = entry("arm", ARM);
+        let inform = message("arm", ARM, Performative::Inform);
+        set_aside(&mut state, inform, Some(&arm));
+        let are_awake = waiting.each_mut().map(|it| it.as_mut().enable());
+        assert_eq!(are_awake, [true, false, false]);
+    }
+
+    /// A slow reader wakes the others once for many messages.
+    #[test]
+    fn readers_wait_for_room_until_an_eighth_of_a_full_queue_is_read() {
+        let (demultiplexer, key) = state();
+        let arm = entry("arm", ARM);
+        let inform = || message("arm", ARM, Performative::Inform);
+        let mut changed = Box::pin(demultiplexer.room.notified());
+        let put = |state: &mut State| set_aside(state, inform(), Some(&arm));
+        (1..MAX_SET_ASIDE).for_each(|_| demultiplexer.change(put));
+        assert!(!changed.as_mut().enable());
+        demultiplexer.change(put);
+        assert!(changed.as_mut().enable());
+        assert!(!demultiplexer.state.lock().has_room());
+
+        let take = |state: &mut State| state.take(Reader::Conversation(&key)).unwrap();
+        let mut changed = Box::pin(demultiplexer.room.notified());
+        (1..MAX_SET_ASIDE / 8).for_each(|_| drop(demultiplexer.change(take)));
+        assert!(!changed.as_mut().enable());
+        drop(demultiplexer.change(take));
+        assert!(changed.as_mut().enable());
+        assert!(demultiplexer.state.lock().has_room());
+        // A queue that ends leaves no place taken, although its messages fill another one.
+        (0..MAX_SET_ASIDE / 8).for_each(|_| demultiplexer.change(put));
+        assert!(!demultiplexer.state.lock().has_room());
+        demultiplexer.end(&key);
+        assert!(!demultiplexer.state.lock().has_room());
+        while demultiplexer
+            .change(|state| state.take(Reader::Others))
+            .is_some()
+        {}
+        assert!(demultiplexer.state.lock().has_room());
     }
 
     #[test]

@@ -128,9 +128,34 @@ enum NoteKey {
 struct WithoutRoom {
     order: VecDeque<NoteKey>,
     notes: Map<NoteKey, Note>,
-    lanes: VecDeque<LaneId>,
+    lanes: WaitingLanes,
     /// Whether a timer is set.
     has_timer: bool,
+}
+
+/// Lanes in the order in which they began to wait, each once.
+#[derive(Debug, Default)]
+struct WaitingLanes {
+    order: VecDeque<LaneId>,
+    members: Set<LaneId>,
+}
+
+impl WaitingLanes {
+    fn push(&mut self, lane: LaneId) {
+        if self.members.insert(lane) {
+            self.order.push_back(lane);
+        }
+    }
+
+    fn pop(&mut self) -> Option<LaneId> {
+        let lane = self.order.pop_front()?;
+        self.members.remove(&lane);
+        Some(lane)
+    }
+
+    fn is_empty(&self) -> bool {
+        self.order.is_empty()
+    }
 }
 
 impl WithoutRoom {
@@ -423,9 +448,7 @@ impl AttemptTable {
 
     pub(crate) fn wait_for_room(&mut self, location: &Location, lane: LaneId) {
         let waiting = self.notes.without_room.entry(location.clone()).or_default();
-        if !waiting.lanes.contains(&lane) {
-            waiting.lanes.push_back(lane);
-        }
+        waiting.lanes.push(lane);
     }
 
     /// Handles the end of an attempt at this location. Sends a note that waits for room there; without one,
@@ -436,7 +459,7 @@ impl AttemptTable {
             return None;
         }
         let waiting = self.notes.without_room.get_mut(location)?;
-        let lane = waiting.lanes.pop_front();
+        let lane = waiting.lanes.pop();
         self.notes.forget_room(location);
         lane
     }
