@@ -20,6 +20,29 @@ pub(crate) fn is_token(text: impl AsRef<[u8]>) -> bool {
     !bytes.is_empty() && classes(bytes).0 == 0
 }
 
+/// Whether JADE reads the text as one word of a string message, and reads it unchanged.
+///
+/// The lexer of JADE has tokens for printable ASCII characters only. It takes `\"` for an escape in
+/// a word too, and a date in front of a word for a date.
+pub(crate) fn is_word_of_jade(text: &str) -> bool {
+    let bytes = text.as_bytes();
+    is_word(bytes)
+        && bytes.iter().all(|byte| (b'!'..=b'~').contains(byte))
+        && memchr::memmem::find(bytes, b"\\\"").is_none()
+        && !begins_with_sign_and_digit(bytes)
+}
+
+/// Whether JADE reads the text in quotation marks as one word.
+pub(crate) fn is_quoted_word_of_jade(text: &str) -> bool {
+    let bytes = text.as_bytes();
+    is_token(bytes) && bytes.iter().all(|byte| (b'!'..=b'~').contains(byte)) && is_quotable(text)
+}
+
+/// Whether the text begins like a signed date. A word begins with no digit and no `-`.
+fn begins_with_sign_and_digit(bytes: &[u8]) -> bool {
+    matches!(bytes, [b'+', digit, ..] if digit.is_ascii_digit())
+}
+
 /// The forms in which a text can be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Shape {
@@ -173,6 +196,36 @@ mod tests {
             assert!(!is_word(other), "{other:?}");
         }
         assert!(is_token("1a") && is_token("@a") && !is_token("a b") && !is_token(""));
+    }
+
+    #[test]
+    fn words_of_jade_are_printable_ascii_without_escapes_and_dates() {
+        for word in [
+            "a",
+            "fipa-request",
+            ":x",
+            "a\"b",
+            "a\\b",
+            "a\\",
+            "+",
+            "conv@x",
+        ] {
+            assert!(is_word_of_jade(word), "{word:?}");
+        }
+        for other in [
+            "",
+            "1a",
+            "é",
+            "a\u{7f}",
+            "a\\\"b",
+            "+00000000T000030000",
+            "a b",
+        ] {
+            assert!(!is_word_of_jade(other), "{other:?}");
+        }
+        assert!(is_quoted_word_of_jade("1a") && is_quoted_word_of_jade("+00000000T000030000"));
+        assert!(!is_quoted_word_of_jade("é") && !is_quoted_word_of_jade("a b"));
+        assert!(!is_quoted_word_of_jade("") && !is_quoted_word_of_jade("1\\"));
     }
 
     #[test]

@@ -11,7 +11,10 @@ use crate::bitefficient::write::Output;
 use crate::dialect::{BASE64, JADE_ENCODING, announces_base64, check_word, local_time, not_a_word};
 use crate::error::EncodeError;
 use crate::time::Time;
-use crate::word::{Piece, is_quotable, is_token, is_word, quoted, string_literal};
+use crate::word::{
+    Piece, is_quotable, is_quoted_word_of_jade, is_token, is_word, is_word_of_jade, quoted,
+    string_literal,
+};
 use crate::{AgentId, Dialect, Message, Performative, Text};
 
 /// Writes the string message with the parameters in the order of the standard, except for the
@@ -112,9 +115,14 @@ impl Writer<'_> {
     fn agent(&mut self, agent: &AgentId, depth: usize) -> Result<(), EncodeError> {
         self.push("(agent-identifier");
         self.key("name");
-        if self.dialect == Dialect::Jade && !is_word(agent.name()) {
-            // JADE accepts strings as names.
-            self.literal(agent.name(), "name of an agent")?;
+        if self.dialect == Dialect::Jade {
+            // JADE accepts strings as names, and removes the white space around them.
+            let what = "name of an agent";
+            if agent.name().trim_matches(|it| it <= ' ') != agent.name() {
+                let why = "JADE removes the white space around it";
+                return Err(EncodeError::Unrepresentable { what, why });
+            }
+            self.expression(agent.name(), what)?;
         } else {
             self.word(agent.name(), "name of an agent", SLOTS)?;
         }
@@ -155,6 +163,9 @@ impl Writer<'_> {
 
     fn address(&mut self, address: &str) -> Result<(), EncodeError> {
         let what = "address of an agent";
+        if self.dialect == Dialect::Jade {
+            return self.word_for_jade(address, what);
+        }
         if !is_token(address) || address.starts_with(['"', '#']) {
             let why = "it is not one word";
             return Err(EncodeError::Unrepresentable { what, why });
@@ -200,12 +211,18 @@ impl Writer<'_> {
         self.expression(text, key)
     }
 
-    /// Writes a text as a word if it is one, and as a string otherwise. For fipa_services, it is
-    /// always a string with its length.
+    /// Writes a text as a word if the reader takes it for one, and as a string otherwise. For
+    /// fipa_services, it is always a string with its length.
     fn expression(&mut self, text: &str, what: &'static str) -> Result<(), EncodeError> {
-        if self.dialect == Dialect::FipaServices {
-            self.counted(text.as_bytes());
-        } else if is_word(text) {
+        let is_word = match self.dialect {
+            Dialect::FipaServices => {
+                self.counted(text.as_bytes());
+                return Ok(());
+            }
+            Dialect::Jade => is_word_of_jade(text),
+            Dialect::Standard => is_word(text),
+        };
+        if is_word {
             self.push(text);
         } else {
             self.literal(text, what)?;
@@ -219,13 +236,33 @@ impl Writer<'_> {
         what: &'static str,
         keywords: &Keywords<T>,
     ) -> Result<(), EncodeError> {
-        if self.dialect == Dialect::FipaServices {
-            check_word(what, word)?;
-            refuse_keyword(word, what, keywords)?;
-        } else if !is_word(word) {
-            return Err(not_a_word(what));
+        match self.dialect {
+            Dialect::FipaServices => {
+                check_word(what, word)?;
+                refuse_keyword(word, what, keywords)?;
+            }
+            Dialect::Jade => return self.word_for_jade(word, what),
+            Dialect::Standard if !is_word(word) => return Err(not_a_word(what)),
+            Dialect::Standard => {}
         }
         self.push(word);
+        Ok(())
+    }
+
+    /// Writes a text where JADE reads a word only. Its lexer takes printable ASCII characters in
+    /// quotation marks for a word too.
+    fn word_for_jade(&mut self, text: &str, what: &'static str) -> Result<(), EncodeError> {
+        if is_word_of_jade(text) {
+            self.push(text);
+        } else if is_quoted_word_of_jade(text) {
+            quoted(text, |piece| self.push(piece));
+        } else {
+            return Err(EncodeError::Unrepresentable {
+                what,
+                why: "JADE reads printable ASCII characters there, without blanks, parentheses and \
+                      a backslash before a quotation mark",
+            });
+        }
         Ok(())
     }
 
