@@ -88,7 +88,7 @@ impl HttpSender {
             .map_err(|error| not_sent(TransportErrorKind::Unreachable, &error))?;
         let signature = self.to.signature();
         let in_dialect = |here: Option<&str>| {
-            translate(&delivery.letter, &delivery.receiver, signature, here)
+            translate(&delivery.letter, &delivery.receiver, &self.to, here)
                 .map_err(|error| not_sent(error.fault(), &error))
         };
         let kept = match self.connection.take() {

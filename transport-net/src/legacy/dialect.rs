@@ -10,7 +10,7 @@ use fipa_acl::{
     AclRepresentation, AgentId, DecodeError, Dialect, EncodeError, Envelope, EnvelopeParams,
     Letter, Message, Representation,
 };
-use fipa_transport::{Signature, TransportErrorKind};
+use fipa_transport::{Kind, Location, Signature, TransportErrorKind};
 
 /// The reason for which a letter cannot be translated for a legacy peer.
 #[derive(Debug, thiserror::Error)]
@@ -40,15 +40,16 @@ impl TranslateError {
     }
 }
 
-/// Translates a letter for one receiver into envelope and message in the dialect of `signature`.
+/// Translates a letter for one receiver into envelope and message in the dialect of the location `at`.
 /// `here` is the URL at which answers are received: JADE answers to the addresses of the sender, so
 /// it is added when the sender has none.
 pub(crate) fn translate(
     letter: &Letter,
     receiver: &str,
-    signature: Signature,
+    at: &Location,
     here: Option<&str>,
 ) -> Result<[Bytes; 2], TranslateError> {
+    let signature = at.signature();
     let envelope = letter.parse_envelope()?;
     let message = Message::decode(letter.payload())?;
     let to = receiver_of(&envelope, receiver)?;
@@ -74,10 +75,15 @@ pub(crate) fn translate(
             }
             let message = with_address(message, here);
             let message = message.encode(representation, Dialect::Jade)?;
-            // JADE counts characters, in US-ASCII unless the envelope names another encoding.
             let is_text = representation != Representation::BitEfficient;
-            let text = std::str::from_utf8(&message).ok().filter(|_| is_text);
-            let length = text.map_or(message.len(), |text| text.chars().count()) as u64;
+            let length = match at.kind() {
+                // JADE's proxy agent reads as many characters, in US-ASCII unless the envelope names
+                // another encoding.
+                Kind::Tcp => characters(&message),
+                // FIPA00067 counts bytes. JADE warns of another number.
+                _ => message.len(),
+            };
+            let length = length as u64;
             let mut envelope = addressed(envelope, to, named, length);
             let names_charset = is_text && !message.is_ascii();
             envelope.base.payload_encoding = names_charset.then(|| "UTF-8".to_owned());
@@ -89,6 +95,11 @@ pub(crate) fn translate(
         }
         other => Err(TranslateError::NoDialect(other)),
     }
+}
+
+/// Number of characters of a text in UTF-8, or of bytes if it is none.
+fn characters(message: &[u8]) -> usize {
+    std::str::from_utf8(message).map_or(message.len(), |text| text.chars().count())
 }
 
 /// Returns the receiver with the parameters that the envelope gives for it.
@@ -190,6 +201,11 @@ mod tests {
 
     use super::*;
 
+    fn at(kind: Kind, signature: Signature) -> Location {
+        let location = Location::new(kind, "10.0.0.7:7778").unwrap();
+        location.with_signature(signature).unwrap()
+    }
+
     fn date() -> Time {
         "20261120T112644481Z".parse().unwrap()
     }
@@ -236,8 +252,13 @@ mod tests {
 
     #[test]
     fn fipa_services_gets_its_dialect_and_one_receiver() {
-        let [envelope, bytes] =
-            translate(&letter("hello"), "echo", Signature::FipaServices, None).unwrap();
+        let [envelope, bytes] = translate(
+            &letter("hello"),
+            "echo",
+            &at(Kind::Tcp, Signature::FipaServices),
+            None,
+        )
+        .unwrap();
         let (read, len) = Envelope::decode(&envelope).unwrap();
         assert_eq!(len, envelope.len());
         let effective = read.effective();
@@ -257,16 +278,27 @@ mod tests {
 
     #[test]
     fn jade_gets_xml_a_string_message_its_length_and_where_to_answer() {
-        for content in ["hello", "grüß dich"] {
+        let over = [Kind::Tcp, Kind::Http, Kind::Https];
+        let contents = ["hello", "grüß dich"];
+        for (kind, content) in over.iter().flat_map(|kind| contents.map(|it| (*kind, it))) {
             let here = Some("tcp://10.0.0.1:7788");
-            let [envelope, bytes] =
-                translate(&letter(content), "arm", Signature::JadeProxy, here).unwrap();
+            let jade = at(kind, Signature::JadeProxy);
+            let [envelope, bytes] = translate(&letter(content), "arm", &jade, here).unwrap();
             assert!(envelope.starts_with(b"<?xml"));
             let (read, len) = Envelope::decode(&envelope).unwrap();
             assert_eq!(len, envelope.len());
             let text = std::str::from_utf8(&bytes).unwrap();
             let effective = read.effective();
-            assert_eq!(effective.payload_length, Some(text.chars().count() as u64));
+            // The proxy agent behind TCP counts characters, and JADE over HTTP counts bytes.
+            let length = match kind {
+                Kind::Tcp => text.chars().count(),
+                _ => text.len(),
+            };
+            assert_eq!(
+                effective.payload_length,
+                Some(length as u64),
+                "{kind} {content}"
+            );
             assert_eq!(effective.payload_encoding.is_some(), !content.is_ascii());
             assert_eq!(
                 effective.acl_representation,
@@ -289,8 +321,13 @@ mod tests {
         ] {
             for content in ["hello", "(a \"b\")", "grüß dich"] {
                 let here = "http://10.0.0.1:7778/acc";
-                let [envelope, bytes] =
-                    translate(&letter(content), "arm", signature, Some(here)).unwrap();
+                let [envelope, bytes] = translate(
+                    &letter(content),
+                    "arm",
+                    &at(Kind::Http, signature),
+                    Some(here),
+                )
+                .unwrap();
                 assert!(envelope.starts_with(b"<?xml"));
                 let (read, _) = Envelope::decode(&envelope).unwrap();
                 let effective = read.effective();
@@ -301,27 +338,29 @@ mod tests {
                 let is_text = signature == Signature::JadeXml;
                 let named = effective.payload_encoding.is_some();
                 assert_eq!(named, is_text && !content.is_ascii());
-                let length = match is_text {
-                    true => String::from_utf8(bytes.to_vec()).unwrap().chars().count(),
-                    false => bytes.len(),
-                };
-                assert_eq!(effective.payload_length, Some(length as u64));
+                assert_eq!(effective.payload_length, Some(bytes.len() as u64));
             }
         }
         // JADE's reader of XML inserts blanks at escaped characters.
         let escaped = letter("a < b");
-        let refused = translate(&escaped, "arm", Signature::JadeXml, None);
+        let refused = translate(&escaped, "arm", &at(Kind::Http, Signature::JadeXml), None);
         let fault = refused.unwrap_err().fault();
         assert_eq!(fault, TransportErrorKind::Inexpressible);
-        assert!(translate(&escaped, "arm", Signature::JadeBitEfficient, None).is_ok());
+        let bit_efficient = at(Kind::Http, Signature::JadeBitEfficient);
+        assert!(translate(&escaped, "arm", &bit_efficient, None).is_ok());
     }
 
     #[test]
     fn letters_that_cannot_be_translated_are_refused() {
         let garbage = Letter::new(Bytes::from_static(b"x"), Bytes::new());
-        let refused = translate(&garbage, "arm", Signature::FipaServices, None);
+        let refused = translate(
+            &garbage,
+            "arm",
+            &at(Kind::Tcp, Signature::FipaServices),
+            None,
+        );
         assert!(matches!(refused, Err(TranslateError::Read(_))));
-        let own = translate(&letter("x"), "arm", Signature::Frames, None);
+        let own = translate(&letter("x"), "arm", &at(Kind::Tcp, Signature::Frames), None);
         assert!(matches!(own, Err(TranslateError::NoDialect(_))));
     }
 }

@@ -45,7 +45,7 @@ impl TcpSender {
     ) -> Result<Conclusion, Conclusion> {
         let (endpoint, to) = (&self.endpoint, &self.to);
         let in_dialect = |here: Option<&str>| {
-            translate(&delivery.letter, &delivery.receiver, to.signature(), here)
+            translate(&delivery.letter, &delivery.receiver, to, here)
                 .map_err(|error| Conclusion::NotSent(TransportError::new(error.fault(), error)))
         };
         // Translated before a connection is opened: a connection without a letter leaks a

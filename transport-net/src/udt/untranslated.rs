@@ -57,7 +57,7 @@ impl Translation {
     /// # Errors
     /// When the dialect cannot express the letter, or the result has more bytes than `max`.
     pub(crate) fn run(&self, max: usize) -> Result<[Bytes; 2], TransportError> {
-        let pieces = translate(&self.letter, &self.receiver, self.to.signature(), None)
+        let pieces = translate(&self.letter, &self.receiver, &self.to, None)
             .map_err(|error| TransportError::new(error.fault(), error))?;
         let len = pieces.iter().map(Bytes::len).sum();
         match len > max {
