@@ -233,6 +233,22 @@ fn a_string_message_of_fipa_services_for_jade_is_decoded() {
 }
 
 #[test]
+fn content_of_jade_may_end_in_a_backslash() {
+    let read = |file: &str| {
+        let bytes = Bytes::from(fs::read(vector(file)).unwrap());
+        Message::decode(&Payload::from(bytes)).unwrap()
+    };
+    let message = read("jade_backslash.str");
+    assert_eq!(message.content().unwrap(), r"C:\logs\");
+    assert_eq!(message.language(), Some("text"));
+    // A later string of the message has the next quotation mark without a backslash.
+    let message = read("jade_backslash_and_quotes.str");
+    assert_eq!(message.content().unwrap(), r#"say "C:\logs\" or C:\logs\"#);
+    assert_eq!(message.ontology(), Some("files on disk"));
+    assert_eq!(message.conversation_id(), Some("c-1"));
+}
+
+#[test]
 fn string_messages_of_jade_are_decoded_and_rewritten() {
     let read = |file: &str| {
         let bytes = Bytes::from(fs::read(vector(file)).unwrap());

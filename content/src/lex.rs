@@ -251,6 +251,9 @@ impl<'a> Lexer<'a> {
     }
 
     /// Reads a string in quotation marks, in which `\"` stands for a quotation mark.
+    ///
+    /// JADE writes a string that ends in a backslash as `"…\"`. As JADE reads it, that ends the string
+    /// if no other quotation mark does.
     pub(crate) fn quoted(&mut self) -> Result<Cow<'a, str>, ParseError> {
         self.bump();
         let start = self.at;
@@ -260,6 +263,9 @@ impl<'a> Lexer<'a> {
         loop {
             let behind = rest.get(end..).unwrap_or_default();
             let Some(found) = memchr::memchr(b'"', behind) else {
+                if escaped && self.dialect == Dialect::Jade {
+                    break;
+                }
                 return Err(ParseError::new(
                     start - 1,
                     STRING,
@@ -368,6 +374,19 @@ mod tests {
                 token => tokens.push(token),
             }
         }
+    }
+
+    #[test]
+    fn the_last_string_of_jade_may_end_in_a_backslash() {
+        let first = |dialect, bytes| Lexer::new(bytes, dialect).next();
+        let text = br#""C:\logs\"))"#;
+        let read = first(Dialect::Jade, text);
+        assert_eq!(read, Ok(Token::Literal(r"C:\logs\".into())));
+        let text = br#""say \"hi\" \"))"#;
+        let read = first(Dialect::Jade, text);
+        assert_eq!(read, Ok(Token::Literal(r#"say "hi" \"#.into())));
+        let refused = first(Dialect::Standard, text).unwrap_err();
+        assert_eq!(refused.problem(), &Problem::Truncated("string"));
     }
 
     #[test]

@@ -281,21 +281,41 @@ impl<'a> Lexer<'a> {
     /// Reads a `StringLiteral`, which must be next. Returns its inside, and whether that has escapes.
     /// A quotation mark behind a backslash is always an escape.
     pub(super) fn quoted(&mut self, what: &'static str) -> Result<(&'a [u8], bool), DecodeError> {
-        let inside = self.rest.get(1..).unwrap_or_default();
-        let mut from = 0;
-        while let Some(found) = inside
-            .get(from..)
-            .and_then(|rest| scan::find_byte(rest, b'"'))
-        {
-            let mark = from + found;
-            let inner = inside.get(..mark).unwrap_or_default();
-            if found == 0 || inner.last() != Some(&b'\\') {
-                self.skip(mark + 2);
-                return Ok((inner, from > 0));
-            }
-            from = mark + 1;
+        let literal = literal(self.rest);
+        let literal = literal.ok_or_else(|| self.error(STRING, Problem::Truncated(what)))?;
+        self.skip(literal.len);
+        Ok((literal.inner, literal.escaped))
+    }
+
+    /// Reads a `StringLiteral` that may be content of JADE, which must be next. Returns its inside, and
+    /// whether that has escapes.
+    ///
+    /// JADE writes content that ends in a backslash as `"…\"`, a blank and a line break. That ending
+    /// counts if the literal has no other one, or if its other one is the beginning of a later string.
+    pub(super) fn quoted_content(
+        &mut self,
+        what: &'static str,
+    ) -> Result<(&'a [u8], bool), DecodeError> {
+        const ENDING: &[u8] = b"\\\" \n";
+        let found = literal(self.rest);
+        let len = match &found {
+            Some(literal) if !literal.escaped => return self.quoted(what),
+            Some(literal) => literal.len,
+            None => self.rest.len(),
+        };
+        let behind = self.rest.get(len..).unwrap_or_default();
+        let is_end = |byte: u8| is_space(byte) || matches!(byte, b')' | b':');
+        if found.is_some() && behind.first().is_none_or(|byte| is_end(*byte)) {
+            return self.quoted(what);
         }
-        Err(self.error(STRING, Problem::Truncated(what)))
+        let inside = self.rest.get(1..len).unwrap_or_default();
+        let Some(backslash) = memchr::memmem::rfind(inside, ENDING) else {
+            return self.quoted(what);
+        };
+        let inner = inside.get(..=backslash).unwrap_or_default();
+        // The opening quotation mark, the inside and the closing quotation mark.
+        self.skip(1 + inner.len() + 1);
+        Ok((inner, memchr::memmem::find(inner, b"\\\"").is_some()))
     }
 
     /// Reads a `ByteLengthEncodedString`: `#n"` and n bytes.
@@ -338,6 +358,34 @@ impl<'a> Lexer<'a> {
             Some(found) => self.error(clause, Problem::Unexpected { found, expected }),
             None => self.error(clause, Problem::Truncated(expected)),
         }
+    }
+}
+
+/// A `StringLiteral` at the beginning of bytes.
+struct Literal<'a> {
+    inner: &'a [u8],
+    /// Number of bytes with the quotation marks.
+    len: usize,
+    escaped: bool,
+}
+
+/// Finds the end of the literal that the bytes begin with. A quotation mark behind a backslash is
+/// always an escape.
+fn literal(bytes: &[u8]) -> Option<Literal<'_>> {
+    let inside = bytes.get(1..)?;
+    let mut from = 0;
+    loop {
+        let found = scan::find_byte(inside.get(from..)?, b'"')?;
+        let mark = from + found;
+        let inner = inside.get(..mark).unwrap_or_default();
+        if found == 0 || inner.last() != Some(&b'\\') {
+            return Some(Literal {
+                inner,
+                len: mark + 2,
+                escaped: from > 0,
+            });
+        }
+        from = mark + 1;
     }
 }
 

@@ -224,7 +224,7 @@ fn content<'a>(
 ) -> Result<Content<'a>, DecodeError> {
     let offset = lexer.offset();
     let (bytes, escaped) = match lexer.peek() {
-        Some(b'"') => lexer.quoted("content")?,
+        Some(b'"') => lexer.quoted_content("content")?,
         Some(b'#') => (lexer.counted("content")?, false),
         Some(b'(') => (lexer.parenthesized("content")?, false),
         _ => (lexer.word(terminators, "content")?.raw(), false),
