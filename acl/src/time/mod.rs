@@ -392,6 +392,29 @@ mod tests {
     }
 
     #[test]
+    fn numeric_zones_are_converted_to_utc() {
+        for (text, expected) in [
+            ("20261120T112644275+0000", "20261120T112644275Z"),
+            ("20261120Z112644275+0130", "20261120T095644275Z"),
+            ("20261231T233000000-0100", "20270101T003000000Z"),
+        ] {
+            let time = text.parse::<Time>().unwrap();
+            assert_eq!(time.to_string(), expected);
+        }
+        for wrong in [
+            "20261120T112644275+000",
+            "20261120T112644275+2400",
+            "20261120T112644275+0060",
+            "20261120T112644275+00:00",
+            "20261120T112644275 0000",
+            "+00000000T000030000+0000",
+            "00000101T000000000+0001",
+        ] {
+            assert!(wrong.parse::<Time>().is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
     fn relative_times_are_relative_to_now() {
         let time = Time::after(Duration::from_secs(30)).unwrap();
         assert_eq!(time.to_string(), "+00000000T000030000");

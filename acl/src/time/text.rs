@@ -74,7 +74,8 @@ impl fmt::Display for Time {
 impl FromStr for Time {
     type Err = TimeError;
 
-    /// Parses the form of FIPA00070 (`DateTime`). `Z` instead of `T` is accepted too (JADE).
+    /// Parses the form of FIPA00070 (`DateTime`). `Z` instead of `T` is accepted too (JADE), and so is
+    /// an offset from UTC behind an absolute time (`+0000`, fipa_acl). Such a time is converted to UTC.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         if let Some(time) = parse_common(text.as_bytes()) {
             return Ok(time);
@@ -88,6 +89,11 @@ impl FromStr for Time {
         let zone = match designator {
             [] => Zone::Unspecified,
             [letter] => Zone::of_letter(*letter).ok_or_else(|| syntax(text))?,
+            [sign @ (b'+' | b'-'), h1, h2, m1, m2] if base == Base::Absolute => {
+                let east = seconds_east(*sign, [*h1, *h2], [*m1, *m2]);
+                let east = east.ok_or_else(|| syntax(text))?;
+                return Self::new(base, Zone::Unspecified, fields)?.with_local_offset(east);
+            }
             _ => return Err(syntax(text)),
         };
         Self::new(base, zone, fields)
@@ -192,13 +198,7 @@ fn parse_rfc3339(text: &str) -> Option<(Fields, i32)> {
     let seconds_east = match zone {
         b"Z" | b"z" => 0,
         [sign @ (b'+' | b'-'), h1, h2, b':', m1, m2] => {
-            let hours = i32::from(number(&[*h1, *h2])?);
-            let minutes = i32::from(number(&[*m1, *m2])?);
-            if hours > 23 || minutes > 59 {
-                return None;
-            }
-            let seconds = hours * 3600 + minutes * 60;
-            if *sign == b'-' { -seconds } else { seconds }
+            seconds_east(*sign, [*h1, *h2], [*m1, *m2])?
         }
         _ => return None,
     };
@@ -212,6 +212,16 @@ fn parse_rfc3339(text: &str) -> Option<(Fields, i32)> {
         millisecond,
     };
     Some((fields, seconds_east))
+}
+
+/// Returns the seconds east of UTC of an offset.
+fn seconds_east(sign: u8, hours: [u8; 2], minutes: [u8; 2]) -> Option<i32> {
+    let (hours, minutes) = (i32::from(number(&hours)?), i32::from(number(&minutes)?));
+    if hours > 23 || minutes > 59 {
+        return None;
+    }
+    let seconds = hours * 3600 + minutes * 60;
+    Some(if sign == b'-' { -seconds } else { seconds })
 }
 
 /// Parses a number of at most four digits.
