@@ -224,23 +224,38 @@ fn process_name(host: &OsStr, process: u32) -> String {
     format!("{}-{process}", fipa_sds::to_name(&host.to_string_lossy()))
 }
 
-/// Logs a warning if the encodings of legacy peers, which write names as words, cannot express this
-/// name.
+/// Logs a warning if legacy peers cannot read or write this name.
 pub(crate) fn warn_of_name(id: &AgentId) {
-    let fails = |dialect| {
-        let message = Message::builder(Performative::Inform)
-            .sender(id.clone())
-            .build()
-            .ok()?;
-        message.encode(Representation::String, dialect).err()
-    };
-    if let Some(error) = fails(Dialect::Standard).or_else(|| fails(Dialect::Jade)) {
+    for (peer, reason) in peers_without(id) {
         log_limit::warn!(
-            "agents of legacy peers (string encoding, JADE) can neither receive letters from {:?} nor \
-             address it ({error}); use a name without blanks and parentheses if there are such peers",
+            "agents of {peer} can neither receive letters from {:?} nor address it ({reason}); use a \
+             name of ASCII letters, digits, '-', '_' and '.' if there are such peers",
             id.name()
         );
     }
+}
+
+/// Returns the implementations of legacy peers that cannot exchange letters with an agent of this
+/// name, with the reason.
+fn peers_without(id: &AgentId) -> Vec<(Dialect, String)> {
+    let peers = [
+        (Dialect::FipaServices, Representation::BitEfficient),
+        (Dialect::Jade, Representation::String),
+    ];
+    let reason = |(dialect, representation)| {
+        // JADE quotes a name that is no word, but writes its messages in US-ASCII, and its envelopes in
+        // an encoding that they do not declare.
+        if dialect == Dialect::Jade && !id.name().is_ascii() {
+            return Some((
+                dialect,
+                "JADE writes names of ASCII characters only".to_owned(),
+            ));
+        }
+        let message = Message::builder(Performative::Inform).sender(id.clone());
+        let encoded = message.build().ok()?.encode(representation, dialect);
+        encoded.err().map(|error| (dialect, error.to_string()))
+    };
+    peers.into_iter().filter_map(reason).collect()
 }
 
 #[cfg(test)]
@@ -248,6 +263,23 @@ mod tests {
     use std::os::unix::ffi::OsStrExt as _;
 
     use super::*;
+
+    #[test]
+    fn a_warning_names_the_peers_that_cannot_use_the_name() {
+        use Dialect::{FipaServices, Jade};
+        for (name, expected) in [
+            ("rover", &[][..]),
+            ("arm.left@robot-1:1099/JADE", &[]),
+            ("odd echo", &[FipaServices]),
+            ("1a", &[FipaServices]),
+            ("ödd", &[FipaServices, Jade]),
+            ("ödd echo", &[FipaServices, Jade]),
+        ] {
+            let peers = peers_without(&AgentId::new(name).unwrap());
+            let peers: Vec<_> = peers.into_iter().map(|(peer, _)| peer).collect();
+            assert_eq!(peers, expected, "{name}");
+        }
+    }
 
     #[test]
     fn a_process_on_a_host_of_any_name_has_a_valid_name() {

@@ -4,8 +4,8 @@
 
 use bytes::Bytes;
 use fipa_acl::{
-    AclRepresentation, AgentId, EncodeError, Envelope, EnvelopeParams, EnvelopeTemplate,
-    EnvelopeView, Letter, Message, Performative, Problem, Received, Time,
+    AclRepresentation, AgentId, Dialect, EncodeError, Envelope, EnvelopeParams, EnvelopeTemplate,
+    EnvelopeView, Letter, Message, Performative, Problem, Received, Representation, Time,
 };
 
 const DATE: &[u8] = b"\x20\x31\x11\x16\x19\x15\x37\x62\x59\x20";
@@ -54,6 +54,91 @@ fn the_code_in_front_of_a_stamp_of_jade_is_accepted() {
     };
     let bytes = envelope.encode_standard().unwrap();
     assert_eq!(Envelope::decode(&bytes).unwrap().0, envelope);
+}
+
+/// Returns an XML envelope with this declaration, whose receiver has this name.
+fn xml(declaration: &str, name: &[u8]) -> Vec<u8> {
+    let start = format!("{declaration}<envelope><params index=\"1\"><to><agent-identifier><name>");
+    let end =
+        "</name></agent-identifier></to><date>20261120T112644275+0000</date></params></envelope>";
+    [start.as_bytes(), name, end.as_bytes()].concat()
+}
+
+#[test]
+fn a_date_with_a_numeric_zone_is_read() {
+    let bytes = xml("", b"rover");
+    let expected = Some("20261120T112644275Z".parse().unwrap());
+    assert_eq!(Envelope::decode(&bytes).unwrap().0.base.date, expected);
+    let view = EnvelopeView::parse(&bytes).unwrap();
+    assert_eq!(view.len(), bytes.len());
+}
+
+#[test]
+fn the_declared_encoding_of_an_xml_envelope_is_honored() {
+    const LATIN: &str = "<?xml version=\"1.0\" encoding=\"ISO-8859-1\"?>";
+    const UTF_8: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>";
+    const WINDOWS: &str = "<?xml version=\"1.0\" encoding=\"windows-1252\"?>";
+    const NONE: &str = "<?xml version=\"1.0\"?>";
+    for (declaration, name, expected) in [
+        (LATIN, &b"\xf6dd"[..], Some("ödd")),
+        (LATIN, "ödd".as_bytes(), Some("Ã¶dd")),
+        (UTF_8, "ödd".as_bytes(), Some("ödd")),
+        (NONE, "ödd".as_bytes(), Some("ödd")),
+        (NONE, b"&#xF6;dd", Some("ödd")),
+        (WINDOWS, b"&#xF6;dd", Some("ödd")),
+        // XML 1.0 clause 4.3.3 has these as errors.
+        (NONE, b"\xf6dd", None),
+        (UTF_8, b"\xf6dd", None),
+        (WINDOWS, b"\xf6dd", None),
+        (WINDOWS, "ödd".as_bytes(), None),
+    ] {
+        let envelope = xml(declaration, name);
+        let payload = b"p\xf6";
+        let bytes = [&envelope[..], payload].concat();
+        let read = Envelope::decode(&bytes).ok();
+        let expected = expected.map(|name| (name, envelope.len()));
+        let found = read.as_ref().map(|(it, len)| (it.base.to[0].name(), *len));
+        assert_eq!(found, expected, "{declaration} {name:?}");
+        if expected.is_some() {
+            let (_, letter) = Letter::decode(bytes.into()).unwrap();
+            assert_eq!(letter.payload().to_bytes(), &payload[..]);
+            assert_eq!(letter.parse_envelope().ok(), read.map(|(it, _)| it));
+        }
+    }
+}
+
+#[test]
+fn an_envelope_that_jade_wrote_with_an_umlaut_is_refused() {
+    // It is in ISO-8859-1 and does not declare that.
+    let bytes = include_bytes!("vectors/jade_umlaut.envelope.xml");
+    let refused = Envelope::decode(bytes).unwrap_err();
+    assert!(
+        matches!(refused.problem(), Problem::NotUtf8(_)),
+        "{refused}"
+    );
+}
+
+/// JADE takes each byte of an envelope for a character, but resolves references.
+#[test]
+fn an_xml_envelope_for_jade_is_ascii() {
+    let stamp = Received::new("mts@日本", date());
+    let envelope = Envelope {
+        base: EnvelopeParams {
+            to: vec![agent("ödd & 日本 😀")],
+            comments: Some("é".into()),
+            received: Some(stamp),
+            ..base()
+        },
+        extensions: Vec::new(),
+    };
+    for dialect in [Dialect::Standard, Dialect::FipaServices, Dialect::Jade] {
+        let bytes = envelope.encode(Representation::Xml, dialect).unwrap();
+        assert_eq!(bytes.is_ascii(), dialect == Dialect::Jade, "{dialect}");
+        assert_eq!(Envelope::decode(&bytes).unwrap().0, envelope, "{dialect}");
+    }
+    let bytes = envelope.encode(Representation::Xml, Dialect::Jade).unwrap();
+    let name = b"<name>&#xF6;dd &amp; &#x65E5;&#x672C; &#x1F600;</name>";
+    assert!(memchr::memmem::find(&bytes, name).is_some(), "{bytes:?}");
 }
 
 #[test]

@@ -16,13 +16,18 @@ impl Envelope {
     /// Bit-efficient envelopes (FIPA00088) and XML envelopes (FIPA00085), which begin with `<`, are
     /// accepted. The reader is lenient: it accepts the standard and what fipa_services and JADE
     /// write. Empty texts and stamps without a name, which fipa_services writes for missing values,
-    /// become absent.
+    /// become absent. An XML envelope is in UTF-8, or in ISO-8859-1 if it declares that.
     ///
     /// # Errors
     /// The bytes do not begin with a whole envelope.
     pub fn decode(bytes: &[u8]) -> Result<(Self, usize), DecodeError> {
         if is_xml(bytes) {
-            decode(xml::EnvelopeReader::new(bytes))
+            let encoding = xml::DeclaredEncoding::of(bytes);
+            let utf8 = encoding.in_utf8(bytes);
+            let (envelope, len) = decode(xml::EnvelopeReader::new(&utf8))?;
+            let document = utf8.get(..len).unwrap_or_default();
+            encoding.check(document, "FIPA00085")?;
+            Ok((envelope, encoding.len_of(document)))
         } else {
             decode(EnvelopeReader::new(bytes))
         }

@@ -20,7 +20,8 @@ pub(crate) fn encode(
     dialect: Dialect,
     out: &mut dyn write::Output,
 ) -> Result<(), EncodeError> {
-    let mut out = XmlWriter::new(out, dialect);
+    // JADE takes each byte of an envelope for a character of ISO-8859-1.
+    let mut out = XmlWriter::new(out, dialect).in_ascii(dialect == Dialect::Jade);
     out.raw(match dialect {
         Dialect::Standard => "<?xml version=\"1.0\"?>",
         Dialect::FipaServices => "<?xml version=\"1.0\" ?>",

@@ -12,6 +12,8 @@ pub(super) struct XmlWriter<'a> {
     /// Whether to escape white space that a condensing reader would change. fipa_services writes
     /// content in CDATA sections, and its reader may condense white space outside of them.
     guards_space: bool,
+    /// Whether to write characters outside ASCII as references.
+    ascii: bool,
 }
 
 impl<'a> XmlWriter<'a> {
@@ -22,7 +24,13 @@ impl<'a> XmlWriter<'a> {
         Self {
             out,
             guards_space: dialect == Dialect::FipaServices,
+            ascii: false,
         }
+    }
+
+    /// Writes characters outside ASCII as references, for a reader of another encoding than UTF-8.
+    pub(super) fn in_ascii(self, ascii: bool) -> Self {
+        Self { ascii, ..self }
     }
 
     /// Writes text that needs no escaping.
@@ -269,12 +277,27 @@ impl<'a> XmlWriter<'a> {
                 }
                 _ => continue,
             };
-            self.raw(text.get(plain..at).unwrap_or_default());
+            self.unescaped(text.get(plain..at).unwrap_or_default());
             self.raw(escape);
             plain = from;
         }
-        self.raw(text.get(plain..).unwrap_or_default());
+        self.unescaped(text.get(plain..).unwrap_or_default());
         Ok(())
+    }
+
+    /// Writes text without characters that XML escapes.
+    fn unescaped(&mut self, text: &str) {
+        if !self.ascii || text.is_ascii() {
+            self.raw(text);
+            return;
+        }
+        for character in text.chars() {
+            if character.is_ascii() {
+                self.raw(character.encode_utf8(&mut [0; 4]));
+            } else {
+                self.raw(&format!("&#x{:X};", u32::from(character)));
+            }
+        }
     }
 }
 
