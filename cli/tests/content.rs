@@ -61,6 +61,22 @@ fn content_is_formatted() {
 }
 
 #[test]
+fn control_characters_survive() {
+    let host = Host::new();
+    let content = "((p \"a\u{1b}[1m\u{7f}\u{202e}\tb\nc\u{85}\" (f :x \u{200b})))\n";
+    let input = content.trim_end().as_bytes();
+    let json = host.run_with_input(&["content", "to-json"], input).done();
+    assert!(!json.contains('\u{1b}'), "{json:?}");
+    let again = host.run_with_input(&["content", "from-json"], json.as_bytes());
+    assert_eq!(again.done(), content);
+    let line = host.run_with_input(&["content", "format", "--line"], input);
+    assert_eq!(line.done(), content);
+    let formatted = host.run_with_input(&["content", "format"], input).done();
+    let line = host.run_with_input(&["content", "format", "--line"], formatted.as_bytes());
+    assert_eq!(line.done(), content);
+}
+
+#[test]
 fn content_survives_json() {
     let host = Host::new();
     let json = host.run_with_input(&["content", "to-json"], GOAL.as_bytes());

@@ -169,9 +169,6 @@ fn print(printer: &Printer, content: &Content<'_>, file: &std::path::Path) -> Re
         Failure::failed(error.to_string(), input::name(file), help)
     })?;
     bytes.push(b'\n');
-    match std::str::from_utf8(&bytes) {
-        Ok(text) => output::text(text),
-        // Byte strings of the standard dialect.
-        Err(_) => output::converted(&bytes),
-    }
+    // Escapes have no meaning in SL. They would change strings with control characters.
+    output::converted(&bytes)
 }
