@@ -64,6 +64,34 @@ fn services_are_registered_found_and_watched() {
         let found = host.run(&[&["df", "search", "--json"], &filter[..]].concat());
         assert_eq!(found.done_json()["agents"], json!([]), "{filter:?}");
     }
+    let towing = ["df", "register", "tug", "towing", "--property", "load=5"];
+    let more = ["--property", "b=true", "--property", "speed=0.5"];
+    let string = ["--property", "model=\"5\""];
+    let _tug = host.start(&[&towing[..], &more, &string].concat());
+    for (filter, is_found) in [
+        ("load=5", true),
+        ("load=+5", true),
+        ("load=\"5\"", false),
+        ("load=5.0", false),
+        ("b=true", true),
+        ("b=\"true\"", false),
+        ("b=false", false),
+        ("speed=.5", true),
+        ("model=\"5\"", true),
+        ("model=5", false),
+    ] {
+        let found = host.run(&["df", "search", "--json", "--property", filter]);
+        let found = found.done_json();
+        let agents = found["agents"].as_array().unwrap();
+        assert_eq!(agents.len(), usize::from(is_found), "{filter}");
+        let values = json!({ "load": "5", "b": "true", "speed": "0.5", "model": "\"5\"" });
+        for agent in agents {
+            assert_eq!(agent["services"][0]["properties"], values);
+        }
+    }
+    let unended = ["df", "search", "--property", "model=\"5"];
+    let refused = host.run(&unended).failed(2);
+    assert!(refused.contains("quotation mark"), "{refused}");
     let table = host.run(&["df", "search"]).done();
     assert!(
         table.contains("crane") && table.contains("load=\"5 t\""),

@@ -537,15 +537,43 @@ pub(crate) fn described(term: Option<&Term<'_>>) -> Option<AgentId> {
     AgentId::try_from(&name.value).ok()
 }
 
-/// Whether a property matches that of a template. Names are compared exactly, texts in any case.
+/// Whether two numbers of the same kind have the same value. JADE writes `1.0E10` for `1e10`.
+fn is_same(one: &Number<'_>, other: &Number<'_>) -> bool {
+    if one == other {
+        return true;
+    }
+    if one.is_integer() || other.is_integer() {
+        let integers = (one.as_i128(), other.as_i128());
+        return matches!(integers, (Some(one), Some(other)) if one == other);
+    }
+    let floats = (one.as_f64(), other.as_f64());
+    matches!(floats, (Some(one), Some(other)) if one == other)
+}
+
+/// Whether a property matches that of a template. Names are compared exactly, and values by their types.
 pub(crate) fn matches_property(template: &Property, property: &Property) -> bool {
     template.name == property.name
         && match (&template.value, &property.value) {
             (None, _) => true,
-            (Some(template), Some(value)) => match (text(template), text(value)) {
-                (Some(template), Some(value)) => template.eq_ignore_ascii_case(value),
-                _ => template == value,
-            },
+            (Some(template), Some(value)) => matches_value(template, value),
             (Some(_), None) => false,
         }
+}
+
+/// Whether two values are equal: texts in any case, numbers by their values. As in JADE, an integer equals
+/// no floating point number, and a number no text. JADE writes the texts `+5` and `.5` without quotation
+/// marks, so that they are read as numbers.
+fn matches_value(template: &Term<'_>, value: &Term<'_>) -> bool {
+    match (template, value) {
+        (Term::Number(one), Term::Number(other)) => is_same(one, other),
+        (Term::Number(number), other) | (other, Term::Number(number)) => {
+            let number = number.as_str();
+            number.starts_with(['+', '.'])
+                && text(other).is_some_and(|text| text.eq_ignore_ascii_case(number))
+        }
+        _ => match (text(template), text(value)) {
+            (Some(template), Some(value)) => template.eq_ignore_ascii_case(value),
+            _ => template == value,
+        },
+    }
 }

@@ -83,6 +83,63 @@ fn an_agent_changes_its_own_description_only() {
     assert_eq!(it.names(0.0, &all_lifting()), ["crane"]);
 }
 
+/// `fipa df` and JADE write the same values in other ways.
+#[test]
+fn values_of_properties_are_compared_by_their_types() {
+    let mut it = Facilitator::new();
+    let value = |text: &'static str| fipa_content::Term::parse(text).unwrap();
+    let crane = local("crane");
+    let registered = ServiceDescription {
+        properties: vec![
+            Property::new("indoor", value("true")),
+            Property::new("load", value("5")),
+            Property::new("range", value("1.0E10")),
+            Property::new("model", value("\"5\"")),
+            Property::new("size", value("\".5\"")),
+            Property::new("color", value("red")),
+        ],
+        ..ServiceDescription::new("lift-1", "lifting")
+    };
+    let description = AgentDescription {
+        services: vec![registered],
+        ..lifting("crane")
+    };
+    it.call(0.0, &crane, &Function::register(&description))
+        .unwrap();
+    for (name, text, is_found) in [
+        ("indoor", "true", true),
+        ("indoor", "TRUE", true),
+        ("indoor", "false", false),
+        ("indoor", "\"true\"", false),
+        ("load", "5", true),
+        ("load", "+5", true),
+        ("load", "0x5", true),
+        ("load", "6", false),
+        ("load", "5.0", false),
+        ("load", "\"5\"", false),
+        ("range", "1e10", true),
+        ("range", "10000000000.", true),
+        ("range", "10000000000", false),
+        ("range", "1e11", false),
+        ("model", "\"5\"", true),
+        ("model", "5", false),
+        // JADE writes this text without quotation marks.
+        ("size", ".5", true),
+        ("size", "0.5", false),
+        ("color", "\"RED\"", true),
+    ] {
+        let template = AgentDescription {
+            services: vec![ServiceDescription {
+                properties: vec![Property::new(name, value(text))],
+                ..ServiceDescription::default()
+            }],
+            ..AgentDescription::default()
+        };
+        let found = it.names(0.0, &template);
+        assert_eq!(!found.is_empty(), is_found, "{name}={text}");
+    }
+}
+
 #[test]
 fn a_template_matches_descriptions_with_all_of_its_slots() {
     let mut it = Facilitator::new();

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use fipa::platform::{AgentDescription, Df, PlatformError, Property, ServiceDescription};
 use fipa::{Agent, AgentId, Config, Incarnation, RegisterOptions, Time};
 use fipa_acl::escape;
-use fipa_content::Term;
+use fipa_content::{Number, Term};
 use serde_json::{Value, json};
 
 use crate::membership::{self, Stop};
@@ -26,6 +26,7 @@ Examples:
   fipa df register crane lifting
   fipa df search --type lifting
   fipa df search --df df@crex-mts --json
+  fipa df search --type lifting --property load=5
   fipa df search --df df@jade --address http://10.0.0.7:7778/acc    at a JADE platform
   fipa df watch --type lifting")]
 pub(crate) struct Arguments {
@@ -42,6 +43,7 @@ enum Action {
 Examples:
   fipa df register crane lifting
   fipa df register crane lifting --service lift-1 --property load=5
+  fipa df register crane lifting --property indoor=true --property 'model=\"5\"'
   fipa df register crane lifting --df df@crex-mts     in the DF of another host")]
     Register {
         /// Name of the agent
@@ -52,14 +54,25 @@ Examples:
         #[arg(long, value_name = "NAME")]
         service: Option<String>,
         /// Property of the service; repeatable
+        ///
+        /// true and false are truth values, 5 is an integer and 0.5 a floating point number. Any other value,
+        /// and one in quotation marks, is a string.
         #[arg(long, value_name = "NAME=VALUE", value_parser = property)]
-        property: Vec<(String, String)>,
+        property: Vec<Property>,
         #[command(flatten)]
         server: Server,
     },
 
     /// List the services that match
     #[command(after_help = "\
+Examples:
+  fipa df search --type lifting
+  fipa df search --property load=5              the integer 5
+  fipa df search --property load=5.0            the floating point number
+  fipa df search --property indoor=true         the truth value
+  fipa df search --property 'model=\"5\"'       the string 5
+  fipa df search --property color=red           the string red
+
 JSON:
   { \"df\": name, \"agents\": [ { \"name\", \"lease\": time or null, \"protocols\", \"ontologies\",
     \"languages\", \"services\": [ { \"name\", \"type\", \"ownership\", \"protocols\", \"ontologies\",
@@ -123,21 +136,36 @@ struct Template {
     agent: Option<AgentId>,
 
     /// Only services with this property; repeatable
+    ///
+    /// true and false are truth values, 5 is an integer and 0.5 a floating point number. Any other value,
+    /// and one in quotation marks, is a string. A string matches in any case, a number by its value. An
+    /// integer matches no floating point number.
     #[arg(long, value_name = "NAME=VALUE", value_parser = property)]
-    property: Vec<(String, String)>,
+    property: Vec<Property>,
 }
 
-fn property(text: &str) -> Result<(String, String), String> {
+fn property(text: &str) -> Result<Property, String> {
     let parts = text.split_once('=');
     let (name, value) = parts.ok_or("expected NAME=VALUE such as load=5")?;
-    Ok((name.to_owned(), value.to_owned()))
+    Ok(Property::new(name, property_value(value)?))
 }
 
-fn properties(properties: &[(String, String)]) -> Vec<Property> {
-    let properties = properties.iter();
-    properties
-        .map(|(name, value)| Property::new(name, Term::from(value.clone())))
-        .collect()
+/// Returns the typed value of a property: a truth value, a number, or a string, which may be in quotation
+/// marks as in SL.
+fn property_value(text: &str) -> Result<Term<'static>, String> {
+    if let Some(behind) = text.strip_prefix('"') {
+        let inner = behind.strip_suffix('"');
+        let inner = inner.ok_or("expected a quotation mark at the end of the value, too")?;
+        return Ok(Term::from(inner.replace("\\\"", "\"")));
+    }
+    Ok(match text {
+        "true" => Term::Boolean(true),
+        "false" => Term::Boolean(false),
+        _ => match Number::new(text) {
+            Some(number) => Term::Number(number.into_owned()),
+            None => Term::from(text.to_owned()),
+        },
+    })
 }
 
 impl Template {
@@ -145,7 +173,7 @@ impl Template {
         let service = ServiceDescription {
             name: self.service.clone(),
             service_type: self.service_type.clone(),
-            properties: properties(&self.property),
+            properties: self.property.clone(),
             ..ServiceDescription::default()
         };
         let services = match service == ServiceDescription::default() {
@@ -183,7 +211,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             server,
         } => {
             let service = ServiceDescription {
-                properties: properties(&property),
+                properties: property,
                 ..ServiceDescription::new(
                     service.unwrap_or_else(|| service_type.clone()),
                     service_type,
