@@ -262,9 +262,10 @@ pub enum ContentError {
 const SHOWN: usize = 80;
 
 /// Writes a form similar to FIPA00070 for people: agents by name only, long texts truncated, all
-/// texts [escaped](escape). No decoder reads it.
+/// texts [escaped](escape). The alternate form (`{:#}`) truncates no text. No decoder reads it.
 impl fmt::Display for Message {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let most = if f.alternate() { usize::MAX } else { SHOWN };
         write!(f, "({}", escape(self.performative.as_str()))?;
         if let Some(sender) = &self.sender {
             write!(f, " :sender {}", escape(sender.name()))?;
@@ -288,32 +289,33 @@ impl fmt::Display for Message {
             ("ontology", &self.ontology),
         ] {
             if let Some(value) = value {
-                write!(f, " :{key} {}", shown(value))?;
+                write!(f, " :{key} {}", shown(value, most))?;
             }
         }
         if let Some(reply_by) = self.reply_by {
             write!(f, " :reply-by {reply_by}")?;
         }
         for (name, value) in &self.user_defined {
-            write!(f, " :X-{} {}", escape(name), shown(value))?;
+            write!(f, " :X-{} {}", escape(name), shown(value, most))?;
         }
         if let Some(content) = &self.content {
-            write!(f, " :content {}", shown_content(content))?;
+            write!(f, " :content {}", shown_content(content, most))?;
         }
         f.write_str(")")
     }
 }
 
-fn shown(text: &str) -> String {
-    if is_token(text) && text.chars().nth(SHOWN).is_none() {
+/// Formats at most the first `most` characters of a text.
+fn shown(text: &str, most: usize) -> String {
+    if is_token(text) && text.chars().nth(most).is_none() {
         return escape(text).into_owned();
     }
-    shown_start(text, text.len())
+    shown_start(text, text.len(), most)
 }
 
 /// Formats a text of `len` bytes that begins with `start`.
-fn shown_start(start: &str, len: usize) -> String {
-    let cut: String = start.chars().take(SHOWN).collect();
+fn shown_start(start: &str, len: usize, most: usize) -> String {
+    let cut: String = start.chars().take(most).collect();
     let mut out = String::new();
     push_string_literal(&mut out, &escape(&cut));
     if cut.len() < len {
@@ -322,15 +324,16 @@ fn shown_start(start: &str, len: usize) -> String {
     out
 }
 
-fn shown_content(content: &Bytes) -> String {
+fn shown_content(content: &Bytes, most: usize) -> String {
     // A copy, because another process may change shared memory after it was checked for UTF-8.
-    let start = content.slice(..content.len().min(4 * SHOWN)).to_vec();
+    let start = content.slice(..content.len().min(most.saturating_mul(4)));
+    let start = start.to_vec();
     match std::str::from_utf8(&start) {
-        Ok(text) => shown_start(text, content.len()),
+        Ok(text) => shown_start(text, content.len(), most),
         // The last character is incomplete.
         Err(error) if error.error_len().is_none() && start.len() < content.len() => {
             let whole = start.get(..error.valid_up_to()).unwrap_or_default();
-            shown_start(&String::from_utf8_lossy(whole), content.len())
+            shown_start(&String::from_utf8_lossy(whole), content.len(), most)
         }
         Err(_) => format!("<{} bytes>", content.len()),
     }
@@ -433,6 +436,7 @@ mod tests {
         long.content = Some("x\x1b".repeat(100).into());
         assert!(long.to_string().ends_with("… (200 bytes))"));
         assert!(!long.to_string().contains('\x1b'));
+        assert!(!format!("{long:#}").contains(['…', '\x1b']));
         long.content = Some(Bytes::from_static(b"\xff\xfe"));
         assert!(long.to_string().contains(":content <2 bytes>"));
     }

@@ -69,10 +69,12 @@ fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
     match action.as_str() {
         "refuse" => return Ok(Reply::Refuse("too heavy".into())),
         "hostile" => return Ok(Reply::Refuse(HOSTILE.into())),
+        "explain" => return Ok(Reply::Refuse(long_reason().into())),
         _ => task.agree("")?,
     }
     match action.as_str() {
         "fail" => Ok(Reply::Failure("it fell".into())),
+        "fail at length" => Ok(Reply::Failure(long_reason().into())),
         "wait" => {
             if !task.cancelled(PATIENCE)? {
                 return Ok(Reply::Failure("no cancel".into()));
@@ -82,6 +84,12 @@ fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
         }
         _ => Ok(Reply::Inform("lifted".into())),
     }
+}
+
+/// A reason as a platform writes it. Its end is the part that helps.
+fn long_reason() -> String {
+    let start = "((action (agent-identifier :name rover@robot) (ACLMessage)) (MTS-error ".repeat(3);
+    format!("{start}(internal-error {HOSTILE}\"Agent not found: nobody@jade\")))")
 }
 
 /// Creates an empty file for the test.
@@ -185,6 +193,25 @@ fn request_prints_the_agreement_and_the_result() {
     );
     assert!(error.contains("too heavy"), "{error}");
     harmless(&host.run(&["request", "arm_1", "hostile"]).failed(1));
+    let send = ["send", "--to", "arm_1", "--performative", "request"];
+    let more = [
+        "--protocol",
+        "fipa-request",
+        "--wait",
+        "--content",
+        "explain",
+    ];
+    let answered = host.run(&[&send[..], &more].concat()).done();
+    for text in [
+        host.run(&["request", "arm_1", "explain"]).failed(1),
+        host.run(&["request", "arm_1", "fail at length"])
+            .failed_text()
+            .1,
+        answered,
+    ] {
+        harmless(&text);
+        assert!(text.contains("Agent not found: nobody@jade"), "{text}");
+    }
     let (json, _) = host
         .run(&["request", "arm_1", "fail", "--json"])
         .failed_json();

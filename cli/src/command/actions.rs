@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 use tokio::task::JoinSet;
 
 use super::df::asking;
+use super::request::in_full;
 use crate::complete;
 use crate::membership;
 use crate::options::Global;
@@ -167,8 +168,12 @@ pub(super) fn failed(error: &ActionError, robot: &AgentId, config: &Config) -> F
             "check with `fipa agents` whether the agent is known, and with `fipa watch` its answers"
         }
     };
+    let problem = match error {
+        ActionError::Dialogue(error) => in_full(error),
+        other => fipa::ErrorChain(other).to_string(),
+    };
     Failure::failed(
-        fipa::ErrorChain(error).to_string(),
+        problem,
         format!("robot {}, domain {:?}", escape(robot.name()), config.domain),
         help,
     )

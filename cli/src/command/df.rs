@@ -10,6 +10,7 @@ use fipa_acl::escape;
 use fipa_content::{Number, Term};
 use serde_json::{Value, json};
 
+use super::request::in_full;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
@@ -245,11 +246,11 @@ pub(super) fn failed(error: &PlatformError, config: &Config) -> Failure {
             "check with `fipa agents` whether the agent is known, and with `fipa watch` its answers"
         }
     };
-    Failure::failed(
-        error.to_string(),
-        format!("domain {:?}", config.domain),
-        help,
-    )
+    let problem = match error {
+        PlatformError::Dialogue(error) => in_full(error),
+        other => other.to_string(),
+    };
+    Failure::failed(problem, format!("domain {:?}", config.domain), help)
 }
 
 /// Registers an agent with a random name, which asks the agents of a platform.

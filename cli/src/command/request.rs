@@ -282,11 +282,33 @@ pub(super) fn failed(error: &DialogueError, name: &AgentId) -> Failure {
         | DialogueError::Cancelled(_) => "the message above has the reason of the agent",
         _ => "`fipa watch` shows the messages of the conversation",
     };
-    Failure::failed(
-        ErrorChain(error).to_string(),
-        format!("{:?}", name.name()),
-        help,
-    )
+    Failure::failed(in_full(error), format!("{:?}", name.name()), help)
+}
+
+/// Formats the error with its whole message, which has the reason of the other agent or platform.
+pub(super) fn in_full(error: &DialogueError) -> String {
+    let text = ErrorChain(error).to_string();
+    let message = match error {
+        DialogueError::Refused(message)
+        | DialogueError::Failed(message)
+        | DialogueError::NotUnderstood(message)
+        | DialogueError::Cancelled(message)
+        | DialogueError::Undelivered(message)
+        | DialogueError::Unexpected(message) => message,
+        _ => return text,
+    };
+    text.replacen(&message.to_string(), &format!("{message:#}"), 1)
+}
+
+/// Formats a message of another agent: with its whole texts if it has a reason.
+pub(super) fn shown(message: &Message) -> String {
+    match message.performative() {
+        Performative::Refuse
+        | Performative::Failure
+        | Performative::NotUnderstood
+        | Performative::RejectProposal => format!("{message:#}"),
+        _ => message.to_string(),
+    }
 }
 
 /// The JSON of a message, for commands that print one object per message.

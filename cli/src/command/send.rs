@@ -21,6 +21,7 @@ use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
 use super::protocol;
+use super::request::shown;
 use crate::options::{self, Global};
 use crate::report::{self, Failure};
 use crate::{complete, input, membership, output};
@@ -478,7 +479,7 @@ async fn wait(
                         Some(failure) => answers.failures.push(failure),
                         None => {
                             if !arguments.json {
-                                output::text(&format!("reply: {}\n", incoming.message()))?;
+                                output::text(&format!("reply: {}\n", shown(incoming.message())))?;
                             }
                             answers.replies.push(incoming);
                         }

@@ -7,6 +7,7 @@ use fipa_acl::escape;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
+use super::super::request::shown;
 use super::{Answers, Arguments, advice};
 use crate::output;
 use crate::report::{self, Failure};
@@ -152,7 +153,7 @@ impl Settled {
                 continue;
             }
             if !arguments.json {
-                output::text(&format!("result: {message}\n"))?;
+                output::text(&format!("result: {}\n", shown(message)))?;
             }
             if *message.performative() == Performative::Failure {
                 self.failures.push(Failure::failed(
