@@ -55,6 +55,20 @@ pub(crate) fn name(path: &Path) -> String {
     }
 }
 
+/// The name of an input in error messages, with the line and the column of an offset. Both count from 1,
+/// columns in characters.
+pub(crate) fn place(path: &Path, bytes: &[u8], offset: usize) -> String {
+    let before = bytes.get(..offset).unwrap_or(bytes);
+    let start = before
+        .iter()
+        .rposition(|byte| *byte == b'\n')
+        .map_or(0, |at| at + 1);
+    let line = 1 + before.iter().filter(|byte| **byte == b'\n').count();
+    let inside = before.get(start..).unwrap_or_default();
+    let column = 1 + String::from_utf8_lossy(inside).chars().count();
+    format!("{}:{line}:{column}", name(path))
+}
+
 /// Whether the source had at most `limit` bytes.
 fn read_all(source: &mut dyn Read, limit: u64, bytes: &mut Vec<u8>) -> io::Result<bool> {
     let read = source.take(limit.saturating_add(1)).read_to_end(bytes)?;

@@ -28,11 +28,35 @@ fn content_is_checked() {
     let wrong = host.run_with_input(&["content", "check"], b"((action crex))");
     let wrong = wrong.failed(1);
     assert!(
-        wrong.contains("at byte 13") && wrong.contains("FIPA00008"),
+        wrong.contains(":1:14\n") && wrong.contains("FIPA00008"),
         "{wrong}"
     );
+    fs::write(host.path("lines.sl"), "((p \"é\n\")\n  (ü ö :x 1))\n").unwrap();
+    let wrong = host.run(&["content", "check", "lines.sl"]).failed(1);
+    assert!(wrong.contains("lines.sl:3:8\n"), "{wrong}");
     let missing = host.run(&["content", "check", "no-such-file"]).failed(1);
     assert!(missing.contains("no-such-file"), "{missing}");
+}
+
+#[test]
+fn missing_parentheses_are_pointed_out() {
+    let host = Host::new();
+    let check = |text: &str| host.run_with_input(&["content", "check"], text.as_bytes());
+    for text in ["(not true)", "(and p q)", "(done (action a (b)))", "(p q)"] {
+        let ran = check(text);
+        let printed = String::from_utf8(ran.stdout).unwrap();
+        assert_eq!((ran.code, printed.lines().count()), (Some(0), 1), "{text}");
+        let warned = ran.stderr;
+        assert!(warned.contains("one more pair of parentheses"), "{text}");
+    }
+    for text in ["((not true))", "(true false)", "(p)", "((p a) q)"] {
+        check(text).done();
+    }
+    let error = check("(action crex (dock :speed 0.5))").failed(1);
+    assert!(error.contains("one more pair of parentheses"), "{error}");
+    assert!(error.contains(":1:20\n"), "{error}");
+    let error = check("((action crex))").failed(1);
+    assert!(!error.contains("one more pair"), "{error}");
 }
 
 #[test]

@@ -6,12 +6,12 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use fipa_acl::escape;
-use fipa_content::{Content, Dialect, Printer, Profile};
+use fipa_content::{Content, ContentExpression, Dialect, Printer, Profile, Wff};
 
 use crate::input;
 use crate::options::Global;
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Check, format and convert content of messages in FIPA-SL
 ///
@@ -32,8 +32,9 @@ pub(crate) struct Arguments {
 enum Action {
     /// Check content, and print the smallest profile that has all of its expressions
     ///
-    /// An error names the byte and the violated clause. With --profile, content that is not in the
-    /// profile is an error, too.
+    /// An error names the line, the column and the violated clause. With --profile, content that is not in
+    /// the profile is an error, too. Content is a list of expressions: (not true) has the two propositions not
+    /// and true, and ((not true)) has one formula. The command warns of the former.
     Check {
         #[command(flatten)]
         source: Source,
@@ -121,6 +122,14 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
                     Failure::failed(error.to_string(), place, help)
                 })?;
             }
+            if let Some(first) = first_of_one(&content, source.dialect, &bytes) {
+                report::warn(&format!(
+                    "{}: the content is a list of {} expressions, the first of which is the proposition \
+                     {first:?}; for one expression, write one more pair of parentheses, as in ((not true))",
+                    input::name(&source.file),
+                    content.expressions.len(),
+                ));
+            }
             let smallest = Profile::of(&content).map_or("JADE's meta-symbols", Profile::as_str);
             output::text(&format!("{smallest}\n"))
         }
@@ -158,8 +167,41 @@ impl Source {
                     ((action crex (dock)))";
         input::check_not_empty(bytes, &self.file, help)?;
         // A text file ends with a newline, which belongs to no content.
-        Content::parse_in(self.dialect.into(), bytes)
-            .map_err(|error| Failure::failed(error.to_string(), input::name(&self.file), help))
+        Content::parse_in(self.dialect.into(), bytes).map_err(|error| {
+            let help = match parses_in_parentheses(self.dialect, bytes) {
+                true => {
+                    "write one more pair of parentheses: content is a list of expressions, for example \
+                     ((action crex (dock)))"
+                }
+                false => help,
+            };
+            let problem = format!("{} ({})", error.problem(), error.clause());
+            let place = input::place(&self.file, bytes, error.offset());
+            Failure::failed(problem, place, help)
+        })
+    }
+}
+
+/// Whether the bytes are content in one more pair of parentheses.
+fn parses_in_parentheses(dialect: ContentDialect, bytes: &[u8]) -> bool {
+    let inside = [b"(", bytes, b")"].concat();
+    Content::parse_in(dialect.into(), &inside).is_ok()
+}
+
+/// Returns the first of several expressions if it is a proposition, and all of them are probably meant as one
+/// expression.
+fn first_of_one<'c>(
+    content: &'c Content<'_>,
+    dialect: ContentDialect,
+    bytes: &[u8],
+) -> Option<&'c str> {
+    match content.expressions.as_slice() {
+        [ContentExpression::Wff(Wff::Proposition(first)), _, ..]
+            if parses_in_parentheses(dialect, bytes) =>
+        {
+            Some(first)
+        }
+        _ => None,
     }
 }
 
