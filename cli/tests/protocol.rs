@@ -188,6 +188,78 @@ fn a_check_warns_of_near_performatives_and_ignored_attributes() {
 }
 
 #[test]
+fn a_check_shows_warnings_beside_errors_and_refuses_messages_of_a_role_to_itself() {
+    let host = Host::new();
+    let file = host.path("lift.scxml");
+    let text = LIFT
+        .replace("performative=\"request\"", "performative=\"reqest\"")
+        .replace(
+            "from=\"B\" to=\"initiator\" target",
+            "from=\"B\" to=\"B\" target",
+        );
+    fs::write(&file, text).unwrap();
+    let file = file.to_str().unwrap();
+    let (printed, error) = host.run(&["protocol", "check", file]).failed_text();
+    let warning = "\"reqest\" is no performative of FIPA00037; did you mean \"request\"?";
+    assert!(printed.contains("lift.scxml: errors: 1\n"), "{printed}");
+    assert!(
+        printed.contains(&format!("warning, line 3: {warning}")),
+        "{printed}"
+    );
+    assert!(
+        error.contains("role \"B\" sends the message to itself"),
+        "{error}"
+    );
+    let (json, _) = host
+        .run(&["protocol", "check", "--json", file])
+        .failed_json();
+    assert_eq!(json[0]["mistakes"][0]["line"], 6);
+    assert_eq!(json[0]["warnings"][0]["what"], warning);
+}
+
+#[test]
+fn drawings_have_conditions_and_a_legend() {
+    let host = Host::new();
+    let file = host.path("bids.scxml");
+    let text = "<scxml initial=\"1\" f:scope=\"participant\" xmlns:f=\"urn:fipa-rs:protocol\">\
+                <state id=\"1\"><transition performative=\"cfp\" from=\"a\" to=\"b\" target=\"2\"/></state>\
+                <state id=\"2\"><transition performative=\"accept-proposal\" from=\"a\" to=\"b\" \
+                target=\"3\" f:when=\"all\" f:at-most=\"2\"/></state><state id=\"3\" final=\"yes\"/></scxml>";
+    fs::write(&file, text).unwrap();
+    let file = file.to_str().unwrap();
+    let svg = host.run(&["protocol", "draw", file]).done();
+    let mermaid = host.run(&["protocol", "draw", file, "--format", "mermaid"]);
+    let mermaid = mermaid.done();
+    let shown = host.run(&["protocol", "show", file]).done();
+    for text in [&svg, &mermaid, &shown] {
+        assert!(text.contains("(when all, at most 2)"), "{text}");
+    }
+    for legend in [
+        "the first state",
+        "may end here",
+        "an optional step, or a timeout",
+    ] {
+        assert!(svg.contains(legend), "{legend}: {svg}");
+    }
+    assert!(mermaid.contains("    note right of s0\n"), "{mermaid}");
+    for text in [&svg, &mermaid] {
+        for legend in [
+            "the step may be skipped",
+            "no more participants",
+            "all participants",
+        ] {
+            assert!(text.contains(legend), "{legend}: {text}");
+        }
+    }
+    let json = host.run(&["protocol", "show", file, "--json"]).done_json();
+    let step = &json["states"][1]["transitions"][0];
+    assert_eq!(
+        (&step["when_all"], &step["at_most"]),
+        (&true.into(), &2.into())
+    );
+}
+
+#[test]
 fn the_transitions_of_every_protocol_are_drawn_on_request() {
     let host = Host::new();
     for format in ["svg", "mermaid"] {

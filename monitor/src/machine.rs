@@ -402,6 +402,11 @@ impl Timeout {
 }
 
 impl Roles {
+    /// Returns the bit of the role, if it is the only one.
+    pub(crate) fn one(&self) -> Option<u32> {
+        (!self.anyone && self.mask.is_power_of_two()).then_some(self.mask)
+    }
+
     #[inline]
     pub(crate) fn includes(&self, mask: u32) -> bool {
         self.anyone || self.mask & mask != 0

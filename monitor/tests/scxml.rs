@@ -265,6 +265,38 @@ fn missing_and_superfluous_items_are_mistakes() {
 }
 
 #[test]
+fn a_message_of_a_role_to_itself_is_a_mistake() {
+    let file = |from: &str, to: &str| {
+        format!(
+            "<scxml initial=\"1\">\n<state id=\"1\">{GOOD}</state>\n<state id=\"2\">\
+             <transition performative=\"agree\" from=\"{from}\" to=\"{to}\" target=\"3\"/></state>\n\
+             <state id=\"3\" final=\"yes\"/></scxml>"
+        )
+    };
+    for (from, to) in [("a", "a"), ("b", "b"), ("b", "(b)")] {
+        let (line, problem) = only(&file(from, to));
+        assert_eq!((line, problem), (3, Problem::ToItself(from.to_owned())));
+    }
+    // Patterns for several roles are allowed.
+    for (from, to) in [("a", "b"), (".*", ".*"), ("a", ".*"), ("a|b", "a|b")] {
+        assert!(Machine::read("own", &file(from, to)).is_ok(), "{from} {to}");
+    }
+}
+
+#[test]
+fn warnings_stand_beside_mistakes() {
+    let text = with(&GOOD.replace("inform", "infrom").replace("\"2\"", "\"3\""));
+    let error = Machine::read_with_warnings("own", &text).unwrap_err();
+    assert_eq!(error.mistakes.len(), 2, "{error}");
+    let [Warning { line: 3, doubt }] = error.warnings.as_slice() else {
+        panic!("{:?}", error.warnings);
+    };
+    assert!(
+        matches!(doubt, Doubt::NearPerformative { performative, .. } if performative == "infrom")
+    );
+}
+
+#[test]
 fn unknown_elements_are_skipped_and_misplaced_elements_are_mistakes() {
     let others = "<datamodel/><onentry><log/><state id=\"no\"/></onentry>";
     let first = "<state id=\"1\">";

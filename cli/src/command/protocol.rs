@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use fipa::monitor::projection::Projection;
-use fipa::monitor::scxml::{MAX_FILE, Mistake, Warning};
+use fipa::monitor::scxml::{MAX_FILE, Mistake, ScxmlError, Warning};
 use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
 use fipa_acl::escape;
 use serde_json::{Value, json};
@@ -66,7 +66,8 @@ JSON:
   { \"name\", \"aliases\", \"title\", \"scope\": \"participant\" or \"conversation\",
     \"cancel\": \"initiator\", \"anyone\" or \"nobody\", \"roles\", \"initiator\", \"initial\",
     \"states\": [ { \"id\", \"final\",
-                  \"transitions\": [ { \"performative\", \"from\", \"to\", \"target\", \"optional\" } ],
+                  \"transitions\": [ { \"performative\", \"from\", \"to\", \"target\", \"optional\",
+                                     \"when_all\", \"at_most\": number or null } ],
                   \"subprotocols\": [ { \"name\", \"from\", \"proxied_to\" } ],
                   \"timeout\": { \"after\": \"reply-by\" or a duration, \"target\" } or null } ] }")]
     Show {
@@ -95,7 +96,7 @@ Examples:
     /// Check protocol files for errors
     ///
     /// Reports every error with its line: unknown and unreachable states, ambiguous transitions, roles
-    /// that no agent can take. The exit code is 0 if there is no error. Warns of performatives that
+    /// that no agent can take, messages of a role to itself. The exit code is 0 if there is no error. Warns of performatives that
     /// differ from standard ones by a typing error, and of attributes that have no effect.
     ///
     /// A protocol with three or more roles is projected onto each role, so that each agent checks what it
@@ -120,6 +121,8 @@ JSON:
     },
 
     /// Draw a protocol as SVG or as a Mermaid state diagram
+    ///
+    /// A drawing has a legend of its signs.
     #[command(after_help = "\
 Examples:
   fipa protocol draw fipa-request --output request.svg
@@ -273,22 +276,22 @@ fn unknown(named: &str, library: &Library) -> Failure {
 }
 
 fn read(path: &Path) -> Result<Machine, Failure> {
-    read_with_warnings(path).map(|(machine, _)| machine)
-}
-
-fn read_with_warnings(path: &Path) -> Result<(Machine, Vec<Warning>), Failure> {
     let text = text_of(path)?;
     let name = input::name(path);
-    Machine::read_with_warnings(&name, &text).map_err(|error| {
-        let all = error.mistakes.iter().map(|mistake| {
-            let place = format!("{name}:{}", mistake.line);
-            Failure::failed(mistake.problem.to_string(), place, "fix the file")
-        });
-        match Failure::all(all) {
-            Err(failure) => failure,
-            Ok(()) => Failure::failed(error.to_string(), name.as_str(), "fix the file"),
-        }
-    })
+    Machine::read(&name, &text).map_err(|error| mistaken(&error))
+}
+
+/// The error report of a file with mistakes.
+fn mistaken(error: &ScxmlError) -> Failure {
+    let name = &error.file;
+    let all = error.mistakes.iter().map(|mistake| {
+        let place = format!("{name}:{}", mistake.line);
+        Failure::failed(mistake.problem.to_string(), place, "fix the file")
+    });
+    match Failure::all(all) {
+        Err(failure) => failure,
+        Ok(()) => Failure::failed(error.to_string(), name.as_str(), "fix the file"),
+    }
 }
 
 fn text_of(path: &Path) -> Result<String, Failure> {
@@ -329,21 +332,26 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     if !as_json {
         let mut failures = Vec::new();
         for file in files {
-            match read_with_warnings(file) {
-                Ok((machine, warnings)) => {
+            let name = input::name(file);
+            let read = text_of(file).map(|text| Machine::read_with_warnings(&name, &text));
+            match read {
+                Ok(Ok((machine, warnings))) => {
                     output::text(&format!(
-                        "{}: {}, states: {}, no errors\n",
-                        input::name(file),
+                        "{name}: {}, states: {}, no errors\n",
                         escape(machine.name()),
                         machine.states().len()
                     ))?;
-                    for Warning { line, doubt } in warnings {
-                        let doubt = doubt.to_string();
-                        output::text(&format!("  warning, line {line}: {}\n", escape(&doubt)))?;
-                    }
+                    print_warnings(&warnings)?;
                     for defect in defects(&machine) {
                         output::text(&format!("  only watched: {defect}\n"))?;
                     }
+                }
+                Ok(Err(error)) => {
+                    if !error.warnings.is_empty() {
+                        output::text(&format!("{name}: errors: {}\n", error.mistakes.len()))?;
+                    }
+                    print_warnings(&error.warnings)?;
+                    failures.push(mistaken(&error));
                 }
                 Err(failure) => failures.push(failure),
             }
@@ -366,7 +374,7 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         };
         let (machine, warnings) = match read {
             Ok((machine, warnings)) => (Some(machine), warnings),
-            Err(_) => (None, Vec::new()),
+            Err(error) => (None, error.warnings),
         };
         let one =
             |warning: &Warning| json!({ "line": warning.line, "what": warning.doubt.to_string() });
@@ -381,6 +389,14 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     output::json(&results)?;
     if invalid {
         return Err(Failure::already_reported());
+    }
+    Ok(())
+}
+
+fn print_warnings(warnings: &[Warning]) -> Result<(), Failure> {
+    for Warning { line, doubt } in warnings {
+        let doubt = doubt.to_string();
+        output::text(&format!("  warning, line {line}: {}\n", escape(&doubt)))?;
     }
     Ok(())
 }
@@ -423,6 +439,31 @@ fn act(step: &Transition) -> &str {
     }
 }
 
+/// The conditions of a transition, as text behind it: nothing, or for example ` (optional, at most 1)`.
+fn conditions(step: &Transition) -> String {
+    let mut all = Vec::new();
+    if step.is_optional() {
+        all.push("optional".to_owned());
+    }
+    if step.needs_all() {
+        all.push("when all".to_owned());
+    }
+    if let Some(most) = step.at_most() {
+        all.push(format!("at most {most}"));
+    }
+    match all.is_empty() {
+        true => String::new(),
+        false => format!(" ({})", all.join(", ")),
+    }
+}
+
+/// The meaning of [`conditions`], for drawings.
+const CONDITIONS: [&str; 3] = [
+    "optional: the step may be skipped",
+    "when all: all participants are at such a step, or behind it",
+    "at most N: no more participants are in the state behind it at the same time",
+];
+
 /// The role of a sender or receiver, as text.
 fn role(named: &str) -> &str {
     match named {
@@ -448,6 +489,8 @@ fn as_json(machine: &Machine) -> Value {
                 "to": transition.to(),
                 "target": machine.target(transition),
                 "optional": transition.is_optional(),
+                "when_all": transition.needs_all(),
+                "at_most": transition.at_most(),
             })
         });
         let subprotocols = state.subprotocols().iter().map(
@@ -505,17 +548,13 @@ fn as_text(machine: &Machine) -> String {
         lines.push(String::new());
         lines.push(format!("{}{marks}", state.id()));
         for step in state.transitions() {
-            let optional = if step.is_optional() {
-                " (optional)"
-            } else {
-                ""
-            };
             lines.push(format!(
-                "  {} from {} to {} -> {}{optional}",
+                "  {} from {} to {} -> {}{}",
                 act(step),
                 role(step.from()),
                 role(step.to()),
-                machine.target(step)
+                machine.target(step),
+                conditions(step)
             ));
         }
         for sub in state.subprotocols() {

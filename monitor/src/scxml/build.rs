@@ -21,7 +21,7 @@ const MAX_STEPS: usize = 100;
 pub(super) fn machine(
     document: &Document,
     file_name: &str,
-) -> Result<(Machine, Vec<Warning>), Vec<Mistake>> {
+) -> (Result<Machine, Vec<Mistake>>, Vec<Warning>) {
     let mut builder = Builder {
         document,
         mistakes: Vec::new(),
@@ -32,10 +32,11 @@ pub(super) fn machine(
         known_roles: HashMap::new(),
     };
     let made = builder.machine(file_name);
-    match made {
-        Some(machine) if builder.mistakes.is_empty() => Ok((machine, builder.warnings)),
+    let made = match made {
+        Some(machine) if builder.mistakes.is_empty() => Ok(machine),
         _ => Err(builder.mistakes),
-    }
+    };
+    (made, builder.warnings)
 }
 
 struct Builder<'d> {
@@ -193,6 +194,11 @@ impl<'d> Builder<'d> {
         let acts = acts.and_then(|text| self.acts(read.line, text));
         let from = from.and_then(|text| self.roles(read.line, "from", text));
         let to = to.and_then(|text| self.roles(read.line, "to", text));
+        if let (Some(from), Some(to)) = (&from, &to)
+            && from.one().is_some_and(|role| to.one() == Some(role))
+        {
+            self.wrong(read.line, Problem::ToItself(from.text.clone()));
+        }
         let guard = self.guard(read);
         Some(Transition {
             acts: acts?,

@@ -67,23 +67,28 @@ impl Machine {
     /// # Errors
     /// See [`read`](Self::read).
     pub fn read_with_warnings(file: &str, text: &str) -> Result<(Self, Vec<Warning>), ScxmlError> {
-        let made = document::read(text)
-            .map_err(|mistake| vec![mistake])
-            .and_then(|(document, mut warnings)| {
-                let (machine, near) = build::machine(&document, protocol_name(file))?;
+        let (made, warnings) = match document::read(text) {
+            Ok((document, mut warnings)) => {
+                let (made, near) = build::machine(&document, protocol_name(file));
                 warnings.extend(near);
                 warnings.sort_by_key(|warning| warning.line);
                 warnings.truncate(MAX_MISTAKES);
-                Ok((machine, warnings))
-            });
-        made.map_err(|mut mistakes| {
-            mistakes.truncate(MAX_MISTAKES);
-            mistakes.sort_by_key(|mistake| mistake.line);
-            ScxmlError {
-                file: file.to_owned(),
-                mistakes,
+                (made, warnings)
             }
-        })
+            Err(mistake) => (Err(vec![mistake]), Vec::new()),
+        };
+        match made {
+            Ok(machine) => Ok((machine, warnings)),
+            Err(mut mistakes) => {
+                mistakes.truncate(MAX_MISTAKES);
+                mistakes.sort_by_key(|mistake| mistake.line);
+                Err(ScxmlError {
+                    file: file.to_owned(),
+                    mistakes,
+                    warnings,
+                })
+            }
+        }
     }
 }
 
@@ -102,6 +107,9 @@ pub struct ScxmlError {
     pub file: String,
     /// Mistakes in the order of their lines.
     pub mistakes: Vec<Mistake>,
+    /// Parts that are probably not meant, as of [`Machine::read_with_warnings`]. A mistake may be a
+    /// consequence of one.
+    pub warnings: Vec<Warning>,
 }
 
 /// A mistake in a file.
@@ -265,6 +273,9 @@ pub enum Problem {
          message, or correct its name"
     )]
     UnboundRole(String),
+    /// A role sends a message to itself.
+    #[error("role {0:?} sends the message to itself; give another role in from or to")]
+    ToItself(String),
     /// A protocol with a state for each participant does not have two roles.
     #[error("scope=\"participant\" needs two roles, but there are {0}: {1}")]
     RolesOfScope(usize, String),

@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use fipa::monitor::{Machine, State};
 use fipa_acl::escape;
 
-use super::{act, defaults, role, within};
+use super::{CONDITIONS, act, conditions, defaults, role, within};
 
 const MARGIN: usize = 24;
 const ROW: usize = 22;
@@ -15,6 +15,8 @@ const HEAD: usize = 30;
 const GAP: usize = 14;
 /// Distance between the lines on the right.
 const TRACK: usize = 18;
+/// Width of a sign of the legend, with the gap behind it.
+const SIGN: usize = 42;
 /// Approximate width of a character: fonts differ.
 const CHAR: usize = 8;
 
@@ -72,7 +74,11 @@ pub(super) fn svg(machine: &Machine, with_defaults: bool) -> String {
     let right = (2 * MARGIN + width + (tracks + 1) * TRACK + MARGIN)
         .max(title.chars().count() * (CHAR + 1) + 2 * MARGIN)
         .max(legend + 2 * MARGIN);
-    let bottom = placed.last().map_or(0, |last| last.top + height(last)) + MARGIN;
+    let end = placed.last().map_or(0, |last| last.top + height(last)) + MARGIN;
+    let signs = signs();
+    let bottom = end + signs.len() * ROW + MARGIN;
+    let longest = signs.iter().map(|sign| sign.text.chars().count()).max();
+    let right = right.max(longest.unwrap_or(0) * CHAR + SIGN + 3 * MARGIN);
 
     let mut out = String::new();
     // Writing to a string cannot fail.
@@ -98,8 +104,74 @@ pub(super) fn svg(machine: &Machine, with_defaults: bool) -> String {
             leading(&mut out, row, y, width, &lines);
         }
     }
+    for (number, sign) in signs.iter().enumerate() {
+        let y = end + number * ROW;
+        let _ = writeln!(
+            out,
+            "{}<text x=\"{}\" y=\"{}\" fill=\"#555555\">{}</text>",
+            (sign.draw)(MARGIN, y),
+            MARGIN + SIGN,
+            y + 5,
+            escaped(sign.text)
+        );
+    }
     out.push_str("</svg>\n");
     out
+}
+
+/// A line of the legend.
+struct Sign {
+    /// Draws the sign at the left end of the line.
+    draw: fn(usize, usize) -> String,
+    text: &'static str,
+}
+
+/// Returns the legend. The colors of the roles are above the states.
+fn signs() -> Vec<Sign> {
+    let initial = |x, y| {
+        format!(
+            "<circle cx=\"{}\" cy=\"{y}\" r=\"6\" fill=\"#333333\"/>{}",
+            x + 6,
+            arrow_right(x + 30, y, "#333333")
+        )
+    };
+    let last = |x: usize, y: usize| {
+        format!(
+            "<rect x=\"{x}\" y=\"{}\" width=\"30\" height=\"16\" rx=\"5\" fill=\"#eef4ea\" \
+             stroke=\"#333333\"/><rect x=\"{}\" y=\"{}\" width=\"24\" height=\"10\" rx=\"3\" \
+             fill=\"none\" stroke=\"#333333\"/>",
+            y - 8,
+            x + 3,
+            y - 5
+        )
+    };
+    let dashed = |x, y| {
+        format!(
+            "<path d=\"M {x} {y} H {}\" fill=\"none\" stroke=\"{}\" stroke-width=\"1.6\" \
+             stroke-dasharray=\"5 4\"/>",
+            x + 30,
+            LINES[0]
+        )
+    };
+    let drawn: [Sign; 3] = [
+        Sign {
+            draw: initial,
+            text: "the first state",
+        },
+        Sign {
+            draw: last,
+            text: "the conversation may end here",
+        },
+        Sign {
+            draw: dashed,
+            text: "an optional step, or a timeout",
+        },
+    ];
+    let words = CONDITIONS.iter().map(|text| Sign {
+        draw: |_, _| String::new(),
+        text,
+    });
+    drawn.into_iter().chain(words).collect()
 }
 
 fn height(placed: &Placed<'_>) -> usize {
@@ -145,18 +217,14 @@ fn placed(machine: &Machine, with_defaults: bool) -> Vec<Placed<'_>> {
 fn rows(machine: &Machine, state: &State) -> Vec<Row> {
     let number = |id: &str| machine.states().iter().position(|state| state.id() == id);
     let messages = state.transitions().iter().map(|step| {
-        let optional = if step.is_optional() {
-            "  (optional)"
-        } else {
-            ""
-        };
+        let conditions = conditions(step);
         let to = if machine.roles().len() > 2 {
             format!(" to {}", role(step.to()))
         } else {
             String::new()
         };
         Row {
-            text: format!("{}: {}{to}{optional}", role(step.from()), act(step)),
+            text: format!("{}: {}{to}{conditions}", role(step.from()), act(step)),
             color: color(machine, step.from()),
             dashed: step.is_optional(),
             target: number(machine.target(step)),

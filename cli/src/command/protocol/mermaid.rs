@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use fipa::monitor::Machine;
 use fipa_acl::escape;
 
-use super::{act, defaults, role, within};
+use super::{CONDITIONS, act, conditions, defaults, role, within};
 use crate::output::mermaid;
 
 /// Draws a protocol, with the transitions that every protocol has if `with_defaults` is set.
@@ -21,17 +21,13 @@ pub(super) fn diagram(machine: &Machine, with_defaults: bool) -> String {
     for (at, state) in machine.states().iter().enumerate() {
         for step in state.transitions() {
             let target = number(machine.target(step)).unwrap_or(at);
-            let optional = if step.is_optional() {
-                " (optional)"
-            } else {
-                ""
-            };
+            let conditions = conditions(step);
             let to = if machine.roles().len() > 2 {
                 format!(" to {}", role(step.to()))
             } else {
                 String::new()
             };
-            let label = format!("{} from {}{to}{optional}", act(step), role(step.from()));
+            let label = format!("{} from {}{to}{conditions}", act(step), role(step.from()));
             let _ = writeln!(out, "    s{at} --> s{target} : {}", escaped(&label));
         }
         if let Some(timeout) = state.timeout() {
@@ -68,6 +64,11 @@ pub(super) fn diagram(machine: &Machine, with_defaults: bool) -> String {
             }
         }
     }
+    let _ = writeln!(out, "    note right of s{initial}");
+    for line in CONDITIONS {
+        let _ = writeln!(out, "        {}", escaped(line));
+    }
+    out.push_str("    end note\n");
     out
 }
 
