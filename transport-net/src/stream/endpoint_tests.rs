@@ -36,6 +36,7 @@ fn endpoint(limits: Limits) -> Arc<Endpoint> {
         identity: identity(1 << 40),
         limits,
         processes: false,
+        refusals: crate::refusals::Refusals::default(),
         #[cfg(feature = "secure")]
         security: None,
     };

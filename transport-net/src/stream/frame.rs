@@ -44,8 +44,13 @@ struct FrameHeader {
 }
 
 pub(crate) const HEADER_LEN: usize = size_of::<FrameHeader>();
+
+/// Length of the first bytes of a header, whose layout is that of every version.
+const COMMON_LEN: usize = 8;
+
 pub(crate) const MAGIC: [u8; 4] = *b"fipa";
-const VERSION: u8 = 2;
+/// The version of the frames of this side.
+pub(crate) const VERSION: u8 = 2;
 
 const HELLO: u8 = 1;
 const PARCEL: u8 = 2;
