@@ -51,7 +51,7 @@ impl Sockets {
         let server = settings::server(&self.security, &self.transport).map_err(io::Error::other)?;
         incoming
             .accept_with(Arc::new(server))
-            .map_err(io::Error::from)
+            .map_err(|error| lost(&error))
     }
 
     /// Begins a handshake with the peer at this address.
