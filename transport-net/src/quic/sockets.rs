@@ -12,6 +12,7 @@ use quinn::{
     Connecting, ConnectionError, Endpoint, EndpointConfig, Incoming, ServerConfig, TokioRuntime,
     TransportConfig,
 };
+use rustls::AlertDescription;
 use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 
@@ -90,13 +91,14 @@ impl Sockets {
 }
 
 /// Returns the alert of TLS that ended a connection (RFC 9001 section 4.8), and the side that sent it.
-fn alert(error: &ConnectionError) -> Option<(u8, Finder)> {
+fn alert(error: &ConnectionError) -> Option<(AlertDescription, Finder)> {
     let (code, finder) = match error {
         ConnectionError::TransportError(error) => (u64::from(error.code), Finder::Here),
         ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),
         _ => return None,
     };
-    Some((u8::try_from(code.checked_sub(0x100)?).ok()?, finder))
+    let alert = u8::try_from(code.checked_sub(0x100)?).ok()?;
+    Some((alert.into(), finder))
 }
 
 /// Whether TLS ended a connection, because the keys or the protocols of the two sides do not match.
@@ -116,7 +118,13 @@ pub(super) fn lost(error: &ConnectionError) -> io::Error {
 pub(super) fn loss_reason(error: &ConnectionError) -> String {
     let text = || advice::in_words(&error.to_string());
     let remedy = match (alert(error), error) {
-        (Some((alert, Finder::Peer)), _) => advice::alert_of_peer(alert),
+        (Some((AlertDescription::NoApplicationProtocol, _)), _) => {
+            let own = String::from_utf8_lossy(settings::PROTOCOL);
+            format!(
+                "the two sides have no version of the protocol over QUIC in common, and this side has {own}: \
+                 install the same release of fipa on both hosts"
+            )
+        }
         // quinn only keeps the text and the alert of a TLS error, and the alert is that of an expired
         // certificate.
         (_, ConnectionError::TransportError(failed)) if failed.reason.ends_with("NotValidYet") => {
@@ -127,13 +135,15 @@ pub(super) fn loss_reason(error: &ConnectionError) -> String {
         {
             advice::ITSELF.to_owned()
         }
-        (Some((alert, Finder::Here)), _) => {
-            advice::of_alert(alert.into(), Finder::Here).into_owned()
-        }
+        (Some((alert, finder)), _) => advice::of_alert(alert, finder).into_owned(),
         (None, ConnectionError::TransportError(_) | ConnectionError::ConnectionClosed(_)) => {
             return text();
         }
         (None, other) => return other.to_string(),
+    };
+    let remedy = match alert(error) {
+        Some((alert, Finder::Peer)) => advice::alert_of_peer(alert, &remedy),
+        _ => remedy,
     };
     format!("{} ({remedy})", text())
 }

@@ -96,15 +96,10 @@ fn alert_name(alert: AlertDescription) -> String {
     }
 }
 
-/// Returns the text for an alert of the peer, with the remedy.
-pub(crate) fn alert_of_peer(alert: u8) -> String {
-    let alert = AlertDescription::from(alert);
-    format!(
-        "the peer sent the TLS alert {} ({}): {}",
-        alert_name(alert),
-        u8::from(alert),
-        of_alert(alert, Finder::Peer)
-    )
+/// Returns the text for an alert of the peer, with its remedy.
+pub(crate) fn alert_of_peer(alert: AlertDescription, remedy: &str) -> String {
+    let (name, code) = (alert_name(alert), u8::from(alert));
+    format!("the peer sent the TLS alert {name} ({code}): {remedy}")
 }
 
 /// Returns the remedy for an alert (RFC 8446 section 6.2).
@@ -115,10 +110,7 @@ pub(crate) fn of_alert(alert: AlertDescription, finder: Finder) -> Cow<'static, 
         (A::CertificateExpired, Here) => return expired().into(),
         // Of a certificate that is not valid yet, too: TLS has no alert for it.
         (A::CertificateExpired, Peer) => return invalid_at_peer().into(),
-        (A::NoApplicationProtocol, _) => {
-            "the peer has another version of the protocol over QUIC than fipa/1, the version of this host: \
-             install the same release of fipa on both hosts"
-        }
+        (A::NoApplicationProtocol, _) => SAME_RELEASE,
         (A::UnknownCA, Here) => {
             "this host does not trust the peer: run `fipa keys trust` with the peer's own.pem"
         }
@@ -190,7 +182,7 @@ fn word(word: &str) -> String {
 /// Returns the text for an error of TLS, with the remedy.
 pub(crate) fn told(error: &Error) -> String {
     match error {
-        Error::AlertReceived(alert) => alert_of_peer(u8::from(*alert)),
+        Error::AlertReceived(alert) => alert_of_peer(*alert, &of_alert(*alert, Finder::Peer)),
         _ => format!("{} ({})", in_words(&error.to_string()), of_error(error)),
     }
 }
