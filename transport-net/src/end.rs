@@ -57,7 +57,7 @@ pub(crate) enum ConnectionEnd {
     Closed,
 }
 
-/// What is known of the peer of a connection that ends.
+/// The knowledge about the peer of a connection that ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Acquaintance {
     /// Nothing has arrived.

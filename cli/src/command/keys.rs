@@ -366,7 +366,7 @@ fn valid_until(certificate: &Certificate) -> String {
     }
 }
 
-/// What to do about a certificate that is not valid now; empty for others.
+/// Returns the advice about a certificate that is not valid now; empty for others.
 fn validity_note(certificate: &Certificate, whose: Whose) -> String {
     let now = SystemTime::now();
     let holding = Holding::at(now, certificate);
