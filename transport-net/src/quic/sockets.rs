@@ -109,7 +109,7 @@ pub(super) fn is_of_tls(error: &ConnectionError) -> bool {
 /// Returns the error of a lost connection.
 pub(super) fn lost(error: &ConnectionError) -> io::Error {
     match is_of_tls(error) {
-        true => TlsFailure::new(loss_reason(error)),
+        true => TlsFailure::io(loss_reason(error)),
         false => io::Error::other(loss_reason(error)),
     }
 }

@@ -31,7 +31,7 @@ pub(crate) struct TlsFailure(String);
 
 impl TlsFailure {
     /// Creates the error of a wire with this text.
-    pub(crate) fn new(told: String) -> io::Error {
+    pub(crate) fn io(told: String) -> io::Error {
         io::Error::new(io::ErrorKind::InvalidData, Self(told))
     }
 

@@ -242,7 +242,7 @@ impl Incoming {
             let processed = session.process_new_packets();
             // In TLS 1.3 a client completes the handshake before the server has accepted its
             // certificate.
-            processed.map_err(|error| TlsFailure::new(advice::told(&error)))?;
+            processed.map_err(|error| TlsFailure::io(advice::told(&error)))?;
         }
     }
 }
