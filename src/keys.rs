@@ -113,12 +113,51 @@ impl Holding {
             Self::Well => None,
             Self::EndsSoon => Some("expires within 30 days"),
             Self::Ended => Some("has expired"),
-            Self::NotYet => Some(
-                "is not valid yet: the clock of this host is before the start of its validity; set the \
-                 clock",
-            ),
+            Self::NotYet => Some("is not valid yet by the clock of this host"),
         }
     }
+
+    /// Returns what to do about the certificate of `whose` at this time; `None` for [`Holding::Well`]. A
+    /// wrong clock is more likely than a certificate of the wrong time, in particular on hosts without a
+    /// battery for their clock. Therefore the clock comes first.
+    #[must_use]
+    pub fn advice(self, now: SystemTime, whose: Whose) -> Option<String> {
+        let renew = match whose {
+            Whose::Own => "`fipa keys renew`",
+            Whose::Peer => {
+                "ask the owner of that host for a new certificate (`fipa keys renew` there)"
+            }
+        };
+        let clock = || {
+            let shown = fipa_acl::Time::from_system_time(now);
+            let shown = shown.ok().and_then(fipa_acl::Time::to_rfc3339);
+            let shown = shown.unwrap_or_else(|| "no time that a calendar has".to_owned());
+            format!("the clock of this host shows {shown}: set it if it is wrong")
+        };
+        Some(match (self, whose) {
+            (Self::Well, _) => return None,
+            (Self::EndsSoon, _) => renew.to_owned(),
+            (Self::Ended, _) => format!("{}; if it is right, {renew}", clock()),
+            (Self::NotYet, Whose::Own) => format!(
+                "{}; if it is right, it was ahead when the certificate was made: {renew} makes another one",
+                clock()
+            ),
+            (Self::NotYet, Whose::Peer) => format!(
+                "{}; if it is right, the clock of that host is or was ahead: set that clock, then {renew}",
+                clock()
+            ),
+        })
+    }
+}
+
+/// The host of a certificate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Whose {
+    /// This host.
+    Own,
+    /// Another host.
+    Peer,
 }
 
 impl Keys {

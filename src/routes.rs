@@ -46,8 +46,8 @@ pub struct Report {
     pub peers: Vec<StaticPeer>,
     /// The gateways with an open connection; empty unless the service is a gateway.
     pub neighbours: Vec<Connected>,
-    /// The connections that the service has refused because only one side has keys, or because a side
-    /// does not trust the other, the latest first; empty unless the service is a gateway. Of each address
+    /// The connections that the service has refused because only one side has keys, because a side does not
+    /// trust the other, or because the sides have different versions of the protocol, the latest first; empty unless the service is a gateway. Of each address
     /// the latest, of at most 16 addresses.
     #[serde(default)]
     pub refused: Vec<RefusedConnection>,
@@ -104,7 +104,7 @@ pub struct Connected {
     pub security: LinkSecurity,
 }
 
-/// A connection that a gateway has refused because of keys.
+/// A connection that a gateway has refused because of keys or of another version of the protocol.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct RefusedConnection {

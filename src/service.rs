@@ -495,6 +495,7 @@ fn quic(
         identity: identity(config, role, dir, incarnation)?,
         limits: stream_limits(config),
         security: security.clone(),
+        refusals: role.refusals.clone(),
     };
     Ok(Arc::new(QuicTransport::new(config, handle.clone())))
 }

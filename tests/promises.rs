@@ -500,6 +500,7 @@ impl RepeatingPeer {
                     identity,
                     limits,
                     security,
+                    refusals: fipa_transport_net::Refusals::default(),
                 };
                 Arc::new(QuicTransport::new(config, Handle::current()))
             }

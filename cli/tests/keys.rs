@@ -421,14 +421,27 @@ fn an_expired_certificate_is_reported_in_every_output() {
     until("the certificate has expired", || {
         rover.keys(&["list"]).contains("(has expired)")
     });
+    let clock = "has expired; the clock of this host shows ";
+    let listed = rover.keys(&["list"]);
+    assert!(listed.contains(clock), "{listed}");
     let output = crex.keys(&["trust", &rover.certificate()]);
     assert!(output.contains("(has expired)"), "{output}");
+    assert!(output.contains(clock), "{output}");
     let (mut theirs, address) = crex.gateway(&[]);
     theirs.wait_for_log(&["the certificate of rover", "has expired"]);
     rover.keys(&["trust", &crex.certificate()]);
     let (mut ours, _) = rover.gateway(&[(&crex.name, &address)]);
-    ours.wait_for_log(&["the certificate of this host has expired"]);
-    theirs.wait_for_log(&["connection refused", "Expired", "`fipa keys renew` there"]);
+    ours.wait_for_log(&[
+        "the certificate of this host has expired",
+        "the clock of this host shows",
+    ]);
+    let clock = "by the clock of this host, which shows 20";
+    theirs.wait_for_log(&[
+        "connection refused",
+        "Expired",
+        clock,
+        "`fipa keys renew` there",
+    ]);
 }
 
 #[test]

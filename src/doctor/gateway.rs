@@ -24,9 +24,9 @@ const MAX_SHOWN: usize = 8;
 /// static peers more often.
 const RECENT: u64 = 60;
 
-/// The advice if a connection is refused because of keys.
-const KEYS_ADVICE: &str = "do what the reason says; `fipa keys list` shows the keys and the trusted \
-                           certificates of a host, and the gateways connect by themselves after the change";
+/// The advice if a connection is refused.
+const REFUSED_ADVICE: &str =
+    "do what the reason says; the gateways connect by themselves after the change";
 
 pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &mut Vec<Check>) {
     let report = match report {
@@ -121,11 +121,11 @@ fn contested(contested: &ContestedName) -> Check {
     )
 }
 
-/// Reports a connection that the gateway has refused because of keys.
+/// Reports a connection that the gateway has refused because of keys or versions.
 fn refused(refused: &RefusedConnection) -> Check {
     let RefusedConnection { from, why, seconds } = refused;
     let found = format!("from {from}, {seconds} s ago: {why}");
-    AREA.problem(REFUSED, Verdict::Doubtful, found, KEYS_ADVICE)
+    AREA.problem(REFUSED, Verdict::Doubtful, found, REFUSED_ADVICE)
 }
 
 /// The TCP addresses of gateways that are known but not connected, without those of the configuration,

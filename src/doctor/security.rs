@@ -42,7 +42,7 @@ fn keys(_now: SystemTime, _config: &Config, checks: &mut Vec<Check>) {
 fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
     use fipa_acl::ErrorChain;
 
-    use crate::keys::{Certificate, Holding, Keys, KeysError};
+    use crate::keys::{Certificate, Holding, Keys, KeysError, Whose};
 
     let keys = Keys::at(&config.security.keys);
     let credentials = match keys.credentials_of(&config.mts.name) {
@@ -63,26 +63,21 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
         let found = "no other host is trusted, so every connection from another host is refused";
         checks.push(AREA.problem(KEYS, Verdict::Doubtful, found, advice));
     }
-    let mut ending = |whose: &str, certificate: &Certificate, renew: &str| {
+    let mut ending = |name: &str, certificate: &Certificate, whose: Whose| {
         let holding = Holding::at(now, certificate);
-        let Some(problem) = holding.told() else {
+        let (Some(problem), Some(advice)) = (holding.told(), holding.advice(now, whose)) else {
             return;
         };
         let verdict = match holding {
             Holding::EndsSoon => Verdict::Doubtful,
             _ => Verdict::Bad,
         };
-        let found = format!("the certificate of {whose} {problem}");
-        checks.push(AREA.problem(KEYS, verdict, found, renew));
+        let found = format!("the certificate of {name} {problem}");
+        checks.push(AREA.problem(KEYS, verdict, found, advice));
     };
-    ending("this host", &credentials.own, "`fipa keys renew`");
+    ending("this host", &credentials.own, Whose::Own);
     for trusted in &credentials.trusted {
-        let whose = trusted.certified().mts().to_owned();
-        ending(
-            &whose,
-            trusted,
-            "ask the owner of that host for a new certificate (`fipa keys renew` there)",
-        );
+        ending(trusted.certified().mts(), trusted, Whose::Peer);
     }
     if checks.iter().all(|check| check.area != AREA.0) {
         let count = credentials.trusted.len();
@@ -178,9 +173,30 @@ mod tests {
             assert_eq!(found.len(), 2, "{found:?}");
             for (verdict, found) in found {
                 assert_eq!(verdict, Verdict::Bad);
-                let cause = "the clock of this host is before the start of its validity";
+                let cause = "is not valid yet by the clock of this host";
                 assert!(found.contains(cause), "{found}");
             }
+            assert_clock_comes_first(wrong, &config);
+        }
+        // Both certificates.
+        assert_eq!(verdicts_at(made + 2 * VALID, &config).len(), 2);
+        assert_clock_comes_first(made + 2 * VALID, &config);
+    }
+
+    /// Asserts that the advice about each certificate shows this time, and names the clock before the keys.
+    fn assert_clock_comes_first(now: SystemTime, config: &Config) {
+        let mut checks = Vec::new();
+        examine(now, config, &mut checks);
+        let shown = fipa_acl::Time::from_system_time(now).unwrap();
+        let clock = format!(
+            "the clock of this host shows {}: set it if it is wrong",
+            shown.to_rfc3339().unwrap()
+        );
+        for check in checks {
+            let advice = check.advice.unwrap();
+            let (first, then) = advice.split_once("; if it is right, ").unwrap();
+            assert_eq!(first, clock);
+            assert!(then.contains("`fipa keys renew`"), "{then}");
         }
     }
 }

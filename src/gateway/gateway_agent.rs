@@ -42,7 +42,7 @@ pub(crate) struct GatewayAgent {
     pub(super) contacts: Arc<KnownPeers>,
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
-    /// The connections that were refused because of keys.
+    /// The connections that were refused because of keys or versions.
     pub(super) refusals: Refusals,
     /// The questions of agents of this host about agents of other hosts.
     pub(super) questions: Mutex<Questions>,

@@ -9,7 +9,7 @@ use fipa_transport_net::secure::{Credentials, Rules, Security};
 
 use crate::config;
 use crate::error::OpenError;
-use crate::keys::{Holding, Keys, Stamp};
+use crate::keys::{Holding, Keys, Stamp, Whose};
 
 /// Interval between checks for changed keys. A check makes three system calls.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
@@ -17,19 +17,19 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// Logs the certificates that are not valid or expire soon.
 fn warn_about_expiry(credentials: &Credentials) {
     let now = SystemTime::now();
-    if let Some(what) = Holding::at(now, &credentials.own).told() {
+    let told = |certificate, whose| {
+        let holding = Holding::at(now, certificate);
+        Some((holding.told()?, holding.advice(now, whose)?))
+    };
+    if let Some((what, advice)) = told(&credentials.own, Whose::Own) {
         log_limit::warn!(
-            "the certificate of this host {what}; peers refuse a host without a valid certificate \
-             (renew it with `fipa keys renew`)"
+            "the certificate of this host {what}; peers refuse a host without a valid certificate; {advice}"
         );
     }
     for trusted in &credentials.trusted {
-        if let Some(what) = Holding::at(now, trusted).told() {
+        if let Some((what, advice)) = told(trusted, Whose::Peer) {
             let peer = trusted.certified().mts();
-            log_limit::warn!(
-                "the certificate of {peer} {what}; it has to be renewed on that host (`fipa keys renew` \
-                 there)"
-            );
+            log_limit::warn!("the certificate of {peer} {what}; {advice}");
         }
     }
 }

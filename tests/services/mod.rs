@@ -180,6 +180,7 @@ impl TestService {
                 identity: identity.clone(),
                 limits: limits.clone(),
                 security: security.clone().unwrap(),
+                refusals: fipa_transport_net::Refusals::default(),
             };
             Arc::new(QuicTransport::new(config, handle.clone()))
         });

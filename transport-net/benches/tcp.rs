@@ -110,6 +110,7 @@ fn quic(client: &Runtime, server: &Runtime) -> (Party, Party) {
             identity,
             limits,
             security: host.security(&[&host]),
+            refusals: fipa_transport_net::Refusals::default(),
         };
         listening(Arc::new(QuicTransport::new(
             config,

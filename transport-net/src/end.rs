@@ -21,14 +21,22 @@ pub(crate) enum ConnectionEnd {
     NotSought,
     /// The peer violated the protocol.
     ProtocolViolation(String),
+    /// The frames of the peer have another version of the protocol than those of this side.
+    OtherVersion { peer: u8, own: u8, is_process: bool },
     /// The peer sent its hello or a frame too slowly.
     TooSlow(&'static str),
     /// The peer did not respond to a ping.
     Silent,
     /// The operating system reported an error.
     Broken(String),
+    /// TLS failed after the handshake of this side, for example by an alert of the peer. The text has the
+    /// cause and the remedy.
+    #[cfg(feature = "secure")]
+    Tls(String),
     /// The peer closed the connection without a goodbye.
     Hangup,
+    /// The process at the other end of a Unix domain socket closed it before its hello.
+    ProcessEnded(String),
     /// The peer sent a goodbye after accepting parcels up to this number.
     Goodbye { last: u64 },
     /// The connection reached its idle timeout.
@@ -38,9 +46,9 @@ pub(crate) enum ConnectionEnd {
     /// The peer is no longer trusted.
     #[cfg(feature = "secure")]
     Distrusted,
-    /// The peer's certificate has expired.
+    /// The peer's certificate has expired. The text has the remedy.
     #[cfg(feature = "secure")]
-    Expired,
+    Expired(String),
     /// The peer opened another connection in place of this one.
     Superseded,
     /// The peer claims to be a service that is connected with another peer.
@@ -48,6 +56,28 @@ pub(crate) enum ConnectionEnd {
     /// This endpoint closes.
     Closed,
 }
+
+/// The knowledge about the peer of a connection that ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Acquaintance {
+    /// Nothing has arrived.
+    Unknown,
+    /// The peer has proved its identity by TLS, but its hello has not arrived.
+    Proved,
+    /// Its hello has arrived.
+    Greeted,
+}
+
+/// The possible causes if a peer without a proved identity closes a connection before its hello. A gateway of an
+/// older release does so when it receives another version.
+const UNKNOWN_CAUSES: &str = "possible causes: the peer requires keys and this host has none (set security.keys \
+                              here, see `fipa keys`), it has another version of the protocol (install the same \
+                              release of fipa on both hosts), it is ending, or no fipa gateway listens there";
+
+/// The same if the peer has proved its identity.
+const PROVED_CAUSES: &str = "possible causes: the peer has another version of the protocol (install the same \
+                             release of fipa on both hosts), it does not trust this host (see its log), or it is \
+                             ending";
 
 /// Returns the error of a transport in an error of a socket: the reason for which a guarded stream has
 /// ended, or a broken connection.
@@ -74,6 +104,7 @@ impl ConnectionEnd {
             self,
             Self::WrongIncarnation { .. }
                 | Self::Itself
+                | Self::OtherVersion { .. }
                 | Self::NotSought
                 | Self::Idle
                 | Self::TooManyConnections
@@ -87,36 +118,51 @@ impl ConnectionEnd {
         matches!(self, Self::ProtocolViolation(_) | Self::TooSlow(_))
     }
 
-    /// Returns the error of parcels that the peer cannot have received. `greeted` is whether the
-    /// peer's hello had arrived.
-    pub(crate) fn before(&self, greeted: bool) -> TransportError {
+    /// Returns the same end for a connection between two processes of this host whose peer has not sent its
+    /// hello. Such processes need no keys.
+    pub(crate) fn of_process(self) -> Self {
         match self {
-            Self::NotOpened(error) => error.clone(),
-            Self::WrongIncarnation { expected, found } => TransportError::new(
+            Self::Hangup => Self::ProcessEnded("it closed the connection before its hello".into()),
+            Self::Broken(what) => Self::ProcessEnded(what),
+            other => other,
+        }
+    }
+
+    /// Returns the error of parcels that the peer cannot have received.
+    pub(crate) fn before(&self, peer: Acquaintance) -> TransportError {
+        match (self, peer) {
+            (Self::NotOpened(error), _) => error.clone(),
+            (Self::WrongIncarnation { expected, found }, _) => TransportError::new(
                 TransportErrorKind::WrongIncarnation,
                 format_args!("the service at this address has incarnation {found}, not {expected}"),
             ),
-            Self::ProtocolViolation(what) => {
+            (Self::ProtocolViolation(what), _) => {
                 TransportError::new(TransportErrorKind::Incompatible, what)
             }
-            Self::Goodbye { .. } if !greeted => TransportError::new(
-                TransportErrorKind::Refused,
-                "the peer refused the connection: its max_connections is reached, \
+            (Self::Goodbye { .. }, Acquaintance::Unknown | Acquaintance::Proved) => {
+                TransportError::new(
+                    TransportErrorKind::Refused,
+                    "the peer refused the connection: it is ending, its max_connections is reached, \
                  or it is connected with another service of this incarnation",
-            ),
-            Self::Hangup if !greeted => TransportError::new(
+                )
+            }
+            (Self::Hangup, Acquaintance::Unknown) => TransportError::new(
                 TransportErrorKind::Incompatible,
-                "the peer closed the connection before its hello: the peer requires keys and this host \
-                 has none (set security.keys here, see `fipa keys`), or no fipa gateway listens there",
+                format_args!("the peer closed the connection before its hello; {UNKNOWN_CAUSES}"),
             ),
-            Self::Broken(what) if !greeted => TransportError::new(
+            (Self::Broken(what), Acquaintance::Unknown) => TransportError::new(
                 TransportErrorKind::Broken,
-                format_args!(
-                    "{what}, before the peer's hello: the peer may require keys that this host has not \
-                     (set security.keys here, see `fipa keys`)"
-                ),
+                format_args!("{what}, before the peer's hello; {UNKNOWN_CAUSES}"),
             ),
-            other => other.after(),
+            (Self::Hangup, Acquaintance::Proved) => TransportError::new(
+                TransportErrorKind::Broken,
+                format_args!("the peer closed the connection before its hello; {PROVED_CAUSES}"),
+            ),
+            (Self::Broken(what), Acquaintance::Proved) => TransportError::new(
+                TransportErrorKind::Broken,
+                format_args!("{what}, before the peer's hello; {PROVED_CAUSES}"),
+            ),
+            (other, _) => other.after(),
         }
     }
 
@@ -124,6 +170,30 @@ impl ConnectionEnd {
     pub(crate) fn after(&self) -> TransportError {
         let (fault, detail) = match self {
             Self::NotOpened(error) => return error.clone(),
+            Self::OtherVersion {
+                peer,
+                own,
+                is_process,
+            } => {
+                let (this, remedy) = match is_process {
+                    true => (
+                        "this process",
+                        "run both processes with the same release of fipa",
+                    ),
+                    false => (
+                        "this host",
+                        "install the same release of fipa on both hosts",
+                    ),
+                };
+                let detail = format!(
+                    "the peer has version {peer} of the protocol and {this} has version {own}: {remedy}"
+                );
+                return TransportError::new(TransportErrorKind::Incompatible, detail);
+            }
+            Self::ProcessEnded(what) => {
+                let detail = format!("the process at this socket has ended or is ending: {what}");
+                return TransportError::new(TransportErrorKind::Broken, detail);
+            }
             Self::WrongIncarnation { .. } => (
                 TransportErrorKind::Broken,
                 "the peer has another incarnation",
@@ -144,6 +214,8 @@ impl ConnectionEnd {
                 "the peer did not respond in time (keep_alive)",
             ),
             Self::Broken(what) => (TransportErrorKind::Broken, what.as_str()),
+            #[cfg(feature = "secure")]
+            Self::Tls(what) => (TransportErrorKind::Broken, what.as_str()),
             Self::Hangup => (TransportErrorKind::Broken, "the peer closed the connection"),
             Self::Goodbye { .. } => (TransportErrorKind::Broken, "the peer ended the connection"),
             Self::Idle => (
@@ -157,10 +229,7 @@ impl ConnectionEnd {
             #[cfg(feature = "secure")]
             Self::Distrusted => (TransportErrorKind::Refused, "the peer is no longer trusted"),
             #[cfg(feature = "secure")]
-            Self::Expired => (
-                TransportErrorKind::Refused,
-                "the peer's certificate has expired; run `fipa keys renew` on the peer's host",
-            ),
+            Self::Expired(why) => (TransportErrorKind::Refused, why.as_str()),
             Self::IdentityConflict(why) => (TransportErrorKind::Refused, *why),
             Self::Superseded => (
                 TransportErrorKind::Broken,

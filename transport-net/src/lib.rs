@@ -14,7 +14,7 @@
 //! Each has a module tree of its own. They share frames and connections (`stream`), the
 //! introduction of endpoints ([`Identity`], `hello`), addresses as text (`address`), the encoding
 //! of answers (`answer`), sockets and tasks over UDP (`datagrams`), the letters of legacy peers
-//! (`legacy`), rate limits (`rate_limit`) and the reasons for which connections end
+//! (`legacy`), rate limits (`rate_limit`), the list of refused connections (`refusals`) and the reasons for which connections end
 //! (`end`). `stream` depends on none of the transports.
 //!
 //! Routes, retries, order across transports and directories do not belong here: a transport tries
@@ -44,6 +44,8 @@ mod quic;
     expect(dead_code, reason = "the processes of this host may send any number")
 )]
 mod rate_limit;
+#[cfg(feature = "ip")]
+mod refusals;
 #[cfg(feature = "secure")]
 pub mod secure;
 #[cfg(feature = "ip")]
@@ -64,10 +66,12 @@ pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;
 #[cfg(feature = "quic")]
 pub use quic::{QuicConfig, QuicTransport};
+#[cfg(feature = "ip")]
+pub use refusals::{Refusal, Refusals};
 pub use stream::config::Limits;
 pub use stream::counters::Counters;
 #[cfg(feature = "ip")]
-pub use tcp::{Refusal, Refusals, TcpConfig, TcpTransport};
+pub use tcp::{TcpConfig, TcpTransport};
 #[cfg(feature = "ip")]
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};
 #[cfg(feature = "udt")]

@@ -8,7 +8,7 @@
 mod common;
 
 use std::io::{Read as _, Write as _};
-use std::net::{IpAddr, Ipv4Addr, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, TcpListener, TcpStream};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -18,7 +18,9 @@ use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
 use fipa_testbed::until_some;
-use fipa_transport::{Answer, Conclusion, FailureReason, Mandate, Transport, TransportErrorKind};
+use fipa_transport::{
+    Answer, Conclusion, FailureReason, Kind, Location, Mandate, Transport, TransportErrorKind,
+};
 use fipa_transport_net::secure::{Rules, Security};
 use fipa_transport_net::{Counters, Limits, TcpTransport};
 
@@ -112,6 +114,20 @@ fn assert_refused<T: Transport>(from: &Party<T>, to: &Party<T>) -> String {
     error.to_string()
 }
 
+/// Asserts that an error names the alert of the peer once, and does not guess about keys.
+fn assert_tells_alert(told: &str, alert: &str) {
+    let part = format!("the peer sent the TLS alert {alert}");
+    assert_eq!(told.matches(&part).count(), 1, "{told}");
+    for guess in [
+        "possible causes",
+        "has none",
+        "security.keys",
+        "may require",
+    ] {
+        assert!(!told.contains(guess), "{told}");
+    }
+}
+
 fn letter_from(sender: &str) -> Letter {
     letter_signed(sender, sender)
 }
@@ -164,6 +180,7 @@ fn untrusted_peers_are_refused_on_either_side<T: Proving>() {
     let from = T::party(stranger.security(&[&crex]));
     let told = assert_refused(&from, &to);
     assert!(told.contains("the peer does not trust this host"), "{told}");
+    assert_tells_alert(&told, "unknown_ca (48)");
     // The listener has another certificate.
     let from = T::party(rover.security(&[&stranger]));
     let told = assert_refused(&from, &to);
@@ -194,11 +211,17 @@ fn certificates_that_are_not_valid_now_are_refused<T: Proving>() {
         );
         let clock = told.contains("not valid yet by the clock of this host");
         assert_eq!(clock, what == "not valid yet", "{told}");
+        // The clock comes before the keys.
+        let shown = told.find("the clock of this host, which shows 20").unwrap();
+        assert!(shown < told.find("renew` there").unwrap(), "{told}");
         let told = assert_refused(&to, &from);
         assert!(
             told.contains("this host's certificate is not valid"),
             "{told}"
         );
+        assert_tells_alert(&told, "certificate_expired (45)");
+        let shown = told.find("the clock of this host, which shows 20").unwrap();
+        assert!(shown < told.find("keys renew`").unwrap(), "{told}");
     }
 }
 
@@ -548,4 +571,71 @@ fn connections_of_a_local_user_do_not_keep_out_peers_with_keys() {
     };
     assert!((1..=20).any(gets_in));
     drop((introduced, letters, silent));
+}
+
+/// A listener that answers each connection with these bytes and closes it.
+fn answering(answer: Vec<u8>) -> Location {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap().to_string();
+    std::thread::spawn(move || {
+        while let Ok((mut stream, _)) = listener.accept() {
+            let _ = stream.read(&mut [0; 4096]);
+            let _ = stream.write_all(&answer);
+        }
+    });
+    Location::new(Kind::Tcp, &at).unwrap()
+}
+
+#[test]
+fn each_alert_is_told_with_its_own_remedy() {
+    let from = party(Host::new(NAME, &[]).security(&[]));
+    for (attempt, (alert, name, remedy)) in [
+        (40, "handshake_failure (40)", "see its log"),
+        (42, "bad_certificate (42)", "`fipa keys trust` there"),
+        (43, "unsupported_certificate (43)", "same release of fipa"),
+        (44, "certificate_revoked (44)", "`fipa keys renew` here"),
+        (45, "certificate_expired (45)", "clock of the peer"),
+        (48, "unknown_ca (48)", "`fipa keys trust` there"),
+        (51, "decrypt_error (51)", "belong together"),
+        (70, "protocol_version (70)", "TLS 1.3"),
+        (80, "internal_error (80)", "see the log of the peer"),
+        (112, "unrecognized_name (112)", "see its log"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        // A fatal alert in a record of its own (RFC 8446 section 6).
+        let to = answering(vec![21, 3, 3, 0, 2, 2, alert]);
+        from.send(attempt as u64, &to, parcel(1, "x")).unwrap();
+        let Conclusion::NotSent(error) = from.conclusion(attempt as u64) else {
+            panic!("{:?}", from.conclusion(attempt as u64));
+        };
+        assert_tells_alert(&error.detail, name);
+        assert!(error.detail.contains(remedy), "{error}");
+    }
+    // The remedy for this one is about keys.
+    let to = answering(vec![21, 3, 3, 0, 2, 2, 116]);
+    from.send(100, &to, parcel(1, "x")).unwrap();
+    let Conclusion::NotSent(error) = from.conclusion(100) else {
+        panic!("{:?}", from.conclusion(100));
+    };
+    let told = "alert certificate_required (116): the peer requires a certificate";
+    assert!(error.detail.contains(told), "{error}");
+}
+
+#[test]
+fn only_without_an_alert_are_there_several_possible_causes() {
+    let from = party(Host::new(NAME, &[]).security(&[]));
+    from.send(1, &answering(Vec::new()), parcel(1, "x"))
+        .unwrap();
+    let Conclusion::NotSent(error) = from.conclusion(1) else {
+        panic!("{:?}", from.conclusion(1));
+    };
+    for part in [
+        "sent no alert",
+        "possible causes: this host has keys and the peer has none",
+        "no fipa gateway listens there",
+    ] {
+        assert!(error.detail.contains(part), "{error}");
+    }
 }

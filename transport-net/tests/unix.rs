@@ -9,7 +9,7 @@ mod common;
 use std::fs;
 use std::io::Read as _;
 use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, PermissionsExt as _};
-use std::os::unix::net::UnixStream;
+use std::os::unix::net::{UnixListener, UnixStream};
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -20,6 +20,7 @@ use fipa_transport::{
     Conclusion, Incarnation, Kind, ListenError, Location, Transport, TransportErrorKind,
 };
 use fipa_transport_net::UnixTransport;
+use tokio::net::unix::pipe;
 
 type Unix = Party<UnixTransport>;
 
@@ -143,12 +144,12 @@ fn sockets_of_dead_processes_are_removed_and_those_of_others_are_not() {
     let a = party(&directory);
     // Dropping the standard library's listener leaves the file, as the end of a process does.
     let dead = directory.join("00000000000000aa");
-    drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
+    drop(UnixListener::bind(&dead).unwrap());
     fs::write(directory.join("notes"), "not a socket of fipa").unwrap();
     a.transport.tidy();
     until_some("the dead socket to go", || (!dead.exists()).then_some(()));
     assert!(directory.join("notes").exists());
-    drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
+    drop(UnixListener::bind(&dead).unwrap());
     // A starting process does the same.
     let b = party(&directory);
     assert!(!dead.exists());
@@ -216,4 +217,77 @@ fn the_end_of_the_other_side_is_reported_without_an_invented_answer() {
     let c = party(&directory);
     a.send(3, c.location(), parcel(3, "x")).unwrap();
     assert_eq!(a.conclusion(3), accepted());
+}
+
+/// Asserts that the error of an attempt is about the end of the process, and that a letter to another process is
+/// delivered afterwards.
+fn assert_process_ended(directory: &Path, to: &str) {
+    let from = party(directory);
+    let to = Location::new(Kind::Unix, to).unwrap();
+    from.send(1, &to, parcel(1, "x")).unwrap();
+    let Conclusion::NotSent(error) = from.conclusion(1) else {
+        panic!("{:?}", from.conclusion(1));
+    };
+    let told = "the process at this socket has ended or is ending";
+    assert!(error.detail.contains(told), "{error}");
+    assert!(!error.detail.contains("keys"), "{error}");
+    from.assert_reaches(2, &party(directory));
+}
+
+/// A listening socket of a process that serves nothing.
+fn listening(directory: &Path) -> (UnixListener, String) {
+    // The directory is created by a transport, with the mode that it needs.
+    drop(party(directory));
+    let name = Incarnation::random().to_string();
+    let listener = UnixListener::bind(directory.join(&name)).unwrap();
+    (listener, name)
+}
+
+#[test]
+fn a_process_that_ends_before_its_hello_is_reported_as_ending() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    for reads in [true, false] {
+        let (listener, name) = listening(&directory);
+        let ending = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            stream.set_nonblocking(true).unwrap();
+            let mut bytes = [0; 4096];
+            if reads {
+                stream.set_nonblocking(false).unwrap();
+                // Nothing is unread, so the other side sees an end of stream instead of a reset.
+                let _ = stream.read(&mut bytes).unwrap();
+            }
+        });
+        assert_process_ended(&directory, &name);
+        ending.join().unwrap();
+    }
+}
+
+#[test]
+fn a_process_that_ends_with_a_connection_in_its_backlog_is_reported_as_ending() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let (listener, name) = listening(&directory);
+    let ending = std::thread::spawn(move || {
+        // Until a connection waits to be accepted.
+        common::runtime().block_on(async {
+            // As a pipe, because tokio only accepts the connections of a listener.
+            let listener = pipe::Receiver::from_owned_fd_unchecked(listener.into()).unwrap();
+            listener.readable().await.unwrap();
+        });
+    });
+    assert_process_ended(&directory, &name);
+    ending.join().unwrap();
+}
+
+#[test]
+fn the_socket_of_a_process_that_has_ended_is_reported_as_such() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let (listener, name) = listening(&directory);
+    drop(listener);
+    assert_process_ended(&directory, &name);
+    let removed = Incarnation::random().to_string();
+    assert_process_ended(&directory, &removed);
 }

@@ -18,8 +18,8 @@ use crate::report::Failure;
 /// discovery.static. If discovery.mdns is on, it also tests multicast on each network interface, which
 /// takes three seconds. It asks the running gateway for its configuration, compares it with the one that
 /// this command reads, shows whether its connections are encrypted, which static peers do not answer and
-/// which connections it refused because only one side has keys, and tests the TCP ports of the gateways that
-/// it knows. It changes nothing.
+/// which connections it refused because keys or protocol versions differ, and tests the TCP ports of the
+/// gateways that it knows. It changes nothing.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:

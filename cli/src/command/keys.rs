@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
 use fipa::ErrorChain;
-use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID};
+use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID, Whose};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
@@ -184,6 +184,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                     escape(certificate.certified().mts())
                 ));
                 text.push_str(&described(certificate));
+                text.push_str(&validity_note(certificate, Whose::Peer));
             }
             let all = keys.trusted().map_err(|error| failed(&error, &keys))?;
             for certificate in &trusted {
@@ -365,6 +366,19 @@ fn valid_until(certificate: &Certificate) -> String {
     }
 }
 
+/// Returns the advice about a certificate that is not valid now; empty for others.
+fn validity_note(certificate: &Certificate, whose: Whose) -> String {
+    let now = SystemTime::now();
+    let holding = Holding::at(now, certificate);
+    match (holding, holding.told(), holding.advice(now, whose)) {
+        (Holding::Ended | Holding::NotYet, Some(problem), Some(advice)) => format!(
+            "note: the certificate of {} {problem}; {advice}\n",
+            escape(certificate.certified().mts())
+        ),
+        _ => String::new(),
+    }
+}
+
 /// The agents for which the host of the certificate may send.
 fn agents(certificate: &Certificate) -> String {
     match certificate.certified().agents() {
@@ -427,8 +441,15 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
             ]);
         }
     }
+    let notes_of = |whose| move |certificate| validity_note(certificate, whose);
+    let notes: String = own
+        .iter()
+        .chain(&next)
+        .map(notes_of(Whose::Own))
+        .chain(trusted.iter().map(notes_of(Whose::Peer)))
+        .collect();
     Ok(output::text(&format!(
-        "{dir}\n{}\n{missing}",
+        "{dir}\n{}\n{missing}{notes}",
         table.trim_fmt()
     )))
 }

@@ -174,6 +174,7 @@ impl HttpTransport {
             identity,
             limits,
             processes: false,
+            refusals: crate::refusals::Refusals::default(),
             #[cfg(feature = "secure")]
             security,
         };

@@ -5,11 +5,12 @@ use std::sync::Arc;
 
 use bytes::BytesMut;
 use fipa_transport::{log_limit, quota_address};
-use quinn::{Connection, ConnectionError, Incoming, RecvStream, SendStream};
+use quinn::{Connection, Incoming, RecvStream, SendStream};
 use tokio::time::timeout;
 
 use super::dial::ends;
-use super::sockets::{Sockets, loss_reason};
+use super::sockets::{Sockets, lost};
+use crate::secure::advice::TlsFailure;
 use crate::stream::counters::count;
 use crate::stream::endpoint::{Endpoint, UnprovedSlot};
 use crate::stream::frame::FrameReader;
@@ -54,7 +55,13 @@ async fn receive(
             Some(proof) => Ok((connection, send, receive, proof)),
             None => Err("the peer's certificate is no longer trusted".to_owned()),
         },
-        Ok(Err(error)) => Err(error.to_string()),
+        Ok(Err(error)) => {
+            let why = error.to_string();
+            if TlsFailure::in_error(&error).is_some() {
+                endpoint.config.refusals.add(from.ip(), &why);
+            }
+            Err(why)
+        }
         Err(_) => Err(format!(
             "handshake not complete within {patience:?} (handshake_timeout)"
         )),
@@ -84,8 +91,10 @@ async fn handshake(
     sockets: &Sockets,
     incoming: Incoming,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| io::Error::other(loss_reason(&error));
-    let connection = sockets.accept(incoming)?.await.map_err(told)?;
-    let (send, receive) = connection.accept_bi().await.map_err(told)?;
+    let connection = sockets
+        .accept(incoming)?
+        .await
+        .map_err(|error| lost(&error))?;
+    let (send, receive) = connection.accept_bi().await.map_err(|error| lost(&error))?;
     Ok((connection, send, receive))
 }

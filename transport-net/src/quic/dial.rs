@@ -7,9 +7,9 @@ use std::time::Instant;
 
 use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
-use quinn::{Connection, ConnectionError, RecvStream, SendStream};
+use quinn::{Connection, RecvStream, SendStream};
 
-use super::sockets::{Sockets, loss_reason};
+use super::sockets::{Sockets, lost};
 use super::streams::{Control, Letters, Outgoing};
 use crate::end::ConnectionEnd;
 use crate::stream::dialing::{addresses, reach};
@@ -54,9 +54,8 @@ async fn connect(
     sockets: Arc<Sockets>,
     address: SocketAddr,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| io::Error::other(loss_reason(&error));
-    let connection = sockets.dial(address)?.await.map_err(told)?;
-    let (send, receive) = connection.open_bi().await.map_err(told)?;
+    let connection = sockets.dial(address)?.await.map_err(|error| lost(&error))?;
+    let (send, receive) = connection.open_bi().await.map_err(|error| lost(&error))?;
     Ok((connection, send, receive))
 }
 

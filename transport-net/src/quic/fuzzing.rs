@@ -340,6 +340,7 @@ impl QuicStreams {
             identity,
             limits,
             processes: false,
+            refusals: crate::refusals::Refusals::default(),
             security: None,
         };
         let endpoint = Endpoint::new(Kind::Quic, config, RUNTIME.handle().clone());

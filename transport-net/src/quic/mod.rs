@@ -34,7 +34,7 @@ use self::sockets::Sockets;
 use crate::secure::Security;
 use crate::stream::config::StreamConfig;
 use crate::stream::endpoint::Endpoint;
-use crate::{Counters, Identity, Limits};
+use crate::{Counters, Identity, Limits, Refusals};
 
 /// Configuration of a [`QuicTransport`].
 #[derive(Debug, Clone)]
@@ -49,6 +49,8 @@ pub struct QuicConfig {
     /// Credentials and trust. QUIC always requires them; the exceptions of its rules do not apply
     /// here.
     pub security: Security,
+    /// Receives the connections that are refused because of certificates or of another version of the protocol.
+    pub refusals: Refusals,
 }
 
 /// Carries parcels over QUIC, between services that have proved their identity to each other.
@@ -75,12 +77,14 @@ impl QuicTransport {
             identity,
             limits,
             security,
+            refusals,
         } = config;
         let sockets = Arc::new(Sockets::new(security.clone(), &limits));
         let config = StreamConfig {
             identity,
             limits,
             processes: false,
+            refusals,
             security: Some(security),
         };
         Self {

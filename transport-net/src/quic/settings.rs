@@ -10,7 +10,7 @@ use crate::Limits;
 use crate::secure::Security;
 
 /// The ALPN protocol name (RFC 7301).
-const PROTOCOL: &[u8] = b"fipa/1";
+pub(super) const PROTOCOL: &[u8] = b"fipa/1";
 
 /// Maximum number of concurrent parcel streams of a connection with the usual window. Parcels are
 /// read one after the other, so more would only wait.

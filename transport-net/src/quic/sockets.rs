@@ -12,13 +12,14 @@ use quinn::{
     Connecting, ConnectionError, Endpoint, EndpointConfig, Incoming, ServerConfig, TokioRuntime,
     TransportConfig,
 };
+use rustls::AlertDescription;
 use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use super::settings;
 use crate::Limits;
 use crate::secure::Security;
-use crate::secure::advice::{self, Finder};
+use crate::secure::advice::{self, Finder, TlsFailure};
 use crate::stream::proof::Proof;
 
 #[derive(Debug)]
@@ -51,7 +52,7 @@ impl Sockets {
         let server = settings::server(&self.security, &self.transport).map_err(io::Error::other)?;
         incoming
             .accept_with(Arc::new(server))
-            .map_err(io::Error::from)
+            .map_err(|error| lost(&error))
     }
 
     /// Begins a handshake with the peer at this address.
@@ -89,31 +90,62 @@ impl Sockets {
     }
 }
 
-/// Returns the reason for which a connection is lost, with a remedy if it is about certificates.
-pub(super) fn loss_reason(error: &ConnectionError) -> String {
-    let text = || advice::in_words(&error.to_string());
+/// Returns the alert of TLS that ended a connection (RFC 9001 section 4.8), and the side that sent it.
+fn alert(error: &ConnectionError) -> Option<(AlertDescription, Finder)> {
     let (code, finder) = match error {
         ConnectionError::TransportError(error) => (u64::from(error.code), Finder::Here),
         ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),
-        other => return other.to_string(),
+        _ => return None,
     };
-    // quinn only keeps the text and the alert of a TLS error, and the alert is that of an expired
-    // certificate.
-    if let ConnectionError::TransportError(failed) = error {
-        for (end, remedy) in [
-            ("NotValidYet", advice::NOT_YET),
-            (advice::OWN_CERTIFICATE, advice::ITSELF),
-        ] {
-            if failed.reason.ends_with(end) {
-                return format!("{} ({remedy})", text());
-            }
+    let alert = u8::try_from(code.checked_sub(0x100)?).ok()?;
+    Some((alert.into(), finder))
+}
+
+/// Whether TLS ended a connection, because the keys or the protocols of the two sides do not match.
+pub(super) fn is_of_tls(error: &ConnectionError) -> bool {
+    alert(error).is_some()
+}
+
+/// Returns the error of a lost connection.
+pub(super) fn lost(error: &ConnectionError) -> io::Error {
+    match is_of_tls(error) {
+        true => TlsFailure::io(loss_reason(error)),
+        false => io::Error::other(loss_reason(error)),
+    }
+}
+
+/// Returns the reason for which a connection is lost, with a remedy if TLS ended it.
+pub(super) fn loss_reason(error: &ConnectionError) -> String {
+    let text = || advice::in_words(&error.to_string());
+    let remedy = match (alert(error), error) {
+        (Some((AlertDescription::NoApplicationProtocol, _)), _) => {
+            let own = String::from_utf8_lossy(settings::PROTOCOL);
+            format!(
+                "the two sides have no version of the protocol over QUIC in common, and this side has {own}: \
+                 install the same release of fipa on both hosts"
+            )
         }
-    }
-    // An alert of TLS (RFC 9001 section 4.8).
-    match code.checked_sub(0x100).map(u8::try_from) {
-        Some(Ok(alert)) => format!("{} ({})", text(), advice::of_alert(alert, finder)),
-        _ => text(),
-    }
+        // quinn only keeps the text and the alert of a TLS error, and the alert is that of an expired
+        // certificate.
+        (_, ConnectionError::TransportError(failed)) if failed.reason.ends_with("NotValidYet") => {
+            advice::not_yet()
+        }
+        (_, ConnectionError::TransportError(failed))
+            if failed.reason.ends_with(advice::OWN_CERTIFICATE) =>
+        {
+            advice::ITSELF.to_owned()
+        }
+        (Some((alert, finder)), _) => advice::of_alert(alert, finder).into_owned(),
+        (None, ConnectionError::TransportError(_) | ConnectionError::ConnectionClosed(_)) => {
+            return text();
+        }
+        (None, other) => return other.to_string(),
+    };
+    let remedy = match alert(error) {
+        Some((alert, Finder::Peer)) => advice::alert_of_peer(alert, &remedy),
+        _ => remedy,
+    };
+    format!("{} ({remedy})", text())
 }
 
 fn open(address: SocketAddr) -> io::Result<UdpSocket> {

@@ -17,7 +17,7 @@ use parking_lot::Mutex;
 use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
 use super::settings;
-use super::sockets::loss_reason;
+use super::sockets::lost;
 use crate::stream::frame::{self, FrameReader, Space};
 use crate::stream::wire::{BoxFuture, ControlStream, ParcelStreams, StreamWriter};
 
@@ -177,11 +177,6 @@ async fn fill(
 ) -> Result<Option<usize>, ReadError> {
     let bytes = stream.next(space.room()).await?;
     Ok(bytes.map(|bytes| space.fill(&bytes)))
-}
-
-/// Returns the error of a lost connection.
-fn lost(error: &ConnectionError) -> io::Error {
-    io::Error::other(loss_reason(error))
 }
 
 fn not_written(error: WriteError) -> io::Error {

@@ -13,7 +13,7 @@ use tokio::time::sleep_until;
 
 #[cfg(feature = "http")]
 use super::certificate::{last_second, left_until};
-use super::{Certificate, Security};
+use super::{Certificate, Security, advice};
 use crate::end::ConnectionEnd;
 
 /// The trust in the peer of a connection.
@@ -115,7 +115,9 @@ impl Trust {
         let left = || self.security.left(&self.evidence, SystemTime::now());
         let end = match is_trusted {
             false => ConnectionEnd::Distrusted,
-            true if judged.expiry.has_passed(now, left) => ConnectionEnd::Expired,
+            true if judged.expiry.has_passed(now, left) => {
+                ConnectionEnd::Expired(advice::expired())
+            }
             true => return Ok(judged.expiry.next_check(now)),
         };
         judged.end = Some(end.clone());

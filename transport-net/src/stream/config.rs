@@ -18,6 +18,9 @@ pub(crate) struct StreamConfig {
     /// Whether processes of this host connect over loopback.
     #[cfg(feature = "ip")]
     pub(crate) processes: bool,
+    /// Receives the connections that are refused because of keys or of another version of the protocol.
+    #[cfg(feature = "ip")]
+    pub(crate) refusals: crate::refusals::Refusals,
     /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<crate::secure::Security>,
@@ -271,6 +274,7 @@ mod tests {
                 identity: identity("here", "test"),
                 limits: Limits::default(),
                 processes,
+                refusals: crate::refusals::Refusals::default(),
                 #[cfg(feature = "secure")]
                 security: None,
             };

@@ -20,7 +20,7 @@ use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
 use crate::answer::{self, Contradictions};
-use crate::end::ConnectionEnd;
+use crate::end::{Acquaintance, ConnectionEnd};
 use crate::hello::{Hello, Load};
 
 /// Upper bound of parcel numbers, so that a ticket also holds the number of the connection.
@@ -727,14 +727,18 @@ impl Connection {
             ConnectionEnd::Goodbye { last } => *last,
             _ => u64::MAX,
         };
-        let greeted = self.peer.is_some();
+        let peer = match (&self.peer, self.proof.principal()) {
+            (Some(_), _) => Acquaintance::Greeted,
+            (None, Some(_)) => Acquaintance::Proved,
+            (None, None) => Acquaintance::Unknown,
+        };
         std::mem::take(&mut self.sent)
             .into_iter()
             .filter_map(|(id, sent)| {
                 let conclusion = if sent.begun.is_some() && id <= taken {
                     Conclusion::Unconfirmed(end.after())
                 } else {
-                    Conclusion::NotSent(end.before(greeted))
+                    Conclusion::NotSent(end.before(peer))
                 };
                 Some((sent.attempt?, conclusion))
             })

@@ -292,6 +292,32 @@ impl Endpoint {
         &self.config.limits
     }
 
+    /// Whether the peers are processes of this host and of this user.
+    pub(crate) fn is_within_host(&self) -> bool {
+        self.kind == Kind::Unix
+    }
+
+    /// Counts, logs and lists a connection that ends because the peer has another version of the protocol.
+    /// `dialled` is the location that this side dialled, if it opened the connection.
+    pub(crate) fn other_version(
+        &self,
+        from: Source,
+        dialled: Option<&Location>,
+        end: &ConnectionEnd,
+    ) {
+        count(&self.tally.refused_nonsense);
+        let (why, key) = (end.after().detail, from.home().whole());
+        if let Some(to) = dialled {
+            log_limit::warn!(of: key, "{to}: connection closed: {why}");
+            return;
+        }
+        log_limit::warn!(of: key, "{from}: connection refused: {why}");
+        #[cfg(feature = "ip")]
+        if let Home::Address(ip) = key {
+            self.config.refusals.add(ip, &why);
+        }
+    }
+
     /// Whether processes of this host connect to this endpoint, whose tasks may block.
     pub(crate) fn serves_processes(&self) -> bool {
         #[cfg(feature = "ip")]

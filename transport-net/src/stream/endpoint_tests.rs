@@ -6,6 +6,10 @@ use std::net::SocketAddr;
 use fipa_acl::Letter;
 use fipa_transport::{Answer, Arrival, Conclusion, Stream, Verdict};
 
+use super::super::frame::FrameReader;
+use super::super::link::LinkTask;
+use super::super::proof::Proof;
+use super::super::wire;
 use super::*;
 use crate::Identity;
 
@@ -36,6 +40,7 @@ fn endpoint(limits: Limits) -> Arc<Endpoint> {
         identity: identity(1 << 40),
         limits,
         processes: false,
+        refusals: crate::refusals::Refusals::default(),
         #[cfg(feature = "secure")]
         security: None,
     };
@@ -578,4 +583,78 @@ async fn a_question_ends_early_after_its_peer_has_announced_another_address() {
     let watchdog = Duration::from_secs(30);
     let answered = tokio::time::timeout(watchdog, answer).await;
     assert!(!answered.expect("the question ends").unwrap());
+}
+
+/// Records the error of the last attempt.
+#[derive(Default)]
+struct Errors(Mutex<Option<TransportError>>);
+
+impl Sink for Errors {
+    fn arrived(&self, _: Arrival) -> Verdict {
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: fipa_transport::LegacySource) {}
+
+    fn concluded(&self, _: AttemptId, conclusion: Conclusion) {
+        if let Conclusion::NotSent(error) = conclusion {
+            *self.0.lock() = Some(error);
+        }
+    }
+}
+
+/// The hello of this side then finds a connection that is reset, before the bytes of the peer are read.
+#[tokio::test]
+async fn the_reason_of_a_peer_counts_when_writing_fails_first() {
+    let endpoint = endpoint(Limits::default());
+    let errors = Arc::new(Errors::default());
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let peer = listener.local_addr().unwrap();
+    let to: Location = format!("tcp://{peer}").parse().unwrap();
+    let stream = tokio::net::TcpStream::connect(peer).await.unwrap();
+    let (mut other, _) = listener.accept().await.unwrap();
+    tokio::io::AsyncWriteExt::write_all(&mut other, b"fipa\x09\x01\0\0")
+        .await
+        .unwrap();
+    let reset = socket2::SockRef::from(&other).set_linger(Some(Duration::ZERO));
+    reset.unwrap();
+    drop(other);
+    // The next write fails.
+    let gone = || matches!(stream.try_write(b"x"), Err(error) if error.kind() != io::ErrorKind::WouldBlock);
+    while !gone() {
+        tokio::task::yield_now().await;
+    }
+    let letter = letter_of(100, 1);
+    let sink = errors.clone();
+    let stream = Mutex::new(Some(stream));
+    let serving = endpoint.dispatch(AttemptId(1), &to, &letter, |link, _| {
+        let running = LinkTask::new(
+            endpoint.clone(),
+            link.clone(),
+            sink.clone(),
+            Some(to.clone()),
+        );
+        let stream = stream.lock().take().unwrap();
+        link.connected(Instant::now());
+        let reader = FrameReader::new(1 << 20, bytes::BytesMut::new());
+        tokio::spawn(running.serve(
+            wire::plain(stream),
+            Proof::default(),
+            reader,
+            Source::Address(peer),
+            || {},
+        ))
+    });
+    serving.unwrap();
+    let error = tokio::time::timeout(Duration::from_secs(60), async {
+        loop {
+            if let Some(error) = errors.0.lock().take() {
+                return error;
+            }
+            tokio::task::yield_now().await;
+        }
+    });
+    let error = error.await.unwrap();
+    assert_eq!(error.fault, TransportErrorKind::Incompatible, "{error}");
+    assert!(error.detail.contains("version 9"), "{error}");
 }

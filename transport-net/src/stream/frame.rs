@@ -10,6 +10,9 @@
 //! | 4 ping, 5 pong | 0 | none |
 //! | 6 goodbye | the last accepted parcel; later ones are never accepted | none |
 //!
+//! A side that receives a frame of another version before the hello answers with a goodbye and ends the connection.
+//! From its first eight bytes, a peer of any version learns the version of this side.
+//!
 //! The first byte distinguishes a frame (`f`) from the letter of a legacy peer (`FE`, `FD`, `<`).
 //!
 //! [`FrameReader`] turns bytes in pieces of any size into frames.
@@ -44,8 +47,13 @@ struct FrameHeader {
 }
 
 pub(crate) const HEADER_LEN: usize = size_of::<FrameHeader>();
+
+/// Length of the first bytes of a header, whose layout is that of every version.
+const COMMON_LEN: usize = 8;
+
 pub(crate) const MAGIC: [u8; 4] = *b"fipa";
-const VERSION: u8 = 2;
+/// The version of the frames of this side.
+pub(crate) const VERSION: u8 = 2;
 
 const HELLO: u8 = 1;
 const PARCEL: u8 = 2;

@@ -27,19 +27,27 @@ use super::budget::ContentBuffer;
 use super::connection::{Connection, Event, MAX_ID, Predecessors, Reader, SendError};
 use super::counters::count;
 use super::endpoint::Endpoint;
-use super::frame::{FrameReader, Placed};
+use super::frame::{FrameError, FrameReader, Placed, VERSION};
 use super::proof::Proof;
 use super::source::{QuotaKey, Source};
 use super::wire::{ExtraStreams, Reading, Writing};
 use crate::end::ConnectionEnd;
 use crate::hello::Load;
 use crate::rate_limit::PeerRateLimit;
+#[cfg(feature = "secure")]
+use crate::secure::advice::TlsFailure;
 
 /// Maximum number of buffers handed to the kernel in one call.
 const MAX_SLICES: usize = 64;
 
 /// Number of waiting frames at which they are written at once.
 const MAX_TOGETHER: usize = 8;
+
+/// Maximum number of bytes that are discarded after this side has refused a peer, while the peer reads the reason.
+const MAX_DISCARDED: usize = 1 << 16;
+
+/// Time to read the reason that a peer sent before its side of the connection was reset.
+const REASON_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// Maximum number of bytes written before the task yields.
 const MAX_BURST: usize = 1 << 20;
@@ -462,7 +470,8 @@ impl State {
             let count = self.connection.gather(&mut slices);
             match writer.try_write(&slices[..count]) {
                 Ok(0) => {
-                    return self.broken("the kernel accepted no bytes");
+                    let what = "the kernel accepted no bytes".to_owned();
+                    return self.ended_by(ConnectionEnd::Broken(what));
                 }
                 Ok(taken) => {
                     burst += taken;
@@ -470,19 +479,18 @@ impl State {
                 }
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Flushed::Rest,
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return self.broken(error),
+                Err(error) => return self.ended_by(end_of(&error)),
             }
         }
         match writer.try_finish() {
             Ok(()) => Flushed::All,
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => Flushed::Rest,
-            Err(error) => self.broken(error),
+            Err(error) => self.ended_by(end_of(&error)),
         }
     }
 
-    fn broken(&mut self, why: impl ToString) -> Flushed {
-        let why = why.to_string();
-        self.ending.get_or_insert(ConnectionEnd::Broken(why));
+    fn ended_by(&mut self, end: ConnectionEnd) -> Flushed {
+        self.ending.get_or_insert(end);
         Flushed::Broken
     }
 }
@@ -574,19 +582,60 @@ impl LinkTask {
             end = exchange => end,
             end = proof.withdrawn() => end,
         };
-        self.end = end;
+        let end = match (end, &self.peer) {
+            (ConnectionEnd::Broken(what), None) => {
+                let reason = self.reason((&mut read, &mut reader), from, &mut greeted);
+                let reason = timeout(REASON_TIMEOUT, reason).await.ok().flatten();
+                reason.unwrap_or(ConnectionEnd::Broken(what))
+            }
+            (end, _) => end,
+        };
+        self.end = match self.peer {
+            None if !writer.leads_out() => end.of_process(),
+            _ => end,
+        };
+        if let ConnectionEnd::OtherVersion { .. } = self.end {
+            self.endpoint
+                .other_version(from, self.dialled.as_ref(), &self.end);
+        }
         if self.end == ConnectionEnd::Silent {
             writer.discard();
         }
         drop((writer, extra, reader));
         let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
+        // A peer of another version has nothing to send that counts.
+        let most = match self.end {
+            ConnectionEnd::OtherVersion { .. } => MAX_DISCARDED,
+            _ => usize::MAX,
+        };
         drop(self);
         if orderly {
             // After the timeout, the socket is closed without waiting for the peer.
-            let _ = timeout(patience, close_gracefully(&link, read)).await;
+            let _ = timeout(patience, close_gracefully(&link, read, most)).await;
         }
         link.state.lock().writer = None;
+    }
+
+    /// Returns the reason that the peer sent before its side of the connection was closed. A write can fail before
+    /// that reason has been read.
+    async fn reason(
+        &mut self,
+        (read, reader): (&mut Reading, &mut FrameReader),
+        from: Source,
+        greeted: &mut Option<impl FnOnce() + Send>,
+    ) -> Option<ConnectionEnd> {
+        match read.read(&mut reader.space()).await {
+            Ok(0) => None,
+            Ok(arrived) => {
+                let reader = (Reader::Main, reader);
+                self.take_frames(reader, arrived, from, greeted).await.err()
+            }
+            Err(error) => match end_of(&error) {
+                ConnectionEnd::Broken(_) => None,
+                end => Some(end),
+            },
+        }
     }
 
     async fn exchange(
@@ -646,7 +695,7 @@ impl LinkTask {
                     let arrived = match arrived {
                         Ok(0) => return ConnectionEnd::Hangup,
                         Ok(bytes) => bytes,
-                        Err(error) => return ConnectionEnd::Broken(error.to_string()),
+                        Err(error) => return end_of(&error),
                     };
                     let taken = self.take_frames((Reader::Main, reader), arrived, from, greeted);
                     if let Err(end) = taken.await {
@@ -721,7 +770,7 @@ impl LinkTask {
         let mut letters = 0;
         loop {
             let frame = reader.next(|arriving| self.buffer_for(arriving));
-            let frame = frame.map_err(|e| ConnectionEnd::ProtocolViolation(e.to_string()))?;
+            let frame = frame.map_err(|error| self.end_by(&error))?;
             let Some(frame) = frame else { break };
             let events: [Option<Event>; 2];
             {
@@ -771,6 +820,18 @@ impl LinkTask {
             link.received.notify_waiters();
         }
         Ok(())
+    }
+
+    /// Returns the end of the connection by these bytes of the peer.
+    fn end_by(&self, error: &FrameError) -> ConnectionEnd {
+        match (error, &self.peer) {
+            (FrameError::Version(peer), None) => ConnectionEnd::OtherVersion {
+                peer: *peer,
+                own: VERSION,
+                is_process: self.endpoint.is_within_host(),
+            },
+            _ => ConnectionEnd::ProtocolViolation(error.to_string()),
+        }
     }
 
     /// Returns memory of the sink for announced content of an introduced peer.
@@ -890,9 +951,18 @@ fn again(error: &TransportError) -> TransportError {
     TransportError::new(TransportErrorKind::Congested, detail)
 }
 
-/// Writes the remaining bytes, closes this direction, and waits until the peer closes the other:
-/// closing a socket with unread bytes would discard the bytes that are on their way to the peer.
-async fn close_gracefully(link: &Link, mut read: Reading) {
+/// Returns the end of a connection by an error of its wire.
+fn end_of(error: &io::Error) -> ConnectionEnd {
+    #[cfg(feature = "secure")]
+    if let Some(failure) = TlsFailure::in_error(error) {
+        return ConnectionEnd::Tls(failure.to_string());
+    }
+    ConnectionEnd::Broken(error.to_string())
+}
+
+/// Writes the remaining bytes, closes this direction, and waits until the peer closes the other or has sent `most`
+/// bytes: closing a socket with unread bytes would discard the bytes that are on their way to the peer.
+async fn close_gracefully(link: &Link, mut read: Reading, most: usize) {
     loop {
         let writer = {
             let mut state = link.state.lock();
@@ -909,5 +979,5 @@ async fn close_gracefully(link: &Link, mut read: Reading) {
         }
     }
     link.state.lock().writer = None;
-    read.drain().await;
+    read.drain(most).await;
 }

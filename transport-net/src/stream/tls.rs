@@ -20,6 +20,7 @@ use tokio_rustls::{TlsAcceptor, TlsConnector};
 use super::frame::Space;
 use super::proof::Proof;
 use super::wire::{Reading, Writing};
+use crate::secure::advice::TlsFailure;
 use crate::secure::{Security, advice};
 
 /// First byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
@@ -53,7 +54,7 @@ pub(crate) async fn accept(
     let handshake = timeout(patience, acceptor.accept(stream)).await;
     let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
     let (stream, session) = handshake
-        .map_err(|error| handshake_error(&error))?
+        .map_err(|error| handshake_error(&error, ACCEPT_CAUSES))?
         .into_inner();
     secured(security, stream, session.into())
 }
@@ -71,7 +72,7 @@ pub(crate) async fn connect(
     let handshake = timeout(patience, connector.connect(name, stream)).await;
     let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
     let (stream, session) = handshake
-        .map_err(|error| handshake_error(&error))?
+        .map_err(|error| handshake_error(&error, CONNECT_CAUSES))?
         .into_inner();
     secured(security, stream, session.into())
 }
@@ -89,18 +90,22 @@ fn is_end(error: &io::Error) -> bool {
     )
 }
 
-fn handshake_error(error: &io::Error) -> String {
+/// The possible causes if a peer that this side dialed closes the connection without an alert.
+const CONNECT_CAUSES: &str = "possible causes: this host has keys and the peer has none (set security.keys there \
+                              (`fipa keys init`) and trust each other's certificates, or remove \
+                              security.keys here), the peer is ending or has too many connections, or no fipa \
+                              gateway listens there";
+
+/// The same for a peer that began TLS, and therefore has keys.
+const ACCEPT_CAUSES: &str = "the peer may have ended or given up; see its log";
+
+/// Returns the error text for a failed handshake. `causes` are those of an end without an alert.
+fn handshake_error(error: &io::Error, causes: &str) -> String {
     let inner = error.get_ref().and_then(|it| it.downcast_ref());
     match inner {
-        Some(inner) => format!(
-            "TLS handshake failed: {} ({})",
-            advice::in_words(&error.to_string()),
-            advice::of_error(inner)
-        ),
+        Some(inner) => format!("TLS handshake failed: {}", advice::told(inner)),
         None if is_end(error) => format!(
-            "the peer closed the connection during the TLS handshake ({error}): this host has keys and \
-             the peer has none; set security.keys there (`fipa keys init`) and trust each other's \
-             certificates, or remove security.keys here"
+            "the peer closed the connection during the TLS handshake and sent no alert ({error}); {causes}"
         ),
         None => format!("TLS handshake failed: {error}"),
     }
@@ -237,11 +242,7 @@ impl Incoming {
             let processed = session.process_new_packets();
             // In TLS 1.3 a client completes the handshake before the server has accepted its
             // certificate.
-            processed.map_err(|error| {
-                let text = advice::in_words(&error.to_string());
-                let told = format!("{text} ({})", advice::of_error(&error));
-                io::Error::new(io::ErrorKind::InvalidData, told)
-            })?;
+            processed.map_err(|error| TlsFailure::io(advice::told(&error)))?;
         }
     }
 }

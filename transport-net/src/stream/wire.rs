@@ -243,15 +243,16 @@ impl Reading {
         }
     }
 
-    /// Waits until the peer has closed its direction, and discards the bytes that arrive until
-    /// then.
-    pub(crate) async fn drain(&mut self) {
+    /// Waits until the peer has closed its direction or has sent `most` bytes, and discards the bytes that arrive
+    /// until then.
+    pub(crate) async fn drain(&mut self, most: usize) {
         match self {
-            Self::Unix(socket) => drain(socket).await,
+            Self::Unix(socket) => drain(socket, most).await,
             #[cfg(feature = "ip")]
-            Self::Plain(socket) => drain(socket).await,
+            Self::Plain(socket) => drain(socket, most).await,
             #[cfg(feature = "secure")]
-            Self::Tls(socket, _) => drain(socket).await,
+            Self::Tls(socket, _) => drain(socket, most).await,
+            // The receive window bounds the bytes.
             #[cfg(feature = "quic")]
             Self::Streams(control, _) => control.drain().await,
         }
@@ -265,9 +266,15 @@ async fn read(socket: &mut (impl AsyncRead + Unpin), space: &mut Space<'_>) -> i
     }
 }
 
-async fn drain(socket: &mut (impl AsyncRead + Unpin)) {
+async fn drain(socket: &mut (impl AsyncRead + Unpin), most: usize) {
     let mut ignored = [0; 4096];
-    while matches!(socket.read(&mut ignored).await, Ok(1..)) {}
+    let mut left = most;
+    while left > 0 {
+        match socket.read(&mut ignored).await {
+            Ok(len @ 1..) => left = left.saturating_sub(len),
+            _ => return,
+        }
+    }
 }
 
 impl Writing {

@@ -191,7 +191,7 @@ async fn receive(
             let why = "the peer has keys and began TLS, but this gateway has no keys: set \
                        security.keys here (`fipa keys init`) and trust each other's certificates, \
                        or remove security.keys there";
-            endpoint.refusals.add(from.ip(), why);
+            endpoint.config.refusals.add(from.ip(), why);
             why.to_owned()
         }
         First::Byte(byte) => format!("unknown protocol: the first byte is {byte:#04x}"),
@@ -382,7 +382,7 @@ async fn prove(
         First::Silence => "no byte arrived in time (handshake_timeout)".to_owned(),
     };
     if matches!(first, First::Byte(_)) {
-        endpoint.refusals.add(from.ip(), &refused);
+        endpoint.config.refusals.add(from.ip(), &refused);
     }
     count(&endpoint.tally().refused_unproved);
     log_limit::warn!(of: quota_address(from.ip()), "{from}: connection refused: {refused}");

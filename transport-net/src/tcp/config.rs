@@ -1,7 +1,7 @@
 //! Configuration of a TCP endpoint.
 
-use super::refusals::Refusals;
 use crate::Identity;
+use crate::refusals::Refusals;
 use crate::stream::config::Limits;
 
 /// Configuration of a [`TcpTransport`](crate::TcpTransport).
@@ -21,7 +21,7 @@ pub struct TcpConfig {
     /// is unproved, even if it claims this host and domain, and must also prove its identity when
     /// `security` is set.
     pub processes: bool,
-    /// Receives the connections that are refused because of keys.
+    /// Receives the connections that are refused because of keys or of another version of the protocol.
     pub refusals: Refusals,
     /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]

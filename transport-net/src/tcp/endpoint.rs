@@ -7,7 +7,6 @@ use std::sync::Arc;
 use fipa_transport::{Abandoned, AttemptId, Location, Signature};
 
 use super::legacy::Legacy;
-use super::refusals::Refusals;
 use crate::stream::endpoint::Endpoint;
 
 /// An endpoint that also exchanges unframed letters with legacy peers.
@@ -17,16 +16,13 @@ pub(super) struct TcpEndpoint {
     pub(super) stream: Arc<Endpoint>,
     /// Letters of legacy peers, in both directions.
     pub(super) legacy: Legacy,
-    /// Receives the connections that are refused because of keys.
-    pub(super) refusals: Refusals,
 }
 
 impl TcpEndpoint {
-    pub(super) fn new(stream: Arc<Endpoint>, refusals: Refusals) -> Arc<Self> {
+    pub(super) fn new(stream: Arc<Endpoint>) -> Arc<Self> {
         Arc::new(Self {
             stream,
             legacy: Legacy::default(),
-            refusals,
         })
     }
 

@@ -6,7 +6,6 @@
 //! * [`accept_queue`]: the order in which accepted connections are read.
 //! * [`unframed`]: letters from legacy peers, on the same port.
 //! * [`legacy_sender`]: letters to legacy peers, in their [dialect](crate::legacy::dialect).
-//! * [`refusals`]: connections that were refused because of keys.
 //! * [`legacy`]: the state of both, which an [`endpoint`] holds beside its framed connections.
 
 mod accept;
@@ -16,7 +15,6 @@ mod dial;
 mod endpoint;
 mod legacy;
 mod legacy_sender;
-mod refusals;
 mod unframed;
 
 use std::sync::Arc;
@@ -30,7 +28,6 @@ use tokio::runtime::Handle;
 pub use self::config::TcpConfig;
 use self::endpoint::TcpEndpoint;
 use self::legacy_sender::TcpSender;
-pub use self::refusals::{Refusal, Refusals};
 use crate::end::ConnectionEnd;
 use crate::sockets;
 use crate::stream::config::StreamConfig;
@@ -77,12 +74,13 @@ impl TcpTransport {
             identity,
             limits,
             processes,
+            refusals,
             #[cfg(feature = "secure")]
             security,
         };
         Self {
             listen,
-            endpoint: TcpEndpoint::new(Endpoint::new(Kind::Tcp, config, runtime), refusals),
+            endpoint: TcpEndpoint::new(Endpoint::new(Kind::Tcp, config, runtime)),
         }
     }
 

@@ -28,7 +28,7 @@ use super::received::Received;
 use super::recovery::{Recovery, SentContent};
 use crate::answer::{self, Contradictions};
 use crate::datagrams::{Outbound, Path};
-use crate::end::ConnectionEnd;
+use crate::end::{Acquaintance, ConnectionEnd};
 use crate::hello::Hello;
 use crate::rate_limit::PeerRateLimit;
 use crate::stream::budget::{Meter, ReservedBytes};
@@ -605,13 +605,16 @@ impl Connection {
             let conclusion = if id <= taken {
                 Conclusion::Unconfirmed(end.after())
             } else {
-                Conclusion::NotSent(end.before(true))
+                Conclusion::NotSent(end.before(Acquaintance::Greeted))
             };
             concluded.push((attempt, conclusion));
         }
-        let greeted = self.peer.is_some();
+        let peer = match self.peer {
+            Some(_) => Acquaintance::Greeted,
+            None => Acquaintance::Unknown,
+        };
         for outgoing in std::mem::take(&mut self.waiting) {
-            let conclusion = Conclusion::NotSent(end.before(greeted));
+            let conclusion = Conclusion::NotSent(end.before(peer));
             concluded.push((outgoing.attempt, conclusion));
         }
         let speechless = matches!(

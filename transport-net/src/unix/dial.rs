@@ -37,7 +37,7 @@ pub(super) async fn dial(
     };
     let (stream, number) = match connected {
         Ok(connected) => connected,
-        Err(error) => return running.fail(ConnectionEnd::unreachable(&to, &error)),
+        Err(error) => return running.fail(ConnectionEnd::unreachable(&to, &in_words(&error))),
     };
     let ends = match wire::unix(stream) {
         Ok(ends) => ends,
@@ -49,6 +49,16 @@ pub(super) async fn dial(
     running
         .serve(ends, Proof::default(), reader, from, || {})
         .await;
+}
+
+/// Returns the text for an error of connecting.
+fn in_words(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::ConnectionRefused | io::ErrorKind::NotFound => {
+            format!("the process at this socket has ended or is ending: {error}")
+        }
+        _ => error.to_string(),
+    }
 }
 
 async fn connect(

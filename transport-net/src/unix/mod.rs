@@ -97,6 +97,8 @@ impl UnixTransport {
             limits,
             #[cfg(feature = "ip")]
             processes: false,
+            #[cfg(feature = "ip")]
+            refusals: crate::Refusals::default(),
             #[cfg(feature = "secure")]
             security: None,
         };

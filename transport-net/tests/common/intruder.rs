@@ -69,14 +69,17 @@ pub(crate) fn hello_and_letter() -> Vec<u8> {
 
 /// Sends them over TLS, and returns the reply.
 pub(crate) fn greet_tls(config: ClientConfig, at: &str) -> Result<Vec<u8>, String> {
+    say_tls(config, at, &hello_and_letter())
+}
+
+/// Sends these bytes over TLS, and returns the reply.
+pub(crate) fn say_tls(config: ClientConfig, at: &str, said: &[u8]) -> Result<Vec<u8>, String> {
     let stream = TcpStream::connect(at).unwrap();
     stream.set_read_timeout(Some(WATCHDOG)).unwrap();
     let name = ServerName::try_from("127.0.0.1").unwrap();
     let session = ClientConnection::new(Arc::new(config), name).unwrap();
     let mut stream = StreamOwned::new(session, stream);
-    stream
-        .write_all(&hello_and_letter())
-        .map_err(|error| error.to_string())?;
+    stream.write_all(said).map_err(|error| error.to_string())?;
     let mut answer = vec![0; 24];
     match stream.read_exact(&mut answer) {
         Ok(()) => Ok(answer),
@@ -88,6 +91,14 @@ pub(crate) fn greet_tls(config: ClientConfig, at: &str) -> Result<Vec<u8>, Strin
 pub(crate) fn hear_tls(
     config: ServerConfig,
 ) -> (SocketAddr, std::thread::JoinHandle<Result<Vec<u8>, String>>) {
+    answer_tls(config, Vec::new())
+}
+
+/// Accepts one TLS connection, and returns the bytes of the other side. Then answers with these bytes.
+pub(crate) fn answer_tls(
+    config: ServerConfig,
+    answer: Vec<u8>,
+) -> (SocketAddr, std::thread::JoinHandle<Result<Vec<u8>, String>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap();
     let heard = std::thread::spawn(move || {
@@ -95,10 +106,11 @@ pub(crate) fn hear_tls(
         stream.set_read_timeout(Some(WATCHDOG)).unwrap();
         let session = ServerConnection::new(Arc::new(config)).unwrap();
         let mut heard = vec![0; 24];
-        match StreamOwned::new(session, stream).read_exact(&mut heard) {
-            Ok(()) => Ok(heard),
-            Err(error) => Err(error.to_string()),
-        }
+        let mut stream = StreamOwned::new(session, stream);
+        let read = stream.read_exact(&mut heard);
+        read.and_then(|()| stream.write_all(&answer))
+            .map_err(|error| error.to_string())?;
+        Ok(heard)
     });
     (at, heard)
 }
@@ -113,6 +125,15 @@ pub(crate) fn quic(mut tls: ClientConfig, protocol: &[u8], version: u32) -> quin
 
 /// Sends them over QUIC, and returns the reply.
 pub(crate) fn greet_quic(config: quinn::ClientConfig, at: &str) -> Result<Vec<u8>, String> {
+    say_quic(config, at, &hello_and_letter())
+}
+
+/// Sends these bytes over QUIC, and returns the reply.
+pub(crate) fn say_quic(
+    config: quinn::ClientConfig,
+    at: &str,
+    said: &[u8],
+) -> Result<Vec<u8>, String> {
     runtime().block_on(async {
         let endpoint = quinn::Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
         let connecting = endpoint
@@ -125,7 +146,7 @@ pub(crate) fn greet_quic(config: quinn::ClientConfig, at: &str) -> Result<Vec<u8
                 .await
                 .map_err(|error| error.to_string());
             let (mut send, mut receive) = opened?;
-            let sent = send.write_all(&hello_and_letter()).await;
+            let sent = send.write_all(said).await;
             sent.map_err(|error| error.to_string())?;
             let mut answer = vec![0; 24];
             let read = receive.read_exact(&mut answer).await;

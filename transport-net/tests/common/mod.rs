@@ -137,6 +137,7 @@ pub(crate) fn quic_config(
             ..config.limits
         },
         security,
+        refusals: config.refusals,
     }
 }
 

@@ -18,7 +18,10 @@ use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader};
 use zerocopy::FromBytes;
 
 use super::super::budget::{ContentBuffer, Meter, ReservedBytes};
-use super::{Frame, FrameError, FrameHeader, HEADER_LEN, MAGIC, PARCEL, PARCEL_ALLOWANCE};
+use super::{
+    COMMON_LEN, Frame, FrameError, FrameHeader, HEADER_LEN, MAGIC, PARCEL, PARCEL_ALLOWANCE,
+    VERSION,
+};
 
 /// Size of the buffer for headers and small bodies, in bytes.
 pub(super) const CHUNK: usize = 16 * 1024;
@@ -294,6 +297,12 @@ impl FrameReader {
             let mut found = [0; 4];
             found[..begun].copy_from_slice(&self.chunk[..begun]);
             return Err(FrameError::Magic(found));
+        }
+        // The rest of a header of another version may have another length.
+        if let Some([.., version, _, _, _]) = self.chunk.get(..COMMON_LEN)
+            && *version != VERSION
+        {
+            return Err(FrameError::Version(*version));
         }
         let Ok((header, _)) = FrameHeader::read_from_prefix(&self.chunk) else {
             return Ok(None);

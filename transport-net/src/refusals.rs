@@ -1,4 +1,4 @@
-//! The latest connections that were refused because the keys of the two sides do not match.
+//! The latest connections that were refused because the keys or the protocol versions of the two sides do not match.
 
 use std::collections::VecDeque;
 use std::net::IpAddr;
@@ -8,8 +8,8 @@ use std::time::Instant;
 use fipa_transport::quota_address;
 use parking_lot::Mutex;
 
-/// A connection that was refused because only one side has keys, or because a side does not trust the
-/// certificate of the other.
+/// A connection that was refused because only one side has keys, because a side does not trust the
+/// certificate of the other, or because the sides speak different versions of the protocol.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Refusal {
