@@ -195,7 +195,7 @@ pub use fipa_sds::{
     NameError, Pattern, PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
 #[doc(hidden)]
-pub use fipa_transport::log_limit;
+pub use fipa_transport::{log_limit, threads};
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, IncarnationError, Kind, ListenError, Location,
     LocationError, Outcome, Signature, TransportError, TransportErrorKind,

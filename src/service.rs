@@ -65,6 +65,9 @@ pub(crate) struct Role<'a> {
     /// Receives the TCP connections that are refused because of keys.
     #[cfg(feature = "net")]
     pub(crate) refusals: fipa_transport_net::Refusals,
+    /// Receives the connections of this side that peers refuse.
+    #[cfg(feature = "net")]
+    pub(crate) refused_dials: fipa_transport_net::RefusedDials,
     /// Creates the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
 }
@@ -214,7 +217,9 @@ impl Service {
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
             neighbours: Vec::new(),
             refused: Vec::new(),
+            refused_dials: Vec::new(),
             contested: Vec::new(),
+            namesakes: Vec::new(),
             configuration: BTreeMap::new(),
         }
     }
@@ -456,6 +461,7 @@ fn tcp(
     tcp.limits = stream_limits(config);
     tcp.processes = config.transport.tcp.processes;
     tcp.refusals = role.refusals.clone();
+    tcp.refused_dials = role.refused_dials.clone();
     #[cfg(feature = "secure")]
     {
         tcp.security = role.security.clone();
@@ -494,6 +500,7 @@ fn quic(
         listen: config.transport.quic.listen.clone(),
         identity: identity(config, role, dir, incarnation)?,
         limits: stream_limits(config),
+        refused_dials: role.refused_dials.clone(),
         security: security.clone(),
     };
     Ok(Arc::new(QuicTransport::new(config, handle.clone())))

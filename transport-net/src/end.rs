@@ -120,6 +120,19 @@ impl ConnectionEnd {
         }
     }
 
+    /// Returns the reason for which the peer refused a connection of this side, for an end before the peer has
+    /// introduced itself. `None` if this side ended it, or if it was not opened.
+    pub(crate) fn refusal(&self) -> Option<TransportError> {
+        match self {
+            Self::Goodbye { .. } | Self::Hangup | Self::Broken(_) | Self::ProtocolViolation(_) => {
+                Some(self.before(false))
+            }
+            #[cfg(feature = "secure")]
+            Self::Distrusted | Self::Expired => Some(self.after()),
+            _ => None,
+        }
+    }
+
     /// Returns the error of parcels that the peer may have received.
     pub(crate) fn after(&self) -> TransportError {
         let (fault, detail) = match self {

@@ -44,6 +44,7 @@ mod quic;
     expect(dead_code, reason = "the processes of this host may send any number")
 )]
 mod rate_limit;
+mod refused_dials;
 #[cfg(feature = "secure")]
 pub mod secure;
 #[cfg(feature = "ip")]
@@ -64,6 +65,7 @@ pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;
 #[cfg(feature = "quic")]
 pub use quic::{QuicConfig, QuicTransport};
+pub use refused_dials::{RefusedDial, RefusedDials};
 pub use stream::config::Limits;
 pub use stream::counters::Counters;
 #[cfg(feature = "ip")]

@@ -813,6 +813,9 @@ impl LinkTask {
                             "another certificate belongs to this service",
                         ));
                     }
+                    let service = introduction.hop.location.incarnation();
+                    let refused_dials = &self.endpoint.config.refused_dials;
+                    refused_dials.connected(self.dialled.as_ref(), service);
                     self.peer = Some(introduction);
                 }
                 self.link.state.lock().connection.welcome();
@@ -868,6 +871,11 @@ impl Drop for LinkTask {
             }
             state.connection.end(&self.end)
         };
+        if let (Some(to), None) = (&self.dialled, &self.peer)
+            && let Some(refusal) = self.end.refusal()
+        {
+            self.endpoint.config.refused_dials.add(to, &refusal.detail);
+        }
         let detour = self.peer.is_none() && self.endpoint.has_detour(&self.link);
         self.endpoint.left(&self.link, &self.end);
         for (attempt, conclusion) in concluded {

@@ -70,12 +70,14 @@ impl TcpTransport {
             limits,
             processes,
             refusals,
+            refused_dials,
             #[cfg(feature = "secure")]
             security,
         } = config;
         let config = StreamConfig {
             identity,
             limits,
+            refused_dials,
             processes,
             #[cfg(feature = "secure")]
             security,
