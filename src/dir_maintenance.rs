@@ -117,9 +117,7 @@ impl DirMaintenance {
             }
             let mut joining = self.clone();
             let runtime = Handle::current();
-            let joined = background::run(&runtime, move |_| {
-                joining.rejoin().map(|()| joining)
-            });
+            let joined = background::run(&runtime, move |_| joining.rejoin().map(|()| joining));
             match joined.await.unwrap_or_else(|error| Err(error.into())) {
                 Ok(joined) => {
                     self = joined;

@@ -429,7 +429,10 @@ fn not_writable(path: &Path, source: io::Error) -> DomainDirError {
     let (problem, remedy) = match Errno::from_io_error(&source) {
         Some(Errno::NOSPC) => match rustix::fs::statvfs(path) {
             Ok(found) if found.f_files > 0 && found.f_favail == 0 => (
-                format!("its file system has no inodes left: 0 of {} are free", found.f_files),
+                format!(
+                    "its file system has no inodes left: 0 of {} are free",
+                    found.f_files
+                ),
                 format!("delete files there (`df -i {at}`), or {ANOTHER}"),
             ),
             Ok(found) => {

@@ -34,7 +34,7 @@ use fipa_sds::{
 use fipa_transport::{
     Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
 };
-use fipa_transport_net::{RefusedDials, Refusals};
+use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -44,8 +44,8 @@ use self::exchange::{Exchanging, Means};
 use self::gateway_agent::GatewayAgent;
 #[cfg(feature = "secure")]
 use self::guard::Guard;
-pub use self::neighbours::Neighbour;
 use self::namesakes::Namesakes;
+pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::platform_agents::PlatformAgents;
 #[cfg(feature = "fuzzing")]
@@ -199,7 +199,14 @@ impl Gateway {
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
         let contacted = Arc::clone(&contacts.directory);
-        gateway.open_for_letters(config, known, contacts, refusals, refused_dials, predecessor)?;
+        gateway.open_for_letters(
+            config,
+            known,
+            contacts,
+            refusals,
+            refused_dials,
+            predecessor,
+        )?;
         #[cfg(feature = "secure")]
         gateway.tasks.extend(guard.map(|guard| {
             let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));

@@ -172,7 +172,17 @@ impl Service {
             service.abort();
             return Err(OpenError::NoTransport(reasons(config, &refused)));
         }
+        // A transport does not know that its directory is the cause.
+        let cause = match refused.is_empty() {
+            true => None,
+            false => service.dir.check_writable().err(),
+        };
+        let cause = cause.map(|cause| ErrorChain(&cause).to_string());
         for (kind, error) in &refused {
+            let error = cause
+                .as_ref()
+                .filter(|_| kind.is_host_local())
+                .unwrap_or(error);
             log_limit::warn!(%kind, error, "a transport cannot be used; continuing without it");
         }
         Ok(service)

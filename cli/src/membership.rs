@@ -153,7 +153,9 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
             domain,
             remedy,
         ),
-        OpenError::DomainDir(error @ DomainDirError::NotWritable { .. }) => not_writable(&error, domain),
+        OpenError::DomainDir(error @ DomainDirError::NotWritable { .. }) => {
+            not_writable(&error, domain)
+        }
         OpenError::Thread(error) => Failure::failed(
             ErrorChain(&error).to_string(),
             domain,
@@ -261,10 +263,14 @@ pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) 
             "the command line",
             "use a name within these limits",
         ),
-        RegisterError::Failed(ref error) if let Some(cause) = error.downcast_ref::<DomainDirError>() => {
+        RegisterError::Failed(ref error)
+            if let Some(cause) = error.downcast_ref::<DomainDirError>() =>
+        {
             not_writable(cause, domain)
         }
-        RegisterError::Failed(ref error) if let Some(cause) = error.downcast_ref::<ThreadError>() => {
+        RegisterError::Failed(ref error)
+            if let Some(cause) = error.downcast_ref::<ThreadError>() =>
+        {
             Failure::failed(
                 ErrorChain(cause).to_string(),
                 domain,

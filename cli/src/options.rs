@@ -187,9 +187,8 @@ pub(crate) fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     })?;
     let mut builder = runtime::Builder::new_multi_thread();
     let runtime = builder.worker_threads(workers).enable_all().build();
-    let runtime = runtime.map_err(|error| {
-        failed(&error, "check the limit on open files: `ulimit -n`")
-    })?;
+    let runtime =
+        runtime.map_err(|error| failed(&error, "check the limit on open files: `ulimit -n`"))?;
     let done = runtime.block_on(work);
     let began = Instant::now();
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
@@ -200,7 +199,9 @@ pub(crate) fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
 /// The number of worker threads, which is that of tokio: `TOKIO_WORKER_THREADS`, or one per processor.
 fn workers() -> usize {
     let given = std::env::var("TOKIO_WORKER_THREADS").ok();
-    let given = given.and_then(|text| text.parse().ok()).filter(|it| *it > 0);
+    let given = given
+        .and_then(|text| text.parse().ok())
+        .filter(|it| *it > 0);
     given.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
 }
 

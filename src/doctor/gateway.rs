@@ -292,13 +292,20 @@ mod tests {
         let [(Verdict::Doubtful, refused)] = of(REFUSED_DIALS)[..] else {
             panic!("{checks:?}");
         };
-        assert!(refused.starts_with("tcp://10.0.0.2:7788, 7 s ago: not"), "{refused}");
+        assert!(
+            refused.starts_with("tcp://10.0.0.2:7788, 7 s ago: not"),
+            "{refused}"
+        );
         assert!(!refused.contains('\u{1b}'), "{refused}");
         let [(Verdict::Bad, own), (Verdict::Doubtful, others)] = of(NAMESAKES)[..] else {
             panic!("{checks:?}");
         };
-        assert!(own.contains("the name of this one, crex: it is at tcp://"), "{own}");
-        let expected = "several gateways have the name crex: tcp://10.0.0.2:7788, tcp://10.0.0.3:7788";
+        assert!(
+            own.contains("the name of this one, crex: it is at tcp://"),
+            "{own}"
+        );
+        let expected =
+            "several gateways have the name crex: tcp://10.0.0.2:7788, tcp://10.0.0.3:7788";
         assert_eq!(others, expected);
     }
 

@@ -14,7 +14,7 @@ use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Contacts as _, letter_for};
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
 use fipa_transport::{Incarnation, log_limit};
-use fipa_transport_net::{RefusedDials, Refusals};
+use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
 
 use super::KnownPeers;
@@ -196,7 +196,12 @@ impl GatewayAgent {
         let report = routes::Report {
             neighbours: neighbours.map(Into::into).collect(),
             refused: self.refusals.latest().into_iter().map(Into::into).collect(),
-            refused_dials: self.refused_dials.latest().into_iter().map(Into::into).collect(),
+            refused_dials: self
+                .refused_dials
+                .latest()
+                .into_iter()
+                .map(Into::into)
+                .collect(),
             contested: self.exchange.contested(),
             namesakes: self.namesakes.found(Instant::now()),
             configuration: self.configuration.lock().clone(),

@@ -190,12 +190,18 @@ mod tests {
     fn a_gateway_that_was_restarted_is_no_other_one_of_its_name() {
         let now = Instant::now();
         let both = |now| {
-            let others = [gateway("crex", 2, Some(now)), gateway("crex", 3, Some(now + TOGETHER))];
+            let others = [
+                gateway("crex", 2, Some(now)),
+                gateway("crex", 3, Some(now + TOGETHER)),
+            ];
             others.into_iter()
         };
         // The connection of the former one ends within this time.
         let later = now + TOGETHER * 2;
-        assert_eq!(found(later - Duration::from_millis(1), "sherpa", both(now)), []);
+        assert_eq!(
+            found(later - Duration::from_millis(1), "sherpa", both(now)),
+            []
+        );
         let found = found(later, "sherpa", both(now));
         assert_eq!(found.len(), 1, "{found:?}");
         assert!(!found[0].is_own && found[0].is_proved, "{found:?}");

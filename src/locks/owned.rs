@@ -264,7 +264,9 @@ impl Drop for Owned {
         let none_was_live = self.shared.disown(&self.core, &self.resource);
         if let Some(files) = self.files.take() {
             let runtime = &self.core.endpoint.domain.inner.service.runtime;
-            drop(background::finish(runtime, move || files.close(none_was_live)));
+            drop(background::finish(runtime, move || {
+                files.close(none_was_live)
+            }));
         }
     }
 }

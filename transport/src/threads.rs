@@ -217,7 +217,10 @@ mod tests {
         assert!(limit(&root).contains("RLIMIT_NPROC"), "{}", limit(&root));
         write("sys/fs/cgroup/robot.slice/pids.current", "9\n");
         let of_group = limit(&root);
-        assert!(of_group.contains("the control group /robot.slice "), "{of_group}");
+        assert!(
+            of_group.contains("the control group /robot.slice "),
+            "{of_group}"
+        );
         assert!(of_group.contains("TasksMax="), "{of_group}");
         std::fs::remove_dir_all(root).unwrap();
     }
