@@ -39,19 +39,19 @@ pub(super) fn connect_all(
     checks: &mut Vec<Check>,
 ) {
     let (sender, done) = mpsc::channel();
-    for (name, address) in addresses.take(MAX_CHECKED) {
-        let sender = sender.clone();
-        let (there, at) = (name.clone(), address.clone());
-        let started = threads::spawn(move || drop(sender.send(check(title, &there, &at))));
+    for (place, (name, address)) in addresses.take(MAX_CHECKED).enumerate() {
+        let (done, there, at) = (sender.clone(), name.clone(), address.clone());
+        let started =
+            threads::spawn(move || drop(done.send((place, check(title, &there, &at)))));
         if started.is_err() {
             // Without another thread, one after the other.
-            checks.push(check(title, &name, &address));
+            let _ = sender.send((place, check(title, &name, &address)));
         }
     }
     drop(sender);
-    let mut checked: Vec<Check> = done.iter().collect();
-    checked.sort_by(|one, other| one.found.cmp(&other.found));
-    checks.extend(checked);
+    let mut checked: Vec<(usize, Check)> = done.iter().collect();
+    checked.sort_by_key(|(place, _)| *place);
+    checks.extend(checked.into_iter().map(|(_, check)| check));
 }
 
 fn check(title: &'static str, name: &str, address: &str) -> Check {

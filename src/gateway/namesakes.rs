@@ -76,6 +76,7 @@ impl Namesakes {
             let incarnation = entry.mts.incarnation;
             if entry.mts.name.as_deref() != Some(own)
                 || incarnation == self.own.incarnation
+                || !incarnation.is_known()
                 || !matches!(entry.reach, Reach::Remote { .. })
                 || others.len() >= MAX_GATEWAYS
             {
