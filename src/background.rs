@@ -213,9 +213,7 @@ mod tests {
     #[test]
     fn a_panic_is_passed_on() {
         let runtime = Builder::new_current_thread().build().unwrap();
-        let caught = std::panic::catch_unwind(|| {
-            runtime.block_on(run(runtime.handle(), |_| panic!("here")))
-        });
+        let caught = catch_unwind(|| runtime.block_on(run(runtime.handle(), |_| panic!("here"))));
         assert!(caught.is_err());
     }
 

@@ -41,8 +41,7 @@ pub(super) fn connect_all(
     let (sender, done) = mpsc::channel();
     for (place, (name, address)) in addresses.take(MAX_CHECKED).enumerate() {
         let (done, there, at) = (sender.clone(), name.clone(), address.clone());
-        let started =
-            threads::spawn(move || drop(done.send((place, check(title, &there, &at)))));
+        let started = threads::spawn(move || drop(done.send((place, check(title, &there, &at)))));
         if started.is_err() {
             // Without another thread, one after the other.
             let _ = sender.send((place, check(title, &name, &address)));
