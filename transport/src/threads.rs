@@ -161,12 +161,11 @@ fn full_group(root: &Path) -> Option<(PathBuf, u64)> {
         text.trim().parse::<u64>().ok()
     };
     let group = Path::new(group.trim_start_matches('/'));
-    let full = group.ancestors().take(MAX_GROUPS).find_map(|group| {
+    group.ancestors().take(MAX_GROUPS).find_map(|group| {
         let most = number(group, "pids.max")?;
         let current = number(group, "pids.current")?;
         (current >= most).then(|| (Path::new("/").join(group), most))
-    });
-    full
+    })
 }
 
 /// Returns the maximum number of processes and threads of this user, if it has one.

@@ -127,10 +127,10 @@ impl UnixTransport {
             sleep(TIDY_AFTER).await;
             tidying.store(false, Ordering::Release);
             let directory = bound.lock().as_ref().map(|it| it.directory.clone());
-            if let Some(directory) = directory {
-                if let Err(error) = threads::spawn(move || directory.sweep()) {
-                    log_limit::warn!(%error, "cannot remove the sockets of ended processes now");
-                }
+            if let Some(directory) = directory
+                && let Err(error) = threads::spawn(move || directory.sweep())
+            {
+                log_limit::warn!(%error, "cannot remove the sockets of ended processes now");
             }
         });
     }
