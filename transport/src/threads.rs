@@ -176,7 +176,6 @@ fn max_of_user(root: &Path) -> Option<u64> {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a panic fails the test")]
 mod tests {
     use std::sync::mpsc;
 
