@@ -92,10 +92,21 @@ impl Domain {
         self.inner.owner.check()?;
         let (domain, name) = (self.clone(), name.to_owned());
         let registered = background::run(&self.inner.service.runtime, move |cancellation| {
-            domain.register_unless(&name, options, cancellation)
+            let registered = domain.register_unless(&name, options, cancellation);
+            registered.map_err(|error| domain.explained(error))
         });
-        // Without a runtime, the domain has no tasks any more.
-        registered.await.unwrap_or(Err(RegisterError::Closed))
+        registered.await?
+    }
+
+    /// Replaces an error that was caused by a directory of the domain in which no file can be written.
+    fn explained(&self, error: RegisterError) -> RegisterError {
+        if !matches!(error, RegisterError::Failed(_)) {
+            return error;
+        }
+        match self.inner.service.dir.check_writable() {
+            Err(cause) => RegisterError::Failed(Arc::new(cause)),
+            Ok(()) => error,
+        }
     }
 
     /// Registers an agent on the calling thread.

@@ -1,44 +1,146 @@
 //! Blocking calls on behalf of a future.
 //!
 //! Joining a domain and registering a name wait for other processes by polling file locks, and write
-//! files, which takes seconds on a slow disk. They run on the runtime's threads for blocking calls.
+//! files, which takes seconds on a slow disk. They run on [threads] of their own. If the system refuses
+//! another thread, the call fails with an error that names the limit.
 
-use fipa_sds::Cancellation;
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::Arc;
+
+use fipa_sds::{Cancellation, RegisterError};
+use fipa_transport::threads::{self, ThreadError};
+#[cfg(any(feature = "net", feature = "locks"))]
+use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
-/// Runs `work` on a thread for blocking calls, and returns its result; `None` if the runtime shuts
-/// down. Dropping the future cancels the work, and a result that is not returned is dropped on such
-/// a thread as well, because dropping an agent or a domain waits for other processes, too.
+use crate::error::OpenError;
+
+/// The error if a blocking call has no result.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum BackgroundError {
+    /// The runtime has been shut down.
+    #[error("the runtime has been shut down")]
+    Ended,
+    /// The system refuses another thread.
+    #[error(transparent)]
+    Thread(#[from] ThreadError),
+    /// The call has panicked.
+    #[error("panicked: {}", message(.0))]
+    Panicked(Box<dyn Any + Send>),
+}
+
+impl From<BackgroundError> for OpenError {
+    fn from(error: BackgroundError) -> Self {
+        match error {
+            BackgroundError::Thread(error) => Self::Thread(error.into()),
+            _ => Self::NoRuntime,
+        }
+    }
+}
+
+impl From<BackgroundError> for RegisterError {
+    fn from(error: BackgroundError) -> Self {
+        match error {
+            BackgroundError::Thread(error) => Self::Failed(Arc::new(error)),
+            // Without a runtime, the domain has no tasks any more.
+            _ => Self::Closed,
+        }
+    }
+}
+
+/// Runs `work` on a thread of its own, within the context of the runtime, and returns its result.
+/// Dropping the future cancels the work, and a result that is not returned is dropped on such a thread
+/// as well, because dropping an agent or a domain waits for other processes, too. A panic is passed on.
 pub(crate) async fn run<T: Send + 'static>(
     runtime: &Handle,
     work: impl FnOnce(&Cancellation) -> T + Send + 'static,
-) -> Option<T> {
+) -> Result<T, BackgroundError> {
+    match try_run(runtime, work).await {
+        Err(BackgroundError::Panicked(panic)) => resume_unwind(panic),
+        other => other,
+    }
+}
+
+/// Runs `work` like [`run`]. A panic is an error.
+pub(crate) async fn try_run<T: Send + 'static>(
+    runtime: &Handle,
+    work: impl FnOnce(&Cancellation) -> T + Send + 'static,
+) -> Result<T, BackgroundError> {
+    if has_ended(runtime) {
+        return Err(BackgroundError::Ended);
+    }
     let cancellation = Cancellation::new();
     let (sender, result) = oneshot::channel();
     let mut pending = Pending {
         result,
         cancellation: cancellation.clone(),
-        runtime: runtime.clone(),
     };
-    let thread = runtime.spawn_blocking(move || {
+    let inside = runtime.clone();
+    threads::spawn(move || {
+        let _inside = inside.enter();
+        let done = catch_unwind(AssertUnwindSafe(|| work(&cancellation)));
         // A result that has no receiver any more is dropped here.
-        drop(sender.send(work(&cancellation)));
+        drop(sender.send(done));
+    })?;
+    match (&mut pending.result).await {
+        Ok(done) => done.map_err(BackgroundError::Panicked),
+        Err(_) => Err(BackgroundError::Ended),
+    }
+}
+
+/// Runs `work` on a thread of its own, within the context of the runtime, and returns its end. If the system
+/// refuses another thread, the work has ended on the calling one, because it must not be left out.
+#[cfg(any(feature = "net", feature = "locks"))]
+pub(crate) fn finish<W: FnOnce() + Send + 'static>(
+    runtime: &Handle,
+    work: W,
+) -> impl Future<Output = ()> + Send + use<W> {
+    let (sender, ended) = oneshot::channel::<()>();
+    let work = Arc::new(Mutex::new(Some(work)));
+    let (inside, taken) = (runtime.clone(), Arc::clone(&work));
+    let started = threads::spawn(move || {
+        let _inside = inside.enter();
+        let _ended = sender;
+        run_once(&taken);
     });
-    if let Ok(result) = (&mut pending.result).await {
-        return Some(result);
+    if started.is_err() {
+        run_once(&work);
     }
-    match thread.await {
-        Err(error) if error.is_panic() => std::panic::resume_unwind(error.into_panic()),
-        _ => None,
+    async {
+        // The end drops the sender.
+        let _ = ended.await;
     }
+}
+
+#[cfg(any(feature = "net", feature = "locks"))]
+fn run_once(work: &Mutex<Option<impl FnOnce()>>) {
+    let work = work.lock().take();
+    if let Some(work) = work {
+        work();
+    }
+}
+
+/// Whether the runtime has been shut down. It then drops a task at once.
+fn has_ended(runtime: &Handle) -> bool {
+    let task = runtime.spawn(std::future::pending::<()>());
+    let ended = task.is_finished();
+    task.abort();
+    ended
+}
+
+/// Returns the message of a panic.
+fn message(panic: &Box<dyn Any + Send>) -> &str {
+    let text = panic.downcast_ref::<&str>().copied();
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str))
+        .unwrap_or("no message")
 }
 
 /// The result of work that may not have ended.
 struct Pending<T: Send + 'static> {
-    result: oneshot::Receiver<T>,
+    result: oneshot::Receiver<std::thread::Result<T>>,
     cancellation: Cancellation,
-    runtime: Handle,
 }
 
 impl<T: Send + 'static> Drop for Pending<T> {
@@ -46,7 +148,8 @@ impl<T: Send + 'static> Drop for Pending<T> {
         self.cancellation.cancel();
         self.result.close();
         if let Ok(result) = self.result.try_recv() {
-            drop(self.runtime.spawn_blocking(move || drop(result)));
+            // Without another thread, it is dropped here.
+            let _ = threads::spawn(move || drop(result));
         }
     }
 }
@@ -110,9 +213,25 @@ mod tests {
     #[test]
     fn a_panic_is_passed_on() {
         let runtime = Builder::new_current_thread().build().unwrap();
-        let caught = std::panic::catch_unwind(|| {
-            runtime.block_on(run(runtime.handle(), |_| panic!("here")))
-        });
+        let caught = catch_unwind(|| runtime.block_on(run(runtime.handle(), |_| panic!("here"))));
         assert!(caught.is_err());
+    }
+
+    #[test]
+    fn without_a_runtime_no_work_is_begun() {
+        let runtime = Builder::new_current_thread().build().unwrap();
+        let handle = runtime.handle().clone();
+        drop(runtime);
+        let other = Builder::new_current_thread().build().unwrap();
+        let ran = other.block_on(run(&handle, |_| ()));
+        assert!(matches!(ran, Err(BackgroundError::Ended)));
+    }
+
+    #[test]
+    fn a_panic_is_an_error_with_its_message() {
+        let runtime = Builder::new_current_thread().build().unwrap();
+        let ran = runtime.block_on(try_run(runtime.handle(), |_| panic!("here: {}", 7)));
+        let error: BackgroundError = ran.map(|(): ()| ()).unwrap_err();
+        assert_eq!(error.to_string(), "panicked: here: 7");
     }
 }

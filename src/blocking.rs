@@ -35,6 +35,7 @@ use std::time::Duration;
 
 use fipa_acl::{BuildError, Message, MessageBuilder, Performative};
 use fipa_sds::{Cancellation, DeregisterError, RegisterError};
+use fipa_transport::threads;
 use tokio::runtime::{Builder, Handle, Runtime};
 
 use crate::config::Sources;
@@ -98,6 +99,8 @@ struct Waiter(Handle);
 
 impl Background {
     fn start() -> std::io::Result<Self> {
+        // The start of a runtime panics if the system refuses its thread.
+        threads::check(1)?;
         let runtime = Builder::new_multi_thread()
             .worker_threads(1)
             .thread_name("fipa")

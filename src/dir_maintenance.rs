@@ -11,8 +11,10 @@ use fipa_transport::log_limit;
 use fipa_transport_net::{UnixError, UnixTransport};
 #[cfg(feature = "shm")]
 use fipa_transport_shm::{ShmError, ShmTransport};
+use tokio::runtime::Handle;
 use tokio::time::{Instant, sleep, sleep_until};
 
+use crate::background::{self, BackgroundError};
 use crate::domain_dir::{DomainDir, DomainDirError};
 
 /// Time between two checks for removed files while the kernel reports no removals.
@@ -52,6 +54,8 @@ enum RejoinError {
     Shm(#[from] ShmError),
     #[error(transparent)]
     Unix(#[from] UnixError),
+    #[error(transparent)]
+    Background(#[from] BackgroundError),
 }
 
 impl DirMaintenance {
@@ -88,7 +92,11 @@ impl DirMaintenance {
                         renewal = Instant::now() + RENEW_EVERY;
                         let dir = self.dir.clone();
                         // There may be many files on a slow SD card.
-                        let _ = tokio::task::spawn_blocking(move || dir.renew()).await;
+                        let runtime = Handle::current();
+                        let renewed = background::run(&runtime, move |_| dir.renew());
+                        if let Err(error) = renewed.await {
+                            log_limit::warn!(%error, "cannot renew the timestamps of {}", self.dir.path().display());
+                        }
                     }
                 }
                 continue;
@@ -108,21 +116,22 @@ impl DirMaintenance {
                 problem = Some(String::new());
             }
             let mut joining = self.clone();
-            let joined = tokio::task::spawn_blocking(move || joining.rejoin().map(|()| joining));
-            match joined.await {
-                Ok(Ok(joined)) => {
+            let runtime = Handle::current();
+            let joined = background::run(&runtime, move |_| joining.rejoin().map(|()| joining));
+            match joined.await.unwrap_or_else(|error| Err(error.into())) {
+                Ok(joined) => {
                     self = joined;
                     log_limit::info!("joined the domain in {} again", self.dir.path().display());
                 }
-                Ok(Err(error)) => {
+                // The runtime is shutting down.
+                Err(RejoinError::Background(BackgroundError::Ended)) => return,
+                Err(error) => {
                     let text = ErrorChain(&error).to_string();
                     if problem.as_ref() != Some(&text) {
                         log_limit::error!(error = text, "cannot join the domain again; retrying");
                     }
                     problem = Some(text);
                 }
-                // The runtime is shutting down.
-                Err(_) => return,
             }
         }
     }

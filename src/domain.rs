@@ -108,9 +108,10 @@ impl Domain {
         let runtime = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let config = config.clone();
         let opened = background::run(&runtime, move |cancellation| {
-            Self::join(&config, brief, cancellation)
+            let joined = Self::join(&config, brief, cancellation);
+            joined.map_err(|error| error.explained(&config.domain))
         });
-        opened.await.unwrap_or(Err(OpenError::NoRuntime))
+        opened.await?
     }
 
     /// Joins the domain on a thread for blocking calls.
@@ -130,6 +131,8 @@ impl Domain {
                 security: None,
                 #[cfg(feature = "net")]
                 refusals: fipa_transport_net::Refusals::default(),
+                #[cfg(feature = "net")]
+                refused_dials: fipa_transport_net::RefusedDials::default(),
                 view: &|host, _| Ok(host),
             },
             cancellation,

@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use bytesize::ByteSize;
 use fipa_transport::log_limit;
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
@@ -49,6 +50,9 @@ const HOST: &str = "host";
 /// Files that end with the last process of the domain: that with the host identifier, and the state of
 /// the gateway with its next version.
 const FILES: [&str; 3] = [HOST, DomainDir::STATE, DomainDir::NEXT_STATE];
+
+/// Length of the file that is written to test a directory: about that of the files of one process.
+const PROBE: usize = 16 << 10;
 
 /// Maximum length of a host identifier, in bytes.
 const MAX_HOST: usize = 128;
@@ -82,6 +86,18 @@ pub enum DomainDirError {
     Io {
         /// The directory.
         path: PathBuf,
+        /// The error of the operating system.
+        source: io::Error,
+    },
+    /// No file can be written in the directory.
+    #[error("{} cannot be used: {problem}; {remedy}", path.display())]
+    NotWritable {
+        /// The directory.
+        path: PathBuf,
+        /// The cause, for example `its file system is full: 0 B free of 1.0 MiB`.
+        problem: String,
+        /// The remedy, for example to delete files.
+        remedy: String,
         /// The error of the operating system.
         source: io::Error,
     },
@@ -236,6 +252,26 @@ impl DomainDir {
         Ok(true)
     }
 
+    /// Checks that files can be written in both levels, and in the directory above if the upper level does
+    /// not exist. Writes a file without a name, which the kernel removes.
+    ///
+    /// # Errors
+    /// [`DomainDirError::NotWritable`] with the cause.
+    pub(crate) fn check_writable(&self) -> Result<(), DomainDirError> {
+        let [base, domain] = self.levels();
+        let base = base.ancestors().find(|path| path.is_dir());
+        let base = base.unwrap_or(Path::new("/"));
+        for path in [base, &domain] {
+            match write_in(path) {
+                Ok(()) => {}
+                // The first process of the domain creates it.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => return Err(not_writable(path, error)),
+            }
+        }
+        Ok(())
+    }
+
     /// Returns the name of the domain.
     #[cfg(feature = "locks")]
     pub(crate) fn name(&self) -> &str {
@@ -361,6 +397,81 @@ fn is_same(directory: &OwnedFd, path: &Path) -> bool {
         (Ok(held), Ok(found)) => (held.st_dev, held.st_ino) == (found.st_dev, found.st_ino),
         (_, Err(Errno::NOENT | Errno::NOTDIR)) => false,
         _ => true,
+    }
+}
+
+/// Writes a file in a directory, and removes it.
+fn write_in(directory: &Path) -> io::Result<()> {
+    let (flags, mode) = (OFlags::WRONLY | OFlags::CLOEXEC, Mode::RUSR | Mode::WUSR);
+    let mut named = None;
+    let opened = match rustix::fs::open(directory, flags | OFlags::TMPFILE, mode) {
+        // The file system has no files without a name.
+        Err(Errno::OPNOTSUPP | Errno::ISDIR | Errno::INVAL) => {
+            let number = getrandom::u64().map_err(io::Error::other)?;
+            let path = named.insert(directory.join(format!(".fipa-doctor-{number:016x}")));
+            rustix::fs::open(&*path, flags | OFlags::CREATE | OFlags::EXCL, mode)
+        }
+        opened => opened,
+    };
+    let mut file = fs::File::from(opened?);
+    // Some file systems report a lack of room only when the bytes reach the disk.
+    let written = file.write_all(&[0; PROBE]).and_then(|()| file.sync_data());
+    if let Some(path) = named {
+        fs::remove_file(path)?;
+    }
+    written
+}
+
+/// Returns the error for a directory in which no file can be written, with the cause and the remedy.
+fn not_writable(path: &Path, source: io::Error) -> DomainDirError {
+    let user = || user_name(rustix::process::geteuid().as_raw());
+    let at = path.display();
+    let (problem, remedy) = match Errno::from_io_error(&source) {
+        Some(Errno::NOSPC) => match rustix::fs::statvfs(path) {
+            Ok(found) if found.f_files > 0 && found.f_favail == 0 => (
+                format!(
+                    "its file system has no inodes left: 0 of {} are free",
+                    found.f_files
+                ),
+                format!("delete files there (`df -i {at}`), or {ANOTHER}"),
+            ),
+            Ok(found) => {
+                let size = |blocks: u64| ByteSize::b(blocks.saturating_mul(found.f_frsize));
+                let (free, total) = (size(found.f_bavail), size(found.f_blocks));
+                (
+                    format!("its file system is full: {free} free of {total}"),
+                    format!("delete files on it or enlarge it (`df -h {at}`), or {ANOTHER}"),
+                )
+            }
+            Err(_) => (
+                "its file system is full".to_owned(),
+                format!("delete files on it, or {ANOTHER}"),
+            ),
+        },
+        Some(Errno::DQUOT) => (
+            format!("the disk quota of {} is used up", user()),
+            format!("delete files of this user, raise its quota, or {ANOTHER}"),
+        ),
+        Some(Errno::ROFS) => (
+            "its file system is read-only".to_owned(),
+            format!(
+                "mount it writable (`findmnt -T {at}` shows the mount, `dmesg` an error of the disk), or {ANOTHER}"
+            ),
+        ),
+        Some(Errno::ACCESS | Errno::PERM) => (
+            format!("{} may not write in it", user()),
+            format!("give the directory to this user (`ls -ld {at}`), or {ANOTHER}"),
+        ),
+        _ => (
+            "no file can be written in it".to_owned(),
+            format!("repair it, or {ANOTHER}"),
+        ),
+    };
+    DomainDirError::NotWritable {
+        path: path.to_owned(),
+        problem,
+        remedy,
+        source,
     }
 }
 

@@ -15,7 +15,7 @@ use fipa_sds::{EntryError, HostError, RegisterError};
 use fipa_transport::{Forked, Kind, ListenError};
 
 use crate::config::{ConfigError, RuleError};
-use crate::domain_dir::DomainDirError;
+use crate::domain_dir::{DomainDir, DomainDirError};
 #[cfg(feature = "secure")]
 use crate::keys::KeysError;
 
@@ -85,6 +85,27 @@ pub enum OpenError {
     #[cfg(feature = "mdns")]
     #[error("cannot start the discovery by multicast DNS")]
     Mdns(#[source] MdnsError),
+}
+
+impl OpenError {
+    /// Replaces an error that was caused by a directory of the domain in which no file can be written.
+    pub(crate) fn explained(self, domain: &str) -> Self {
+        let may_be_caused = matches!(
+            self,
+            Self::DomainDir(DomainDirError::Io { .. })
+                | Self::Directory(_)
+                | Self::NoTransport(_)
+                | Self::Name(RegisterError::Failed(_))
+                | Self::Watch(_)
+        );
+        if !may_be_caused {
+            return self;
+        }
+        match DomainDir::of(domain).check_writable() {
+            Err(cause) => cause.into(),
+            Ok(()) => self,
+        }
+    }
 }
 
 /// The error if a message is not sent.

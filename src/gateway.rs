@@ -10,6 +10,7 @@ mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
 mod names;
+mod namesakes;
 mod neighbours;
 mod platform_agents;
 mod presence;
@@ -33,7 +34,7 @@ use fipa_sds::{
 use fipa_transport::{
     Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
 };
-use fipa_transport_net::Refusals;
+use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -43,6 +44,7 @@ use self::exchange::{Exchanging, Means};
 use self::gateway_agent::GatewayAgent;
 #[cfg(feature = "secure")]
 use self::guard::Guard;
+use self::namesakes::Namesakes;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::platform_agents::PlatformAgents;
@@ -89,9 +91,10 @@ impl Gateway {
         let runtime = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let config = config.clone();
         let opened = background::run(&runtime, move |cancellation| {
-            Self::start(&config, cancellation)
+            let started = Self::start(&config, cancellation);
+            started.map_err(|error| error.explained(&config.domain))
         });
-        opened.await.unwrap_or(Err(OpenError::NoRuntime))
+        opened.await?
     }
 
     /// Starts the gateway on a thread for blocking calls.
@@ -106,7 +109,7 @@ impl Gateway {
         let contacts = Arc::new(KnownPeers::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
         let made = Mutex::new(None);
-        let refusals = Refusals::default();
+        let (refusals, refused_dials) = (Refusals::default(), RefusedDials::default());
         let service = Service::start(
             config,
             Role {
@@ -117,6 +120,7 @@ impl Gateway {
                 #[cfg(feature = "secure")]
                 security: guard.as_ref().map(Guard::security),
                 refusals: refusals.clone(),
+                refused_dials: refused_dials.clone(),
                 view: &|host, mts| {
                     contacts.neighbours.name_own(&config.mts.name);
                     let network = network(config, mts)?;
@@ -195,7 +199,14 @@ impl Gateway {
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
         let contacted = Arc::clone(&contacts.directory);
-        gateway.open_for_letters(config, known, contacts, refusals, predecessor)?;
+        gateway.open_for_letters(
+            config,
+            known,
+            contacts,
+            refusals,
+            refused_dials,
+            predecessor,
+        )?;
         #[cfg(feature = "secure")]
         gateway.tasks.extend(guard.map(|guard| {
             let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));
@@ -214,9 +225,17 @@ impl Gateway {
         known: Arc<MergedDirectory>,
         contacts: Arc<KnownPeers>,
         refusals: Refusals,
+        refused_dials: RefusedDials,
         predecessor: Arc<Predecessor>,
     ) -> Result<(), OpenError> {
         let means = self.means()?;
+        let namesakes = Arc::new(Namesakes {
+            own: self.service.own.clone(),
+            neighbours: Arc::clone(&self.neighbours),
+            known: Arc::clone(&known),
+            has_keys: means.has_keys,
+        });
+        self.tasks.push(tokio::spawn(Arc::clone(&namesakes).run()));
         let gateway_agent = GatewayAgent {
             service: Arc::clone(&self.service),
             id: means.id.clone(),
@@ -226,6 +245,8 @@ impl Gateway {
             contacts,
             configuration: Arc::clone(&self.configuration),
             refusals,
+            refused_dials,
+            namesakes,
             questions: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));
@@ -387,14 +408,11 @@ impl Gateway {
         }
         if let Some(network) = self.network.take() {
             // Closing blocks until the goodbye has been sent.
-            let goodbye = tokio::task::spawn_blocking(move || network.close()).await;
-            if let Err(error) = goodbye {
-                log_limit::warn!(%error, "the directory of the network was not closed properly");
-            }
+            background::finish(&self.service.runtime, move || network.close()).await;
         }
         // Before the domain is left: the last process removes the file.
         let state = Arc::clone(&self.state);
-        let _ = tokio::task::spawn_blocking(move || {
+        background::finish(&self.service.runtime, move || {
             state.write();
             state.close();
         })
@@ -481,7 +499,7 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
         let registered = background::run(&service.runtime, move |cancellation| {
             register(&registering, cancellation)
         });
-        if let Some(Err(error)) = registered.await {
+        if let Err(error) = registered.await.unwrap_or_else(|error| Err(error.into())) {
             log_limit::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
         }
         service.mts.greet(neighbours.to_greet(Instant::now()));

@@ -194,12 +194,12 @@ pub use fipa_sds::{
     Change, DeregisterError, Entry, EntryError, HostError, Matcher, Members, MembersError,
     NameError, Pattern, PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
-#[doc(hidden)]
-pub use fipa_transport::log_limit;
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, IncarnationError, Kind, ListenError, Location,
     LocationError, Outcome, Signature, TransportError, TransportErrorKind,
 };
+#[doc(hidden)]
+pub use fipa_transport::{log_limit, threads};
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};
 pub use incoming::Incoming;

@@ -51,6 +51,14 @@ pub struct Report {
     /// the latest, of at most 16 addresses.
     #[serde(default)]
     pub refused: Vec<RefusedConnection>,
+    /// The connections of the service that peers have refused, the latest first; empty unless the service
+    /// is a gateway. Of each address the latest, of at most 16 addresses. A connection that succeeds
+    /// removes the refusals of its peer.
+    #[serde(default)]
+    pub refused_dials: Vec<RefusedDial>,
+    /// The names that several gateways have, at most 16; empty unless the service is a gateway.
+    #[serde(default)]
+    pub namesakes: Vec<Namesakes>,
     /// The agents of the host whose names agents of other hosts also have, at most 64; empty unless the
     /// service is a gateway.
     #[serde(default)]
@@ -114,6 +122,32 @@ pub struct RefusedConnection {
     pub why: String,
     /// Seconds since the refusal.
     pub seconds: u64,
+}
+
+/// A connection of a gateway that a peer has refused.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct RefusedDial {
+    /// The dialed location.
+    pub to: Location,
+    /// The reason as far as it is known. It may contain text from the peer.
+    pub why: String,
+    /// Seconds since the refusal.
+    pub seconds: u64,
+}
+
+/// Gateways with the same name.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct Namesakes {
+    /// The name.
+    pub name: String,
+    /// Whether it is the name of the gateway that reports.
+    pub is_own: bool,
+    /// A location of each other gateway with the name, at most 8.
+    pub at: Vec<Location>,
+    /// Whether certificates prove all of these gateways. Without, the name is their claim.
+    pub is_proved: bool,
 }
 
 /// The security of the connections with a gateway. All connections with one gateway have the same.
@@ -231,6 +265,17 @@ impl From<fipa_transport_net::Refusal> for RefusedConnection {
             from: refusal.from,
             seconds: refusal.at.elapsed().as_secs(),
             why: refusal.why,
+        }
+    }
+}
+
+#[cfg(feature = "net")]
+impl From<fipa_transport_net::RefusedDial> for RefusedDial {
+    fn from(refused: fipa_transport_net::RefusedDial) -> Self {
+        Self {
+            to: refused.to,
+            seconds: refused.at.elapsed().as_secs(),
+            why: refused.why,
         }
     }
 }

@@ -65,6 +65,9 @@ pub(crate) struct Role<'a> {
     /// Receives the TCP connections that are refused because of keys.
     #[cfg(feature = "net")]
     pub(crate) refusals: fipa_transport_net::Refusals,
+    /// Receives the connections of this side that peers refuse.
+    #[cfg(feature = "net")]
+    pub(crate) refused_dials: fipa_transport_net::RefusedDials,
     /// Creates the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
 }
@@ -169,7 +172,17 @@ impl Service {
             service.abort();
             return Err(OpenError::NoTransport(reasons(config, &refused)));
         }
+        // A transport does not know that its directory is the cause.
+        let cause = match refused.is_empty() {
+            true => None,
+            false => service.dir.check_writable().err(),
+        };
+        let cause = cause.map(|cause| ErrorChain(&cause).to_string());
         for (kind, error) in &refused {
+            let error = cause
+                .as_ref()
+                .filter(|_| kind.is_host_local())
+                .unwrap_or(error);
             log_limit::warn!(%kind, error, "a transport cannot be used; continuing without it");
         }
         Ok(service)
@@ -214,7 +227,9 @@ impl Service {
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
             neighbours: Vec::new(),
             refused: Vec::new(),
+            refused_dials: Vec::new(),
             contested: Vec::new(),
+            namesakes: Vec::new(),
             configuration: BTreeMap::new(),
         }
     }
@@ -456,6 +471,7 @@ fn tcp(
     tcp.limits = stream_limits(config);
     tcp.processes = config.transport.tcp.processes;
     tcp.refusals = role.refusals.clone();
+    tcp.refused_dials = role.refused_dials.clone();
     #[cfg(feature = "secure")]
     {
         tcp.security = role.security.clone();
@@ -494,6 +510,7 @@ fn quic(
         listen: config.transport.quic.listen.clone(),
         identity: identity(config, role, dir, incarnation)?,
         limits: stream_limits(config),
+        refused_dials: role.refused_dials.clone(),
         security: security.clone(),
         refusals: role.refusals.clone(),
     };

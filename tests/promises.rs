@@ -499,6 +499,7 @@ impl RepeatingPeer {
                     listen,
                     identity,
                     limits,
+                    refused_dials: fipa_transport_net::RefusedDials::default(),
                     security,
                     refusals: fipa_transport_net::Refusals::default(),
                 };

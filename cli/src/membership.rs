@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use clap::Args;
 use fipa::routes::{self, AskError, Report};
+use fipa::threads::ThreadError;
 use fipa::{
     Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
     OpenError, Reach, RegisterError, RegisterOptions, Role, contact,
@@ -66,8 +67,9 @@ impl Stop {
     /// second signal ends the process at once; the next process of the domain removes the files that
     /// it leaves behind.
     pub(crate) fn ending() {
-        // A thread and a runtime of its own: all threads of the command may be blocked.
-        std::thread::spawn(|| {
+        // A thread and a runtime of its own: all threads of the command may be blocked. If the system refuses
+        // it, a second signal changes nothing.
+        let _ = std::thread::Builder::new().spawn(|| {
             // Some programs, for example `timeout`, send the signal twice.
             std::thread::sleep(SIGNAL_GRACE);
             let signaled = options::block_on(async {
@@ -151,6 +153,14 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
             domain,
             remedy,
         ),
+        OpenError::DomainDir(error @ DomainDirError::NotWritable { .. }) => {
+            not_writable(&error, domain)
+        }
+        OpenError::Thread(error) => Failure::failed(
+            ErrorChain(&error).to_string(),
+            domain,
+            "raise the limit that the message names, or end processes",
+        ),
         OpenError::NoTransport(_) => Failure::failed(
             ErrorChain(&error).to_string(),
             domain,
@@ -161,6 +171,27 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
             domain,
             "check whether this user can write to $FIPA_RUNTIME_DIR, or to /tmp/fipa-<user id> when it is \
              not set: the processes of a domain meet there",
+        ),
+    }
+}
+
+/// The error report for a directory of the domain in which no file can be written.
+fn not_writable(error: &DomainDirError, domain: String) -> Failure {
+    match error {
+        DomainDirError::NotWritable {
+            path,
+            problem,
+            remedy,
+            source,
+        } => Failure::failed(
+            format!("{} cannot be used: {problem} ({source})", path.display()),
+            domain,
+            remedy,
+        ),
+        other => Failure::failed(
+            ErrorChain(other).to_string(),
+            domain,
+            "`fipa doctor` checks the directory of the domain",
         ),
     }
 }
@@ -232,6 +263,20 @@ pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) 
             "the command line",
             "use a name within these limits",
         ),
+        RegisterError::Failed(ref error)
+            if let Some(cause) = error.downcast_ref::<DomainDirError>() =>
+        {
+            not_writable(cause, domain)
+        }
+        RegisterError::Failed(ref error)
+            if let Some(cause) = error.downcast_ref::<ThreadError>() =>
+        {
+            Failure::failed(
+                ErrorChain(cause).to_string(),
+                domain,
+                "raise the limit that the message names, or end processes",
+            )
+        }
         other => Failure::failed(
             ErrorChain(&other).to_string(),
             domain,

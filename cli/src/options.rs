@@ -1,14 +1,15 @@
 //! The command line: the options all commands share.
 
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::{
     ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser, ValueHint,
 };
 use fipa::Config;
 use fipa::config::{ConfigError, Effective, Sources};
-use tokio::runtime::Runtime;
+use fipa::{ErrorChain, threads};
+use tokio::runtime;
 
 use crate::command::Command;
 use crate::complete;
@@ -172,16 +173,36 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 /// Runs a future to completion on a new runtime. A thread that is still blocked afterwards, for
 /// example in a name lookup without an answer or in a read of standard input, ends with the process.
 pub(crate) fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
-    let runtime = Runtime::new().map_err(|error| {
-        Failure::failed(
-            format!("cannot start the worker threads: {error}"),
-            "this process",
-            "check the limits on threads and open files: `ulimit -u`, `ulimit -n`",
+    let failed = |error: &(dyn std::error::Error + 'static), help: &str| {
+        let problem = format!("cannot start the worker threads: {}", ErrorChain(error));
+        Failure::failed(problem, "this process", help)
+    };
+    let workers = workers();
+    // The start of a runtime panics if the system refuses its threads.
+    threads::check(workers).map_err(|error| {
+        failed(
+            &error,
+            &format!("raise the limit that the message names; this command needs {workers} threads and some more"),
         )
     })?;
+    let mut builder = runtime::Builder::new_multi_thread();
+    let runtime = builder.worker_threads(workers).enable_all().build();
+    let runtime =
+        runtime.map_err(|error| failed(&error, "check the limit on open files: `ulimit -n`"))?;
     let done = runtime.block_on(work);
+    let began = Instant::now();
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
+    threads::wait(SHUTDOWN_TIMEOUT.saturating_sub(began.elapsed()));
     Ok(done)
+}
+
+/// The number of worker threads, which is that of tokio: `TOKIO_WORKER_THREADS`, or one per processor.
+fn workers() -> usize {
+    let given = std::env::var("TOKIO_WORKER_THREADS").ok();
+    let given = given
+        .and_then(|text| text.parse().ok())
+        .filter(|it| *it > 0);
+    given.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
 }
 
 #[cfg(test)]

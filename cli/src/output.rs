@@ -116,8 +116,9 @@ impl Reader {
     /// Starts watching standard output.
     pub(crate) fn of_output() -> Self {
         let (gone, reader) = oneshot::channel();
-        // This thread ends with the process at the latest: only the loss of the reader ends `poll`.
-        std::thread::spawn(move || {
+        // This thread ends with the process at the latest: only the loss of the reader ends `poll`. If the system
+        // refuses it, the loss is not detected.
+        let _ = std::thread::Builder::new().spawn(move || {
             let stdout = io::stdout();
             let mut watched = [PollFd::new(&stdout, PollFlags::empty())];
             while let Err(Errno::INTR) = poll(&mut watched, None) {}

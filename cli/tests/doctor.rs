@@ -7,9 +7,10 @@ mod common;
 
 use std::fs::{Permissions, set_permissions};
 use std::os::unix::fs::PermissionsExt;
+use std::process::Output;
 
 use common::{Host, Running, unshared};
-use fipa_testbed::until;
+use fipa_testbed::{until, until_some};
 use serde_json::Value;
 
 /// The verdict and the finding of a check.
@@ -182,4 +183,153 @@ fn without_inotify_letters_are_delivered_and_the_doctor_names_the_sysctl() {
     assert_eq!(code, Some(0), "{log}");
     let times = log.matches("fs.inotify.max_user_instances").count();
     assert_eq!(times, 1, "{log}");
+}
+
+/// Runs a command of a host whose runtime directory is a file system of its own, with these options of mount.
+/// `filled` is a line of shell that runs in the directory first.
+fn with_file_system(
+    host: &Host,
+    options: &str,
+    filled: &str,
+    arguments: &[&str],
+) -> Option<Output> {
+    let run = host.path("run");
+    let _ = std::fs::create_dir(&run);
+    let run = run.display();
+    let mount = format!(
+        "mount -t tmpfs -o mode=700,{options} tmpfs {run} && cd {run} && {{ {filled}; }} 2>/dev/null; cd /"
+    );
+    let mut command = unshared(&host.command(arguments), &["--mount"], &mount)?;
+    Some(command.output().unwrap())
+}
+
+#[test]
+fn a_runtime_directory_without_room_is_bad_and_agents_name_it_as_the_cause() {
+    let host = Host::new();
+    let run = host.path("run").display().to_string();
+    let fill = "head -c 1M /dev/zero >junk";
+    let domain = format!("mkdir -m 700 {}; {fill}", host.domain);
+    for (options, filled, cause, remedy) in [
+        (
+            "size=128k",
+            fill,
+            "its file system is full: 0 B free of 128.0 KiB",
+            "df -h",
+        ),
+        (
+            "size=128k",
+            &*domain,
+            "its file system is full: 0 B free of 128.0 KiB",
+            "df -h",
+        ),
+        (
+            "size=1M,nr_inodes=3",
+            "touch a b c",
+            "no inodes left: 0 of 3 are free",
+            "df -i",
+        ),
+        (
+            "size=128k",
+            "mount -o remount,ro .",
+            "its file system is read-only",
+            "mount it writable",
+        ),
+    ] {
+        let ran = |arguments: &[&str]| {
+            let output = with_file_system(&host, options, filled, arguments)?;
+            let errors = String::from_utf8(output.stderr).unwrap();
+            assert_eq!(output.status.code(), Some(1), "{filled}: {errors}");
+            Some((output.stdout, errors))
+        };
+        let Some((report, _)) = ran(&["doctor", "--json"]) else {
+            return;
+        };
+        let report: Value = serde_json::from_slice(&report).unwrap();
+        let (verdict, found) = check(&report, "room in the directory of the domain");
+        assert_eq!(verdict, "bad", "{found}");
+        assert!(found.contains(&run) && found.contains(cause), "{found}");
+        assert!(report.to_string().contains(remedy), "{report}");
+        for command in [&["echo", "parrot"][..], &["up"]] {
+            let (_, errors) = ran(command).unwrap();
+            for part in [&*run, cause, remedy, "FIPA_RUNTIME_DIR"] {
+                assert!(errors.contains(part), "{filled}: {errors}");
+            }
+            for blamed in ["limit of open files", "fipa agents"] {
+                assert!(!errors.contains(blamed), "{filled}: {errors}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_runtime_directory_with_room_is_fine_and_stays_as_it_is() {
+    let host = Host::new();
+    let _parrot = host.echo("parrot");
+    let files = || {
+        let domain = host.path("run").join(&host.domain);
+        let levels = [host.path("run"), domain];
+        let mut found = Vec::new();
+        for level in levels {
+            let entries = std::fs::read_dir(level).unwrap();
+            found.extend(entries.map(|entry| entry.unwrap().path()));
+        }
+        found.sort();
+        found
+    };
+    let before = files();
+    let report = host.run(&["doctor", "--json"]).done_json();
+    let (verdict, found) = check(&report, "room in the directory of the domain");
+    assert_eq!(verdict, "fine", "{found}");
+    assert_eq!(files(), before);
+}
+
+/// A gateway that restarts has another incarnation for a moment beside the former one, and no namesake.
+#[test]
+fn two_gateways_of_one_name_are_shown_on_both_hosts_and_a_restarted_one_is_not() {
+    let [near, far, other] = [Host::new(), Host::new(), Host::new()];
+    let up = |host: &Host, name: &str, peers: &[&str]| {
+        let peers = peers.iter().enumerate();
+        let peers = peers.map(|(number, at)| format!("peer{number} = [\"tcp://{at}\"]"));
+        let peers: Vec<String> = peers.collect();
+        let peers = format!("discovery.static={{ {} }}", peers.join(", "));
+        let name = format!("mts.name={name}");
+        let gateway = host.start(&["--set", &name, "--set", &peers, "up", "--json"]);
+        let address = gateway.tcp_address();
+        (gateway, address)
+    };
+    let checks = |host: &Host, name: &str| {
+        let report = host.run(&["doctor", "--json"]).done_json();
+        let checks = report["checks"].as_array().unwrap().iter();
+        let found = checks.filter(|check| check["check"] == name);
+        let found: Vec<Value> = found.cloned().collect();
+        found
+    };
+    let (_near_gateway, near_at) = up(&near, "twin", &[]);
+    let (_other_gateway, other_at) = up(&other, "other", &[]);
+    let (far_gateway, far_at) = up(&far, "twin", &[&near_at, &other_at]);
+    for (host, own, others) in [(&near, &near_at, &far_at), (&far, &far_at, &near_at)] {
+        let found = until_some("the doctor shows the name", || {
+            checks(host, "names of gateways").pop()
+        });
+        assert_eq!(found["verdict"], "doubtful", "{found}");
+        let text = found["found"].as_str().unwrap();
+        // The far gateway opened the connection, so the near one shows the port of that connection, too.
+        let there = others.rsplit_once(':').unwrap().0;
+        for part in ["the name of this one, twin", own, there] {
+            assert!(text.contains(part), "{text}");
+        }
+        assert!(
+            found["advice"].as_str().unwrap().contains("mts.name"),
+            "{found}"
+        );
+    }
+    far_gateway.signal("-KILL");
+    let (_far_gateway, _) = up(&far, "twin", &[&other_at]);
+    until("the restarted gateway is connected", || {
+        let connections = checks(&other, "connections with other gateways");
+        connections
+            .iter()
+            .any(|it| it["found"].as_str().unwrap().starts_with("twin:"))
+    });
+    assert_eq!(checks(&other, "names of gateways"), [] as [Value; 0]);
 }

@@ -7,7 +7,7 @@ mod common;
 use std::process::Command;
 
 use common::{Host, Running};
-use fipa_testbed::until;
+use fipa_testbed::{until, until_some};
 use serde_json::{Value, json};
 
 /// A host with keys.
@@ -171,6 +171,30 @@ fn finding(report: &Value, name: &str) -> (String, String) {
     let check = check.unwrap_or_else(|| panic!("no check {name}: {report}"));
     let text = |key: &str| check[key].as_str().unwrap().to_owned();
     (text("verdict"), text("found"))
+}
+
+#[test]
+fn a_refusal_by_the_peer_is_shown_on_the_host_of_the_sender_until_the_peer_accepts() {
+    let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+    rover.keys(&["trust", &crex.certificate()]);
+    let (_theirs, address) = crex.gateway(&[]);
+    let (_ours, _) = rover.gateway(&[(&crex.name, &address)]);
+    let refused = || {
+        let report = rover.host.run(&["doctor", "--json"]).done_json();
+        let checks = report["checks"].as_array().unwrap().iter();
+        let mut refused = checks.filter(|it| it["check"] == "connections that peers refused");
+        refused.next().cloned()
+    };
+    let check = until_some("the doctor shows the refusal", refused);
+    assert_eq!(check["verdict"], "doubtful", "{check}");
+    let found = check["found"].as_str().unwrap();
+    assert!(found.starts_with(&address), "{found}");
+    assert!(found.contains("trust"), "{found}");
+    crex.keys(&["trust", &rover.certificate()]);
+    until("the refusal is gone", || refused().is_none());
+    let report = rover.host.run(&["doctor", "--json"]).done_json();
+    let (verdict, found) = finding(&report, "connections with other gateways");
+    assert_eq!(verdict, "fine", "{found}");
 }
 
 #[test]

@@ -7,12 +7,14 @@ use std::time::Duration;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use tokio::runtime::Handle;
+
 use super::{Agent, Background, Waiter};
-use crate::AgentId;
 use crate::actions::{
     self, Action, ActionDescription, ActionError, Execution, Goal, GoalError, GoalStatus,
     OfferError, Term,
 };
+use crate::{AgentId, background};
 
 /// An offered action; see [`crate::actions::Offer`].
 #[derive(Debug)]
@@ -91,7 +93,8 @@ impl Agent {
         let offer = self.agent.offer(action, move |goal: G, execution| {
             let handler = Arc::clone(&handler);
             async move {
-                let handled = tokio::task::spawn_blocking(move || handler(goal, execution));
+                let runtime = Handle::current();
+                let handled = background::try_run(&runtime, move |_| handler(goal, execution));
                 match handled.await {
                     Ok(handled) => handled.map_err(|error| error.to_string()),
                     Err(error) => Err(error.to_string()),

@@ -8,12 +8,14 @@ use std::time::Duration;
 use bytes::Bytes;
 use fipa_acl::{Message, MessageBuilder, Performative};
 
+use tokio::runtime::Handle;
+
 use super::{Agent, Background, Waiter};
 use crate::protocol::{
     Auction, Awarded, Bids, ContractNet, Decision, DialogueError, PartnerEvent, PartnerWatch,
     Proxied, Publisher, Reply, Request, Server, Subscription, Task,
 };
-use crate::{AgentId, AgentIdError, Incoming};
+use crate::{AgentId, AgentIdError, Incoming, background};
 
 /// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
 /// [`Auction`], [`Proxied`] or [`Task`], or a [`Server`], [`Publisher`] or [`PartnerWatch`]. Dereferences to that type for the calls that do not wait.
@@ -243,9 +245,9 @@ impl Agent {
         let _context = self.runtime.enter();
         let server = self.agent.serve(protocol, move |task| {
             let (handler, side) = (Arc::clone(&handler), of_served(task, &runtime));
-            let handled = tokio::task::spawn_blocking(move || handler(side));
             async move {
-                match handled.await {
+                let runtime = Handle::current();
+                match background::try_run(&runtime, move |_| handler(side)).await {
                     Ok(handled) => handled.map_err(|error| error.to_string()),
                     Err(error) => Err(error.to_string()),
                 }

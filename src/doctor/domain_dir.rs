@@ -6,12 +6,40 @@ use fipa_acl::ErrorChain;
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::domain_dir::{DomainDir, user_name};
+use crate::domain_dir::{DomainDir, DomainDirError, user_name};
 
 const AREA: Area = Area("domain");
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
-    checks.push(directory(&DomainDir::of(&config.domain)));
+    let dir = DomainDir::of(&config.domain);
+    checks.push(directory(&dir));
+    checks.push(writing(&dir));
+}
+
+const WRITING: &str = "room in the directory of the domain";
+
+/// Writes a file in the directory.
+fn writing(dir: &DomainDir) -> Check {
+    match dir.check_writable() {
+        Ok(()) => AREA.fine(WRITING, "a file can be written there"),
+        Err(DomainDirError::NotWritable {
+            path,
+            problem,
+            remedy,
+            source,
+        }) => AREA.problem(
+            WRITING,
+            Verdict::Bad,
+            format!("{}: {problem} ({source})", path.display()),
+            remedy,
+        ),
+        Err(error) => AREA.problem(
+            WRITING,
+            Verdict::Bad,
+            ErrorChain(&error).to_string(),
+            "follow the remedy above; until then no process can join the domain",
+        ),
+    }
 }
 
 const CHECK: &str = "directory of the domain";

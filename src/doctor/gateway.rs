@@ -2,11 +2,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use fipa_acl::escape;
 use fipa_transport::Signature;
 
 use super::peers;
 use super::{Area, Check, Verdict};
-use crate::routes::{Connected, ContestedName, RefusedConnection, Report, StaticPeer};
+use crate::routes::{
+    Connected, ContestedName, Namesakes, RefusedConnection, RefusedDial, Report, StaticPeer,
+};
 use crate::{Config, Kind};
 
 const AREA: Area = Area("gateway");
@@ -14,6 +17,8 @@ const CONFIGURATION: &str = "configuration of the running gateway";
 const CONNECTIONS: &str = "connections with other gateways";
 const PEERS: &str = "static peers";
 const REFUSED: &str = "refused connections";
+const REFUSED_DIALS: &str = "connections that peers refused";
+const NAMESAKES: &str = "names of gateways";
 const NAMES: &str = "names of agents";
 const PORTS: &str = "ports of known gateways";
 
@@ -27,6 +32,8 @@ const RECENT: u64 = 60;
 /// The advice if a connection is refused.
 const REFUSED_ADVICE: &str =
     "do what the reason says; the gateways connect by themselves after the change";
+/// Age in seconds of the latest refusal of a connection of this gateway. Without letters, it does not try again.
+const RECENT_DIAL: u64 = 3_600;
 
 pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &mut Vec<Check>) {
     let report = match report {
@@ -43,6 +50,10 @@ pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &m
     checks.extend(report.contested.iter().map(contested));
     let recent = report.refused.iter().filter(|it| it.seconds <= RECENT);
     checks.extend(recent.map(refused));
+    let recent = report.refused_dials.iter();
+    let recent = recent.filter(|it| it.seconds <= RECENT_DIAL);
+    checks.extend(recent.map(refused_dial));
+    checks.extend(report.namesakes.iter().map(|it| namesakes(report, it)));
     peers::connect_all(PORTS, unconnected(config, report).into_iter(), checks);
 }
 
@@ -128,6 +139,47 @@ fn refused(refused: &RefusedConnection) -> Check {
     AREA.problem(REFUSED, Verdict::Doubtful, found, REFUSED_ADVICE)
 }
 
+/// Reports a connection of the gateway that a peer has refused.
+fn refused_dial(refused: &RefusedDial) -> Check {
+    let RefusedDial { to, why, seconds } = refused;
+    AREA.problem(
+        REFUSED_DIALS,
+        Verdict::Doubtful,
+        format!("{to}, {seconds} s ago: {}", escape(why)),
+        "do what the reason says, mostly on the host of that peer: `fipa doctor` and the log of its gateway show \
+         the refusal; with keys, both hosts trust each other's certificate (`fipa keys list`), and both run the \
+         same version",
+    )
+}
+
+/// Reports gateways with the same name.
+fn namesakes(report: &Report, found: &Namesakes) -> Check {
+    let name = escape(&found.name);
+    let at: Vec<String> = found.at.iter().map(ToString::to_string).collect();
+    let at = at.join(", ");
+    let own: Vec<String> = report.locations.iter().map(ToString::to_string).collect();
+    let text = match found.is_own {
+        true => format!(
+            "another gateway has the name of this one, {name}: it is at {at}; this one is at {}",
+            own.join(", ")
+        ),
+        false => format!("several gateways have the name {name}: {at}"),
+    };
+    // Without keys, any host can claim a name.
+    let verdict = match found.is_proved {
+        true => Verdict::Bad,
+        false => Verdict::Doubtful,
+    };
+    AREA.problem(
+        NAMESAKES,
+        verdict,
+        text,
+        "set mts.name on all but one of the hosts to names of their own, and restart their gateways; a host with \
+         keys then needs new ones (`fipa keys init` in an empty directory). Until then, lists and logs do not tell \
+         the hosts apart, and ams@NAME and df@NAME reach one of them only",
+    )
+}
+
 /// The TCP addresses of gateways that are known but not connected, without those of the configuration,
 /// which have a check of their own. Each has the name of an agent there.
 fn unconnected(config: &Config, report: &Report) -> Vec<(String, String)> {
@@ -207,6 +259,53 @@ mod tests {
             found.starts_with("the agent arm is also registered at the gateway crex:"),
             "{found}"
         );
+    }
+
+    #[test]
+    fn refusals_of_peers_and_gateways_of_one_name_are_listed() {
+        let config = Config::for_host("sherpa");
+        let mut report = report(&config);
+        let at = |text: &str| text.parse::<fipa_transport::Location>().unwrap();
+        for seconds in [7, RECENT_DIAL + 1] {
+            report.refused_dials.push(RefusedDial {
+                to: at("tcp://10.0.0.2:7788"),
+                why: "not\u{1b}[2J trusted".to_owned(),
+                seconds,
+            });
+        }
+        for (is_own, is_proved) in [(true, true), (false, false)] {
+            report.namesakes.push(Namesakes {
+                name: "crex".to_owned(),
+                is_own,
+                at: vec![at("tcp://10.0.0.2:7788"), at("tcp://10.0.0.3:7788")],
+                is_proved,
+            });
+        }
+        let mut checks = Vec::new();
+        examine(&config, Ok(&report), &mut checks);
+        let of = |name| {
+            let checks = checks.iter().filter(move |check| check.check == name);
+            let checks = checks.map(|check| (check.verdict, check.found.as_str()));
+            checks.collect::<Vec<_>>()
+        };
+        let [(Verdict::Doubtful, refused)] = of(REFUSED_DIALS)[..] else {
+            panic!("{checks:?}");
+        };
+        assert!(
+            refused.starts_with("tcp://10.0.0.2:7788, 7 s ago: not"),
+            "{refused}"
+        );
+        assert!(!refused.contains('\u{1b}'), "{refused}");
+        let [(Verdict::Bad, own), (Verdict::Doubtful, others)] = of(NAMESAKES)[..] else {
+            panic!("{checks:?}");
+        };
+        assert!(
+            own.contains("the name of this one, crex: it is at tcp://"),
+            "{own}"
+        );
+        let expected =
+            "several gateways have the name crex: tcp://10.0.0.2:7788, tcp://10.0.0.3:7788";
+        assert_eq!(others, expected);
     }
 
     #[test]

@@ -1,8 +1,9 @@
 //! Checks whether this machine meets the requirements of the configuration.
 //!
 //! Each area has a file with one function that examines it and adds its [`Check`]s. A new area is
-//! a file here and a line in [`examine`]. The checks change nothing on the machine; the check of
-//! multicast sends mDNS queries, and the check of static peers opens connections to them.
+//! a file here and a line in [`examine`]. The checks change nothing on the machine. The check of the
+//! domain's directory writes a file without a name, the check of multicast sends mDNS queries, and the
+//! check of static peers opens connections to them.
 
 mod domain_dir;
 #[cfg(feature = "net")]
@@ -82,7 +83,7 @@ pub fn examine(config: &Config) -> Vec<Check> {
 
 /// Examines the gateway of this host by its report ([`routes::of_gateway`](crate::routes::of_gateway) for
 /// all receivers), or by the reason why it gave none: whether it runs with this configuration, whether its
-/// connections are encrypted, and whether the ports of the gateways that it knows let this host in. Blocks
+/// connections are encrypted, which peers refuse its connections, which gateways have one name, and whether the ports of the gateways that it knows let this host in. Blocks
 /// for some seconds if those do not answer.
 #[cfg(feature = "net")]
 #[must_use]

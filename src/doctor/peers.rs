@@ -2,7 +2,10 @@
 
 use std::io;
 use std::net::TcpStream;
+use std::sync::mpsc;
 use std::time::Duration;
+
+use fipa_transport::threads;
 
 use super::{Area, Check, Verdict};
 use crate::{Config, Kind};
@@ -35,12 +38,19 @@ pub(super) fn connect_all(
     addresses: impl Iterator<Item = (String, String)>,
     checks: &mut Vec<Check>,
 ) {
-    let threads: Vec<_> = addresses
-        .take(MAX_CHECKED)
-        .map(|(name, address)| std::thread::spawn(move || check(title, &name, &address)))
-        .collect();
-    // A thread that cannot report has panicked, and its check is missing.
-    checks.extend(threads.into_iter().filter_map(|thread| thread.join().ok()));
+    let (sender, done) = mpsc::channel();
+    for (place, (name, address)) in addresses.take(MAX_CHECKED).enumerate() {
+        let (done, there, at) = (sender.clone(), name.clone(), address.clone());
+        let started = threads::spawn(move || drop(done.send((place, check(title, &there, &at)))));
+        if started.is_err() {
+            // Without another thread, one after the other.
+            let _ = sender.send((place, check(title, &name, &address)));
+        }
+    }
+    drop(sender);
+    let mut checked: Vec<(usize, Check)> = done.iter().collect();
+    checked.sort_by_key(|(place, _)| *place);
+    checks.extend(checked.into_iter().map(|(_, check)| check));
 }
 
 fn check(title: &'static str, name: &str, address: &str) -> Check {

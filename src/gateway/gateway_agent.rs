@@ -14,11 +14,12 @@ use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Contacts as _, letter_for};
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
 use fipa_transport::{Incarnation, log_limit};
-use fipa_transport_net::Refusals;
+use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
 
 use super::KnownPeers;
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
+use super::namesakes::Namesakes;
 use super::neighbours::Neighbours;
 use super::presence::Questions;
 use crate::contact;
@@ -44,6 +45,9 @@ pub(crate) struct GatewayAgent {
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
     /// The connections that were refused because of keys or versions.
     pub(super) refusals: Refusals,
+    /// The connections of this gateway that peers refused.
+    pub(super) refused_dials: RefusedDials,
+    pub(super) namesakes: Arc<Namesakes>,
     /// The questions of agents of this host about agents of other hosts.
     pub(super) questions: Mutex<Questions>,
 }
@@ -192,7 +196,14 @@ impl GatewayAgent {
         let report = routes::Report {
             neighbours: neighbours.map(Into::into).collect(),
             refused: self.refusals.latest().into_iter().map(Into::into).collect(),
+            refused_dials: self
+                .refused_dials
+                .latest()
+                .into_iter()
+                .map(Into::into)
+                .collect(),
             contested: self.exchange.contested(),
+            namesakes: self.namesakes.found(Instant::now()),
             configuration: self.configuration.lock().clone(),
             ..self.service.report(&entries)
         };

@@ -6,7 +6,9 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::ErrorChain;
 use fipa_transport::log_limit;
 use fipa_transport_net::secure::{Credentials, Rules, Security};
+use tokio::runtime::Handle;
 
+use crate::background::{self, BackgroundError};
 use crate::config;
 use crate::error::OpenError;
 use crate::keys::{Holding, Keys, Stamp, Whose};
@@ -35,6 +37,7 @@ fn warn_about_expiry(credentials: &Credentials) {
 }
 
 /// Applies the changes in the directory of the keys to a running gateway.
+#[derive(Clone)]
 pub(super) struct Guard {
     keys: Keys,
     name: String,
@@ -85,11 +88,15 @@ impl Guard {
         loop {
             interval.tick().await;
             let revision = self.security.revision();
-            self = match tokio::task::spawn_blocking(move || self.checked()).await {
+            let guard = self.clone();
+            let runtime = Handle::current();
+            let checked = background::try_run(&runtime, move |_| guard.checked());
+            self = match checked.await {
                 Ok(guard) => guard,
+                Err(BackgroundError::Ended) => return,
                 Err(error) => {
-                    log_limit::error!(%error, "key changes are ignored; restart the gateway");
-                    return;
+                    log_limit::error!(%error, "cannot check the keys for changes; trying again");
+                    continue;
                 }
             };
             if self.security.revision() != revision {

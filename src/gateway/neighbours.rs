@@ -69,6 +69,8 @@ pub struct Neighbour {
     /// The locations at which the gateway accepts letters, one for each open connection, the latest
     /// last.
     hops: Vec<Location>,
+    /// Time of the first connection.
+    pub(super) since: Instant,
     /// Number of open connections with the gateway.
     pub connections: usize,
     /// The identity that the links prove. A connection that proves another one is ignored.
@@ -127,6 +129,11 @@ impl Neighbours {
         let state = self.state.lock();
         let mut neighbours = state.present.values();
         state.own_name.as_deref() == Some(name) || neighbours.any(|it| *it.entry.name == *name)
+    }
+
+    /// Whether a neighbor with the name of this gateway was logged.
+    pub(super) fn has_namesake(&self) -> bool {
+        self.state.lock().has_namesake
     }
 
     /// Returns all neighbors, in no particular order.
@@ -309,6 +316,7 @@ impl State {
             entry: Arc::new(entry),
             configured: Vec::new(),
             hops: Vec::new(),
+            since: Instant::now(),
             connections: 0,
             principal: peer.hop.principal,
             mandate: peer.mandate.clone(),

@@ -20,9 +20,11 @@ use fipa_transport::{Incarnation, Location, Principal, Signature, log_limit};
 use parking_lot::Mutex;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
+use tokio::runtime::Handle;
 use tokio::sync::Notify;
 
 use super::neighbours::Neighbours;
+use crate::background;
 use crate::domain_dir::DomainDir;
 
 const VERSION: u32 = 1;
@@ -403,8 +405,12 @@ impl StateFile {
         loop {
             let began = Instant::now();
             let writer = Arc::clone(&self);
-            // The task goes on after a panic, which is reported by the runtime.
-            let _ = tokio::task::spawn_blocking(move || writer.write()).await;
+            let runtime = Handle::current();
+            let written = background::try_run(&runtime, move |_| writer.write());
+            if let Err(error) = written.await {
+                log_limit::warn!(%error, "cannot write the state of the gateway; trying again");
+                self.changed.notify_one();
+            }
             tokio::time::sleep(PAUSE.max(began.elapsed() * (SHARE - 1))).await;
             tokio::select! {
                 () = self.changed.notified() => {}

@@ -5,8 +5,10 @@ use std::io;
 use fipa_acl::BuildError;
 use fipa_locking::{Failure, NameError, OptionsError, Refusal, Resource};
 use fipa_transport::Forked;
+use fipa_transport::threads::ThreadError;
 
 use super::StateFileError;
+use crate::background::BackgroundError;
 use crate::error::SendError;
 
 /// The error if an agent does not get a lock, or has lost it.
@@ -70,6 +72,9 @@ pub enum LockError {
     /// The system has no timer left.
     #[error("cannot create a timer")]
     Timer(#[source] io::Error),
+    /// The system refuses another thread.
+    #[error(transparent)]
+    Thread(ThreadError),
     /// The question to the owners cannot be written.
     #[error("cannot write the question to the owners")]
     Question(#[from] BuildError),
@@ -79,6 +84,15 @@ pub enum LockError {
     /// This process is a forked child of the one that registered the agent.
     #[error(transparent)]
     Forked(#[from] Forked),
+}
+
+impl From<BackgroundError> for LockError {
+    fn from(error: BackgroundError) -> Self {
+        match error {
+            BackgroundError::Thread(error) => Self::Thread(error),
+            _ => Self::Closed,
+        }
+    }
 }
 
 impl LockError {

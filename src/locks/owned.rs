@@ -161,7 +161,7 @@ impl Owned {
         let prepared = background::run(&service.runtime, move |_| {
             prepare(&agent, &resource, &options)
         });
-        let files = prepared.await.ok_or(LockError::Closed)??;
+        let files = prepared.await.map_err(LockError::from)??;
         let life = match &files.state {
             Some(file) => file.state(),
             None => OwnerState::volatile(time_of_day(), lease),
@@ -250,7 +250,7 @@ impl Owned {
             return;
         };
         let runtime = &self.core.endpoint.domain.inner.service.runtime;
-        background::run(runtime, move |_| files.close(none_was_live)).await;
+        background::finish(runtime, move || files.close(none_was_live)).await;
     }
 }
 
@@ -264,7 +264,9 @@ impl Drop for Owned {
         let none_was_live = self.shared.disown(&self.core, &self.resource);
         if let Some(files) = self.files.take() {
             let runtime = &self.core.endpoint.domain.inner.service.runtime;
-            drop(runtime.spawn_blocking(move || files.close(none_was_live)));
+            drop(background::finish(runtime, move || {
+                files.close(none_was_live)
+            }));
         }
     }
 }

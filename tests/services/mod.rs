@@ -179,6 +179,7 @@ impl TestService {
                 listen: listen.clone(),
                 identity: identity.clone(),
                 limits: limits.clone(),
+                refused_dials: fipa_transport_net::RefusedDials::default(),
                 security: security.clone().unwrap(),
                 refusals: fipa_transport_net::Refusals::default(),
             };

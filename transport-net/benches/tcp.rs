@@ -109,6 +109,7 @@ fn quic(client: &Runtime, server: &Runtime) -> (Party, Party) {
             listen,
             identity,
             limits,
+            refused_dials: fipa_transport_net::RefusedDials::default(),
             security: host.security(&[&host]),
             refusals: fipa_transport_net::Refusals::default(),
         };

@@ -5,9 +5,10 @@ use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV6, ToSocketAddrs as _};
 use std::path::Path;
 
-use fipa_transport::{Incarnation, Kind, ListenError, Location, LocationError};
+use fipa_transport::{Incarnation, Kind, ListenError, Location, LocationError, threads};
 use if_addrs::{IfOperStatus, Interface};
 use rustix::io::Errno;
+use tokio::sync::oneshot;
 
 /// The reason for which a text is not an address.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -98,6 +99,20 @@ pub fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
         Target::Numeric(address) => Ok(vec![address]),
         Target::Named(name, port) => Ok((name.as_str(), port).to_socket_addrs()?.collect()),
     }
+}
+
+/// Looks up a host name on a thread of its own.
+///
+/// # Errors
+/// When the name cannot be resolved, or the system refuses another thread.
+pub(crate) async fn look_up(name: String, port: u16) -> io::Result<Vec<SocketAddr>> {
+    let (sender, found) = oneshot::channel();
+    threads::spawn(move || {
+        let addresses = (name.as_str(), port).to_socket_addrs();
+        // The receiver may have been dropped meanwhile.
+        let _ = sender.send(addresses.map(Iterator::collect));
+    })?;
+    found.await.map_err(io::Error::other)?
 }
 
 /// Returns the addresses at which other hosts presently reach an endpoint that listens on these

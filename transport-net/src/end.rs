@@ -166,6 +166,21 @@ impl ConnectionEnd {
         }
     }
 
+    /// Returns the reason for which the peer refused a connection of this side, for an end before the peer has
+    /// introduced itself. `None` if this side ended it, or if it was not opened.
+    pub(crate) fn refusal(&self, peer: Acquaintance) -> Option<TransportError> {
+        match self {
+            Self::Goodbye { .. }
+            | Self::Hangup
+            | Self::Broken(_)
+            | Self::ProtocolViolation(_)
+            | Self::OtherVersion { .. } => Some(self.before(peer)),
+            #[cfg(feature = "secure")]
+            Self::Tls(_) | Self::Distrusted | Self::Expired(_) => Some(self.after()),
+            _ => None,
+        }
+    }
+
     /// Returns the error of parcels that the peer may have received.
     pub(crate) fn after(&self) -> TransportError {
         let (fault, detail) = match self {

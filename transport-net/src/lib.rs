@@ -46,6 +46,7 @@ mod quic;
 mod rate_limit;
 #[cfg(feature = "ip")]
 mod refusals;
+mod refused_dials;
 #[cfg(feature = "secure")]
 pub mod secure;
 #[cfg(feature = "ip")]
@@ -68,6 +69,7 @@ pub use identity::Identity;
 pub use quic::{QuicConfig, QuicTransport};
 #[cfg(feature = "ip")]
 pub use refusals::{Refusal, Refusals};
+pub use refused_dials::{RefusedDial, RefusedDials};
 pub use stream::config::Limits;
 pub use stream::counters::Counters;
 #[cfg(feature = "ip")]

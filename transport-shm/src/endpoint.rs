@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Incarnation, Location, Parcel, Sink, Ticket, TransportError,
-    TransportErrorKind,
+    TransportErrorKind, log_limit, threads,
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
@@ -410,13 +410,27 @@ impl Endpoint {
     /// processes.
     fn start_backlog(self: &Arc<Self>, peer: Arc<Peer>) {
         let (endpoint, threads) = (Arc::downgrade(self), Arc::clone(&self.backlogs));
-        self.runtime.spawn_blocking(move || {
+        let (runtime, served) = (self.runtime.clone(), Arc::clone(&peer));
+        let started = threads::spawn(move || {
+            let _inside = runtime.enter();
             let _running = threads.enter();
             // Without the endpoint, the parcels are concluded already.
             if let Some(endpoint) = endpoint.upgrade() {
-                endpoint.serve_backlog(&peer);
+                endpoint.serve_backlog(&served);
             }
         });
+        if let Err(error) = started {
+            let error = TransportError::new(TransportErrorKind::Congested, error);
+            let endpoint = Arc::downgrade(self);
+            // A task, because the sink must not be called from within `dispatch`.
+            self.runtime.spawn(async move {
+                if let Some(endpoint) = endpoint.upgrade() {
+                    let mut concluded = Concluded::new();
+                    peer.fail_backlog(&error, &mut concluded);
+                    endpoint.report(concluded);
+                }
+            });
+        }
     }
 
     fn serve_backlog(&self, peer: &Peer) {
@@ -680,8 +694,10 @@ impl Endpoint {
             return;
         }
         let (endpoint, closing) = (Arc::downgrade(self), Arc::clone(&self.closing));
-        // On a blocking thread: it takes milliseconds of file system calls, and waits.
-        self.runtime.spawn_blocking(move || {
+        let runtime = self.runtime.clone();
+        // On a thread of its own: it takes milliseconds of file system calls, and waits.
+        let started = threads::spawn(move || {
+            let _inside = runtime.enter();
             loop {
                 let Some(now) = endpoint.upgrade() else {
                     return;
@@ -716,6 +732,11 @@ impl Endpoint {
                 }
             }
         });
+        if let Err(error) = started {
+            // Repeated at the next occasion.
+            self.cleaning.store(false, Ordering::SeqCst);
+            log_limit::warn!(%error, "cannot remove the files of ended processes now");
+        }
     }
 
     fn report(&self, concluded: Concluded) {

@@ -25,6 +25,7 @@ mod owner;
 mod parcel;
 mod peer_id;
 mod quota_address;
+pub mod threads;
 mod token_bucket;
 mod transport;
 pub mod wire;

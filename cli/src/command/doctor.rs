@@ -17,9 +17,10 @@ use crate::report::Failure;
 /// files left by dead processes, domains of other users, and the TCP ports of the peers in
 /// discovery.static. If discovery.mdns is on, it also tests multicast on each network interface, which
 /// takes three seconds. It asks the running gateway for its configuration, compares it with the one that
-/// this command reads, shows whether its connections are encrypted, which static peers do not answer and
-/// which connections it refused because keys or protocol versions differ, and tests the TCP ports of the
-/// gateways that it knows. It changes nothing.
+/// this command reads, shows whether its connections are encrypted, which static peers do not answer,
+/// which connections it refused because keys or protocol versions differ, which of its connections peers
+/// refused and which gateways have the same name, and tests the TCP ports of the gateways that it knows. It
+/// changes nothing; to test the directory of the domain, it writes a file without a name.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:

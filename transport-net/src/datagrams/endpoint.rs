@@ -4,7 +4,6 @@
 //! task handles timers; each of them may call the sink, one at a time.
 
 use std::collections::HashMap;
-use std::io;
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
@@ -13,7 +12,6 @@ use fipa_transport::{
     Incarnation, ListenError, Location, Sink, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::Mutex;
-use tokio::net::lookup_host;
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
@@ -421,9 +419,7 @@ async fn look_up<P: Protocol>(
     name: String,
     port: u16,
 ) {
-    let found: io::Result<Vec<SocketAddr>> = lookup_host((name.as_str(), port))
-        .await
-        .map(Iterator::collect);
+    let found = address::look_up(name.clone(), port).await;
     let mut state = endpoint.state.lock();
     match found {
         Ok(addresses) => endpoint.begin(&mut state, connection, &addresses),

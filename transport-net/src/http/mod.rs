@@ -173,6 +173,7 @@ impl HttpTransport {
         let config = StreamConfig {
             identity,
             limits,
+            refused_dials: crate::refused_dials::RefusedDials::default(),
             processes: false,
             refusals: crate::refusals::Refusals::default(),
             #[cfg(feature = "secure")]

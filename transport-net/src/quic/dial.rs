@@ -7,11 +7,12 @@ use std::time::Instant;
 
 use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
-use quinn::{Connection, RecvStream, SendStream};
+use quinn::{Connection, ConnectionError, RecvStream, SendStream};
 
 use super::sockets::{Sockets, lost};
 use super::streams::{Control, Letters, Outgoing};
 use crate::end::ConnectionEnd;
+use crate::refused_dials::RefusedDials;
 use crate::stream::dialing::{addresses, reach};
 use crate::stream::endpoint::Endpoint;
 use crate::stream::frame::FrameReader;
@@ -29,9 +30,13 @@ pub(super) async fn dial(
 ) {
     let limits = endpoint.limits().clone();
     let addresses = addresses(&*sink, &to);
+    let refused = Refused {
+        dials: endpoint.config.refused_dials.clone(),
+        to: to.clone(),
+    };
     let running = LinkTask::new(endpoint, link.clone(), sink, Some(to.clone()));
     let by = sockets.clone();
-    let connect = move |address| connect(by.clone(), address);
+    let connect = move |address| connect(by.clone(), address, refused.clone());
     let reached = reach(running.endpoint(), &link, &to, addresses, connect);
     let (connection, send, receive) = match reached.await {
         Ok(connected) => connected,
@@ -50,12 +55,27 @@ pub(super) async fn dial(
     running.serve(ends, proof, reader, from, || {}).await;
 }
 
+/// Records that the peer refused the connection to a location.
+#[derive(Clone)]
+struct Refused {
+    dials: RefusedDials,
+    to: Location,
+}
+
 async fn connect(
     sockets: Arc<Sockets>,
     address: SocketAddr,
+    refused: Refused,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let connection = sockets.dial(address)?.await.map_err(|error| lost(&error))?;
-    let (send, receive) = connection.open_bi().await.map_err(|error| lost(&error))?;
+    let told = |error: ConnectionError| {
+        let lost = lost(&error);
+        if let ConnectionError::TransportError(_) | ConnectionError::ConnectionClosed(_) = error {
+            refused.dials.add(&refused.to, &lost.to_string());
+        }
+        lost
+    };
+    let connection = sockets.dial(address)?.await.map_err(told)?;
+    let (send, receive) = connection.open_bi().await.map_err(told)?;
     Ok((connection, send, receive))
 }
 

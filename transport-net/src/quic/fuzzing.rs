@@ -339,6 +339,7 @@ impl QuicStreams {
         let config = StreamConfig {
             identity,
             limits,
+            refused_dials: crate::refused_dials::RefusedDials::default(),
             processes: false,
             refusals: crate::refusals::Refusals::default(),
             security: None,

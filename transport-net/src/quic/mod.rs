@@ -34,7 +34,7 @@ use self::sockets::Sockets;
 use crate::secure::Security;
 use crate::stream::config::StreamConfig;
 use crate::stream::endpoint::Endpoint;
-use crate::{Counters, Identity, Limits, Refusals};
+use crate::{Counters, Identity, Limits, Refusals, RefusedDials};
 
 /// Configuration of a [`QuicTransport`].
 #[derive(Debug, Clone)]
@@ -46,6 +46,8 @@ pub struct QuicConfig {
     /// Limits and timeouts. In addition, a connection holds at most 33 MiB of unread and 8 MiB of
     /// unacknowledged bytes.
     pub limits: Limits,
+    /// Receives the connections of this side that peers refuse.
+    pub refused_dials: RefusedDials,
     /// Credentials and trust. QUIC always requires them; the exceptions of its rules do not apply
     /// here.
     pub security: Security,
@@ -76,6 +78,7 @@ impl QuicTransport {
             listen,
             identity,
             limits,
+            refused_dials,
             security,
             refusals,
         } = config;
@@ -83,6 +86,7 @@ impl QuicTransport {
         let config = StreamConfig {
             identity,
             limits,
+            refused_dials,
             processes: false,
             refusals,
             security: Some(security),

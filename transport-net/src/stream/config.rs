@@ -9,12 +9,15 @@ use super::source::{Home, QuotaKey};
 use crate::Identity;
 #[cfg(feature = "ip")]
 use crate::rate_limit::{Rates, is_one_peer};
+use crate::refused_dials::RefusedDials;
 
 /// Identity, limits and trust of an endpoint.
 #[derive(Debug, Clone)]
 pub(crate) struct StreamConfig {
     pub(crate) identity: Identity,
     pub(crate) limits: Limits,
+    /// Receives the connections of this side that peers refuse.
+    pub(crate) refused_dials: RefusedDials,
     /// Whether processes of this host connect over loopback.
     #[cfg(feature = "ip")]
     pub(crate) processes: bool,
@@ -273,6 +276,7 @@ mod tests {
             let config = StreamConfig {
                 identity: identity("here", "test"),
                 limits: Limits::default(),
+                refused_dials: RefusedDials::default(),
                 processes,
                 refusals: crate::refusals::Refusals::default(),
                 #[cfg(feature = "secure")]

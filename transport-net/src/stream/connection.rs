@@ -711,6 +711,15 @@ impl Connection {
         Ok(())
     }
 
+    /// Returns what this side knows about the peer.
+    pub(crate) fn acquaintance(&self) -> Acquaintance {
+        match (&self.peer, self.proof.principal()) {
+            (Some(_), _) => Acquaintance::Greeted,
+            (None, Some(_)) => Acquaintance::Proved,
+            (None, None) => Acquaintance::Unknown,
+        }
+    }
+
     /// Ends the connection. Returns the conclusion of every attempt, in the order of sending. After
     /// an orderly end, a goodbye remains to be written.
     pub(crate) fn end(&mut self, end: &ConnectionEnd) -> Vec<(AttemptId, Conclusion)> {
@@ -727,11 +736,7 @@ impl Connection {
             ConnectionEnd::Goodbye { last } => *last,
             _ => u64::MAX,
         };
-        let peer = match (&self.peer, self.proof.principal()) {
-            (Some(_), _) => Acquaintance::Greeted,
-            (None, Some(_)) => Acquaintance::Proved,
-            (None, None) => Acquaintance::Unknown,
-        };
+        let peer = self.acquaintance();
         std::mem::take(&mut self.sent)
             .into_iter()
             .filter_map(|(id, sent)| {

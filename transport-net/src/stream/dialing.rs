@@ -8,7 +8,6 @@ use std::time::Duration;
 
 use fipa_transport::{Kind, Location, Sink, log_limit};
 use parking_lot::Mutex;
-use tokio::net::lookup_host;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
@@ -181,8 +180,8 @@ where
     match target.map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error))? {
         Target::Numeric(address) => connect(address).await,
         Target::Named(name, port) => {
-            let found = lookup_host((name.as_str(), port)).await?;
-            let addresses = alternating(found.take(MAX_ADDRESSES).collect());
+            let found = address::look_up(name, port).await?;
+            let addresses = alternating(found.into_iter().take(MAX_ADDRESSES).collect());
             race(addresses.into_iter().map(connect)).await
         }
     }

@@ -39,6 +39,7 @@ fn endpoint(limits: Limits) -> Arc<Endpoint> {
     let config = StreamConfig {
         identity: identity(1 << 40),
         limits,
+        refused_dials: crate::refused_dials::RefusedDials::default(),
         processes: false,
         refusals: crate::refusals::Refusals::default(),
         #[cfg(feature = "secure")]

@@ -874,6 +874,9 @@ impl LinkTask {
                             "another certificate belongs to this service",
                         ));
                     }
+                    let service = introduction.hop.location.incarnation();
+                    let refused_dials = &self.endpoint.config.refused_dials;
+                    refused_dials.connected(self.dialled.as_ref(), service);
                     self.peer = Some(introduction);
                 }
                 self.link.state.lock().connection.welcome();
@@ -919,7 +922,7 @@ impl LinkTask {
 
 impl Drop for LinkTask {
     fn drop(&mut self) {
-        let concluded = {
+        let (acquaintance, concluded) = {
             let mut state = self.link.state.lock();
             self.endpoint
                 .tally()
@@ -927,8 +930,14 @@ impl Drop for LinkTask {
             if !self.end.is_orderly() {
                 state.writer = None;
             }
-            state.connection.end(&self.end)
+            let acquaintance = state.connection.acquaintance();
+            (acquaintance, state.connection.end(&self.end))
         };
+        if let (Some(to), None) = (&self.dialled, &self.peer)
+            && let Some(refusal) = self.end.refusal(acquaintance)
+        {
+            self.endpoint.config.refused_dials.add(to, &refusal.detail);
+        }
         let detour = self.peer.is_none() && self.endpoint.has_detour(&self.link);
         self.endpoint.left(&self.link, &self.end);
         for (attempt, conclusion) in concluded {

@@ -2,6 +2,7 @@
 
 use crate::Identity;
 use crate::refusals::Refusals;
+use crate::refused_dials::RefusedDials;
 use crate::stream::config::Limits;
 
 /// Configuration of a [`TcpTransport`](crate::TcpTransport).
@@ -23,6 +24,8 @@ pub struct TcpConfig {
     pub processes: bool,
     /// Receives the connections that are refused because of keys or of another version of the protocol.
     pub refusals: Refusals,
+    /// Receives the connections of this side that peers refuse.
+    pub refused_dials: RefusedDials,
     /// Credentials and trust. Without them, peers need not prove their identity.
     #[cfg(feature = "secure")]
     pub security: Option<crate::secure::Security>,
@@ -39,6 +42,7 @@ impl TcpConfig {
             limits: Limits::default(),
             processes: false,
             refusals: Refusals::default(),
+            refused_dials: RefusedDials::default(),
             #[cfg(feature = "secure")]
             security: None,
         }

@@ -61,7 +61,10 @@ pub(crate) async fn dial(
     let (ends, proof) = tokio::select! {
         proved = prove(&running, stream, peer) => match proved {
             Ok(proved) => proved,
-            Err(why) => return running.fail(ConnectionEnd::unreachable(&to, &why)),
+            Err(why) => {
+                endpoint.config.refused_dials.add(&to, &why);
+                return running.fail(ConnectionEnd::unreachable(&to, &why));
+            }
         },
         end = link.leaving() => return running.fail(end),
     };

@@ -67,12 +67,14 @@ impl TcpTransport {
             limits,
             processes,
             refusals,
+            refused_dials,
             #[cfg(feature = "secure")]
             security,
         } = config;
         let config = StreamConfig {
             identity,
             limits,
+            refused_dials,
             processes,
             refusals,
             #[cfg(feature = "secure")]

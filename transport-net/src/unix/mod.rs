@@ -20,12 +20,11 @@ use std::time::Duration;
 use fipa_acl::ErrorChain;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, OwnerProcess, Parcel, Sink, Ticket,
-    Transport, TransportError,
+    Transport, TransportError, log_limit, threads,
 };
 use parking_lot::Mutex;
 use tokio::net::UnixListener;
 use tokio::runtime::Handle;
-use tokio::task::spawn_blocking;
 use tokio::time::sleep;
 
 pub use self::directory::UnixError;
@@ -95,6 +94,7 @@ impl UnixTransport {
         let config = StreamConfig {
             identity,
             limits,
+            refused_dials: crate::refused_dials::RefusedDials::default(),
             #[cfg(feature = "ip")]
             processes: false,
             #[cfg(feature = "ip")]
@@ -129,9 +129,10 @@ impl UnixTransport {
             sleep(TIDY_AFTER).await;
             tidying.store(false, Ordering::Release);
             let directory = bound.lock().as_ref().map(|it| it.directory.clone());
-            if let Some(directory) = directory {
-                // An error means that the runtime shuts down.
-                let _ = spawn_blocking(move || directory.sweep()).await;
+            if let Some(directory) = directory
+                && let Err(error) = threads::spawn(move || directory.sweep())
+            {
+                log_limit::warn!(%error, "cannot remove the sockets of ended processes now");
             }
         });
     }

@@ -136,6 +136,7 @@ pub(crate) fn quic_config(
             connect_timeout: Duration::from_secs(3),
             ..config.limits
         },
+        refused_dials: fipa_transport_net::RefusedDials::default(),
         security,
         refusals: config.refusals,
     }
