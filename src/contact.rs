@@ -2,7 +2,7 @@
 //!
 //! An agent that no directory lists is reached at an address of its identifier after the process has
 //! [introduced](introduce) it to the gateway of its host. It is then in the directory of all
-//! processes of the host, as if a letter of it had arrived, for [`MEMORY`] after the last one.
+//! processes of the host, as if a letter of it had arrived.
 //!
 //! The introduction is a `request` to the gateway with the [`ONTOLOGY`]. Its content is JSON, the
 //! answer an `inform` without content or a `refuse` with the reason:
@@ -25,9 +25,6 @@ use crate::routes::{self, AskError};
 
 /// The ontology of an introduction.
 pub const ONTOLOGY: &str = "fipa-mts-contact";
-
-/// Time for which the gateway keeps the agent after its introduction, or after its last letter.
-pub const MEMORY: Duration = fipa_sds::ContactDirectory::MEMORY;
 
 const VERSION: u32 = 1;
 

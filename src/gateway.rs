@@ -24,12 +24,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
-use fipa_acl::ErrorChain;
+use fipa_acl::{ErrorChain, escape};
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    Cancellation, ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
-    Role as EntryRole, StaticDirectory, reserved_for,
+    Cancellation, ContactDirectory, ContactError, Directory, Entry, MergedDirectory, RegisterError,
+    Registration, Role as EntryRole, StaticDirectory, reserved_for,
 };
 use fipa_transport::{
     Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
@@ -634,15 +634,25 @@ impl KnownPeers {
         name: &str,
         agent: Incarnation,
         location: Location,
-    ) -> Result<(), fipa_sds::EntryError> {
+    ) -> Result<(), ContactError> {
         // An agent of a platform without a gateway, such as JADE, must not pass for one of a gateway.
         if let Some(gateway) = reserved_for(name).filter(|_| !agent.is_known())
             && self.neighbours.has_gateway(gateway)
         {
-            return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()));
+            return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()).into());
         }
-        if self.directory.heard(now, name, agent, location)? {
+        let heard = self.directory.heard(now, name, agent, location)?;
+        if heard.is_new {
             self.heard.fetch_add(1, Ordering::AcqRel);
+        }
+        if let Some(replaced) = heard.replaced {
+            let (agent, at) = (escape(&replaced.name), replaced.locations.first());
+            let at = at.map(|at| escape(at.address()).into_owned());
+            log_limit::info!(
+                of: replaced.peer, %agent, at,
+                "forgot an agent of another host, because this gateway knows as many as it can from there; \
+                 letters to it fail until it sends another one"
+            );
         }
         Ok(())
     }
@@ -653,6 +663,14 @@ impl Contacts for KnownPeers {
         if let Err(error) = self.record(Instant::now(), name, agent, location) {
             log_limit::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
         }
+    }
+
+    fn heard_again(&self, name: &str) {
+        self.directory.heard_again(Instant::now(), name);
+    }
+
+    fn took(&self, name: &str) {
+        self.directory.took(Instant::now(), name);
     }
 
     fn publish(&self) {

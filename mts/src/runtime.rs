@@ -72,6 +72,14 @@ pub trait Contacts: Send + Sync {
     /// locked; must not block.
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
 
+    /// A known agent has sent another letter; see [`Action::HeardAgain`]. Called with the service locked; must not
+    /// block.
+    fn heard_again(&self, name: &str);
+
+    /// An agent of a legacy peer has taken a letter; see [`Action::Taken`]. Called with the service locked; must
+    /// not block.
+    fn took(&self, name: &str);
+
     /// Publishes the agents of [`heard`](Self::heard) to the processes of this host. Called without the service
     /// locked, because it may write files.
     fn publish(&self);
@@ -763,6 +771,16 @@ impl Shared {
                         contacts.heard(&name, agent, location);
                         state.update_view(&*self.directory);
                         rest.has_heard = true;
+                    }
+                }
+                Action::HeardAgain { name } => {
+                    if let Some(contacts) = &self.config.contacts {
+                        contacts.heard_again(&name);
+                    }
+                }
+                Action::Taken { name } => {
+                    if let Some(contacts) = &self.config.contacts {
+                        contacts.took(&name);
                     }
                 }
                 // One refresh is enough for all that were requested before it.

@@ -48,6 +48,10 @@ impl Contacts for Publishing {
         self.events.lock().push(Event::Heard(name.to_owned()));
     }
 
+    fn heard_again(&self, _: &str) {}
+
+    fn took(&self, _: &str) {}
+
     fn publish(&self) {
         let service = self.service.get().unwrap().clone();
         let (ended, end) = mpsc::channel();

@@ -31,6 +31,10 @@ struct Halting {
 impl Contacts for Halting {
     fn heard(&self, _: &str, _: Incarnation, _: Location) {}
 
+    fn heard_again(&self, _: &str) {}
+
+    fn took(&self, _: &str) {}
+
     fn publish(&self) {}
 
     fn doubtful(&self, _: &Location, _: TransportErrorKind) {}

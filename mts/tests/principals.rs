@@ -619,11 +619,11 @@ fn a_peer_that_invents_senders_makes_few_of_them_known() {
             .filter(|action| matches!(action, Action::Heard { .. }))
             .count()
     };
-    let at_once: usize = (0..1000).map(|number| heard(&mut bench, number)).sum();
-    assert_eq!(at_once, 128);
+    let at_once: usize = (0..2000).map(|number| heard(&mut bench, number)).sum();
+    assert_eq!(at_once, 1000);
     bench.now.instant += Duration::from_secs(1);
-    let later: usize = (1000..2000).map(|number| heard(&mut bench, number)).sum();
-    assert_eq!(later, 20);
+    let later: usize = (2000..3000).map(|number| heard(&mut bench, number)).sum();
+    assert_eq!(later, 50);
 }
 
 /// The state of a small letter takes more memory than its bytes.

@@ -1,10 +1,10 @@
 //! Back end for agents of other hosts that are known only from a letter of theirs.
 //!
-//! A letter may arrive before the announcement of its sender, and on some networks the announcement
-//! never arrives. This back end makes it possible to answer such a sender for a limited time.
+//! A letter may arrive before the announcement of its sender, and agents of other platforms are never
+//! announced. This back end makes it possible to answer such a sender. A conversation may pause for days, so a
+//! contact has no end by time: it stays until its place is needed.
 
-use std::cmp::Reverse;
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -15,50 +15,169 @@ use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
 use crate::{Directory, Entry, EntryError, Mts, Reach, Role, Source, Subscriber};
 
-/// Agents of other hosts that sent a letter, each until its entry expires.
+/// The error of [`ContactDirectory::heard`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ContactError {
+    /// The entry of the sender is not valid.
+    #[error(transparent)]
+    Entry(#[from] EntryError),
+    /// An agent of another host has the name, and exchanged a letter with this host within
+    /// [`ContactDirectory::SILENCE`].
+    #[error("an agent at {0} has the name")]
+    Taken(Location),
+    /// All contacts that could make room are [pinned](ContactDirectory::pin).
+    #[error("the contacts of this host and its source are all in use")]
+    Full,
+}
+
+/// Agents of other hosts that sent a letter.
 ///
-/// Bounded: beyond [`ContactDirectory::MAX_CONTACTS`] the contact with the oldest last letter is
-/// evicted, among those of the host with most contacts. A contact must not replace the entries of other back ends: merge this directory last,
-/// and drop a contact as soon as another back end has the agent ([`forget`](Self::forget)).
+/// Bounded: a host has [`MAX_OF_HOST`](Self::MAX_OF_HOST) contacts at most, all hosts
+/// [`MAX_CONTACTS`](Self::MAX_CONTACTS). Beyond that, a new contact replaces another one: the first without a
+/// letter from this side, of the host with the most; otherwise the one without a letter in either direction for
+/// the longest time. The latest that were replaced are the [lost agents](Directory::lost_agents).
+///
+/// A contact must not replace the entries of other back ends: merge this directory last, and drop a contact as
+/// soon as another back end has the agent ([`forget`](Self::forget)).
 #[derive(Debug)]
 pub struct ContactDirectory {
     table: Table<()>,
-    heard: Mutex<Vec<(Arc<Entry>, Instant)>>,
+    contacts: Mutex<Contacts>,
+}
+
+#[derive(Debug, Default)]
+struct Contacts {
+    all: HashMap<Arc<str>, Contact>,
+    /// The contacts of each host; the first is the next to be replaced.
+    of_host: HashMap<PeerId, BTreeSet<Rank>>,
+    pinned: HashSet<Arc<str>>,
+    /// The contacts that were replaced last.
+    replaced: VecDeque<Arc<Entry>>,
+    /// Number of uses so far.
+    uses: u64,
+}
+
+#[derive(Debug)]
+struct Contact {
+    entry: Arc<Entry>,
+    host: PeerId,
+    rank: Rank,
+    /// The time of the last letter in either direction.
+    used: Instant,
+    /// The time of its last letter.
+    heard: Instant,
+}
+
+/// The place of a contact in the order in which contacts are replaced.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Rank {
+    is_pinned: bool,
+    /// Whether an agent of this side has sent it a letter.
+    is_answered: bool,
+    /// The number of its last use.
+    last_use: u64,
+    name: Arc<str>,
+}
+
+impl Contacts {
+    /// Gives a contact another rank.
+    fn change(&mut self, name: &str, change: impl FnOnce(&mut Contact)) {
+        let Some(contact) = self.all.get_mut(name) else {
+            return;
+        };
+        let order = self.of_host.entry(contact.host.clone()).or_default();
+        order.remove(&contact.rank);
+        change(contact);
+        order.insert(contact.rank.clone());
+    }
+
+    fn use_now(&mut self, now: Instant, name: &str, change: impl FnOnce(&mut Contact)) {
+        self.uses += 1;
+        let uses = self.uses;
+        self.change(name, |contact| {
+            contact.rank.last_use = uses;
+            contact.used = now;
+            change(contact);
+        });
+    }
+
+    fn insert(&mut self, contact: Contact) {
+        let order = self.of_host.entry(contact.host.clone()).or_default();
+        order.insert(contact.rank.clone());
+        self.all.insert(Arc::clone(&contact.entry.name), contact);
+    }
+
+    fn remove(&mut self, name: &str) -> Option<Contact> {
+        let contact = self.all.remove(name)?;
+        if let Some(order) = self.of_host.get_mut(&contact.host) {
+            order.remove(&contact.rank);
+            if order.is_empty() {
+                self.of_host.remove(&contact.host);
+            }
+        }
+        Some(contact)
+    }
+
+    /// Removes and returns the contact that a new one of this host replaces, if there is no room for both.
+    fn make_room(&mut self, host: &PeerId) -> Result<Option<Contact>, ContactError> {
+        let own = self.of_host.get(host);
+        let rank = if own.is_some_and(|own| own.len() >= ContactDirectory::MAX_OF_HOST) {
+            own.and_then(BTreeSet::first)
+        } else if self.all.len() >= ContactDirectory::MAX_CONTACTS {
+            let firsts = || {
+                let hosts = self.of_host.values();
+                hosts.filter_map(|of_host| Some((of_host.len(), of_host.first()?)))
+            };
+            let unanswered = firsts().filter(|(_, first)| !first.is_pinned && !first.is_answered);
+            let most = unanswered.max_by_key(|(most, _)| *most);
+            most.or_else(|| firsts().min_by_key(|(_, first)| *first))
+                .map(|(_, first)| first)
+        } else {
+            return Ok(None);
+        };
+        let rank = rank.filter(|rank| !rank.is_pinned);
+        let name = Arc::clone(&rank.ok_or(ContactError::Full)?.name);
+        Ok(self.remove(&name))
+    }
 }
 
 impl ContactDirectory {
     /// Maximum number of contacts.
-    pub const MAX_CONTACTS: usize = 1024;
-    /// Time for which a contact is kept after its last letter.
-    pub const MEMORY: Duration = Duration::from_secs(60);
+    pub const MAX_CONTACTS: usize = 8_192;
+    /// Maximum number of contacts of one host. A platform with more agents has an address of its own for them.
+    pub const MAX_OF_HOST: usize = 2_048;
+    /// Time without a letter in either direction after which an agent of another host may take over the name.
+    pub const SILENCE: Duration = Duration::from_secs(60);
     /// Time for which a contact is kept if its gateway sends the agents of its host and this agent is
     /// not among them: it has left.
     pub const UNLISTED: Duration = Duration::from_secs(5);
+    /// Number of replaced contacts that are known as [lost](Directory::lost_agents).
+    const MAX_REPLACED: usize = 256;
 
     /// Creates an empty directory.
     #[must_use]
     pub fn new() -> Self {
         Self {
             table: Table::new(),
-            heard: Mutex::default(),
+            contacts: Mutex::default(),
         }
     }
 
     /// Records that an agent of another host sent a letter at `now`; letters to it go to
-    /// `location`, which has the incarnation of the message transport service there. Returns true
-    /// if this incarnation of the agent was not a contact before.
+    /// `location`, which has the incarnation of the message transport service there. Returns what is new.
     ///
     /// # Errors
-    /// Fails when the name is not valid.
+    /// Fails when the name is not valid, another host has it, or there is no room.
     pub fn heard(
         &self,
         now: Instant,
         name: &str,
         incarnation: Incarnation,
         location: Location,
-    ) -> Result<bool, EntryError> {
+    ) -> Result<Heard, ContactError> {
         let gateway = location.incarnation();
-        let peer = PeerId::of(Principal::Unproved, Some(&location));
+        let host = PeerId::of(Principal::Unproved, Some(&location));
         let entry = Entry {
             name: name.into(),
             agent_type: String::new(),
@@ -69,76 +188,148 @@ impl ContactDirectory {
             registered: time_of_millis(millis_of_time(SystemTime::now())),
             source: Source::Contact,
             reach: Reach::Remote { gateway },
-            peer,
+            peer: host.clone(),
             role: Role::Agent,
         };
         entry.check()?;
-        let mut heard = self.heard.lock();
-        let before = heard.iter().position(|(other, _)| *other.name == *name);
-        let known = before.map(|index| heard.remove(index));
-        if heard.len() >= Self::MAX_CONTACTS
-            && let Some(index) = to_evict(&heard)
-        {
-            let (oldest, _) = heard.remove(index);
-            self.table.release((), &oldest.name, oldest.incarnation);
+        let mut contacts = self.contacts.lock();
+        let known = contacts.all.get(name);
+        if let Some(known) = known {
+            if known.entry.incarnation == incarnation && known.entry.locations == entry.locations {
+                contacts.use_now(now, name, |contact| contact.heard = now);
+                return Ok(Heard::default());
+            }
+            let is_in_use = now.saturating_duration_since(known.used) < Self::SILENCE;
+            let is_same = known.host == host
+                && (!gateway.is_known() || known.entry.mts.incarnation == gateway);
+            if !is_same && is_in_use {
+                let taken = known.entry.locations.first();
+                return Err(taken.map_or(ContactError::Full, |it| ContactError::Taken(it.clone())));
+            }
+        }
+        let is_new = known.is_none_or(|known| known.entry.incarnation != incarnation);
+        let before = contacts.remove(name);
+        let replaced = match contacts.make_room(&host) {
+            Ok(replaced) => replaced.map(|it| self.replace(&mut contacts, it)),
+            Err(error) => {
+                if let Some(before) = before {
+                    contacts.insert(before);
+                }
+                return Err(error);
+            }
+        };
+        if contacts.replaced.iter().any(|it| *it.name == *name) {
+            contacts.replaced.retain(|it| *it.name != *name);
+            self.table.set_lost(contacts.replaced.iter().cloned());
         }
         let entry = Arc::new(entry);
         self.table.put((), Arc::clone(&entry));
-        heard.push((entry, now));
-        Ok(known.is_none_or(|(known, _)| known.incarnation != incarnation))
+        contacts.uses += 1;
+        let rank = Rank {
+            is_pinned: contacts.pinned.contains(name),
+            is_answered: before.is_some_and(|before| before.rank.is_answered),
+            last_use: contacts.uses,
+            name: Arc::clone(&entry.name),
+        };
+        contacts.insert(Contact {
+            entry,
+            host,
+            rank,
+            used: now,
+            heard: now,
+        });
+        Ok(Heard { is_new, replaced })
+    }
+
+    /// Takes a contact that made room out of the directory. Its entry tells senders when.
+    fn replace(&self, contacts: &mut Contacts, contact: Contact) -> Arc<Entry> {
+        let entry = contact.entry;
+        self.table.release((), &entry.name, entry.incarnation);
+        let lost = Arc::new(Entry {
+            registered: time_of_millis(millis_of_time(SystemTime::now())),
+            ..Entry::clone(&entry)
+        });
+        if contacts.replaced.len() >= Self::MAX_REPLACED {
+            contacts.replaced.pop_front();
+        }
+        contacts.replaced.push_back(Arc::clone(&lost));
+        self.table.set_lost(contacts.replaced.iter().cloned());
+        lost
+    }
+
+    /// Records another letter of a contact at `now`.
+    pub fn heard_again(&self, now: Instant, name: &str) {
+        let mut contacts = self.contacts.lock();
+        contacts.use_now(now, name, |contact| contact.heard = now);
+    }
+
+    /// Records that a contact took a letter from an agent of this side at `now`.
+    pub fn took(&self, now: Instant, name: &str) {
+        let mut contacts = self.contacts.lock();
+        contacts.use_now(now, name, |contact| contact.rank.is_answered = true);
+    }
+
+    /// Sets the names of contacts that stay, because they have left something here that refers to them, such as a
+    /// subscription. Replaces the earlier names.
+    pub fn pin(&self, names: HashSet<Arc<str>>) {
+        let mut contacts = self.contacts.lock();
+        let before = std::mem::replace(&mut contacts.pinned, names);
+        let changed = before.symmetric_difference(&contacts.pinned);
+        let changed: Vec<Arc<str>> = changed.cloned().collect();
+        for name in changed {
+            let is_pinned = contacts.pinned.contains(&name);
+            contacts.change(&name, |contact| contact.rank.is_pinned = is_pinned);
+        }
     }
 
     /// Drops the contacts at these gateways.
     pub fn withdraw(&self, gateways: &HashSet<Incarnation>) {
-        self.heard.lock().retain(|(entry, _)| {
-            let stays = !gateways.contains(&entry.mts.incarnation);
-            if !stays {
-                self.table.release((), &entry.name, entry.incarnation);
-            }
-            stays
-        });
+        self.drop_those(|contact| gateways.contains(&contact.entry.mts.incarnation));
     }
 
-    /// Drops contacts that `others`, the other back ends, know, and those that are older than
-    /// [`MEMORY`](Self::MEMORY), or than [`UNLISTED`](Self::UNLISTED) if `others` [speak
-    /// for](Directory::speaks_for) their gateway. Returns the time at which to call this again.
+    fn drop_those(&self, mut which: impl FnMut(&Contact) -> bool) {
+        let mut contacts = self.contacts.lock();
+        let left = contacts.all.values().filter(|contact| which(contact));
+        let left: Vec<Arc<Entry>> = left.map(|contact| Arc::clone(&contact.entry)).collect();
+        for entry in left {
+            contacts.remove(&entry.name);
+            self.table.release((), &entry.name, entry.incarnation);
+        }
+    }
+
+    /// Drops contacts that `others`, the other back ends, know, and those without a letter for
+    /// [`UNLISTED`](Self::UNLISTED) if `others` [speak for](Directory::speaks_for) their gateway. Returns the time
+    /// at which to call this again.
     pub fn forget(&self, now: Instant, others: &dyn Directory) -> Option<Instant> {
         let mut next: Option<Instant> = None;
-        self.heard.lock().retain(|(entry, heard)| {
-            let memory = match others.speaks_for(entry.mts.incarnation) {
-                true => Self::UNLISTED,
-                false => Self::MEMORY,
-            };
-            let until = *heard + memory;
-            let stays = now < until && others.known(&entry.name).is_none();
-            // `others` may begin to speak for the gateway without a notification.
-            let check = until.min(now + Self::UNLISTED);
-            match stays {
-                true => next = Some(next.map_or(check, |next| next.min(check))),
-                false => {
-                    self.table.release((), &entry.name, entry.incarnation);
-                }
+        self.drop_those(|contact| {
+            let gateway = contact.entry.mts.incarnation;
+            let until = contact.heard + Self::UNLISTED;
+            let is_unlisted = now >= until && others.speaks_for(gateway);
+            if is_unlisted || others.known(&contact.entry.name).is_some() {
+                return true;
             }
-            stays
+            if gateway.is_known() {
+                // `others` may begin to speak for the gateway without a notification.
+                let check = match until > now {
+                    true => until,
+                    false => now + Self::UNLISTED,
+                };
+                next = Some(next.map_or(check, |next| next.min(check)));
+            }
+            false
         });
         next
     }
 }
 
-/// Returns the index of the first contact of the host with most contacts.
-fn to_evict(contacts: &[(Arc<Entry>, Instant)]) -> Option<usize> {
-    let hosts = contacts
-        .iter()
-        .map(|(entry, _)| PeerId::of(Principal::Unproved, entry.locations.first()));
-    let mut of_host: HashMap<PeerId, (usize, usize)> = HashMap::new();
-    for (index, host) in hosts.enumerate() {
-        let (count, _) = of_host.entry(host).or_insert((0, index));
-        *count += 1;
-    }
-    let most = of_host
-        .into_values()
-        .max_by_key(|(count, first)| (*count, Reverse(*first)));
-    most.map(|(_, first)| first)
+/// What a letter changed in the contacts.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Heard {
+    /// Whether this incarnation of the sender was not a contact before.
+    pub is_new: bool,
+    /// The contact that made room. Its time of registration is that of this change.
+    pub replaced: Option<Arc<Entry>>,
 }
 
 impl Default for ContactDirectory {
@@ -164,35 +355,59 @@ mod tests {
         Incarnation::from_u64(number)
     }
 
+    fn is_new() -> Result<Heard, ContactError> {
+        Ok(Heard {
+            is_new: true,
+            replaced: None,
+        })
+    }
+
     #[test]
-    fn a_sender_is_a_contact_until_it_expires() {
+    fn a_sender_is_a_contact_without_an_end_by_time() {
         let contacts = ContactDirectory::new();
         let start = Instant::now();
-        assert_eq!(
-            contacts.heard(start, "arm", incarnation(1), location()),
-            Ok(true)
-        );
-        assert_eq!(
-            contacts.heard(start, "arm", incarnation(1), location()),
-            Ok(false)
-        );
+        let heard = |at, number| contacts.heard(at, "arm", incarnation(number), location());
+        assert_eq!(heard(start, 1), is_new());
+        assert_eq!(heard(start, 1), Ok(Heard::default()));
         let entry = contacts.lookup("arm").unwrap();
         assert_eq!(entry.locations, [location()]);
         assert_eq!(contacts.by_incarnation(incarnation(1)).unwrap(), entry);
-        // Another incarnation of the same name replaces it.
-        assert_eq!(
-            contacts.heard(start, "arm", incarnation(2), location()),
-            Ok(true)
-        );
+        // Another incarnation at the same gateway replaces it.
+        assert_eq!(heard(start, 2), is_new());
         assert!(contacts.by_incarnation(incarnation(1)).is_none());
-        let end = start + ContactDirectory::MEMORY;
-        let soon = start + ContactDirectory::UNLISTED;
-        assert_eq!(contacts.forget(start, &nothing()), Some(soon));
-        let late = end.checked_sub(Duration::from_millis(1)).unwrap();
-        assert_eq!(contacts.forget(late, &nothing()), Some(end));
+        let month = start + Duration::from_secs(30 * 24 * 60 * 60);
+        let next = contacts.forget(month, &nothing());
+        assert_eq!(next, Some(month + ContactDirectory::UNLISTED));
         assert!(contacts.lookup("arm").is_some());
-        assert_eq!(contacts.forget(end, &nothing()), None);
-        assert!(contacts.lookup("arm").is_none());
+    }
+
+    /// A platform keeps its names while it is silent for less than a minute, whoever else states them.
+    #[test]
+    fn another_host_takes_over_the_name_of_a_silent_contact_only() {
+        let contacts = ContactDirectory::new();
+        let jade = |host: &str| -> Location { format!("http://{host}:7778/acc").parse().unwrap() };
+        let heard = |at, host| contacts.heard(at, "echo@jade", Incarnation::UNKNOWN, jade(host));
+        let start = Instant::now();
+        let just_before = |at: Instant| at.checked_sub(Duration::from_millis(1)).unwrap();
+        heard(start, "192.0.2.1").unwrap();
+        let silent = start + ContactDirectory::SILENCE;
+        let taken = Err(ContactError::Taken(jade("192.0.2.1")));
+        assert_eq!(heard(just_before(silent), "192.0.2.2"), taken);
+        // A letter in either direction shows that it is there.
+        contacts.took(just_before(silent), "echo@jade");
+        assert_eq!(heard(silent, "192.0.2.2"), taken);
+        contacts.heard_again(silent, "echo@jade");
+        let later = silent + ContactDirectory::SILENCE;
+        assert_eq!(heard(just_before(later), "192.0.2.2"), taken);
+        assert_eq!(heard(later, "192.0.2.2").map(|it| it.is_new), Ok(false));
+        let entry = contacts.lookup("echo@jade").unwrap();
+        assert_eq!(entry.locations, [jade("192.0.2.2")]);
+        // On its own host, its port may change at any time.
+        let moved: Location = "http://192.0.2.2:7779/acc".parse().unwrap();
+        let heard = contacts.heard(later, "echo@jade", Incarnation::UNKNOWN, moved.clone());
+        assert_eq!(heard, Ok(Heard::default()));
+        let entry = contacts.lookup("echo@jade").unwrap();
+        assert_eq!(entry.locations, [moved]);
     }
 
     #[test]
@@ -206,7 +421,7 @@ mod tests {
         ]) {
             let (name, location) = (format!("arm {number}"), at.parse().unwrap());
             let heard = contacts.heard(Instant::now(), &name, incarnation(number), location);
-            assert_eq!(heard, Ok(true), "{at}");
+            assert_eq!(heard, is_new(), "{at}");
             assert_eq!(contacts.lookup(&name).unwrap().mts.name, None);
         }
     }
@@ -261,34 +476,103 @@ mod tests {
         assert!(contacts.lookup("leg").is_some());
     }
 
+    /// Contacts of the host with this number, named by their numbers.
+    fn fill(contacts: &ContactDirectory, host: u8, numbers: std::ops::Range<usize>) -> Vec<Heard> {
+        let heard = numbers.map(|number| {
+            let (name, location) = (format!("{host} {number}"), at_host(host));
+            let heard = contacts.heard(Instant::now(), &name, Incarnation::UNKNOWN, location);
+            heard.unwrap()
+        });
+        heard.collect()
+    }
+
+    fn at_host(host: u8) -> Location {
+        format!("http://192.0.2.{host}:7778/acc").parse().unwrap()
+    }
+
     #[test]
-    fn the_number_of_contacts_is_bounded_and_names_are_checked() {
+    fn a_host_replaces_its_own_contacts_beyond_its_share() {
         let contacts = ContactDirectory::new();
-        let now = Instant::now();
-        for number in 0..ContactDirectory::MAX_CONTACTS as u64 + 10 {
-            let name = format!("agent {number}");
-            contacts
-                .heard(now, &name, incarnation(number + 1), location())
-                .unwrap();
+        fill(&contacts, 2, 0..1);
+        let most = ContactDirectory::MAX_OF_HOST;
+        let heard = fill(&contacts, 1, 0..most);
+        assert!(heard.iter().all(|it| it.replaced.is_none()));
+        // The first was answered, the second is the subject of a subscription here, the third was heard again.
+        contacts.took(Instant::now(), "1 0");
+        contacts.pin(HashSet::from(["1 1".into()]));
+        contacts.heard_again(Instant::now(), "1 2");
+        for (number, name) in (most..).zip(["1 3", "1 4"]) {
+            let heard = fill(&contacts, 1, number..number + 1).remove(0);
+            assert_eq!(&*heard.replaced.unwrap().name, name);
+            assert!(contacts.lookup(name).is_none());
+            assert_eq!(&*contacts.view().lost(name).unwrap().name, name);
         }
-        assert_eq!(contacts.entries().len(), ContactDirectory::MAX_CONTACTS);
-        assert!(contacts.lookup("agent 0").is_none());
-        // The contacts of another host stay.
-        let other = "tcp://192.0.2.2:7788#00000000000000ab".parse().unwrap();
-        contacts.heard(now, "other", incarnation(1), other).unwrap();
-        for number in 0..ContactDirectory::MAX_CONTACTS as u64 {
-            let name = format!("later {number}");
-            contacts
-                .heard(now, &name, incarnation(number + 9999), location())
-                .unwrap();
+        let others = most + 2..2 * most - 1;
+        fill(&contacts, 1, others.clone());
+        for name in ["1 0", "1 1"] {
+            assert!(contacts.lookup(name).is_some(), "{name}");
         }
-        assert_eq!(contacts.entries().len(), ContactDirectory::MAX_CONTACTS);
-        assert!(contacts.lookup("other").is_some());
-        assert!(contacts.heard(now, "", incarnation(1), location()).is_err());
+        assert!(contacts.lookup("1 2").is_none());
+        // Now all others are answered, too.
+        others.for_each(|number| contacts.took(Instant::now(), &format!("1 {number}")));
+        let all = contacts.entries();
+        let left = all.iter().filter(|it| it.name.starts_with("1 "));
+        left.for_each(|it| contacts.took(Instant::now(), &it.name));
+        fill(&contacts, 1, 2 * most..2 * most + 1);
+        assert!(contacts.lookup("1 1").is_some());
         assert!(
-            contacts
-                .heard(now, "a\nb", incarnation(1), location())
-                .is_err()
+            contacts.lookup("2 0").is_some(),
+            "another host lost a contact"
         );
+        assert_eq!(contacts.entries().len(), most + 1);
+        assert!(contacts.lost_agents().len() <= ContactDirectory::MAX_REPLACED);
+        // A letter makes a replaced one a contact again.
+        fill(&contacts, 1, 3..4);
+        assert!(contacts.lookup("1 3").is_some());
+        assert!(contacts.view().lost("1 3").is_none());
+    }
+
+    #[test]
+    fn the_host_with_most_makes_room_for_all_others() {
+        let contacts = ContactDirectory::new();
+        let (most, share) = (
+            ContactDirectory::MAX_CONTACTS,
+            ContactDirectory::MAX_OF_HOST,
+        );
+        for host in 0..=(most / share) as u8 {
+            fill(&contacts, host, 0..share - 1);
+        }
+        let all = contacts.entries();
+        assert_eq!(all.len(), most);
+        let of = |host: &str| {
+            let all = contacts.entries();
+            all.iter().filter(|it| it.name.starts_with(host)).count()
+        };
+        let last = format!("{} ", most / share);
+        assert!(of(&last) >= share / 2, "{}", of(&last));
+        // Without one that is not answered, the longest unused makes room.
+        all.iter()
+            .for_each(|it| contacts.took(Instant::now(), &it.name));
+        let heard = fill(&contacts, 99, 0..1).remove(0);
+        assert_eq!(heard.replaced.unwrap().name, all[0].name);
+        assert_eq!(contacts.entries().len(), most);
+    }
+
+    #[test]
+    fn contacts_in_use_are_not_replaced_and_names_are_checked() {
+        let contacts = ContactDirectory::new();
+        let most = ContactDirectory::MAX_OF_HOST;
+        fill(&contacts, 1, 0..most);
+        let all = contacts.entries();
+        contacts.pin(all.iter().map(|it| Arc::clone(&it.name)).collect());
+        let heard =
+            |name: &str| contacts.heard(Instant::now(), name, Incarnation::UNKNOWN, at_host(1));
+        assert_eq!(heard("another"), Err(ContactError::Full));
+        assert_eq!(heard("1 7"), Ok(Heard::default()));
+        assert_eq!(contacts.entries().len(), most);
+        contacts.pin(HashSet::new());
+        assert!(heard("another").unwrap().replaced.is_some());
+        assert!(matches!(heard(""), Err(ContactError::Entry(_))));
+        assert!(matches!(heard("a\nb"), Err(ContactError::Entry(_))));
     }
 }

@@ -571,7 +571,7 @@ fn entries_of_a_gateway_without_trust_end_at_once() {
         Incarnation::from_u64(7),
         location(0).with_incarnation(gateway),
     );
-    assert_eq!(heard, Ok(true));
+    assert!(heard.unwrap().is_new);
     let directory = world.gateways[1].exchange.directory();
     let all = MergedDirectory::new(vec![
         Arc::clone(&contacts) as _,

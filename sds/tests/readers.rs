@@ -138,6 +138,12 @@ fn contacts() -> (Instant, ContactDirectory) {
     (now, contacts)
 }
 
+/// Another back end that has the agents.
+fn named() -> StaticDirectory {
+    let agents = NAMES.map(|name| (name, vec![location(1)]));
+    StaticDirectory::new(agents).unwrap()
+}
+
 /// Returns an exchange in which each agent was sent by a different gateway.
 fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
     let (now, mut exchange) = (Instant::now(), Exchange::new(0));
@@ -179,10 +185,7 @@ fn contacts_conform() {
     let (now, contacts) = contacts();
     conforms(&contacts, Source::Contact);
     tells_departures(&contacts, || {
-        contacts.forget(
-            now + ContactDirectory::MEMORY,
-            &MergedDirectory::new(Vec::new()),
-        );
+        contacts.forget(now, &named());
     });
 }
 
@@ -208,10 +211,7 @@ fn merged_views_of_them_conform() {
     let only_heard = MergedDirectory::new(vec![heard.clone()]);
     conforms(&only_heard, Source::Contact);
     tells_departures(&only_heard, || {
-        heard.forget(
-            now + ContactDirectory::MEMORY,
-            &MergedDirectory::new(Vec::new()),
-        );
+        heard.forget(now, &named());
     });
     // A writable directory makes the view writable.
     let memory = Arc::new(MemoryDirectory::new(Mts::new("own", Incarnation::random())));

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_acl::ErrorChain;
 use fipa_sds::{
@@ -18,6 +18,9 @@ use super::names::own_agents;
 use super::publish_pace::PublishPace;
 use crate::config::is_on_loopback;
 use crate::service::Service;
+
+/// Time between looks for lost agents that have ended, which causes no notification.
+const LOST_CHECK: Duration = Duration::from_secs(15);
 
 /// Publishes the agents of other hosts to the processes of this host, as reachable through this
 /// gateway.
@@ -86,7 +89,8 @@ impl Publisher {
                 }),
             });
         let through_here: Vec<Arc<Entry>> = through_here.collect();
-        let lost = self.known.lost_agents();
+        let mut lost = self.known.lost_agents();
+        lost.extend(self.contacts.lost_agents());
         let published = self.host.publish_remote(&through_here, &lost);
         let size = *published.as_ref().unwrap_or(&0);
         self.pace.lock().wrote(Instant::now(), size);
@@ -135,26 +139,37 @@ impl PublishTask {
                  mDNS until it has one; see transport.tcp.listen and `ip address`"
             );
         }
+        let mut forget = Some(Instant::now());
         loop {
             if let Some(network) = &publisher.network {
                 self.announce(&**network);
             }
             let now = Instant::now();
-            let forget = publisher.contacts.forget(now, &*known);
+            if forget.is_some_and(|forget| forget <= now) {
+                forget = publisher.contacts.forget(now, &*known);
+            }
             // Announcements do not wait for the pause after a publication.
             let publish = publisher.pace.lock().next(now);
             // Lost agents end without a notification.
-            let mut next = now + ContactDirectory::MEMORY / 4;
+            let mut next = now + LOST_CHECK;
             if publish <= now {
                 publisher.publish();
             } else {
                 next = next.min(publish);
             }
             let next = forget.map_or(next, |forget| forget.min(next));
+            // Whether contacts are to be compared with the other agents of other hosts.
+            let mut compare = None;
             let goes_on = tokio::select! {
                 change = here.next() => change.is_some(),
-                change = there.next() => change.is_some(),
-                change = heard.next() => change.is_some(),
+                change = there.next() => {
+                    compare = Some(Instant::now());
+                    change.is_some()
+                }
+                change = heard.next() => {
+                    compare = Some(Instant::now() + ContactDirectory::UNLISTED);
+                    change.is_some()
+                }
                 moved = located.changed() => {
                     if let Some(network) = &self.network {
                         network.interfaces_changed();
@@ -167,8 +182,14 @@ impl PublishTask {
                 return;
             }
             // Several pending changes are handled together.
-            let mut more = || here.try_next().or_else(|| there.try_next());
-            while more().or_else(|| heard.try_next()).is_some() {}
+            while heard.try_next().or_else(|| here.try_next()).is_some() {}
+            while there.try_next().is_some() {
+                compare = Some(Instant::now());
+            }
+            forget = match (forget, compare) {
+                (Some(forget), Some(compare)) => Some(forget.min(compare)),
+                (forget, compare) => forget.or(compare),
+            };
         }
     }
 

@@ -384,6 +384,7 @@ impl StateFile {
     pub(super) fn set_agents(&self, now: Instant, agents: Vec<KeptDescription>) {
         let mut kept = self.kept.lock();
         (kept.agents, kept.agents_at) = (agents.into(), Some(now));
+        self.pin(&kept);
         self.changed.notify_one();
     }
 
@@ -396,7 +397,16 @@ impl StateFile {
         let mut kept = self.kept.lock();
         (kept.descriptions, kept.subscriptions) = (descriptions.into(), subscriptions.into());
         kept.facilitator_at = Some(now);
+        self.pin(&kept);
         self.changed.notify_one();
+    }
+
+    /// Keeps the contacts that have left a description or a subscription here.
+    fn pin(&self, kept: &Kept) {
+        let descriptions = kept.agents.iter().chain(&*kept.descriptions);
+        let names = descriptions.map(|it| &it.name);
+        let names = names.chain(kept.subscriptions.iter().map(|it| &it.name));
+        self.contacts.pin(names.cloned().collect());
     }
 
     /// Writes the file after changes, until the directory ends.

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::Letter;
-use fipa_sds::{Entry, View};
+use fipa_acl::{Letter, Time};
+use fipa_sds::{Entry, Source, View};
 use fipa_transport::{
     Answer, Attempt, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location,
     Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, TransportError,
@@ -73,6 +73,16 @@ pub enum Action {
         agent: Incarnation,
         /// Location of its message transport service.
         location: Location,
+    },
+    /// An agent of another host that is in the directory as a contact has sent another letter.
+    HeardAgain {
+        /// Its name.
+        name: Arc<str>,
+    },
+    /// An agent of a legacy peer has taken a letter.
+    Taken {
+        /// Its name.
+        name: Arc<str>,
     },
     /// An attempt at this location, of a known incarnation, failed: the service may have ended
     /// without a goodbye. Reported by gateways only.
@@ -274,16 +284,29 @@ impl AttemptTable {
         let Some(lost) = self.view.lost(name) else {
             return (FailureReason::NoSuchAgent, None);
         };
+        let location = lost.locations.first();
+        let attempt = |fault, why| {
+            location.map(|location| Attempt {
+                via: location.kind(),
+                location: location.clone(),
+                error: TransportError::new(fault, why),
+            })
+        };
+        if lost.source == Source::Contact {
+            let time = Time::from_system_time(lost.registered).ok();
+            let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
+            let why = format!(
+                "the gateway forgot this agent at {time}, because it knows as many of that host as it can; it can be \
+                 answered after it sends another letter"
+            );
+            let attempt = attempt(TransportErrorKind::Unreachable, why);
+            return (FailureReason::NoSuchAgent, attempt);
+        }
         let why = format!(
             "the connection with the gateway {} ended without a farewell, and has not been restored since",
             lost.mts.shown()
         );
-        let location = lost.locations.first();
-        let attempt = location.map(|location| Attempt {
-            via: location.kind(),
-            location: location.clone(),
-            error: TransportError::new(TransportErrorKind::Unreachable, why),
-        });
+        let attempt = attempt(TransportErrorKind::Unreachable, why);
         (FailureReason::Unreachable, attempt)
     }
 
@@ -577,6 +600,14 @@ impl AttemptTable {
     /// The smoothed time in which this service acknowledges reports, if known.
     pub(crate) fn round_trip(&self, service: Incarnation) -> Option<Duration> {
         self.round_trips.get(&service).copied()
+    }
+
+    /// Records that an agent of a legacy peer took a letter.
+    pub(crate) fn taken_by_legacy_peer(&mut self, receiver: &Arc<str>) {
+        if self.config.forwards {
+            let name = Arc::clone(receiver);
+            self.actions.push_back(Action::Taken { name });
+        }
     }
 
     pub(crate) fn route_worked(&mut self, location: &Location) {

@@ -36,10 +36,6 @@ const FOUND_AFTER: Duration = Duration::from_millis(1500);
 /// Time that remains for the delivery of a letter that waits until its sender is found.
 const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
-/// Time after which another letter renews an agent of a legacy peer that is known only by its
-/// letters. Less than the time after which it is dropped.
-const HEARD_AGAIN_AFTER: Duration = Duration::from_secs(15);
-
 /// Maximum number of receivers of one letter of a legacy peer. fipa_services writes one.
 const MAX_UNFRAMED_RECEIVERS: usize = 64;
 /// Maximum number of patterns among the receivers of one letter of a legacy peer.
@@ -285,14 +281,13 @@ fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(Str
     Some((sender.name().to_owned(), locations.next()?))
 }
 
-/// Limits the rate at which agents of legacy peers become known by their letters: each is published
-/// to the processes of the host. The agents of a platform have one address and may begin together,
-/// so a burst is larger than the rate.
+/// Limits the rate at which agents become known by their letters: each is published to the processes of the host.
+/// The agents of a platform have one address and may begin together, so a burst is larger than the rate.
 pub(super) fn contact_limit() -> SenderLimit {
     SenderLimit::new(
         Rate::of(2.0),
-        Rate::with_burst(20.0, 128.0),
-        Rate::with_burst(50.0, 256.0),
+        Rate::with_burst(50.0, 1000.0),
+        Rate::with_burst(200.0, 4000.0),
     )
 }
 
@@ -476,8 +471,8 @@ impl Core {
         Ok((entry, stamped, envelope))
     }
 
-    /// Reports the sender of a letter with this envelope as a contact if it is unknown, so that it can
-    /// be answered. Returns whether it did.
+    /// Reports the sender of a letter with this envelope as a contact if it is unknown, or known as a contact at
+    /// another location, so that it can be answered. Returns whether it did.
     fn report_contact(
         &mut self,
         now: Instant,
@@ -486,15 +481,27 @@ impl Core {
         from: &Hop,
     ) -> bool {
         let view = &self.table.view;
-        if !agent.is_known() || view.registered(agent).is_some() {
+        if !agent.is_known() {
             return false;
+        }
+        let registered = view.registered(agent);
+        if let Some(known) = &registered {
+            if known.source != Source::Contact {
+                return false;
+            }
+            if known.locations.first() == Some(&from.location) {
+                let name = Arc::clone(&known.name);
+                self.table.actions.push_back(Action::HeardAgain { name });
+                return false;
+            }
         }
         // A letter that was forwarded by the receiver's previous gateway does not come from the
         // sender's location.
         let Some(name) = envelope.sender.filter(|_| envelope.stamps <= 1) else {
             return false;
         };
-        if view.named(&name).is_some() {
+        let known = registered.or_else(|| view.named(&name));
+        if known.is_some_and(|known| known.source != Source::Contact || *known.name != name) {
             return false;
         }
         let address = from.location.authority().parse::<SocketAddr>();
@@ -520,8 +527,8 @@ impl Core {
         }
     }
 
-    /// Reports an agent of a legacy peer as a contact, at the location that it states as its own.
-    /// Only for an agent that is unknown, or known as a contact that sends from the same host. Returns whether it did.
+    /// Reports an agent of a legacy peer as a contact, at the location that it states as its own. Only for an
+    /// agent that is unknown, or known as a contact. Returns whether it did.
     fn report_legacy_contact(
         &mut self,
         now: Now,
@@ -532,13 +539,15 @@ impl Core {
             return false;
         }
         if let Some(known) = self.table.view.named(&name) {
-            let at = known.locations.first();
-            let address = at.and_then(|at| at.authority().parse::<SocketAddr>().ok());
-            let same = address.is_some_and(|address| address.ip().to_canonical() == from);
-            let age = now.utc.duration_since(known.registered);
-            let is_due = at != Some(&location) || age.is_ok_and(|age| age >= HEARD_AGAIN_AFTER);
-            let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
-            if !(is_contact && same && is_due) {
+            if known.source != Source::Contact || known.incarnation.is_known() {
+                return false;
+            }
+            if known.locations.first() == Some(&location) {
+                let address = location.authority().parse::<SocketAddr>();
+                if address.is_ok_and(|address| address.ip().to_canonical() == from) {
+                    let name = Arc::clone(&known.name);
+                    self.table.actions.push_back(Action::HeardAgain { name });
+                }
                 return false;
             }
         }

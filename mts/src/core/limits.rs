@@ -78,19 +78,21 @@ pub(super) struct SenderLimit {
     in_all: Rate,
     /// Time after which the token buckets of a sender and of an address are full again.
     memory: Duration,
+    /// Maximum number of senders, and of addresses. Only granted requests create entries: within `memory`, at most
+    /// a burst and the rate of `in_all`.
+    max_entries: usize,
     all: Option<TokenBucket>,
     addresses: Map<IpAddr, TokenBucket>,
     senders: Map<Sender, TokenBucket>,
 }
 
 impl SenderLimit {
-    /// Maximum number of senders, and of addresses. Only granted requests create entries: within
-    /// `memory`, at most a burst and the rate of `in_all`, which is less.
-    const MAX_ENTRIES: usize = 1024;
-
     pub(super) fn new(per_sender: Rate, per_address: Rate, in_all: Rate) -> Self {
+        let memory = per_sender.memory().max(per_address.memory());
+        let granted = in_all.burst + in_all.per_second * memory.as_secs_f64();
         Self {
-            memory: per_sender.memory().max(per_address.memory()),
+            memory,
+            max_entries: (granted as usize).max(1024),
             per_sender,
             per_address,
             in_all,
@@ -102,12 +104,12 @@ impl SenderLimit {
 
     /// Takes a token; returns whether the action is allowed.
     pub(super) fn take(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
-        if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
+        if self.senders.len().max(self.addresses.len()) >= self.max_entries {
             let memory = self.memory;
             let is_recent = |it: &TokenBucket| now.saturating_duration_since(it.asked()) < memory;
             self.senders.retain(|_, allowance| is_recent(allowance));
             self.addresses.retain(|_, allowance| is_recent(allowance));
-            if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
+            if self.senders.len().max(self.addresses.len()) >= self.max_entries {
                 return false;
             }
         }

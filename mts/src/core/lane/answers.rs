@@ -69,6 +69,7 @@ impl Lane {
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
                 let outcome = Outcome::Sent { via, attempts };
+                table.taken_by_legacy_peer(&self.receiver);
                 self.settle(now, index, Settlement::Outcome(outcome), table);
             }
             Conclusion::NotSent(error) => {
