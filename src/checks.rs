@@ -255,7 +255,8 @@ impl Monitored {
         let mut header = incoming.header();
         // Only a message with both begins a conversation.
         if header.protocol_name().is_some() && header.conversation().is_some() {
-            let sender = directory.known_incarnation(origin.sender);
+            let name = header.sender_name().unwrap_or_default();
+            let sender = directory.sender(origin.sender, name, &incoming.peer());
             header = match origin.peer(sender.as_deref()) {
                 Some(peer) => header.peer(peer),
                 None => header,

@@ -398,10 +398,9 @@ impl Demultiplexer {
 
     /// Hands a message to its reader: returns it if that is the caller, and otherwise sets it aside.
     fn put(&self, endpoint: &Endpoint, received: Incoming, caller: Reader<'_>) -> Option<Incoming> {
-        let sender = received.sender;
-        let leads = sender.is_known() && self.state.lock().leads(&received);
+        let leads = received.sender.is_known() && self.state.lock().leads(&received);
         // Outside of the lock, because a miss reads the files of the directory.
-        let registered = leads.then(|| endpoint.domain.directory().by_incarnation(sender));
+        let registered = leads.then(|| received.registered(endpoint.domain.directory()));
         let registered = registered.flatten();
         self.change(|state| state.put(received, registered.as_deref(), caller))
     }

@@ -5,6 +5,8 @@ use std::sync::Arc;
 
 use fipa_sds::{Directory, Entry, Query, Watch};
 use fipa_transport::Incarnation;
+#[cfg(feature = "protocols")]
+use fipa_transport::PeerId;
 
 /// A read-only view of the known agents and coalitions.
 ///
@@ -53,6 +55,17 @@ impl<'a> DirectoryView<'a> {
     #[must_use]
     pub fn by_incarnation(self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         self.0.by_incarnation(incarnation)
+    }
+
+    /// Returns the entry of the agent of this name and registration whose letter `peer` handed to this host.
+    #[cfg(feature = "protocols")]
+    pub(crate) fn sender(
+        self,
+        incarnation: Incarnation,
+        name: &str,
+        peer: &PeerId,
+    ) -> Option<Arc<Entry>> {
+        self.0.sender(incarnation, name, peer)
     }
 
     /// Returns all known entries, sorted by name. Returns the same allocation until something

@@ -1,6 +1,6 @@
 //! A received message.
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use bytes::Bytes;
 use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
@@ -10,7 +10,12 @@ use fipa_acl::{Envelope, Performative, Text, Time};
 use fipa_monitor::{Header, Violation};
 use fipa_mts::core::Received;
 use fipa_mts::stamped_peer;
+#[cfg(feature = "protocols")]
+use fipa_sds::Entry;
 use fipa_transport::{Incarnation, Kind, PeerId};
+
+#[cfg(feature = "protocols")]
+use crate::directory_view::DirectoryView;
 
 /// A received message.
 #[derive(Debug, Clone)]
@@ -134,6 +139,16 @@ impl Incoming {
         }
         // A letter of an agent of this host has no stamp of the process that hands it over.
         stamped_peer(&self.parts.letter, self.service).unwrap_or_default()
+    }
+
+    /// Returns the entry of the agent that sent the message, as far as its connection proves the agent. On a miss,
+    /// the files of the domain are read.
+    #[cfg(feature = "protocols")]
+    pub(crate) fn registered(&self, directory: DirectoryView<'_>) -> Option<Arc<Entry>> {
+        let view = self.view();
+        let name = view.sender().map(|sender| sender.name());
+        let name = name.as_ref().map(|name| name.as_str());
+        directory.sender(self.sender, &name.unwrap_or_default(), &self.peer())
     }
 
     /// Returns the number of bytes of the letter.

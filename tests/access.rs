@@ -188,10 +188,7 @@ async fn hand_over(peer: TcpConfig, sender: &str, to: &Entry, at: &[Location]) -
     let parcel = Parcel {
         receiver: Arc::clone(&to.name),
         // A registration that the directory does not know: one that it knows belongs to its own link.
-        stream: Stream {
-            sender: Incarnation::random(),
-            receiver: to.incarnation,
-        },
+        stream: Stream::between(Incarnation::random(), to.incarnation),
         sequence: 1,
         after: 0,
         remaining: Duration::from_secs(5),

@@ -525,10 +525,7 @@ impl RepeatingPeer {
     async fn send(&self, attempt: u64, to: &TestService, kind: Kind, sequence: u64) {
         let parcel = Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: ROVER,
-                receiver: ARM,
-            },
+            stream: Stream::between(ROVER, ARM),
             sequence,
             after: sequence - 1,
             remaining: Duration::from_secs(30),

@@ -95,10 +95,7 @@ fn repaired(kind: u8, record: &[u8]) -> Vec<u8> {
 
 fn written_records_are_accepted(letter: &Letter) {
     let notice = Notice {
-        stream: Stream {
-            sender: Incarnation::from_u64(7),
-            receiver: Incarnation::from_u64(8),
-        },
+        stream: Stream::between(Incarnation::from_u64(7), Incarnation::from_u64(8)),
         sequence: 3,
         receiver: "arm_1".into(),
         news: News::Sent {

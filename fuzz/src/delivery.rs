@@ -496,10 +496,7 @@ impl World {
                 Body::Letter(letter(sender, receiver, u64::MAX))
             }
         };
-        let mut stream = Stream {
-            sender: input.one_of(&NAMED),
-            receiver: input.one_of(&NAMED),
-        };
+        let mut stream = Stream::between(input.one_of(&NAMED), input.one_of(&NAMED));
         if is_mole && matches!(body, Body::Letter(_)) {
             stream.sender = input.one_of(&[MOLE_AGENT, MOLE, UNKNOWN, STRANGER]);
         }

@@ -84,10 +84,10 @@ pub fn parcel(input: &mut Input<'_>) -> Parcel {
     };
     Parcel {
         receiver: String::from_utf8_lossy(input.bytes(20)).into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(input.number()),
-            receiver: Incarnation::from_u64(input.number()),
-        },
+        stream: Stream::between(
+            Incarnation::from_u64(input.number()),
+            Incarnation::from_u64(input.number()),
+        ),
         sequence: input.number(),
         after: input.number(),
         transfer: input.number(),

@@ -170,10 +170,7 @@ impl Gateway {
         let _ = self.sink.arrived(Arrival {
             parcel: Parcel {
                 receiver: "arm_0".into(),
-                stream: Stream {
-                    sender: Incarnation::from_u64(agent),
-                    receiver: Incarnation::from_u64(100),
-                },
+                stream: Stream::between(Incarnation::from_u64(agent), Incarnation::from_u64(100)),
                 sequence: 1,
                 after: 0,
                 transfer: 1,

@@ -200,10 +200,7 @@ fn shm(service: Incarnation) -> Location {
 fn parcel(sequence: u64, transfer: u64, body: Body) -> Parcel {
     Parcel {
         receiver: "arm".into(),
-        stream: Stream {
-            sender: ROVER,
-            receiver: ARM,
-        },
+        stream: Stream::between(ROVER, ARM),
         sequence,
         after: 0,
         transfer,

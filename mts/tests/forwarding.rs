@@ -160,10 +160,7 @@ fn tcp(of: u64) -> Location {
 fn parcel(sequence: u64, letter: Letter) -> Parcel {
     Parcel {
         receiver: "arm".into(),
-        stream: Stream {
-            sender: ROVER,
-            receiver: ARM,
-        },
+        stream: Stream::between(ROVER, ARM),
         sequence,
         after: 0,
         transfer: 1,

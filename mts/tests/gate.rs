@@ -61,10 +61,7 @@ fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
         .unwrap();
     let parcel = Parcel {
         receiver: called.into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(1),
-            receiver: to,
-        },
+        stream: Stream::between(Incarnation::from_u64(1), to),
         sequence,
         after: sequence - 1,
         remaining: Duration::from_secs(5),

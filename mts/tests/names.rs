@@ -70,10 +70,7 @@ fn arrive(core: &mut Core, principal: Principal, sequence: u64, letter: Letter) 
     let arrival = Arrival {
         parcel: Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(1),
-                receiver: ARM,
-            },
+            stream: Stream::between(Incarnation::from_u64(1), ARM),
             sequence,
             after: 0,
             remaining: Duration::from_secs(5),

@@ -92,10 +92,7 @@ impl Gateway {
         self.sequence += 1;
         let parcel = Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: ROVER,
-                receiver: ARM,
-            },
+            stream: Stream::between(ROVER, ARM),
             sequence: self.sequence,
             after: 0,
             transfer: self.sequence,
@@ -275,10 +272,7 @@ fn a_question_about_a_letter_brings_its_report_again() {
     }
     let parcel = Parcel {
         receiver: "arm".into(),
-        stream: Stream {
-            sender: ROVER,
-            receiver: ARM,
-        },
+        stream: Stream::between(ROVER, ARM),
         sequence,
         after: 0,
         transfer: sequence,

@@ -4,6 +4,7 @@
 
 mod common;
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -15,8 +16,8 @@ use fipa_sds::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, TransportError,
-    TransportErrorKind, Verdict,
+    Kind, Location, Mandate, Outcome, Parcel, Principal, Realm, Report, Stream, Ticket,
+    TransportError, TransportErrorKind, Verdict,
 };
 
 use self::common::letter;
@@ -127,7 +128,15 @@ impl Bench {
                 ROVER => "rover".into(),
                 _ => "arm".into(),
             },
-            stream: Stream { sender, receiver },
+            stream: Stream {
+                realm: match from.is_remote() {
+                    // The core sets it.
+                    true => Realm::UNPROVED,
+                    // A process repeats that of the parcel that it was handed.
+                    false => Realm::of(&link(HONEST, HONEST).principal),
+                },
+                ..Stream::between(sender, receiver)
+            },
             sequence,
             after: self.after,
             transfer: 1,
@@ -240,7 +249,7 @@ fn an_unknown_sender_belongs_to_the_first_link() {
 
 /// A hello that names the registration of an agent takes nothing from that agent.
 #[test]
-fn a_service_cannot_introduce_itself_as_the_agent_of_another_host() {
+fn a_service_that_introduces_itself_as_an_agent_of_another_host_takes_nothing_from_it() {
     let mut bench = Bench::new();
     let stranger = Incarnation::from_u64(99);
     let heard = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
@@ -252,10 +261,13 @@ fn a_service_cannot_introduce_itself_as_the_agent_of_another_host() {
             dialled: None,
             mandate: Mandate::Unproved,
         };
-        assert!(!bench.core.accepts(&introduction), "as {agent}");
+        assert!(bench.core.accepts(&introduction), "as {agent}");
         bench.core.handle_introduced(bench.now, &introduction);
-        let junk = bench.letter(link(agent, LIAR), (agent, ARM), 2);
+        let junk = bench.letter(link(LIAR, LIAR), (agent, ARM), 2);
         assert!(is_refused(&junk), "{junk:?}");
+        // A letter of the service itself is of another realm.
+        let own = bench.letter(link(agent, LIAR), (agent, ARM), 2);
+        assert_eq!(own, Verdict::Later);
         let real = bench.letter(link(HONEST, HONEST), (agent, ARM), 2);
         assert_eq!(real, Verdict::Later, "of {agent}");
     }
@@ -277,9 +289,38 @@ fn a_connected_service_is_accepted_with_its_own_certificate_only() {
     assert!(!accepts(HONEST, LIAR));
     assert!(accepts(LIAR, LIAR));
     assert!(accepts(Incarnation::from_u64(77), LIAR));
-    // Of agents, a gateway has connected and this host has one.
-    assert!(!accepts(ROVER, LIAR));
+    // What another gateway lists keeps no certificate out; what this host has does.
+    assert!(accepts(ROVER, LIAR));
     assert!(!accepts(ARM, LIAR));
+}
+
+/// Registrations are public, so a gateway can list one of another gateway for an agent of its own, also before it
+/// comes to know the other gateway.
+#[test]
+fn a_registration_that_two_certificates_list_is_two_senders() {
+    let mut bench = Bench::with(&[("stray", ROVER, LIAR), ("rover", ROVER, HONEST)]);
+    let letter = |bench: &mut Bench, holder, name: &str, sequence| {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new(name).unwrap())
+            .receiver(AgentId::new("arm").unwrap());
+        let letter = letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap();
+        let body = (sequence, Body::Letter(letter));
+        bench.arrives(link(holder, holder), (ROVER, ARM), body)
+    };
+    for sequence in 1..=3 {
+        let stray = letter(&mut bench, LIAR, "stray", sequence);
+        assert_eq!(stray, Verdict::Later);
+    }
+    let mut realms = HashSet::new();
+    for sequence in 1..=3 {
+        let real = letter(&mut bench, HONEST, "rover", sequence);
+        assert_eq!(real, Verdict::Later, "{sequence}");
+    }
+    while let Some((_, _, parcel)) = dispatched(&mut bench) {
+        assert_eq!(parcel.stream.sender, ROVER);
+        realms.insert(parcel.stream.realm);
+    }
+    assert_eq!(realms.len(), 2, "{realms:?}");
 }
 
 /// Another host may announce an agent of its own with the registration of the receiver.

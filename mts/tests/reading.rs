@@ -117,10 +117,7 @@ fn the_service_is_not_locked_while_the_gate_reads_a_letter() {
     let verdict = sink.arrived(Arrival {
         parcel: Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(9),
-                receiver: ARM,
-            },
+            stream: Stream::between(Incarnation::from_u64(9), ARM),
             sequence: 1,
             after: 0,
             transfer: 1,

@@ -280,10 +280,7 @@ impl Service {
     fn forward(mut self, after: u64, len: usize) -> Self {
         let copy = Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: ROVER,
-                receiver: ARM,
-            },
+            stream: Stream::between(ROVER, ARM),
             sequence: after + 1,
             after,
             transfer: 1,

@@ -242,10 +242,7 @@ fn answer(forwards: bool, is_own: bool, len: usize) -> Option<Answer> {
     let arrival = Arrival {
         parcel: Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: ROVER,
-                receiver: ARM,
-            },
+            stream: Stream::between(ROVER, ARM),
             sequence: 1,
             after: 0,
             transfer: 1,

@@ -124,10 +124,10 @@ fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
     Arrival {
         parcel: Parcel {
             receiver: format!("arm_{}", receiver - 100).into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(sender),
-                receiver: Incarnation::from_u64(receiver),
-            },
+            stream: Stream::between(
+                Incarnation::from_u64(sender),
+                Incarnation::from_u64(receiver),
+            ),
             sequence,
             after: sequence - 1,
             transfer: sequence,

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fipa_transport::{Forked, Incarnation, Mandate};
+use fipa_transport::{Forked, Incarnation, Mandate, PeerId};
 
 use crate::{Entry, EntryError, Query, Registration, Snapshot, Subscriber, View, Watch};
 
@@ -36,6 +36,20 @@ pub trait Directory: Send + Sync {
             self.refresh();
             self.known_incarnation(incarnation)
         })
+    }
+
+    /// Returns the entry of the agent of this name and registration whose letter `peer` handed to this host.
+    ///
+    /// Other hosts choose the registrations that they announce. So the entry that holds the registration counts
+    /// only if the peer may have announced it; otherwise the one that holds the name.
+    fn sender(&self, incarnation: Incarnation, name: &str, peer: &PeerId) -> Option<Arc<Entry>> {
+        let holder = self.by_incarnation(incarnation)?;
+        if !holder.peer.is_proved_other_than(peer) {
+            return Some(holder);
+        }
+        let named = self.known(name)?;
+        let is_own = named.incarnation == incarnation && !named.peer.is_proved_other_than(peer);
+        is_own.then_some(named)
     }
 
     /// Returns all known entries, sorted by name. Returns the same allocation until something

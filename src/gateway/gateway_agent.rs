@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Contacts as _, letter_for};
-use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query, Source};
+use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query, Source};
 use fipa_transport::{Incarnation, log_limit};
 use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
@@ -218,7 +218,15 @@ impl GatewayAgent {
         performative: Performative,
         fill: impl FnOnce(fipa_acl::MessageBuilder) -> fipa_acl::MessageBuilder,
     ) {
-        let Some(to) = self.view.by_incarnation(sender) else {
+        let name = message.sender().map(AgentId::name);
+        let is_asker =
+            |entry: &Arc<Entry>| entry.incarnation == sender && Some(&*entry.name) == name;
+        let listed = self.view.by_incarnation(sender);
+        let neighbours = self.neighbours.all().into_iter();
+        let mut all = listed.into_iter().chain(neighbours.map(|it| it.entry));
+        let asker = all.find(is_asker);
+        let named = || name.and_then(|name| self.view.known(name));
+        let Some(to) = asker.or_else(|| named().filter(is_asker)) else {
             log_limit::info!("dropping a reply: its requester is no longer registered");
             return;
         };
@@ -230,7 +238,7 @@ impl GatewayAgent {
     }
 
     /// Sends a message from the gateway.
-    pub(crate) fn send(&self, message: &Message, to: &fipa_sds::Entry) {
+    pub(crate) fn send(&self, message: &Message, to: &Entry) {
         match letter_for(message, SystemTime::now()) {
             Ok(letter) => {
                 let submission = Submission {

@@ -380,11 +380,10 @@ impl Directory for View {
     }
 
     fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.all.known_incarnation(incarnation).or_else(|| {
-            let state = self.neighbours.state.lock();
-            let neighbour = state.present.get(&incarnation)?;
-            Some(Arc::clone(&neighbour.entry))
-        })
+        let listed = self.all.known_incarnation(incarnation);
+        let state = self.neighbours.state.lock();
+        let neighbour = state.present.get(&incarnation).map(|it| &it.entry);
+        unless_claimed(listed, neighbour)
     }
 
     fn refresh(&self) {
@@ -427,6 +426,16 @@ impl Directory for View {
     }
 }
 
+/// Returns the listed entry of an incarnation, or that of the connected gateway that has it: other hosts list what
+/// they choose.
+fn unless_claimed(
+    listed: Option<Arc<Entry>>,
+    neighbour: Option<&Arc<Entry>>,
+) -> Option<Arc<Entry>> {
+    let listed = listed.filter(|it| it.reach == Reach::Local || neighbour.is_none());
+    listed.or_else(|| neighbour.cloned())
+}
+
 /// A [`View`] at one time.
 struct PresentView {
     all: Arc<dyn DirectoryView>,
@@ -439,8 +448,8 @@ impl DirectoryView for PresentView {
     }
 
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        let known = self.all.registered(incarnation);
-        known.or_else(|| self.neighbours.get(&incarnation).cloned())
+        let listed = self.all.registered(incarnation);
+        unless_claimed(listed, self.neighbours.get(&incarnation))
     }
 
     fn all(&self) -> Arc<[Arc<Entry>]> {

@@ -89,7 +89,8 @@ impl PlatformAgents {
         let claimed = message.sender()?;
         let holder = self.view.lookup(claimed.name());
         let (entry, is_proved) = if received.sender.is_known() {
-            let entry = self.view.by_incarnation(received.sender)?;
+            let (sender, peer) = (received.sender, &received.peer);
+            let entry = self.view.sender(sender, claimed.name(), peer)?;
             let is_holder = holder.is_some_and(|it| it.incarnation == entry.incarnation);
             let is_proved = is_holder && *entry.name == *claimed.name();
             (entry, is_proved)
@@ -234,7 +235,10 @@ impl PlatformAgents {
             submission.receivers = vec![Arc::clone(&answer.to)];
             return Some(self.service.mts.send(submission));
         }
-        let Some(to) = self.view.by_incarnation(registration) else {
+        let holder = self.view.by_incarnation(registration);
+        let holder = holder.filter(|holder| *holder.name == *answer.to);
+        let to = holder.or_else(|| self.view.known(&answer.to));
+        let Some(to) = to.filter(|to| to.incarnation == registration) else {
             log_limit::info!("dropping a reply: its requester is no longer registered");
             return None;
         };

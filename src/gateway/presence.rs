@@ -202,15 +202,13 @@ impl GatewayAgent {
         let mut answer = Answer::default();
         let mut others = Vec::new();
         for Asked { id, mts } in asked {
-            match self.view.known_incarnation(id) {
+            let known = self.service.host.known_incarnation(id);
+            match known {
                 Some(entry) if entry.reach == Reach::Local => answer.here.push(id),
-                Some(entry) if !entry.mts.incarnation.is_known() => answer.unsupported.push(id),
-                // The gateway may have started again since the agent's last look at its entry.
-                Some(entry) => others.push(Asked {
-                    id,
-                    mts: entry.mts.incarnation,
-                }),
-                None => others.push(Asked { id, mts }),
+                _ if !mts.is_known() => answer.unsupported.push(id),
+                // Only the gateway that lists the agent to the one that asks: another gateway may list the
+                // registration for an agent of its own.
+                _ => others.push(Asked { id, mts }),
             }
         }
         if answer != Answer::default() {

@@ -606,10 +606,11 @@ impl Task {
         let registration = match incoming.sender {
             proved if proved.is_known() => {
                 let peer = Peer::new(name, proved.as_u64()).ok()?;
-                if self.watched.contains(&peer) {
-                    return Some(peer);
-                }
-                let entry = directory.by_incarnation(proved)?;
+                let Some(entry) = incoming.registered(directory) else {
+                    // The entry of a member may have left before its last messages arrive.
+                    let is_free = directory.known_incarnation(proved).is_none();
+                    return (is_free && self.watched.contains(&peer)).then_some(peer);
+                };
                 let by_gateway = entry.role == Role::Gateway && entry.reach == Reach::Local;
                 match *entry.name == *name {
                     true => proved,

@@ -82,10 +82,7 @@ impl Stranger {
         self.sent += 1;
         let parcel = Parcel {
             receiver: gateway.as_str().into(),
-            stream: Stream {
-                sender: self.incarnation,
-                receiver: *to,
-            },
+            stream: Stream::between(self.incarnation, *to),
             sequence: self.sent,
             after: 0,
             remaining: Duration::from_secs(30),

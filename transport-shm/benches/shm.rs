@@ -218,10 +218,7 @@ fn parcel(content: Bytes) -> Parcel {
     };
     Parcel {
         receiver: "arm_left".into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(1),
-            receiver: Incarnation::from_u64(2),
-        },
+        stream: Stream::between(Incarnation::from_u64(1), Incarnation::from_u64(2)),
         sequence: 1,
         after: 0,
         remaining: Duration::from_secs(5),

@@ -35,7 +35,7 @@ pub use incarnation::{Incarnation, IncarnationError};
 pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
-pub use parcel::{Body, Parcel, Report, Stream};
+pub use parcel::{Body, Parcel, Realm, Report, Stream};
 pub use peer_id::PeerId;
 pub use quota_address::{quota_address, scoped_quota_address};
 pub use token_bucket::TokenBucket;

@@ -5,17 +5,67 @@ use std::time::Duration;
 
 use fipa_acl::Letter;
 
-use crate::{Incarnation, Outcome};
+use crate::{Incarnation, Outcome, Principal};
+
+/// The senders whose registrations one holder of a certificate vouches for.
+///
+/// Other hosts choose the registrations that they announce, and registrations are public. So a registration names
+/// an agent only together with the proof of the link on which its letters came to this host: agents of two holders
+/// of certificates never share a stream, whatever they announce.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Realm(u64);
+
+impl Realm {
+    /// This host, and all hosts that prove nothing.
+    pub const UNPROVED: Self = Self(0);
+
+    /// Returns the realm of the senders on a link that proves this identity.
+    #[must_use]
+    pub fn of(principal: &Principal) -> Self {
+        match principal {
+            Principal::Certificate([a, b, c, d, e, f, g, h, ..]) => {
+                Self(u64::from_le_bytes([*a, *b, *c, *d, *e, *f, *g, *h]).max(1))
+            }
+            Principal::Host | Principal::Unproved => Self::UNPROVED,
+        }
+    }
+
+    /// Returns the realm with this number.
+    #[must_use]
+    pub const fn from_u64(number: u64) -> Self {
+        Self(number)
+    }
+
+    /// Returns its number: 0, or the first eight bytes of the fingerprint of a certificate, little-endian.
+    #[must_use]
+    pub const fn as_u64(self) -> u64 {
+        self.0
+    }
+}
 
 /// The pair of registrations, of a sender and of a receiver, within which letters are ordered and
 /// deduplicated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Stream {
+    /// The realm of the sender. The gateway that receives a letter from another host sets it.
+    pub realm: Realm,
     /// The sending agent. [`Incarnation::UNKNOWN`] for letters of legacy peers, which are neither
     /// ordered nor deduplicated.
     pub sender: Incarnation,
     /// The receiving agent.
     pub receiver: Incarnation,
+}
+
+impl Stream {
+    /// Returns the stream between an agent of this host, or of a host that proves nothing, and a receiver.
+    #[must_use]
+    pub const fn between(sender: Incarnation, receiver: Incarnation) -> Self {
+        Self {
+            realm: Realm::UNPROVED,
+            sender,
+            receiver,
+        }
+    }
 }
 
 /// The unit that a transport carries: the header that delivery requires, and a body.

@@ -63,6 +63,20 @@ impl PeerId {
         }
     }
 
+    /// Whether the two cannot be one peer, because both are proved: each is the processes of this host or the holder
+    /// of a certificate.
+    #[must_use]
+    pub fn is_proved_other_than(&self, other: &Self) -> bool {
+        self.is_proved() && other.is_proved() && self != other
+    }
+
+    fn is_proved(&self) -> bool {
+        let fingerprint = |text: &str| {
+            text.len() == 2 * FINGERPRINT && text.bytes().all(|it| it.is_ascii_hexdigit())
+        };
+        self.0.as_deref().is_none_or(fingerprint)
+    }
+
     /// Returns the text.
     #[must_use]
     pub fn as_str(&self) -> &str {
@@ -76,7 +90,10 @@ impl PeerId {
     }
 }
 
-fn hex(bytes: &[u8]) -> String {
+/// Length of the fingerprint of a certificate, in bytes.
+const FINGERPRINT: usize = 32;
+
+fn hex(bytes: &[u8; FINGERPRINT]) -> String {
     use fmt::Write as _;
     let mut text = String::with_capacity(2 * bytes.len());
     for byte in bytes {
@@ -129,6 +146,19 @@ mod tests {
         assert_ne!(at("tcp://[fe80::1%2]:1"), at("tcp://[fe80::2%2]:1"));
         assert_eq!(at("tcp://arm.local:1"), at("tcp://arm.local:2"));
         assert!(!PeerId::of(Principal::Unproved, None).is_this_host());
+    }
+
+    #[test]
+    fn two_proved_peers_are_never_one() {
+        let certified = |number| PeerId::of(Principal::Certificate([number; 32]), None);
+        let unproved = PeerId::of_ip([192, 0, 2, 1].into());
+        assert!(certified(1).is_proved_other_than(&certified(2)));
+        assert!(certified(1).is_proved_other_than(&PeerId::THIS_HOST));
+        assert!(!certified(1).is_proved_other_than(&certified(1)));
+        for other in [certified(1), PeerId::THIS_HOST, PeerId::unknown()] {
+            assert!(!unproved.is_proved_other_than(&other));
+            assert!(!other.is_proved_other_than(&unproved));
+        }
     }
 
     #[test]

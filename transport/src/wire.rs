@@ -17,8 +17,8 @@ use zerocopy::little_endian::{U16, U32, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::{
-    Arriving, Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report,
-    Stream, TransportError, TransportErrorKind,
+    Arriving, Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Realm,
+    Report, Stream, TransportError, TransportErrorKind,
 };
 
 /// The header of a parcel: [`HEADER_LEN`] bytes, little-endian.
@@ -34,6 +34,7 @@ pub struct ParcelHeader {
     head_len: U32,
     tail_len: U32,
     content_len: U64,
+    realm: U64,
     sender: U64,
     receiver: U64,
     sequence: U64,
@@ -132,6 +133,7 @@ impl ParcelHeader {
             head_len: U32::ZERO,
             tail_len: U32::ZERO,
             content_len: U64::ZERO,
+            realm: U64::new(parcel.stream.realm.as_u64()),
             sender: U64::new(parcel.stream.sender.as_u64()),
             receiver: U64::new(parcel.stream.receiver.as_u64()),
             sequence: U64::new(parcel.sequence),
@@ -211,6 +213,7 @@ impl ParcelHeader {
 
     fn stream(&self) -> Stream {
         Stream {
+            realm: Realm::from_u64(self.realm.get()),
             sender: Incarnation::from_u64(self.sender.get()),
             receiver: Incarnation::from_u64(self.receiver.get()),
         }
@@ -454,10 +457,7 @@ mod tests {
     fn parcel(body: Body) -> Parcel {
         Parcel {
             receiver: "béla@home".into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(7),
-                receiver: Incarnation::from_u64(u64::MAX),
-            },
+            stream: Stream::between(Incarnation::from_u64(7), Incarnation::from_u64(u64::MAX)),
             sequence: 3,
             after: 2,
             transfer: 5,

@@ -260,10 +260,7 @@ mod faults {
         let unknown = Incarnation::UNKNOWN;
         Parcel {
             receiver: "x".into(),
-            stream: Stream {
-                sender: unknown,
-                receiver: unknown,
-            },
+            stream: Stream::between(unknown, unknown),
             sequence: 1,
             after: 0,
             remaining: Duration::ZERO,

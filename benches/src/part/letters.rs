@@ -187,10 +187,7 @@ fn parcel(content: Bytes) -> Parcel {
     };
     Parcel {
         receiver: NAME.into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(1),
-            receiver: Incarnation::from_u64(2),
-        },
+        stream: Stream::between(Incarnation::from_u64(1), Incarnation::from_u64(2)),
         sequence: 1,
         after: 0,
         remaining: REMAINING,

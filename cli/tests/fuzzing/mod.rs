@@ -261,14 +261,14 @@ impl Writer<'_> {
         };
         let parcel = Parcel {
             receiver: receiver.as_str().into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(match self.random.u8(..4) {
+            stream: Stream::between(
+                Incarnation::from_u64(match self.random.u8(..4) {
                     0 => self.claim(),
                     1 => self.random.u64(..4),
                     _ => self.random.u64(..),
                 }),
-                receiver: self.life_of(receiver),
-            },
+                self.life_of(receiver),
+            ),
             sequence: self.counted(),
             after: match self.random.u8(..4) {
                 0 => self.counted(),
@@ -287,10 +287,10 @@ impl Writer<'_> {
         let letter = letter_with(self.random, &self.receivers[0], vec![7; len]);
         written(&Parcel {
             receiver: self.receivers[0].as_str().into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(self.random.u64(1..)),
-                receiver: Incarnation::from_u64(self.random.u64(1..)),
-            },
+            stream: Stream::between(
+                Incarnation::from_u64(self.random.u64(1..)),
+                Incarnation::from_u64(self.random.u64(1..)),
+            ),
             sequence: 1,
             after: 0,
             remaining: Duration::from_secs(5),

@@ -106,10 +106,7 @@ impl Crowd {
         self.arrived += 1;
         let parcel = Parcel {
             receiver: Arc::clone(&self.name),
-            stream: Stream {
-                sender: agent(from),
-                receiver: ROVER,
-            },
+            stream: Stream::between(agent(from), ROVER),
             sequence: self.arrived,
             after: 0,
             remaining: Duration::from_secs(5),

@@ -62,12 +62,9 @@ impl Core {
         let sender = if self.agents.contains_key(&registration) {
             FailureTarget::Ours(registration)
         } else {
-            let known = self.table.view.registered(registration);
-            match known {
-                Some(entry) if failed.sender.name() == &*entry.name => {
-                    FailureTarget::Remote(failed)
-                }
-                _ => return,
+            match self.table.receiver(registration, failed.sender.name()) {
+                Some(_) => FailureTarget::Remote(failed),
+                None => return,
             }
         };
         self.table.undelivered.push_back(Undelivered {
@@ -134,10 +131,7 @@ impl Core {
                     }
                 };
                 if inbox.push_failure(letter.clone()) {
-                    let stream = Stream {
-                        sender: own,
-                        receiver: agent,
-                    };
+                    let stream = Stream::between(own, agent);
                     let name = Arc::clone(&inbox.name);
                     self.table.notice(stream, sequence, &name, || News::Taken {
                         via: None,
@@ -173,10 +167,7 @@ impl Core {
             if !self.failure_limit.debit(address, letter.len()) {
                 continue;
             }
-            let stream = Stream {
-                sender: self.table.config.incarnation,
-                receiver: registration_of(&entry),
-            };
+            let stream = Stream::between(self.table.config.incarnation, registration_of(&entry));
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
             if !self.has_room_for_stranger(id, letter.len()) {
                 log_omitted(address);

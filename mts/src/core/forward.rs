@@ -649,10 +649,7 @@ impl Core {
             *is_contact = self.report_legacy_contact(now, located, from.address);
         }
         let stream_sender = self.table.config.incarnation;
-        let stream = Stream {
-            sender: stream_sender,
-            receiver: entry.incarnation,
-        };
+        let stream = Stream::between(stream_sender, entry.incarnation);
         let sequence = self.sequence_of(stream_sender);
         if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
             && inbox.push_unframed(letter.clone(), via, from.address)
@@ -702,10 +699,7 @@ impl Core {
         (reason, detail): (FailureReason, String),
     ) {
         let own = self.table.config.incarnation;
-        let stream = Stream {
-            sender: own,
-            receiver: Incarnation::UNKNOWN,
-        };
+        let stream = Stream::between(own, Incarnation::UNKNOWN);
         let sequence = self.sequence_of(own);
         self.table
             .notice(stream, sequence, receiver, || News::Passed {

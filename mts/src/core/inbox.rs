@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, PeerId, Stream,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, PeerId, Realm, Stream,
 };
 
 use super::rules::{self, Offer};
@@ -47,7 +47,7 @@ pub(crate) struct Inbox {
     /// Number of remembered letters of one sender: as many as it can have open.
     recent: usize,
     /// With a keyed hash, because untrusted peers choose these keys, tens of thousands of them.
-    senders: HashMap<Incarnation, SenderState>,
+    senders: HashMap<(Realm, Incarnation), SenderState>,
     /// Streams that were told that the queue is full and wait for a credit, in order.
     waiting: VecDeque<(Stream, Location)>,
     /// Failure messages in the queue, which do not count against its bound.
@@ -105,7 +105,7 @@ impl Inbox {
         let has_room = self.has_room(len);
         // Looked up once: the keyed hash takes a tenth of the time of an arrival.
         let mut taken = match stream.sender.is_known() {
-            true => self.senders.get_mut(&stream.sender),
+            true => self.senders.get_mut(&(stream.realm, stream.sender)),
             false => None,
         };
         if stream.sender.is_known() {
@@ -133,7 +133,7 @@ impl Inbox {
         match taken {
             Some(taken) => taken.take(sequence, self.recent),
             None if stream.sender.is_known() => {
-                if let Err(refusal) = self.remember(now, stream.sender, sequence) {
+                if let Err(refusal) = self.remember(now, &stream, sequence) {
                     return refusal;
                 }
             }
@@ -232,7 +232,7 @@ impl Inbox {
     }
 
     /// Remembers the first letter of a sender.
-    fn remember(&mut self, now: Instant, sender: Incarnation, sequence: u64) -> Result<(), Answer> {
+    fn remember(&mut self, now: Instant, stream: &Stream, sequence: u64) -> Result<(), Answer> {
         // Not for each letter while there are too many senders: it visits all of them.
         if self.next_sweep.is_none_or(|due| due <= now) {
             self.forget_old(now);
@@ -249,7 +249,7 @@ impl Inbox {
             seen: now,
         };
         state.take(sequence, self.recent);
-        self.senders.insert(sender, state);
+        self.senders.insert((stream.realm, stream.sender), state);
         Ok(())
     }
 
@@ -323,10 +323,7 @@ mod tests {
     fn parcel(sequence: u64, after: u64) -> Parcel {
         Parcel {
             receiver: "b".into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(1),
-                receiver: Incarnation::from_u64(2),
-            },
+            stream: Stream::between(Incarnation::from_u64(1), Incarnation::from_u64(2)),
             sequence,
             after,
             transfer: 0,
@@ -371,6 +368,20 @@ mod tests {
         assert_eq!(offer(&mut inbox, 3, 0), Answer::Accepted);
         assert_eq!(offer(&mut inbox, 9, 5), Answer::Accepted);
         assert_eq!(inbox.len(), 3);
+    }
+
+    /// Another host may have chosen the registration of a sender for an agent of its own.
+    #[test]
+    fn a_registration_in_two_realms_is_two_senders() {
+        let mut inbox = inbox(10);
+        for realm in [7, 0, 8, 7] {
+            let mut parcel = parcel(1, 0);
+            parcel.stream.realm = Realm::from_u64(realm);
+            let hop = (Kind::Shm, &back());
+            let answer = inbox.accept(Instant::now(), &parcel, Letter::default(), hop, None);
+            assert_eq!(answer, Answer::Accepted);
+        }
+        assert_eq!(inbox.len(), 3, "one is a copy");
     }
 
     #[cfg(debug_assertions)]

@@ -60,7 +60,7 @@ use fipa_acl::Letter;
 use fipa_sds::{Entry, Pattern, Resolution, Role, Source, View};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
-    Introduction, Kind, Location, Outcome, Parcel, Principal, Report, Stream, Verdict,
+    Introduction, Kind, Location, Outcome, Parcel, Principal, Realm, Report, Stream, Verdict,
 };
 
 pub use attempts::Action;
@@ -506,10 +506,7 @@ impl Core {
         letter: Letter,
         deadline: Instant,
     ) {
-        let stream = Stream {
-            sender,
-            receiver: attempts::registration_of(entry),
-        };
+        let stream = Stream::between(sender, attempts::registration_of(entry));
         let name = &entry.name;
         if self.closed {
             let reason = FailureReason::Closed;
@@ -570,10 +567,7 @@ impl Core {
         let attempts = attempt.into_iter().collect();
         let outcome = Outcome::Failed { reason, attempts };
         let sequence = self.sequence_of(sender);
-        let stream = Stream {
-            sender,
-            receiver: Incarnation::UNKNOWN,
-        };
+        let stream = Stream::between(sender, Incarnation::UNKNOWN);
         self.table
             .notice(stream, sequence, &receiver, || News::Sent {
                 send: Some(send),
@@ -709,9 +703,17 @@ impl Core {
         if let Err(error) = self.principals.check_service(&from, is_letter, view) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, error.to_string()));
         }
+        if from.is_remote() {
+            parcel.stream.realm = match parcel.body {
+                Body::Letter(_) | Body::Predecessor => Realm::of(&from.principal),
+                // About letters of agents of this host.
+                Body::Report(_) | Body::Credit => Realm::UNPROVED,
+            };
+        }
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
-                let sender = parcel.stream.sender;
+                let name = read.as_ref().and_then(|read| read.sender_name());
+                let sender = (parcel.stream.sender, name);
                 let view = &*self.table.view;
                 if let Err(error) = self.principals.check_sender(sender, &from, view) {
                     if error == PrincipalError::NotIntroduced {
@@ -1087,10 +1089,7 @@ impl Core {
     /// them: dispatches one credit to each, which no lane waits for. It is not repeated.
     pub fn greet(&mut self, services: Vec<(Arc<str>, Location)>) {
         for (name, location) in services {
-            let no_stream = Stream {
-                sender: Incarnation::UNKNOWN,
-                receiver: Incarnation::UNKNOWN,
-            };
+            let no_stream = Stream::between(Incarnation::UNKNOWN, Incarnation::UNKNOWN);
             let parcel = attempts::note_parcel(no_stream, name, 0, Body::Credit);
             self.table.note(Note::once(location, parcel));
         }
@@ -1187,10 +1186,7 @@ fn own_lane(sender: Incarnation, entry: &Entry) -> LaneKey {
     match entry.role {
         Role::Agent => LaneKey::Name(sender, Arc::clone(&entry.name)),
         // Several services may have the same name.
-        _ => LaneKey::Service(Stream {
-            sender,
-            receiver: attempts::registration_of(entry),
-        }),
+        _ => LaneKey::Service(Stream::between(sender, attempts::registration_of(entry))),
     }
 }
 

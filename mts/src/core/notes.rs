@@ -633,10 +633,7 @@ mod tests {
     fn a_note_without_room_replaces_an_earlier_one() {
         let location: Location = "tcp://192.0.2.1:7100#0000000000000009".parse().unwrap();
         let note = |sender: u64, sequence: u64, after: u64, body: Body| {
-            let stream = Stream {
-                sender: Incarnation::from_u64(sender),
-                receiver: Incarnation::from_u64(1),
-            };
+            let stream = Stream::between(Incarnation::from_u64(sender), Incarnation::from_u64(1));
             let parcel = Parcel {
                 after,
                 ..note_parcel(stream, "arm".into(), sequence, body)

@@ -381,10 +381,7 @@ impl PeerLocation {
     }
 
     fn ask(&mut self, now: Instant, (peer, name): (u64, &Arc<str>), table: &mut AttemptTable) {
-        let no_stream = Stream {
-            sender: Incarnation::UNKNOWN,
-            receiver: Incarnation::UNKNOWN,
-        };
+        let no_stream = Stream::between(Incarnation::UNKNOWN, Incarnation::UNKNOWN);
         let parcel = note_parcel(no_stream, Arc::clone(name), 0, Body::Credit);
         let attempt = table.next_attempt();
         let purpose = Purpose::PeerCheck { peer };

@@ -99,6 +99,11 @@ impl Principals {
         if reach == Some(Reach::Local) {
             return false;
         }
+        // What others state about the incarnation keeps no certificate out. The letters of an agent with this
+        // registration are of another realm.
+        if matches!(principal, Principal::Certificate(_)) {
+            return true;
+        }
         if listed.is_some_and(|it| it.role != Role::Agent) {
             // A letter in its name, before it connected, does not keep it out.
             return true;
@@ -190,20 +195,54 @@ impl Principals {
 
     /// Checks whether the link may carry letters of this sender. If the directory has the sender,
     /// its gateway's principal decides; otherwise the link of the sender's first letter.
+    ///
+    /// Gateways of several principals may list one registration, each with an agent of its own. Then each may send
+    /// letters of its agent, which has the name in the envelope: they are of different [realms](fipa_transport::Realm).
     pub(super) fn check_sender(
         &mut self,
-        sender: Incarnation,
+        (sender, name): (Incarnation, Option<&str>),
         from: &Hop,
         view: &dyn View,
     ) -> Result<(), PrincipalError> {
         if !from.is_remote() || !sender.is_known() {
             return Ok(());
         }
+        let refused = match self.check_holder(sender, from, view) {
+            Err(refused) => refused,
+            Ok(()) => return Ok(()),
+        };
+        let service = match sender == from.location.incarnation() {
+            true => Some(sender),
+            false => {
+                let own = name.and_then(|name| view.named(name));
+                let own = own.filter(|own| own.incarnation == sender && own.role == Role::Agent);
+                own.map(|own| own.mts.incarnation)
+            }
+        };
+        let owner = service.and_then(|service| self.of_service(service));
+        let is_certified = matches!(from.principal, Principal::Certificate(_));
+        match owner == Some(from.principal) && is_certified {
+            true => Ok(()),
+            false => Err(refused),
+        }
+    }
+
+    /// Checks whether the link may carry letters of the agent that holds the registration.
+    fn check_holder(
+        &mut self,
+        sender: Incarnation,
+        from: &Hop,
+        view: &dyn View,
+    ) -> Result<(), PrincipalError> {
         let known = view.registered(sender);
         // Letters of a service itself come only on its own links. A service that introduces itself
         // with the registration of an agent takes nothing from that agent.
         let is_agent = known.as_ref().is_some_and(|it| it.role == Role::Agent);
-        if !is_agent && self.services.contains_key(&sender) && sender != from.location.incarnation()
+        let is_heard = self.senders.get(&sender) == Some(&Some(from.principal));
+        if !is_agent
+            && !is_heard
+            && self.services.contains_key(&sender)
+            && sender != from.location.incarnation()
         {
             return Err(PrincipalError::Sender);
         }
@@ -348,7 +387,7 @@ mod tests {
         let directory = no_agents();
         let mut hear = |sender: u64, principal| {
             let sender = Incarnation::from_u64(sender);
-            principals.check_sender(sender, &hop(SERVICE, principal), &directory)
+            principals.check_sender((sender, None), &hop(SERVICE, principal), &directory)
         };
         assert_eq!(hear(100, ROVER), Ok(()));
         for sender in 0..2 * MAX_SENDERS as u64 {

@@ -90,6 +90,13 @@ pub struct ReadLetter {
     pub(super) envelope: Option<Result<EnvelopeParts, DecodeError>>,
 }
 
+impl ReadLetter {
+    /// Returns the name of the sender in the envelope.
+    pub(super) fn sender_name(&self) -> Option<&str> {
+        self.envelope.as_ref()?.as_ref().ok()?.sender.as_deref()
+    }
+}
+
 impl fmt::Debug for LetterReader {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("LetterReader").finish_non_exhaustive()

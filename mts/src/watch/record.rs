@@ -435,10 +435,10 @@ impl Record {
 impl Header {
     fn id(&self, name: &[u8]) -> Result<LetterId, RecordError> {
         Ok(LetterId {
-            stream: Stream {
-                sender: Incarnation::from_u64(self.sender.get()),
-                receiver: Incarnation::from_u64(self.receiver.get()),
-            },
+            stream: Stream::between(
+                Incarnation::from_u64(self.sender.get()),
+                Incarnation::from_u64(self.receiver.get()),
+            ),
             sequence: self.sequence.get(),
             receiver: name_of(name)?,
         })

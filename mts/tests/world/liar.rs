@@ -629,10 +629,7 @@ impl World {
         };
         let mut parcel = known.unwrap_or_else(|| Parcel {
             receiver: "h0_p0_0".into(),
-            stream: Stream {
-                sender: Incarnation::UNKNOWN,
-                receiver: Incarnation::UNKNOWN,
-            },
+            stream: Stream::between(Incarnation::UNKNOWN, Incarnation::UNKNOWN),
             sequence: 1,
             after: 0,
             transfer: 1,

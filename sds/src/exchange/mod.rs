@@ -41,7 +41,7 @@ use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
 use crate::shares;
-use crate::{Directory as _, Entry, Mts, Reach, Role, Source};
+use crate::{Entry, Mts, Reach, Role, Source};
 
 /// Ontology of the letters of the exchange.
 pub const EXCHANGE_ONTOLOGY: &str = "fipa-sds-exchange";
@@ -513,8 +513,7 @@ impl Exchange {
             }
             return Err(ExchangeError::Stranger);
         }
-        let mut message = wire::decode(content)?;
-        self.keep_services(from, &mut message);
+        let message = wire::decode(content)?;
         let Some(neighbor) = self.neighbors.get_mut(&from) else {
             return Err(ExchangeError::Stranger);
         };
@@ -569,26 +568,6 @@ impl Exchange {
                 neighbor.request_all(now);
             }
         }
-    }
-
-    /// Removes agents whose registration is the incarnation of another connected gateway: letters
-    /// for that gateway would go to the agent, and its own letters would be refused. An agent that
-    /// was listed before that gateway connected stays.
-    fn keep_services(&self, from: Incarnation, message: &mut ExchangeMessage) {
-        let agents = match message {
-            ExchangeMessage::Full(full) => &mut full.agents,
-            ExchangeMessage::Changes(changes) => &mut changes.agents,
-            ExchangeMessage::Again | ExchangeMessage::Goodbye => return,
-        };
-        agents.retain(|agent| {
-            let is_service =
-                agent.incarnation != from && self.neighbors.contains_key(&agent.incarnation);
-            let is_listed = || {
-                let known = self.directory.known_incarnation(agent.incarnation);
-                known.is_some_and(|known| known.mts.incarnation == from)
-            };
-            !is_service || is_listed()
-        });
     }
 
     /// Handles the result of the letter in flight to this neighbor.

@@ -36,7 +36,7 @@
 use std::collections::HashSet;
 use std::time::SystemTime;
 
-use fipa_transport::{Incarnation, Kind, Location, LocationError, PeerId, Signature};
+use fipa_transport::{Incarnation, Kind, Location, LocationError, PeerId, Principal, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::{Entry, EntryError, Members, Mts, Reach, Role, Source};
@@ -273,13 +273,13 @@ fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
         name: record.parsed::<String>("fipa-name")?.into(),
         agent_type: whole("fipa-type", "TYPE")?,
         incarnation: record.parsed("fipa-id")?,
+        peer: PeerId::of(Principal::Unproved, known.first()),
         locations: known,
         mts: Mts::new(record.parsed::<String>("fipa-mts")?, mts),
         description: whole("fipa-description", "DESCRIPTION")?,
         registered: time_of_millis(record.parsed("fipa-time")?),
         source: Source::Mdns,
         reach: Reach::Remote { gateway: mts },
-        peer: PeerId::default(),
         role,
     })
 }
@@ -299,11 +299,12 @@ fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
         .and_then(millis_of_timestamp)
         .unwrap_or_else(|| millis_of_time(now));
     let locator = record.joined("LOCATOR");
-    let locator = String::from_utf8_lossy(&locator);
+    let locations = locations_of_locator(&String::from_utf8_lossy(&locator));
     Entry {
         agent_type: record.legacy_text("TYPE", Entry::MAX_TYPE),
         incarnation: Incarnation::UNKNOWN,
-        locations: locations_of_locator(&locator),
+        peer: PeerId::of(Principal::Unproved, locations.first()),
+        locations,
         // Legacy records do not name the service; each agent may have its own.
         mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
         name: name.into(),
@@ -313,7 +314,6 @@ fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
         reach: Reach::Remote {
             gateway: Incarnation::UNKNOWN,
         },
-        peer: PeerId::default(),
         role: Role::Agent,
     }
 }

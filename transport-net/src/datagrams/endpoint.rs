@@ -533,10 +533,10 @@ mod tests {
         let (now, attempt) = (Instant::now(), AttemptId(1));
         let parcel = Parcel {
             receiver: "arm".into(),
-            stream: fipa_transport::Stream {
-                sender: Incarnation::from_u64(1),
-                receiver: Incarnation::from_u64(2),
-            },
+            stream: fipa_transport::Stream::between(
+                Incarnation::from_u64(1),
+                Incarnation::from_u64(2),
+            ),
             sequence: 1,
             after: 0,
             remaining: Duration::from_secs(1),

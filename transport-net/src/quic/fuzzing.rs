@@ -550,10 +550,7 @@ mod tests {
     fn letter(number: u64) -> Vec<u8> {
         let parcel = Parcel {
             receiver: "arm".into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(7),
-                receiver: Incarnation::from_u64(8),
-            },
+            stream: Stream::between(Incarnation::from_u64(7), Incarnation::from_u64(8)),
             sequence: number,
             after: number - 1,
             transfer: number,

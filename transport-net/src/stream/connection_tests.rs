@@ -12,10 +12,7 @@ use crate::hello::tests::sample;
 fn parcel(sequence: u64, len: usize) -> Parcel {
     Parcel {
         receiver: "arm".into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(1),
-            receiver: Incarnation::from_u64(2),
-        },
+        stream: Stream::between(Incarnation::from_u64(1), Incarnation::from_u64(2)),
         sequence,
         after: 0,
         remaining: Duration::from_secs(1),

@@ -376,10 +376,7 @@ fn letter_of(len: usize, sender: u64) -> Parcel {
     };
     Parcel {
         receiver: "arm".into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(sender),
-            receiver: Incarnation::from_u64(2),
-        },
+        stream: Stream::between(Incarnation::from_u64(sender), Incarnation::from_u64(2)),
         sequence: 1,
         after: 0,
         transfer: 1,

@@ -16,10 +16,7 @@ fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
     };
     Parcel {
         receiver: "arm@crex".into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(1),
-            receiver: Incarnation::from_u64(2),
-        },
+        stream: Stream::between(Incarnation::from_u64(1), Incarnation::from_u64(2)),
         sequence: 1,
         after: 1,
         remaining: Duration::from_secs(1),

@@ -411,10 +411,7 @@ pub(crate) fn message_parcel(sequence: u64, content: &str) -> Parcel {
 pub(crate) fn letter_parcel(sequence: u64, letter: Letter) -> Parcel {
     Parcel {
         receiver: "arm_1".into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(1),
-            receiver: Incarnation::from_u64(2),
-        },
+        stream: Stream::between(Incarnation::from_u64(1), Incarnation::from_u64(2)),
         sequence,
         after: 0,
         remaining: Duration::from_secs(5),

@@ -219,10 +219,7 @@ pub(super) fn letter(content: impl Into<Bytes>) -> Body {
 pub(super) fn parcel(sequence: u64, body: Body) -> Parcel {
     Parcel {
         receiver: "arm_1".into(),
-        stream: Stream {
-            sender: Incarnation::from_u64(0x5e4d),
-            receiver: Incarnation::from_u64(0x4ec3),
-        },
+        stream: Stream::between(Incarnation::from_u64(0x5e4d), Incarnation::from_u64(0x4ec3)),
         sequence,
         after: 0,
         transfer: 1,

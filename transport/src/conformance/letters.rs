@@ -38,10 +38,7 @@ pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
     for (index, body) in bodies.into_iter().enumerate() {
         let sent = Parcel {
             receiver: "ärm.of [the] robot".into(),
-            stream: Stream {
-                sender: Incarnation::from_u64(u64::MAX),
-                receiver: Incarnation::UNKNOWN,
-            },
+            stream: Stream::between(Incarnation::from_u64(u64::MAX), Incarnation::UNKNOWN),
             sequence: u64::MAX - 1,
             after: 1 << 40,
             transfer: 1 << 41,

@@ -30,8 +30,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{Entry, Reach};
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, TransportError,
-    TransportErrorKind,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Realm, Stream,
+    TransportError, TransportErrorKind,
 };
 
 use self::custody::LettersLeft;
@@ -234,9 +234,13 @@ impl Lane {
     }
 
     fn stream_of(&self, delivery: &Delivery) -> Stream {
+        let realm = match self.key {
+            LaneKey::Custody(stream) => stream.realm,
+            LaneKey::Name(..) | LaneKey::Service(_) => Realm::UNPROVED,
+        };
         Stream {
-            sender: self.sender,
-            receiver: delivery.registration,
+            realm,
+            ..Stream::between(self.sender, delivery.registration)
         }
     }
 

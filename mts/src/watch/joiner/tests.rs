@@ -11,10 +11,7 @@ const GATEWAY: Source = Source(3);
 
 fn id(sender: u64, sequence: u64) -> LetterId {
     LetterId {
-        stream: Stream {
-            sender: Incarnation::from_u64(sender),
-            receiver: Incarnation::from_u64(99),
-        },
+        stream: Stream::between(Incarnation::from_u64(sender), Incarnation::from_u64(99)),
         sequence,
         receiver: "arm_1".into(),
     }

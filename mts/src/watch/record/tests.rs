@@ -23,10 +23,7 @@ fn letter(content: &str) -> Letter {
 
 fn notice(news: News) -> Notice {
     Notice {
-        stream: Stream {
-            sender: Incarnation::from_u64(7),
-            receiver: Incarnation::from_u64(8),
-        },
+        stream: Stream::between(Incarnation::from_u64(7), Incarnation::from_u64(8)),
         sequence: 3,
         receiver: "arm_1".into(),
         news,
