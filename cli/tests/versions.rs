@@ -15,7 +15,7 @@ use fipa_testbed::{frame, until};
 const ANSWER: &[u8] = b"fipa\x02\x06";
 
 const TOLD: [&str; 3] = [
-    "the peer has version 9 of the protocol and this host has version 2",
+    "the peer has version 9 of the protocol and this host has version 3",
     "install the same release of fipa on both hosts",
     "127.0.0.1",
 ];

@@ -804,7 +804,11 @@ impl World {
                     self.service(at).core.handle_refreshed(now, number);
                 }
                 Action::Resolved { outcomes, .. } => assert_eq!(outcomes, 1),
-                Action::Heard { .. } | Action::Doubtful { .. } | Action::Notice(_) => {}
+                Action::Heard { .. }
+                | Action::HeardAgain { .. }
+                | Action::Taken { .. }
+                | Action::Doubtful { .. }
+                | Action::Notice(_) => {}
             }
         }
     }

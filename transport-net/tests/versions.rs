@@ -241,7 +241,7 @@ fn versions_are_told_over_quic() {
 
 #[test]
 fn between_processes_of_one_host_the_remedy_is_about_the_processes() {
-    const OWN: &str = "this process has version 2";
+    const OWN: &str = "this process has version 3";
     const SAME: &str = "run both processes with the same release of fipa";
     let home = tempfile::tempdir().unwrap();
     let directory = home.path().join("unix");

@@ -36,7 +36,7 @@ pub(crate) const ALIGNMENT: usize = 8;
 
 /// Version of this layout and of the status page. iceoryx2 refuses other versions, because their
 /// types have other names.
-const VERSION: u32 = 5;
+const VERSION: u32 = 6;
 
 /// The user header of every request.
 ///

@@ -595,7 +595,10 @@ impl World {
                     outcome,
                 } => self.outcome((at, send), receiver, outcome)?,
                 // Every process knows all others here.
-                Action::Heard { .. } | Action::Doubtful { .. } => {}
+                Action::Heard { .. }
+                | Action::HeardAgain { .. }
+                | Action::Taken { .. }
+                | Action::Doubtful { .. } => {}
                 Action::Notice(notice) => {
                     let Now { instant, utc } = self.clocks();
                     let watching = &mut self.watching[self.processes[at].host];
