@@ -297,8 +297,8 @@ mod tests {
             let now = start + Duration::from_micros(u64::from(number) * 200);
             let from = Some(Ipv4Addr::from(number).into());
             allowed += u32::from(limit.allows(now, from, &format!("name {number}")));
-            assert!(limit.limit.senders.len() <= SenderLimit::MAX_ENTRIES);
-            assert!(limit.limit.addresses.len() <= SenderLimit::MAX_ENTRIES);
+            assert!(limit.limit.senders.len() <= limit.limit.max_entries);
+            assert!(limit.limit.addresses.len() <= limit.limit.max_entries);
         }
         // Ten seconds, and the initial burst.
         assert!((4000..=4400).contains(&allowed), "{allowed}");
