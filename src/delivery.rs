@@ -3,7 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 use fipa_mts::Sending;
 use fipa_transport::Outcome;
 
@@ -35,7 +35,7 @@ impl fmt::Display for Deliveries {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, Delivery { receiver, outcome }) in self.0.iter().enumerate() {
             let newline = if index > 0 { "\n" } else { "" };
-            write!(f, "{newline}{}: {outcome}", escape(receiver))?;
+            write!(f, "{newline}{}: {outcome}", escape_name(receiver))?;
         }
         Ok(())
     }

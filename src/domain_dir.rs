@@ -23,7 +23,7 @@ use fipa_transport::log_limit;
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
-use crate::user_dir::UserDir;
+use crate::user_dir::{Holder, UserDir, user_name};
 
 /// The environment variable with the directory of all domains, instead of that in `/tmp`.
 pub(crate) const VARIABLE: &str = "FIPA_RUNTIME_DIR";
@@ -61,8 +61,8 @@ const MAX_HOST: usize = 128;
 #[derive(Debug, Clone)]
 pub(crate) struct DomainDir {
     base: PathBuf,
-    /// The other user that holds the name `/tmp/fipa-<uid>`, if the base has another name.
-    name_held_by: Option<u32>,
+    /// The holder of the name `/tmp/fipa-<uid>`, if the base has another name.
+    name_held_by: Option<Holder>,
     domain: String,
     /// The locks; set when the process has joined.
     locks: Option<Arc<DirLocks>>,
@@ -128,11 +128,10 @@ impl DomainDir {
             make_private(&dir.base)?;
         }
         make_private(&dir.path())?;
-        if let Some(user) = dir.name_held_by {
+        if let Some(holder) = dir.name_held_by {
             log_limit::warn!(
-                "{} holds the name of the directory in which the domains of this user are, so they are \
+                "{holder} holds the name of the directory in which the domains of this user are, so they are \
                  in {}; to reserve the name at boot, see fipa doctor",
-                user_name(user),
                 dir.base.display()
             );
         }
@@ -162,8 +161,8 @@ impl DomainDir {
         }
     }
 
-    /// Returns the other user that holds the name `/tmp/fipa-<uid>`, if the directory has another name.
-    pub(crate) fn name_held_by(&self) -> Option<u32> {
+    /// Returns the holder of the name `/tmp/fipa-<uid>`, if the directory has another name.
+    pub(crate) fn name_held_by(&self) -> Option<Holder> {
         self.name_held_by
     }
 
@@ -556,25 +555,6 @@ fn check_private(path: &Path) -> Result<(), DomainDirError> {
 /// The remedy for a directory that this user cannot repair.
 const ANOTHER: &str = "set FIPA_RUNTIME_DIR to another directory of this user";
 
-/// Returns the name of a user with its identifier. Users that are not in `/etc/passwd` have no name.
-pub(crate) fn user_name(uid: u32) -> String {
-    let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
-    match name_in(&users, uid) {
-        Some(name) => format!("user {} ({uid})", fipa_acl::escape(name)),
-        None => format!("user {uid}"),
-    }
-}
-
-/// Finds the name of a user in the text of `/etc/passwd`.
-fn name_in(users: &str, uid: u32) -> Option<&str> {
-    users.lines().find_map(|line| {
-        let mut fields = line.split(':');
-        let name = fields.next().filter(|name| !name.is_empty())?;
-        let found = fields.nth(1)?;
-        (found.parse() == Ok(uid)).then_some(name)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -668,10 +648,6 @@ mod tests {
         let remedy = format!("chmod 700 {}", home.path().display());
         assert!(error.contains(&remedy), "{error}");
         assert!(error.contains("RuntimeDirectoryMode=0700"), "{error}");
-        let users = "root:x:0:0:root:/root:/bin/sh\nrobot:x:1001:1001::/home/robot:/bin/sh\n";
-        assert_eq!(name_in(users, 1001), Some("robot"));
-        assert_eq!(name_in(users, 1), None);
-        assert_eq!(name_in("broken\n:x:5\n", 5), None);
     }
 
     #[test]

@@ -6,6 +6,7 @@
 //! this host.
 
 mod exchange;
+mod exchange_queues;
 mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
@@ -263,6 +264,8 @@ impl Gateway {
         self.tasks.extend(platform_agents.start(&config.platform));
         self.tasks.push(tokio::spawn(Arc::clone(&self.state).run()));
         let exchange = Arc::clone(&self.exchange);
+        self.tasks
+            .push(tokio::spawn(Arc::clone(&exchange).read_letters()));
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);
         self.neighbours.name_peers(peers.clone());

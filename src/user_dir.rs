@@ -1,16 +1,19 @@
 //! The directory of all domains of a user below `/tmp`.
 //!
-//! It is `/tmp/fipa-<uid>`. Every user may create files in `/tmp`, so another user may hold that name.
-//! Then it is `/tmp/fipa-<uid>.<16 hexadecimal digits>`: any process of the user finds it by its name and
+//! It is `/tmp/fipa-<uid>`. Every user may create files in `/tmp`, so another user may hold that name. It may do so
+//! with a file of this user: depending on the system, it can link a file of any user to a name in `/tmp`.
+//! Then the directory is `/tmp/fipa-<uid>.<16 hexadecimal digits>`: any process of the user finds it by its name and
 //! owner. Only root can remove the directory of another user from `/tmp`, and no process of a domain
 //! removes it, so a user that has it keeps it until the host starts again.
 
+use std::fmt;
 use std::fs::{self, DirBuilder, Metadata};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use fipa_acl::escape;
 use fipa_transport::log_limit;
 use rustix::fs::{FlockOperation, Mode, OFlags};
 
@@ -27,21 +30,40 @@ const MAX_FILES: usize = 262_144;
 /// The directory of all domains of a user.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct UserDir {
-    /// The directory, which may not exist unless another user holds its first name.
+    /// The directory, which may not exist unless its first name is held.
     pub(crate) path: PathBuf,
-    /// The other user that holds the name `fipa-<uid>`.
-    pub(crate) name_held_by: Option<u32>,
+    /// The holder of the name `fipa-<uid>`, unless it is a directory of this user.
+    pub(crate) name_held_by: Option<Holder>,
+}
+
+/// The holder of a name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Holder {
+    /// Another user.
+    User(u32),
+    /// A file of this user, to which another user may have given the name.
+    File,
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::User(user) => f.write_str(&user_name(*user)),
+            Self::File => f.write_str("a file of this user that is not a directory"),
+        }
+    }
 }
 
 impl UserDir {
-    /// Finds the directory. Creates it only if another user holds the name `fipa-<uid>`. If that fails,
-    /// the result is the directory of the other user, which cannot be used.
+    /// Finds the directory. Creates it only if the name `fipa-<uid>` is held. If that fails, the result is
+    /// the file with this name, which cannot be used.
     pub(crate) fn find(temporary: &Path, user: u32) -> Self {
         let first = temporary.join(format!("fipa-{user}"));
         let found = fs::symlink_metadata(&first);
         let name_held_by = match &found {
-            Ok(found) if found.uid() == user => return Self::free(first),
-            Ok(found) => Some(found.uid()),
+            Ok(found) if found.uid() != user => Some(Holder::User(found.uid())),
+            Ok(found) if found.is_dir() => return Self::free(first),
+            Ok(_) => Some(Holder::File),
             Err(_) => None,
         };
         let other = match (other(temporary, user, MAX_FILES), name_held_by) {
@@ -80,6 +102,25 @@ pub(crate) fn user_in(name: &str) -> Option<u32> {
         }
     };
     user.parse().ok()
+}
+
+/// Returns the name of a user with its identifier. Users that are not in `/etc/passwd` have no name.
+pub(crate) fn user_name(uid: u32) -> String {
+    let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
+    match name_in(&users, uid) {
+        Some(name) => format!("user {} ({uid})", escape(name)),
+        None => format!("user {uid}"),
+    }
+}
+
+/// Finds the name of a user in the text of `/etc/passwd`.
+fn name_in(users: &str, uid: u32) -> Option<&str> {
+    users.lines().find_map(|line| {
+        let mut fields = line.split(':');
+        let name = fields.next().filter(|name| !name.is_empty())?;
+        let found = fields.nth(1)?;
+        (found.parse() == Ok(uid)).then_some(name)
+    })
 }
 
 /// Returns the directory with another name. Of several, which processes have created at the same time, all
@@ -166,10 +207,33 @@ mod tests {
         let another = user.wrapping_add(1);
         hold(temporary, another);
         let found = UserDir::find(temporary, another);
-        assert_eq!(found.name_held_by, Some(user));
+        assert_eq!(found.name_held_by, Some(Holder::User(user)));
         let name = found.path.file_name().unwrap().to_str().unwrap();
         assert_eq!(user_in(name), Some(another));
         assert!(found.path.is_dir());
+    }
+
+    #[test]
+    fn a_file_of_the_user_that_another_user_linked_there_does_not_block_the_directory() {
+        let user = this_user();
+        for is_link in [false, true] {
+            let temporary = tempfile::tempdir().unwrap();
+            let temporary = temporary.path();
+            let first = temporary.join(format!("fipa-{user}"));
+            let file = temporary.join("notes");
+            fs::write(&file, "").unwrap();
+            match is_link {
+                true => symlink(&file, &first).unwrap(),
+                false => fs::hard_link(&file, &first).unwrap(),
+            }
+            let found = UserDir::find(temporary, user);
+            assert_eq!(found.name_held_by, Some(Holder::File));
+            assert!(found.path.is_dir() && found.path != first);
+            assert_eq!(UserDir::find(temporary, user), found);
+            // After the user has removed the file, processes meet those that run.
+            fs::remove_file(&first).unwrap();
+            assert_eq!(UserDir::find(temporary, user).path, found.path);
+        }
     }
 
     #[test]
@@ -235,5 +299,13 @@ mod tests {
         ] {
             assert_eq!(user_in(name), user, "{name}");
         }
+    }
+
+    #[test]
+    fn the_name_of_a_user_is_read_from_its_line() {
+        let users = "root:x:0:0:root:/root:/bin/sh\nrobot:x:1001:1001::/home/robot:/bin/sh\n";
+        assert_eq!(name_in(users, 1001), Some("robot"));
+        assert_eq!(name_in(users, 1), None);
+        assert_eq!(name_in("broken\n:x:5\n", 5), None);
     }
 }

@@ -9,6 +9,8 @@
 use std::borrow::Cow;
 use std::fmt::Write as _;
 
+use crate::word::is_token;
+
 /// Returns the text with each [unprintable](is_unprintable) character written as `\u{…}` in
 /// hexadecimal digits: `\u{1b}`.
 ///
@@ -32,6 +34,42 @@ pub fn escape(text: &str) -> Cow<'_, str> {
         rest = rest.get(c.len_utf8()..).unwrap_or_default();
     }
     Cow::Owned(out)
+}
+
+/// Returns a name from outside as part of a line: [escaped](escape), and in quotation marks unless it is one word
+/// (for example `rover-1`).
+///
+/// A name may have blanks, colons and parentheses. Without quotation marks, the agent `a :receiver b` would look like
+/// an agent with a receiver, and `a to b` like two agents.
+#[must_use]
+pub fn escape_name(name: &str) -> Cow<'_, str> {
+    let escaped = escape(name);
+    let is_word = is_token(&*escaped)
+        && !escaped.starts_with([':', '"'])
+        && !escaped.contains(char::is_whitespace);
+    if is_word {
+        return escaped;
+    }
+    Cow::Owned(quote(name))
+}
+
+/// Returns a text in quotation marks, with `\` before each quotation mark and `\` in it, and each
+/// [unprintable](is_unprintable) character as in [`escape`].
+pub(crate) fn quote(text: &str) -> String {
+    let mut out = String::with_capacity(text.len() + 16);
+    out.push('"');
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            c if is_unprintable(c) => {
+                // Writing to a string cannot fail.
+                let _ = write!(out, "\\u{{{:x}}}", u32::from(c));
+            }
+            c => out.push(c),
+        }
+    }
+    out.push('"');
+    out
 }
 
 /// Whether the character can change how a terminal or a reader interprets a text, or is invisible.
@@ -137,6 +175,26 @@ mod tests {
         assert_eq!(escape("a\u{34f}\u{3164}b"), r"a\u{34f}\u{3164}b");
         assert_eq!(escape(r"\u{1b}"), r"\u{5c}u{1b}");
         assert_eq!(escape("\\\u{1b}"), r"\\u{1b}");
+    }
+
+    #[test]
+    fn names_that_are_not_one_word_are_quoted() {
+        for (name, shown) in [
+            ("rover-1@host:7", "rover-1@host:7"),
+            ("béla", "béla"),
+            ("a\u{1b}b", r"a\u{1b}b"),
+            ("", r#""""#),
+            ("a :receiver b", r#""a :receiver b""#),
+            (":receiver", r#"":receiver""#),
+            ("a)", r#""a)""#),
+            ("a\u{a0}to\u{a0}b", "\"a\u{a0}to\u{a0}b\""),
+            (r#""a""#, r#""\"a\"""#),
+            (r"a b\", r#""a b\\""#),
+            ("a \u{1b}", r#""a \u{1b}""#),
+            (r#"a" :sender "b"#, r#""a\" :sender \"b""#),
+        ] {
+            assert_eq!(escape_name(name), shown);
+        }
     }
 
     /// Compares with the tables of the crate `regex`, which follows the releases of Unicode.

@@ -73,7 +73,7 @@ pub use envelope::{
 };
 pub use error::{DecodeError, EncodeError, Problem};
 pub use error_chain::ErrorChain;
-pub use escape::{escape, is_unprintable};
+pub use escape::{escape, escape_name, is_unprintable};
 pub use explain::{Explanation, Span, explain};
 pub use letter::{Letter, Payload};
 pub use message::{ContentError, Message};

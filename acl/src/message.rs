@@ -7,8 +7,8 @@ use std::str::{FromStr, Utf8Error};
 use bytes::Bytes;
 
 use crate::builder::MessageBuilder;
-use crate::word::{is_token, push_string_literal};
-use crate::{AgentId, Performative, Time, escape};
+use crate::escape::quote;
+use crate::{AgentId, Performative, Time, escape, escape_name};
 
 /// A FIPA message (FIPA00061).
 ///
@@ -262,19 +262,20 @@ pub enum ContentError {
 const SHOWN: usize = 80;
 
 /// Writes a form similar to FIPA00070 for people: agents by name only, long texts truncated, all
-/// texts [escaped](escape). The alternate form (`{:#}`) truncates no text. No decoder reads it.
+/// texts [escaped](escape), and those that are not one word [in quotation marks](escape_name). The alternate form
+/// (`{:#}`) truncates no text. No decoder reads it.
 impl fmt::Display for Message {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let most = if f.alternate() { usize::MAX } else { SHOWN };
-        write!(f, "({}", escape(self.performative.as_str()))?;
+        write!(f, "({}", escape_name(self.performative.as_str()))?;
         if let Some(sender) = &self.sender {
-            write!(f, " :sender {}", escape(sender.name()))?;
+            write!(f, " :sender {}", escape_name(sender.name()))?;
         }
         for (key, agents) in [("receiver", &self.receivers), ("reply-to", &self.reply_to)] {
             if !agents.is_empty() {
                 write!(f, " :{key} (set")?;
                 for agent in agents {
-                    write!(f, " {}", escape(agent.name()))?;
+                    write!(f, " {}", escape_name(agent.name()))?;
                 }
                 f.write_str(")")?;
             }
@@ -296,7 +297,7 @@ impl fmt::Display for Message {
             write!(f, " :reply-by {reply_by}")?;
         }
         for (name, value) in &self.user_defined {
-            write!(f, " :X-{} {}", escape(name), shown(value, most))?;
+            write!(f, " :X-{} {}", escape_name(name), shown(value, most))?;
         }
         if let Some(content) = &self.content {
             write!(f, " :content {}", shown_content(content, most))?;
@@ -307,8 +308,8 @@ impl fmt::Display for Message {
 
 /// Formats at most the first `most` characters of a text.
 fn shown(text: &str, most: usize) -> String {
-    if is_token(text) && text.chars().nth(most).is_none() {
-        return escape(text).into_owned();
+    if text.chars().nth(most).is_none() {
+        return escape_name(text).into_owned();
     }
     shown_start(text, text.len(), most)
 }
@@ -316,8 +317,7 @@ fn shown(text: &str, most: usize) -> String {
 /// Formats a text of `len` bytes that begins with `start`.
 fn shown_start(start: &str, len: usize, most: usize) -> String {
     let cut: String = start.chars().take(most).collect();
-    let mut out = String::new();
-    push_string_literal(&mut out, &escape(&cut));
+    let mut out = quote(&cut);
     if cut.len() < len {
         out.push_str(&format!("… ({len} bytes)"));
     }
@@ -439,5 +439,19 @@ mod tests {
         assert!(!format!("{long:#}").contains(['…', '\x1b']));
         long.content = Some(Bytes::from_static(b"\xff\xfe"));
         assert!(long.to_string().contains(":content <2 bytes>"));
+    }
+
+    #[test]
+    fn names_cannot_forge_parameters_of_the_shown_message() {
+        let name = "boss-mts :receiver rover :ontology \"estop\"";
+        let message = Message::builder(Performative::Inform)
+            .sender(agent(name))
+            .receiver(agent("rover) :content \"stop\""))
+            .build()
+            .unwrap();
+        assert_eq!(
+            message.to_string(),
+            r#"(inform :sender "boss-mts :receiver rover :ontology \"estop\"" :receiver (set "rover) :content \"stop\""))"#
+        );
     }
 }

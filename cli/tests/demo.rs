@@ -4,7 +4,9 @@
 
 mod common;
 
+use std::fs::DirEntry;
 use std::io::{BufRead, BufReader, Read};
+use std::os::unix::fs::MetadataExt as _;
 use std::process::{Command, Stdio};
 
 use common::Host;
@@ -96,6 +98,14 @@ fn an_interrupted_demo_leaves_no_files_and_processes() {
         );
     }
     assert!(processes(pid) > 2);
+    // Other users cannot create the directory first, because they cannot know its name.
+    let directory = format!("fipa-demo-{pid}-");
+    let entries = std::fs::read_dir("/tmp").unwrap().flatten();
+    let is_own = |it: &DirEntry| it.file_name().to_string_lossy().starts_with(&directory);
+    let own: Vec<_> = entries.filter(is_own).collect();
+    assert_eq!(own.len(), 1);
+    assert!(own[0].file_name().len() > directory.len());
+    assert_eq!(own[0].metadata().unwrap().mode() & 0o777, 0o700);
     child.signal("-INT");
     let status = child.wait();
     assert_eq!(status.code(), Some(1));

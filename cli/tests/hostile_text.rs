@@ -203,6 +203,30 @@ fn messages_and_entries_are_shown_without_unprintable_characters() {
 }
 
 #[test]
+fn names_with_blanks_are_quoted_in_lines_about_messages() {
+    let host = Host::new();
+    let name = "boss-mts :receiver rover :ontology \"estop\"";
+    let mut rover = host.start(&["listen", "rover"]);
+    let mut watch = host.start(&["watch", "--count", "1"]);
+    let ran = host.run(&["send", "--to", "rover", "--from", name, "--content", "stop"]);
+    assert_eq!(ran.code, Some(0), "{ran:?}");
+    let line = rover.line();
+    let quoted = r#":sender "boss-mts :receiver rover :ontology \"estop\"" :receiver (set rover)"#;
+    assert!(line.contains(quoted), "{line}");
+    watch.end();
+    let lines: Vec<String> = std::iter::from_fn(|| watch.next_line()).collect();
+    let is_quoted = |line: &String| line.contains(" \"boss-mts");
+    assert!(lines.iter().any(is_quoted), "{lines:?}");
+    let agent = host.start(&["listen", name]);
+    let ready = &agent.ready;
+    assert!(ready.contains("agent \"boss-mts :receiver"), "{ready}");
+    let agents = host.run(&["agents"]);
+    let agents = String::from_utf8(agents.stdout).unwrap();
+    let is_listed = |line: &str| line.starts_with("\"boss-mts :receiver");
+    assert!(agents.lines().any(is_listed), "{agents}");
+}
+
+#[test]
 fn the_gateway_logs_letters_of_legacy_peers_without_unprintable_characters() {
     let host = Host::new();
     let mut gateway = host.start(&["up", "--json", "-vv"]);

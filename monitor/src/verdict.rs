@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 
 /// The verdict of a monitor on a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -241,13 +241,14 @@ impl fmt::Display for Violation {
             conversation_id,
             ..
         } = self;
-        let to = listed(receivers.iter().map(String::as_str), " and ");
+        let to: Vec<_> = receivers.iter().map(|name| escape_name(name)).collect();
+        let to = to.join(" and ");
         write!(
             f,
             "{} from {} to {} breaks {} in conversation {conversation_id:?}: ",
             escape(performative),
-            escape(sender),
-            escape(&to),
+            escape_name(sender),
+            to,
             escape(protocol)
         )?;
         f.write_str(match self.kind {
@@ -287,7 +288,7 @@ impl fmt::Display for Violation {
         }
         match (&self.state, &self.participant) {
             (Some(state), Some(participant)) => {
-                let participant = escape(participant);
+                let participant = escape_name(participant);
                 write!(f, "; state {state:?} with {participant}")?;
             }
             (Some(state), None) => write!(f, "; state {state:?}")?,
@@ -305,8 +306,4 @@ impl fmt::Display for Violation {
         }
         Ok(())
     }
-}
-
-fn listed<'a>(names: impl Iterator<Item = &'a str>, and: &str) -> String {
-    names.collect::<Vec<_>>().join(and)
 }

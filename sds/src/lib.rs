@@ -51,7 +51,8 @@ pub use contacts::{ContactDirectory, ContactError, Heard};
 pub use directory::{DeregisterError, Directory, RegisterError, Updated};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use exchange::{
-    DfEntry, EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, OwnDfEntry, Present,
+    DfEntry, EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, LetterKind, OwnDfEntry,
+    Present,
 };
 pub use fipa_acl::{Pattern, PatternError, is_pattern};
 pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};

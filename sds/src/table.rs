@@ -1,12 +1,12 @@
 //! The index behind the back ends: the claims on each name, and its holder.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::hash::Hash;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
 
 use arc_swap::ArcSwap;
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, PeerId};
 use parking_lot::{Mutex, RwLock};
 
 use crate::watch::Subscribers;
@@ -76,6 +76,19 @@ struct Index<O> {
     origins: HashMap<O, Arc<str>>,
 }
 
+/// Returns the items of all lists: the first of each list, then the second ones, and so on.
+fn in_turns<T>(lists: impl IntoIterator<Item = Vec<T>>) -> Vec<T> {
+    let mut lists: VecDeque<_> = lists.into_iter().map(Vec::into_iter).collect();
+    let mut all = Vec::new();
+    while let Some(mut list) = lists.pop_front() {
+        if let Some(item) = list.next() {
+            all.push(item);
+            lists.push_back(list);
+        }
+    }
+    all
+}
+
 impl<O: Clone + Eq + Hash> Table<O> {
     pub(crate) fn new() -> Self {
         Self::proved_by(|_| false)
@@ -135,19 +148,38 @@ impl<O: Clone + Eq + Hash> Table<O> {
     }
 
     /// Returns at most `most` pairs for names that several origins claim: the entry that holds the
-    /// name, and each other entry. An entry without proof does not count beside a proved one.
+    /// name, and each other entry. An entry without proof does not count beside a proved one, and neither do two
+    /// proved entries of one peer.
+    ///
+    /// The claiming peers take turns, and for each of them the peers that hold the names, so that the conflicts of
+    /// one peer do not hide those of others.
     pub(crate) fn contested(&self, most: usize) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         let index = self.index.read();
-        let names = index.contested.iter();
-        let claims = names.filter_map(|name| index.claims.get(name)?.split_first());
-        let pairs = claims.flat_map(|((of, holder), others)| {
-            let is_proved = index.is_proved;
-            let equal = others
-                .iter()
-                .filter(move |(origin, _)| is_proved(origin) == is_proved(of));
-            equal.map(|(_, other)| (Arc::clone(holder), Arc::clone(other)))
-        });
-        pairs.take(most).collect()
+        let mut of_peers: BTreeMap<&PeerId, BTreeMap<&PeerId, Vec<_>>> = BTreeMap::new();
+        for name in &index.contested {
+            let Some(((of, holder), others)) = index
+                .claims
+                .get(name)
+                .and_then(|claims| claims.split_first())
+            else {
+                continue;
+            };
+            let is_proved = (index.is_proved)(of);
+            for (origin, other) in others {
+                let is_own = is_proved && other.peer == holder.peer;
+                if (index.is_proved)(origin) == is_proved && !is_own {
+                    let of_peer = of_peers.entry(&other.peer).or_default();
+                    let pairs = of_peer.entry(&holder.peer).or_default();
+                    pairs.push((holder, other));
+                }
+            }
+        }
+        let of_peers = of_peers.into_values();
+        let pairs = in_turns(of_peers.map(|of_peer| in_turns(of_peer.into_values())));
+        let pairs = pairs.into_iter().take(most);
+        pairs
+            .map(|(holder, other)| (Arc::clone(holder), Arc::clone(other)))
+            .collect()
     }
 
     /// Tells all watchers to read again, because the mandates that a merged view applies to these

@@ -9,8 +9,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use fipa_sds::{
-    Change, ContactDirectory, Directory, Entry, Exchange, ExchangeError, MergedDirectory, Mts,
-    OwnDfEntry, Present, Reach, Role, Source,
+    Change, ContactDirectory, Directory, Entry, Exchange, ExchangeError, LetterKind,
+    MergedDirectory, Mts, OwnDfEntry, Present, Reach, Role, Source,
 };
 use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 
@@ -45,6 +45,8 @@ struct World {
     next: u64,
     /// Milliseconds by which the clock of each host is ahead of that of the first one.
     clocks: Vec<u64>,
+    /// The share of the letters that arrive and are not read.
+    unread: f64,
     /// The proof of each gateway's links, and addresses of other gateways that it also lists.
     proofs: Vec<(Mandate, Principal, Vec<Location>)>,
 }
@@ -71,6 +73,7 @@ impl World {
             sent: 0,
             next: 1000,
             clocks: vec![0; count],
+            unread: 0.0,
             proofs: vec![(Mandate::Unproved, Principal::Unproved, Vec::new()); count],
         }
     }
@@ -254,9 +257,13 @@ impl World {
             if goes && !expired {
                 let from = self.gateways[letter.from].mts.incarnation;
                 let receiver = &mut self.gateways[letter.to].exchange;
-                match receiver.handle_letter(now, from, &letter.content) {
-                    Ok(()) | Err(ExchangeError::Stranger) => {}
-                    Err(error) => panic!("{error}"),
+                if self.random.f64() < self.unread {
+                    receiver.handle_unread(now, from);
+                } else {
+                    match receiver.handle_letter(now, from, &letter.content) {
+                        Ok(()) | Err(ExchangeError::Stranger) => {}
+                        Err(error) => panic!("{error}"),
+                    }
                 }
             }
             let to = self.gateways[letter.to].mts.incarnation;
@@ -479,6 +486,61 @@ fn many_agents_take_several_letters_and_may_change_meanwhile() {
     world.cut.clear();
     world.run(Duration::from_secs(12));
     assert!(world.agrees());
+}
+
+#[test]
+fn a_list_of_which_parts_arrived_and_were_not_read_is_sent_again() {
+    for seed in 0..20 {
+        let mut world = World::new(3, seed);
+        for number in 0..900 {
+            world.appear(0, &format!("agent_{number:04}"));
+        }
+        world.join(0, "last");
+        world.connect();
+        world.unread = 0.4;
+        for number in 0..20 {
+            world.run(Duration::from_millis(200));
+            world.leave(0, &format!("agent_{:04}", number * 7));
+            world.join(1, &format!("between_{number}"));
+        }
+        // Also if no agent changes afterwards.
+        world.unread = 0.0;
+        world.run(Duration::from_secs(3));
+        assert!(world.agrees(), "seed {seed}");
+    }
+}
+
+#[test]
+fn the_kind_of_a_letter_is_read_from_its_beginning() {
+    let (mut exchange, now) = (with_neighbour(), Instant::now());
+    let mut kinds = Vec::new();
+    let mut send = |exchange: &mut Exchange, now| {
+        let (to, content) = exchange.poll_letter(now).unwrap();
+        exchange.handle_sent(now, to, true);
+        kinds.push(Exchange::letter_kind(&content));
+    };
+    // The second part of a list follows at once, then changes.
+    let mut world = World::new(1, 1);
+    for number in 0..300 {
+        world.appear(0, &format!("agent_{number:04}"));
+    }
+    exchange.handle_own(now, world.gateways[0].agents.values());
+    let later = now + Duration::from_secs(1);
+    send(&mut exchange, later);
+    send(&mut exchange, later);
+    send(&mut exchange, later + Duration::from_secs(60));
+    let (_, goodbye) = exchange.goodbye();
+    kinds.push(Exchange::letter_kind(&goodbye));
+    let expected = [
+        LetterKind::NewList,
+        LetterKind::List,
+        LetterKind::List,
+        LetterKind::Other,
+    ];
+    assert_eq!(kinds, expected);
+    for other in ["", "{}", r#"{"version":1,"tell":"again"}"#] {
+        assert_eq!(Exchange::letter_kind(other.as_bytes()), LetterKind::Other);
+    }
 }
 
 #[test]

@@ -202,6 +202,41 @@ fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
 }
 
 #[test]
+fn many_conflicts_of_one_peer_do_not_hide_those_of_others() {
+    let of = |gateway: u64, certificate_of: u64| Present {
+        principal: certificate(certificate_of),
+        ..present(gateway, certified(&[]))
+    };
+    // Gateways 1 and 2 have one certificate; 5 claims the names of 1, too.
+    let mut bench = Bench::new(vec![of(1, 1), of(2, 1), of(3, 3), of(4, 4), of(5, 5)]);
+    let names: Vec<String> = (0..1100).map(|number| format!("a_{number:04}")).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    bench.tell(1, &names, 1);
+    bench.tell(2, &names, 1);
+    bench.tell(3, &["rover"], 1);
+    bench.tell(4, &["rover"], 1);
+    let contested = |bench: &Bench| {
+        let pairs = bench.exchange.directory().contested().into_iter();
+        let pairs = pairs.map(|(holder, other)| {
+            let of = |entry: &Entry| entry.mts.incarnation.as_u64();
+            (other.name.to_string(), of(&holder), of(&other))
+        });
+        pairs.collect::<Vec<_>>()
+    };
+    assert_eq!(contested(&bench), [("rover".to_owned(), 3, 4)]);
+    bench.tell(5, &names, 1);
+    let pairs = contested(&bench);
+    assert_eq!(pairs.len(), ExchangeDirectory::MAX_CONTESTED);
+    assert!(pairs[..2].contains(&("rover".to_owned(), 3, 4)));
+    // A peer whose names another one took first has its real conflict listed, too.
+    bench.tell(1, &names, 1);
+    let mut own = names.clone();
+    own.push("rover");
+    bench.tell(5, &own, 1);
+    assert!(contested(&bench).contains(&("rover".to_owned(), 3, 5)));
+}
+
+#[test]
 fn a_gateway_that_restarts_at_another_address_takes_its_agents_back() {
     // Gateway 2 is gateway 1 after a restart; gateway 3 has another name.
     let restarted = |gateway: u64, name: &str| Present {

@@ -6,7 +6,8 @@ use fipa_acl::ErrorChain;
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::domain_dir::{DomainDir, DomainDirError, user_name};
+use crate::domain_dir::{DomainDir, DomainDirError};
+use crate::user_dir::Holder;
 
 const AREA: Area = Area("domain");
 
@@ -49,7 +50,7 @@ fn directory(dir: &DomainDir) -> Check {
     match dir.exists() {
         Ok(true) => match dir.name_held_by() {
             None => AREA.fine(CHECK, format!("{} is private", path.display())),
-            Some(user) => name_held(&path, user),
+            Some(holder) => name_held(&path, holder),
         },
         Ok(false) => {
             let found = format!(
@@ -67,16 +68,15 @@ fn directory(dir: &DomainDir) -> Check {
     }
 }
 
-/// Reports another user that holds the name of the directory in `/tmp`.
-fn name_held(path: &Path, user: u32) -> Check {
+/// Reports what holds the name of the directory in `/tmp`.
+fn name_held(path: &Path, holder: Holder) -> Check {
     let own = rustix::process::geteuid().as_raw();
     AREA.problem(
         CHECK,
         Verdict::Doubtful,
         format!(
-            "{} is private; the domains of this user are not in /tmp/fipa-{own}, because {} holds that name",
+            "{} is private; the domains of this user are not in /tmp/fipa-{own}, because {holder} holds that name",
             path.display(),
-            user_name(user)
         ),
         format!(
             "reserve the name at boot: write the line `d /tmp/fipa-{own} 0700 {own}` into a file in \

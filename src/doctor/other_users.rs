@@ -10,8 +10,8 @@ use rustix::process::geteuid;
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::domain_dir::user_name;
 use crate::user_dir::user_in;
+use crate::user_dir::user_name;
 
 const AREA: Area = Area("domain");
 const CHECK: &str = "domains of other users";

@@ -2,29 +2,31 @@
 //!
 //! A letter of the exchange goes from this gateway to a neighbor, over any transport that leads
 //! there. The letters arrive in order and are acknowledged. The gateway agent passes the letters of
-//! neighbors to [`Exchanging::received`].
+//! neighbors to [`Exchanging::received`], which queues them: the agent handles its other letters meanwhile.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape, escape_name};
 use fipa_mts::core::Submission;
 use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
-    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, OwnDfEntry,
-    Present,
+    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, ExchangeError,
+    MergedDirectory, OwnDfEntry, Present,
 };
 #[cfg(feature = "secure")]
 use fipa_transport::Principal;
-use fipa_transport::{Incarnation, Location, TransportErrorKind, log_limit};
-use parking_lot::Mutex;
+use fipa_transport::{Incarnation, Location, PeerId, TransportErrorKind, log_limit};
+use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::Network;
+use super::exchange_queues::{ExchangeQueues, Unread};
 use super::names::{Contested, contested, own_agents};
 use super::neighbours::{Neighbour, Neighbours};
+use crate::background::{self, BackgroundError};
 use crate::routes::ContestedName;
 use crate::service::Service;
 
@@ -47,6 +49,10 @@ pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 pub(super) struct Exchanging {
     core: Mutex<Exchange>,
     directory: Arc<ExchangeDirectory>,
+    /// The letters of neighbors that are to be read.
+    unread: Mutex<ExchangeQueues>,
+    /// Wakes the task that reads them.
+    arrived: Notify,
     /// The agents of this host whose names agents of other hosts have.
     contested: Mutex<Vec<ContestedName>>,
     /// Wakes the task after a letter has changed the state.
@@ -71,6 +77,8 @@ impl Exchanging {
         Self {
             directory: core.directory(),
             core: Mutex::new(core),
+            unread: Mutex::default(),
+            arrived: Notify::new(),
             contested: Mutex::default(),
             wake: Notify::new(),
         }
@@ -103,20 +111,69 @@ impl Exchanging {
         self.wake.notify_one();
     }
 
-    /// Handles the content of a letter with [`EXCHANGE_ONTOLOGY`] from this gateway.
-    pub(super) fn received(&self, from: Incarnation, content: &[u8]) {
-        let taken = self
-            .core
-            .lock()
-            .handle_letter(Instant::now(), from, content);
-        match taken {
-            Ok(()) => self.wake.notify_one(),
-            Err(error) => {
-                // The text of a malformed letter may be part of the error.
-                let error = ErrorChain(&error).to_string();
-                log_limit::info!(of: from, error = %escape(&error), "rejected an exchange letter of a gateway");
+    /// Queues the content of a letter with [`EXCHANGE_ONTOLOGY`] from this gateway, which the peer handed over.
+    pub(super) fn received(&self, peer: &PeerId, from: Incarnation, content: &[u8]) {
+        if content.len() > Exchange::MAX_CONTENT {
+            return rejected(from, &ExchangeError::TooLarge(content.len()));
+        }
+        self.unread.lock().push(peer, from, content);
+        self.arrived.notify_one();
+    }
+
+    /// Reads the letters of neighbors until the task is aborted: one after the other, on a thread of its own,
+    /// because a list of many agents takes long.
+    pub(super) async fn read_letters(self: Arc<Self>) {
+        loop {
+            let now = Instant::now();
+            let (next, due) = {
+                let mut unread = self.unread.lock();
+                (unread.poll(now), unread.poll_timeout(now))
+            };
+            let Some(next) = next else {
+                let due = due.map(tokio::time::Instant::from_std);
+                tokio::select! {
+                    () = self.arrived.notified() => {}
+                    () = tokio::time::sleep_until(due.unwrap_or_else(tokio::time::Instant::now)),
+                        if due.is_some() => {}
+                }
+                continue;
+            };
+            let (this, gateway, unread) = (Arc::clone(&self), next.gateway, next.unread);
+            let runtime = tokio::runtime::Handle::current();
+            let read = background::try_run(&runtime, move |_| this.read(gateway, &unread)).await;
+            match read {
+                Ok(cost) => {
+                    let mut unread = self.unread.lock();
+                    unread.handle_cost(Instant::now(), next.peer, cost);
+                }
+                Err(BackgroundError::Ended) => return,
+                Err(error) => {
+                    log_limit::error!(of: gateway, %error, "cannot read a letter of a gateway");
+                    self.read(gateway, &Unread::Lost);
+                }
             }
         }
+    }
+
+    /// Reads a letter from this gateway. Returns the time that it took.
+    fn read(&self, from: Incarnation, unread: &Unread) -> Duration {
+        let mut core = self.core.lock();
+        let began = Instant::now();
+        let taken = match unread {
+            Unread::Letter(content) => core.handle_letter(began, from, content),
+            Unread::Lost => {
+                core.handle_unread(began, from);
+                Ok(())
+            }
+        };
+        let cost = began.elapsed();
+        // Without fairness, the next letter may take the lock before the task that sends letters.
+        MutexGuard::unlock_fair(core);
+        match taken {
+            Ok(()) => self.wake.notify_one(),
+            Err(error) => rejected(from, &error),
+        }
+        cost
     }
 
     /// Runs the exchange until the service ends.
@@ -253,6 +310,12 @@ impl Exchanging {
         // A neighbor that does not receive the goodbye detects the end of the connection.
         while sent.join_next().await.is_some() {}
     }
+}
+
+fn rejected(from: Incarnation, error: &ExchangeError) {
+    // The text of a malformed letter may be part of the error.
+    let error = ErrorChain(error).to_string();
+    log_limit::info!(of: from, error = %escape(&error), "rejected an exchange letter of a gateway");
 }
 
 /// Greetings to gateways that the network announces. Gateways become neighbors when letters pass between
@@ -437,8 +500,8 @@ impl Disputes {
     fn report(&mut self, means: &Means, now: Instant, contested: &[(Arc<Entry>, Arc<Entry>)]) {
         for (holder, other) in self.next(now, contested) {
             let (name, at, by) = (&other.name, holder.mts.shown(), other.mts.shown());
-            let (shown, by_shown) = (escape(at), escape(by));
-            log_limit::warn!(of: other.mts.incarnation, %name, holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
+            let (shown, by_shown) = (escape_name(at), escape_name(by));
+            log_limit::warn!(of: other.mts.incarnation, name = %escape_name(name), holder = %shown, other = %by_shown, "agents of two hosts claim the same name");
             let content = format!(
                 "the name {name:?} is registered at {at:?} and at {by:?}: this host reaches the agent \
                  at {at:?}; deregister one of them"
@@ -492,8 +555,8 @@ impl Contested {
     /// Logs the conflict and informs the agent of this host.
     fn report(&self, means: &Means) {
         let Self { entry, claim } = self;
-        let (name, mts) = (&entry.name, escape(claim.mts.shown()));
-        log_limit::warn!(%name, other = %mts, "an agent of another host has the same name");
+        let (name, mts) = (&entry.name, escape_name(claim.mts.shown()));
+        log_limit::warn!(name = %escape_name(name), other = %mts, "an agent of another host has the same name");
         if entry.is_platform_agent() {
             // It gets a second name.
             return;
@@ -579,7 +642,7 @@ mod tests {
             registered: SystemTime::UNIX_EPOCH,
             source: fipa_sds::Source::Exchange,
             reach: fipa_sds::Reach::Remote { gateway },
-            peer: fipa_transport::PeerId::THIS_HOST,
+            peer: PeerId::THIS_HOST,
             role: fipa_sds::Role::Agent,
         })
     }

@@ -1,7 +1,8 @@
 //! The gateway agent answers the letters that agents of this host and other gateways send to the
 //! gateway. It has the gateway's name and incarnation.
 //!
-//! The ontology of a letter selects its handler. A request with an unknown ontology is answered
+//! The ontology of a letter selects its handler. Exchange letters are queued for another task, because they
+//! take long; all others are answered at once. A request with an unknown ontology is answered
 //! with `not-understood`.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,7 +10,7 @@ use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape, escape_name};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Contacts as _, letter_for};
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query, Source};
@@ -80,7 +81,8 @@ impl GatewayAgent {
                 return;
             }
             let content = message.content().map(|content| &content[..]);
-            return self.exchange.received(sender, content.unwrap_or_default());
+            let content = content.unwrap_or_default();
+            return self.exchange.received(&received.peer, sender, content);
         }
         if message.ontology() == Some(MANAGEMENT_ONTOLOGY)
             && *message.performative() == Performative::Failure
@@ -168,7 +170,7 @@ impl GatewayAgent {
             let content = message.content().map(|content| &content[..]);
             let text = String::from_utf8_lossy(content.unwrap_or_default());
             let text: String = text.chars().take(MAX_NOTICE).collect();
-            let (gateway, notice) = (escape(&neighbour.entry.name), escape(&text));
+            let (gateway, notice) = (escape_name(&neighbour.entry.name), escape(&text));
             log_limit::warn!(of: neighbour.entry.incarnation, %gateway, %notice, "another gateway reports a problem with a name");
         }
     }

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{ErrorChain, escape};
+use fipa_acl::{ErrorChain, escape_name};
 use fipa_mts::core::Peer;
 use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
@@ -176,7 +176,7 @@ impl Neighbours {
         let mut state = self.state.lock();
         let before = state.present.get(&incarnation);
         if before.is_some_and(|before| before.principal != peer.hop.principal) {
-            let (name, at) = (escape(&peer.name), &peer.hop.location);
+            let (name, at) = (escape_name(&peer.name), &peer.hop.location);
             log_limit::info!(of: source(at), %name, %at, "ignored a connection with another certificate");
             return;
         }
@@ -190,7 +190,7 @@ impl Neighbours {
         if is_new {
             let security = security(peer.hop.principal);
             log_limit::info!(
-                of: source(&peer.hop.location), name = %peer.name,
+                of: source(&peer.hop.location), name = %escape_name(&peer.name),
                 at = %peer.hop.location,
                 encrypted = security.encrypted,
                 certificate = security.certificate.as_deref(),
@@ -202,7 +202,7 @@ impl Neighbours {
                 of: source(&peer.hop.location), "the gateway at {} has the name of this gateway, {}: logs and lists do not tell the hosts \
                  apart; set mts.name on one of them",
                 peer.hop.location,
-                escape(&peer.name)
+                escape_name(&peer.name)
             );
         }
         state.present.insert(incarnation, neighbour);
@@ -243,7 +243,7 @@ impl Neighbours {
         }
         self.generation.fetch_add(1, Ordering::Release);
         self.changed.notify_one();
-        log_limit::info!(of: source(&peer.hop.location), name = %peer.name, at = %peer.hop.location, "no longer connected");
+        log_limit::info!(of: source(&peer.hop.location), name = %escape_name(&peer.name), at = %peer.hop.location, "no longer connected");
     }
 
     /// Returns the gateways to greet from the current locations of this one, by name and location:
@@ -285,8 +285,8 @@ impl State {
         if let Some(listed) = listed
             && *listed.name != *peer.name
         {
-            let (name, says) = (&listed.name, &peer.name);
-            log_limit::info!(of: &**name, %name, %says, "a static peer has another name than in discovery.static");
+            let (name, says) = (escape_name(&listed.name), escape_name(&peer.name));
+            log_limit::info!(of: &*listed.name, %name, %says, "a static peer has another name than in discovery.static");
         }
         let configured = listed.iter().flat_map(|listed| &listed.locations);
         let configured: Vec<Location> = configured

@@ -8,7 +8,7 @@ use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, ErrorChain, Message, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, escape_name};
 use fipa_content::Dialect;
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::{Sending, letter_for};
@@ -545,7 +545,7 @@ impl Task {
         let staying = self.means.send_df(local);
         for (agent, _) in staying.difference(&self.staying) {
             log_limit::warn!(
-                %agent,
+                agent = %escape_name(agent),
                 "the services of an agent are not told to other hosts: at most {} descriptions of {} \
                  bytes and {} parts, and {} bytes together, travel; agents of other hosts find them \
                  with `fipa df search --df {}`",
@@ -622,7 +622,7 @@ impl Task {
         self.second = match enter(means, self.kind, Arc::clone(&name)) {
             Some(second) => {
                 log_limit::info!(
-                    agent = self.own.name(), second = %name, other = %escape(claim.mts.shown()),
+                    agent = self.own.name(), second = %name, other = %escape_name(claim.mts.shown()),
                     "an agent of the gateway has a second name for other hosts: an agent of another host \
                      has its name"
                 );

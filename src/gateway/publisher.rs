@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::ErrorChain;
+use fipa_acl::{ErrorChain, escape_name};
 use fipa_sds::{
     ContactDirectory, Directory, Entry, HostDirectory, HostError, MergedDirectory, Registration,
     Role,
@@ -235,7 +235,7 @@ impl PublishTask {
         let updated = network.update(&leaving, registrations.collect());
         for ((name, _), left) in leaving.iter().zip(updated.left) {
             if let Err(error) = left {
-                tracing::debug!(%name, error = %ErrorChain(&error), "cannot withdraw an announcement");
+                tracing::debug!(name = %escape_name(name), error = %ErrorChain(&error), "cannot withdraw an announcement");
             }
         }
         for ((name, entry), joined) in joining.into_iter().zip(updated.joined) {
@@ -250,11 +250,11 @@ impl PublishTask {
                     if let Some(was) = was
                         && let Err(error) = network.deregister(name, was.incarnation)
                     {
-                        tracing::debug!(%name, error = %ErrorChain(&error), "cannot withdraw an announcement");
+                        tracing::debug!(name = %escape_name(name), error = %ErrorChain(&error), "cannot withdraw an announcement");
                     }
                     let before = self.refused.insert(Arc::clone(name), entry.incarnation);
                     if before != Some(entry.incarnation) {
-                        log_limit::warn!(%name, error = %ErrorChain(&error), "cannot announce an agent to other hosts");
+                        log_limit::warn!(name = %escape_name(name), error = %ErrorChain(&error), "cannot announce an agent to other hosts");
                     }
                 }
             }

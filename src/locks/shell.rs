@@ -8,7 +8,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, ErrorChain, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
     Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Kind,
     LockMessage, Locks, Millis, Peer, Resource, codec,
@@ -212,7 +212,7 @@ impl State {
             }
             Event::Contested { resource, by } => {
                 log_limit::warn!(
-                    of: resource.as_str(), resource = %escape(resource.as_str()), by = %escape(by.name()),
+                    of: resource.as_str(), resource = %escape(resource.as_str()), by = %escape_name(by.name()),
                     "another agent claims a resource that this agent owns; each admits its own fences only"
                 );
                 let by = by.name().to_owned();
@@ -318,7 +318,7 @@ impl Shared {
                     .map_err(|error| ErrorChain(&error).to_string())
             });
         if let Err(error) = sent {
-            tracing::debug!(%error, to = %escape(to.name()), "cannot send a message of a lock");
+            tracing::debug!(%error, to = %escape_name(to.name()), "cannot send a message of a lock");
         }
     }
 
@@ -565,7 +565,7 @@ impl Task {
             Ok(decoded) => decoded,
             Err(error) => {
                 tracing::debug!(
-                    %error, from = %escape(from.name()), "ignored a message of a lock"
+                    %error, from = %escape_name(from.name()), "ignored a message of a lock"
                 );
                 return;
             }

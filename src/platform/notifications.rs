@@ -5,7 +5,7 @@ use std::fmt;
 use std::pin::Pin;
 use std::time::Duration;
 
-use fipa_acl::{AgentId, ErrorChain, escape};
+use fipa_acl::{AgentId, ErrorChain, escape_name};
 use fipa_platform::{AgentDescription, Constraints, Function, found, notified};
 use fipa_transport::log_limit;
 use tokio::time::Instant;
@@ -125,7 +125,7 @@ impl Notifications {
 
     /// Subscribes again as soon as there is a directory facilitator.
     fn lose(&mut self) {
-        let name = escape(self.server.id.name());
+        let name = escape_name(self.server.id.name());
         log_limit::info!("{name} has ended; the subscription to it waits for its return");
         self.unconfirmed = self.known.keys().cloned().collect();
         self.check = None;

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{
     AgentId, BuildError, ErrorChain, Message, MessageBuilder, Performative, Time, escape,
+    escape_name,
 };
 use fipa_monitor::{
     Header, Library, Monitor, Policy, Unchecked, Verdict, Violation, ViolationKind,
@@ -43,7 +44,7 @@ pub enum DialogueError {
     #[error("the initiator cancelled: {0}")]
     Cancelled(Box<Message>),
     /// A message was not delivered.
-    #[error("not delivered to {}: {reason}", escape(receiver))]
+    #[error("not delivered to {}: {reason}", escape_name(receiver))]
     NotDelivered {
         /// The name of the receiver.
         receiver: String,
@@ -61,7 +62,7 @@ pub enum DialogueError {
     #[error(
         "the agent {} is gone: it has left, or its process has ended; start it again, or choose \
          another agent",
-        escape(agent)
+        escape_name(agent)
     )]
     Gone {
         /// The name of the agent.
@@ -70,7 +71,7 @@ pub enum DialogueError {
     /// The host of the other agent gives no sign of life. The agent may still run.
     #[error(
         "the host of the agent {} has been silent for {} s; check the network and the gateway there",
-        escape(agent),
+        escape_name(agent),
         since.elapsed().as_secs()
     )]
     Unreachable {
@@ -431,13 +432,13 @@ impl Dialogue {
                     match event {
                         PartnerEvent::Gone { agent } => return Err(DialogueError::Gone { agent }),
                         PartnerEvent::Unreachable { agent, since } => {
-                            log_limit::warn!(of: &*agent, agent = %escape(&agent), "the host of an agent is silent");
+                            log_limit::warn!(of: &*agent, agent = %escape_name(&agent), "the host of an agent is silent");
                             if silence == Silence::Ends {
                                 return Err(DialogueError::Unreachable { agent, since });
                             }
                         }
                         PartnerEvent::Returned { agent } => {
-                            log_limit::info!(of: &*agent, agent = %escape(&agent), "the host of an agent answers again");
+                            log_limit::info!(of: &*agent, agent = %escape_name(&agent), "the host of an agent answers again");
                         }
                     }
                 }
@@ -808,6 +809,10 @@ pub(super) fn after(span: Duration) -> Option<Instant> {
 fn listed(names: &[String]) -> String {
     const SHOWN: usize = 8;
     let more = if names.len() > SHOWN { ", …" } else { "" };
-    let shown: Vec<_> = names.iter().take(SHOWN).map(|name| escape(name)).collect();
+    let shown: Vec<_> = names
+        .iter()
+        .take(SHOWN)
+        .map(|name| escape_name(name))
+        .collect();
     format!("{}{more}", shown.join(", "))
 }

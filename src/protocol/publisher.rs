@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fipa_acl::{ErrorChain, Message, Performative, escape};
+use fipa_acl::{ErrorChain, Message, Performative, escape_name};
 use fipa_transport::{FailureReason, log_limit};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -166,7 +166,7 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
             let served = serve(&core, &first, &subscribers).await;
             drop(place);
             if let Err(error) = served {
-                log_limit::info!(of: &*name, subscriber = %escape(&name), error = %ErrorChain(&error), "a subscription has ended");
+                log_limit::info!(of: &*name, subscriber = %escape_name(&name), error = %ErrorChain(&error), "a subscription has ended");
             }
         });
     }

@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape};
+use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape_name};
 use fipa_mts::core::Submission;
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Directory, Entry, Reach, Role, Watch};
@@ -286,7 +286,7 @@ async fn next_answer(core: &AgentCore, key: Option<&ReaderKey>) -> Option<Messag
 impl fmt::Debug for PartnerWatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("PartnerWatch")
-            .field("agent", &escape(&self.core.endpoint.name))
+            .field("agent", &escape_name(&self.core.endpoint.name))
             .field("partners", &self.partners)
             .finish_non_exhaustive()
     }

@@ -13,7 +13,7 @@ use fipa::{
     DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role, Source,
     Time,
 };
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
 use super::routes::security;
@@ -288,8 +288,8 @@ impl Row {
                     |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
                 let names = members.names().iter();
                 let line = |name: &Arc<str>| match is_leader(name) {
-                    true => format!("{} (leader)", escape(name)),
-                    false => escape(name).into_owned(),
+                    true => format!("{} (leader)", escape_name(name)),
+                    false => escape_name(name).into_owned(),
                 };
                 names.map(line).collect()
             }
@@ -299,15 +299,15 @@ impl Row {
             None => "this host".to_owned(),
             Some(gateway) => {
                 let link = link.map(|link| format!(", {}", security(link.encrypted)));
-                format!("via {}{}", escape(&gateway), link.unwrap_or_default())
+                format!("via {}{}", escape_name(&gateway), link.unwrap_or_default())
             }
         };
         let cells = [
-            escape(&entry.name).into_owned(),
+            escape_name(&entry.name).into_owned(),
             escape(&entry.agent_type).into_owned(),
             reach,
             locations.join("\n"),
-            escape(entry.mts.shown()).into_owned(),
+            escape_name(entry.mts.shown()).into_owned(),
             source(entry.source).to_owned(),
             age(entry),
         ];

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use fipa::{Agent, Config, ErrorChain, Incoming, Message, MessageBuilder, Performative};
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 
 use crate::answers::Answers;
 use crate::membership::{self, Receiver, Stop};
@@ -45,7 +45,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let agent = arguments.receiver.register(&domain, config).await?;
     output::text(&format!(
         "agent {} of domain {} is ready; press Ctrl-C to stop\n",
-        escape(agent.name()),
+        escape_name(agent.name()),
         config.domain
     ))?;
     let ended = tokio::select! {

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use fipa::{Config, ErrorChain, Incoming};
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 use fipa_acl::json::message_to_json;
 use serde_json::json;
 
@@ -52,7 +52,7 @@ async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         true => output::json_line(&json!({ "agent": agent.name(), "domain": config.domain }))?,
         false => output::text(&format!(
             "agent {} of domain {} is listening; press Ctrl-C to stop\n",
-            escape(agent.name()),
+            escape_name(agent.name()),
             config.domain
         ))?,
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use clap::Args;
 use fipa::locks::{Fence, ResourceStatus};
 use fipa::{Agent, Config, ErrorChain, Incarnation, RegisterOptions};
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
 use crate::membership::{self, Stop};
@@ -167,7 +167,7 @@ fn cells(status: &ResourceStatus) -> [String; 6] {
         false => "?",
     };
     let name = |name: &Option<String>| match name {
-        Some(name) => escape(name).into_owned(),
+        Some(name) => escape_name(name).into_owned(),
         None => none.to_owned(),
     };
     let lease = status.expires.map(|left| {
@@ -177,7 +177,7 @@ fn cells(status: &ResourceStatus) -> [String; 6] {
     let mut waiting: Vec<String> = status
         .waiters
         .iter()
-        .map(|waiter| escape(waiter).into_owned())
+        .map(|waiter| escape_name(waiter).into_owned())
         .collect();
     let more = status.waiting.saturating_sub(waiting.len());
     if more > 0 {

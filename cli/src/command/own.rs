@@ -11,7 +11,7 @@ use fipa::locks::{Owned, OwnerEvent};
 use fipa::{
     Agent, AgentId, Config, ErrorChain, Message, MessageBuilder, Performative, RegisterOptions,
 };
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 
 use crate::answers::Answers;
 use crate::membership::{self, Stop};
@@ -150,7 +150,7 @@ async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Fail
     output::text(&format!(
         "{} is owned by {} in domain {}; press Ctrl-C to stop\n",
         escape(owned.resource()),
-        escape(agent.name()),
+        escape_name(agent.name()),
         config.domain
     ))?;
     let mut answers = Answers::new(agent);
@@ -186,7 +186,7 @@ fn line(event: &OwnerEvent) -> String {
     };
     match event {
         OwnerEvent::Granted { holder, fence } => {
-            format!("granted to {}{}\n", escape(holder), fenced(fence))
+            format!("granted to {}{}\n", escape_name(holder), fenced(fence))
         }
         OwnerEvent::Ended { holder, fence, how } => {
             let how = match how {
@@ -196,11 +196,11 @@ fn line(event: &OwnerEvent) -> String {
                 Ending::Forced => "taken from",
                 _ => "ended for",
             };
-            format!("{how} {}{}\n", escape(holder), fenced(fence))
+            format!("{how} {}{}\n", escape_name(holder), fenced(fence))
         }
-        OwnerEvent::Contested { by } => format!("contested by {}\n", escape(by)),
+        OwnerEvent::Contested { by } => format!("contested by {}\n", escape_name(by)),
         OwnerEvent::Silent { holder } => {
-            format!("{} holds it and does not answer\n", escape(holder))
+            format!("{} holds it and does not answer\n", escape_name(holder))
         }
         _ => String::new(),
     }

@@ -7,7 +7,7 @@ use fipa::{
     Agent, AgentId, Config, Deliveries, ErrorChain, Incarnation, Outcome, Performative,
     RegisterOptions,
 };
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 use serde_json::json;
 use tokio::time::MissedTickBehavior;
 
@@ -164,7 +164,7 @@ fn print(deliveries: &Deliveries, number: u64, time: Duration, json: bool) -> Re
             true => format!(", {:.3} ms", millis(time)),
             false => String::new(),
         };
-        let (receiver, outcome) = (escape(&delivery.receiver), &delivery.outcome);
+        let (receiver, outcome) = (escape_name(&delivery.receiver), &delivery.outcome);
         output::text(&format!("{receiver}: ping {number}, {outcome}{time}\n"))?;
     }
     Ok(())
@@ -223,7 +223,10 @@ impl Tally {
             max,
             ..
         } = self;
-        let mut text = format!("{}: {pings} pings, {delivered} delivered", escape(receiver));
+        let mut text = format!(
+            "{}: {pings} pings, {delivered} delivered",
+            escape_name(receiver)
+        );
         if *delivered > 0 {
             let (average, deviation) = self.average();
             text.push_str(&format!(

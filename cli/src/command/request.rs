@@ -9,7 +9,7 @@ use fipa::{
     Agent, AgentId, Config, ErrorChain, Incarnation, Message, MessageBuilder, Performative,
     RegisterOptions,
 };
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
@@ -152,7 +152,7 @@ async fn converse(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Resu
             let lead = async {
                 agreed = request.agreed().await?;
                 if agreed && !arguments.json {
-                    let agent = escape(arguments.name.name());
+                    let agent = escape_name(arguments.name.name());
                     // A closed output ends the command with the result.
                     let _ = output::text(&format!("{agent} agreed\n"));
                 }

@@ -6,7 +6,7 @@ use clap::Args;
 use comfy_table::Table;
 use fipa::routes::{Connected, Report, Route, RouteState, Standing};
 use fipa::{Matcher, Query};
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 use serde_json::json;
 
 use crate::complete;
@@ -127,7 +127,7 @@ fn described(process: &Report, gateway: Option<&Report>) -> String {
 
 fn gateway_described(gateway: &Report) -> String {
     let locations: Vec<String> = gateway.locations.iter().map(ToString::to_string).collect();
-    let mut text = format!("\nGateway {}:\n", escape(&gateway.mts));
+    let mut text = format!("\nGateway {}:\n", escape_name(&gateway.mts));
     text.push_str(&format!("listening on {}\n", locations.join(", ")));
     let mut ways = output::table([
         "ROUTE",
@@ -167,7 +167,10 @@ fn gateway_described(gateway: &Report) -> String {
             }
             (None, None) => "no response yet".to_owned(),
         };
-        text.push_str(&format!("static peer {}: {status}\n", escape(&peer.name)));
+        text.push_str(&format!(
+            "static peer {}: {status}\n",
+            escape_name(&peer.name)
+        ));
     }
     if !gateway.neighbours.is_empty() {
         text.push_str(&connections(&gateway.neighbours));
@@ -190,7 +193,7 @@ fn connections(neighbours: &[Connected]) -> String {
         let since = humantime::format_duration(Duration::from_secs(neighbor.seconds));
         let certificate = neighbor.security.certificate.as_deref();
         table.add_row([
-            escape(&neighbor.name).into_owned(),
+            escape_name(&neighbor.name).into_owned(),
             since.to_string(),
             security(neighbor.security.encrypted).to_owned(),
             certificate.map_or("-", fingerprint).to_owned(),
@@ -215,8 +218,8 @@ fn fingerprint(certificate: &str) -> &str {
 
 fn rows_of(table: &mut Table, route: &Route, from: &str) {
     let receiver = match &route.exception {
-        Some(pattern) => format!("{} (by routes.{pattern:?})", escape(&route.receiver)),
-        None => escape(&route.receiver).into_owned(),
+        Some(pattern) => format!("{} (by routes.{pattern:?})", escape_name(&route.receiver)),
+        None => escape_name(&route.receiver).into_owned(),
     };
     if route.ways.is_empty() {
         table.add_row([

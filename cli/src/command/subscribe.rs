@@ -5,7 +5,7 @@ use std::time::Duration;
 use clap::Args;
 use fipa::protocol::{DialogueError, Subscription};
 use fipa::{Agent, AgentId, Performative};
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 use serde_json::json;
 
 use super::request::{CANCEL_WITHIN, Opening, failed, line, unless_stopped};
@@ -92,7 +92,7 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
         true => output::json_line(&json!({ "subscribed": name.name() }))?,
         false => output::text(&format!(
             "subscribed to {}; press Ctrl-C to stop\n",
-            escape(name.name())
+            escape_name(name.name())
         ))?,
     }
     let mut reader = Reader::of_output();

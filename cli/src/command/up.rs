@@ -3,7 +3,7 @@
 use clap::Args;
 use fipa::keys::{Certificate, Keys};
 use fipa::{Change, Config, Entry, Gateway, Reach, log_limit};
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
 use crate::membership::{self, SignalRequest, Stop};
@@ -113,7 +113,7 @@ fn reload(gateway: &mut Gateway, global: &Global) {
 fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     let mut text = format!(
         "gateway {} of domain {} is ready\n",
-        escape(gateway.name()),
+        escape_name(gateway.name()),
         config.domain
     );
     for location in gateway.locations() {

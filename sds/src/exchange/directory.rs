@@ -136,7 +136,8 @@ impl ExchangeDirectory {
     pub const MAX_CONTESTED: usize = 1024;
 
     /// Returns the names that several neighbors claim, with certified links or else without: the entry
-    /// that holds the name, and each other entry. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED) pairs.
+    /// that holds the name, and each other entry. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED) pairs, in which the
+    /// claiming peers take turns. Two gateways with one certificate do not contest names.
     #[must_use]
     pub fn contested(&self) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         self.table.contested(Self::MAX_CONTESTED)

@@ -30,7 +30,7 @@ use std::ops::Bound;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{ErrorChain, escape};
+use fipa_acl::{ErrorChain, escape_name};
 use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal, log_limit};
 
 use df::DfEntries;
@@ -100,6 +100,18 @@ impl Present {
             principal: Principal::Unproved,
         }
     }
+}
+
+/// The kind of a letter of the exchange, for a queue of unread letters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum LetterKind {
+    /// The beginning of a new list: earlier letters about lists may be left out.
+    NewList,
+    /// A further part of a list, or changes of one.
+    List,
+    /// Anything else, or a letter of another library.
+    Other,
 }
 
 /// The agents that this gateway sends to its neighbors.
@@ -519,13 +531,7 @@ impl Exchange {
         };
         match message {
             ExchangeMessage::Again => {
-                neighbor.state = SyncState::nothing();
-                if let Some(under_way) = &mut neighbor.under_way {
-                    *under_way = SyncState::nothing();
-                }
-                // Limits the rate of answers to a neighbor that keeps asking.
-                let told = neighbor.told.map_or(now, |told| told + Self::FIRST_PAUSE);
-                neighbor.due = told.max(now);
+                neighbor.tell_all(now);
                 Ok(())
             }
             ExchangeMessage::Goodbye => {
@@ -548,6 +554,23 @@ impl Exchange {
                 neighbor.handle_changes(now, changes, &self.directory);
                 Ok(())
             }
+        }
+    }
+
+    /// Returns the kind of a letter with this content, without reading it.
+    #[must_use]
+    pub fn letter_kind(content: &[u8]) -> LetterKind {
+        wire::kind(content)
+    }
+
+    /// Handles the loss of letters from this gateway that had arrived and were not read. The gateway is asked for
+    /// all entries again, and gets all entries, in case it has asked for them.
+    pub fn handle_unread(&mut self, now: Instant, from: Incarnation) {
+        if let Some(neighbor) = self.neighbors.get_mut(&from) {
+            // The rest of an incomplete list would be taken for the lost part.
+            neighbor.staged = None;
+            neighbor.request_all(now);
+            neighbor.tell_all(now);
         }
     }
 
@@ -984,6 +1007,17 @@ impl Neighbor {
         self.ask = Some(earliest.max(now));
     }
 
+    /// Schedules a letter with all entries of this gateway.
+    fn tell_all(&mut self, now: Instant) {
+        self.state = SyncState::nothing();
+        if let Some(under_way) = &mut self.under_way {
+            *under_way = SyncState::nothing();
+        }
+        // Limits the rate of answers to a neighbor that keeps asking.
+        let told = self.told.map_or(now, |told| told + Exchange::FIRST_PAUSE);
+        self.due = told.max(now);
+    }
+
     fn sender(&self) -> Sender {
         Sender {
             gateway: self.mts.incarnation,
@@ -1027,7 +1061,7 @@ impl Neighbor {
         if let Some(first) = cut.last()
             && !std::mem::replace(&mut self.is_cut_reported, true)
         {
-            let (gateway, first) = (escape(self.mts.shown()), escape(first));
+            let (gateway, first) = (escape_name(self.mts.shown()), escape_name(first));
             log_limit::warn!(
                 %gateway,
                 %first,
@@ -1075,7 +1109,7 @@ impl Neighbor {
     /// other agents of the letter are still used.
     fn entry(&self, agent: wire::Agent) -> Option<Arc<Entry>> {
         if !self.mandate.speaks_for(&agent.name) {
-            let (gateway, agent) = (escape(self.mts.shown()), escape(&agent.name));
+            let (gateway, agent) = (escape_name(self.mts.shown()), escape_name(&agent.name));
             tracing::debug!(%gateway, %agent, "agent ignored: the certificate of its gateway does not name it");
             return None;
         }

@@ -20,6 +20,7 @@ use fipa_transport::Incarnation;
 use serde::de::Error as _;
 use serde::{Deserialize, Serialize};
 
+use super::LetterKind;
 use crate::entry::millis_of_time;
 use crate::{Entry, Members, Role};
 
@@ -62,6 +63,25 @@ pub(super) struct Changes {
     pub(super) agents: Vec<Agent>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) left: Vec<String>,
+}
+
+/// Returns the kind of a letter from its beginning, as this library writes it.
+pub(super) fn kind(content: &[u8]) -> LetterKind {
+    let Some(message) = content.strip_prefix(br#"{"version":1,"tell":{""#) else {
+        return LetterKind::Other;
+    };
+    if message.starts_with(br#"changes":"#) {
+        return LetterKind::List;
+    }
+    let Some(version) = message.strip_prefix(br#"full":{"version":"#) else {
+        return LetterKind::Other;
+    };
+    let digits = version.iter().take_while(|byte| byte.is_ascii_digit());
+    let rest = version.get(digits.count()..).unwrap_or_default();
+    match rest.starts_with(br#","first":true,"#) {
+        true => LetterKind::NewList,
+        false => LetterKind::List,
+    }
 }
 
 #[derive(Debug, Serialize, Deserialize)]

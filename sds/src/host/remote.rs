@@ -35,7 +35,7 @@ use std::io::{self, BufRead as _, BufReader, Read};
 use std::os::unix::fs::FileExt;
 use std::sync::Arc;
 
-use fipa_acl::{ErrorChain, escape};
+use fipa_acl::{ErrorChain, escape_name};
 use fipa_transport::{Incarnation, Location, PeerId, log_limit};
 use serde::{Deserialize, Serialize};
 
@@ -190,7 +190,10 @@ fn record(entry: &Entry, flags: u8, locations: &[Location]) -> Option<Vec<u8>> {
     let len = FIXED + entry.name.len() + fields.len();
     let checked = entry.check();
     if checked.is_err() || len > MAX_RECORD {
-        let (name, error) = (escape(&entry.name), checked.err().map(|e| e.to_string()));
+        let (name, error) = (
+            escape_name(&entry.name),
+            checked.err().map(|e| e.to_string()),
+        );
         tracing::debug!(%name, len, error, "an agent of another host is not published");
         return None;
     }
@@ -408,7 +411,7 @@ impl<F: ReadAt> RemoteAgents<F> {
         match read() {
             Ok(entry) => Some(Arc::new(entry)),
             Err(error) => {
-                let name = escape(record.name);
+                let name = escape_name(record.name);
                 log_limit::error!(%name, error = %ErrorChain(&error), "an agent of another host is ignored");
                 None
             }

@@ -1,10 +1,12 @@
 //! Starts, controls and ends the processes of the demo.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
+use tempfile::TempDir;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
@@ -106,14 +108,19 @@ impl Process {
 pub(super) struct Processes {
     program: PathBuf,
     /// `FIPA_RUNTIME_DIR` of all processes, separate from the domains of this user.
-    runtime_dir: PathBuf,
+    runtime_dir: TempDir,
     by_name: BTreeMap<String, Process>,
 }
 
 impl Processes {
     pub(super) fn new() -> Result<Self, String> {
         let program = std::env::current_exe().map_err(|error| error.to_string())?;
-        let runtime_dir = std::env::temp_dir().join(format!("fipa-demo-{}", std::process::id()));
+        // Private and with a random name: another user cannot create it first.
+        let runtime_dir = tempfile::Builder::new()
+            .prefix(&format!("fipa-demo-{}-", std::process::id()))
+            .permissions(std::fs::Permissions::from_mode(0o700))
+            .tempdir()
+            .map_err(|error| format!("cannot create a directory for the demo: {error}"))?;
         Ok(Self {
             program,
             runtime_dir,
@@ -150,7 +157,7 @@ impl Processes {
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
             .args(["--set", "mts.transports=shm,unix,tcp"])
             .args(["--set", set])
-            .env("FIPA_RUNTIME_DIR", &self.runtime_dir)
+            .env("FIPA_RUNTIME_DIR", self.runtime_dir.path())
             .env_remove("FIPA_CONFIG")
             .current_dir("/")
             .stdin(Stdio::piped())
@@ -227,7 +234,7 @@ impl Processes {
     /// All files of the demo.
     fn files(&self) -> Vec<PathBuf> {
         let mut files = self.shared_memory();
-        collect(&self.runtime_dir, &mut files);
+        collect(self.runtime_dir.path(), &mut files);
         files
     }
 
@@ -244,9 +251,7 @@ impl Processes {
         for file in &left {
             let _ = std::fs::remove_file(file);
         }
-        if self.runtime_dir.exists() {
-            let _ = std::fs::remove_dir_all(&self.runtime_dir);
-        }
+        let _ = std::fs::remove_dir_all(self.runtime_dir.path());
         left
     }
 }

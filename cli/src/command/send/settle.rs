@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use fipa::{Agent, AgentId, ErrorChain, Incoming, Message, Performative};
-use fipa_acl::escape;
+use fipa_acl::escape_name;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
 
@@ -89,7 +89,7 @@ impl Settled {
             Ok(deliveries) if deliveries.all_succeeded() => {
                 names.push(bidder.to_owned());
                 if !arguments.json {
-                    output::text(&format!("{done}: {}\n", escape(bidder)))?;
+                    output::text(&format!("{done}: {}\n", escape_name(bidder)))?;
                 }
                 return Ok(());
             }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa::Outcome;
 use fipa::watch::{Fate, Passage};
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 
 use super::checker::CheckResult;
 use super::sequence;
@@ -152,7 +152,7 @@ impl Conversation {
 
     /// The title of the diagram.
     pub(super) fn title(&self) -> String {
-        let id = escape(&self.id);
+        let id = escape_name(&self.id);
         match &self.protocol {
             Some(protocol) => format!("conversation {id} ({})", escape(protocol)),
             None => format!("conversation {id}"),
@@ -199,8 +199,8 @@ impl Step {
         }
         Self {
             at: passage.at,
-            from: escape(passage.sender().unwrap_or("?")).into_owned(),
-            to: escape(&passage.receiver).into_owned(),
+            from: escape_name(passage.sender().unwrap_or("?")).into_owned(),
+            to: escape_name(&passage.receiver).into_owned(),
             label,
             failed: match &passage.fate {
                 Fate::Settled(Outcome::Failed { reason, .. })

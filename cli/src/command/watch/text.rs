@@ -6,7 +6,7 @@ use std::time::SystemTime;
 use anstyle::{AnsiColor, Style};
 use fipa::watch::{Fate, Passage};
 use fipa::{Message, Outcome, Time};
-use fipa_acl::escape;
+use fipa_acl::{escape, escape_name};
 use fipa_content::{Content, Printer, Profile};
 use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
@@ -152,19 +152,16 @@ impl TextOutput {
         let cells = [
             time_of_day(passage.at, columns.time),
             agents(
-                &escape(passage.sender().unwrap_or("?")),
-                &escape(&passage.receiver),
+                &escape_name(passage.sender().unwrap_or("?")),
+                &escape_name(&passage.receiver),
                 columns.agents,
             ),
             message.map_or_else(
                 || "(unreadable)".to_owned(),
-                |it| it.performative().to_string(),
+                |it| escape(it.performative().as_str()).into_owned(),
             ),
-            protocol.to_owned(),
-            message
-                .and_then(Message::conversation_id)
-                .unwrap_or("-")
-                .to_owned(),
+            escape_name(protocol).into_owned(),
+            escape_name(message.and_then(Message::conversation_id).unwrap_or("-")).into_owned(),
             size(passage.size),
             passage.via.map_or("-", fipa::Kind::name).to_owned(),
             outcome(&passage.fate, columns.narrow).to_owned(),
@@ -192,7 +189,7 @@ impl TextOutput {
         if let Some(problem) = delivery_problem(&passage.fate) {
             below(
                 Ink::Warning,
-                &format!("to {}: {problem}", escape(&passage.receiver)),
+                &format!("to {}: {problem}", escape_name(&passage.receiver)),
             );
         }
         if !passage.content.is_empty() {
@@ -221,8 +218,8 @@ impl TextOutput {
         let text = format!(
             "    later: {} from {} to {}: {news}",
             escape(performative.as_deref().unwrap_or("a letter")),
-            escape(passage.sender().unwrap_or("?")),
-            escape(&passage.receiver),
+            escape_name(passage.sender().unwrap_or("?")),
+            escape_name(&passage.receiver),
         );
         let ink = if is_failure(&passage.fate) {
             Ink::Warning
@@ -257,7 +254,7 @@ pub(super) fn refused(look: Look, process: &str, why: &str) -> String {
 
 pub(super) fn overdue(look: Look, overdue: &Overdue) -> String {
     let with = overdue.participant.as_ref();
-    let with = with.map(|it| format!(" with {}", escape(it)));
+    let with = with.map(|it| format!(" with {}", escape_name(it)));
     let what = format!(
         "    overdue: no message in conversation {:?} of {}, state {:?}{}",
         overdue.conversation_id,
@@ -289,7 +286,7 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
     ];
     let mut text = String::new();
     for (cell, width) in left {
-        text.push_str(&fitted(&escape(&cell), width));
+        text.push_str(&fitted(&cell, width));
         text.push_str(gap);
     }
     let blank = " ".repeat(columns.size.saturating_sub(size.width()));
