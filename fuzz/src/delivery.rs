@@ -165,7 +165,7 @@ enum Coming {
         from: Incarnation,
         kind: Kind,
         attempt: AttemptId,
-        parcel: Parcel,
+        parcel: Box<Parcel>,
     },
     Conclusion(AttemptId, Conclusion),
 }
@@ -586,7 +586,7 @@ impl World {
                 from: to.location.incarnation(),
                 kind: to.location.kind(),
                 attempt: AttemptId(u64::MAX),
-                parcel: Parcel { body, ..parcel },
+                parcel: Box::new(Parcel { body, ..parcel }),
             };
             self.coming.push_back((self.now + DELAY, at, note));
         }
@@ -768,7 +768,7 @@ impl World {
                             from: at,
                             kind: location.kind(),
                             attempt,
-                            parcel,
+                            parcel: Box::new(parcel),
                         };
                         self.coming.push_back((self.now + DELAY, to, parcel));
                     } else if [LIAR, MOLE].contains(&to) {
@@ -903,7 +903,7 @@ impl World {
         // Shared memory has few slots for late answers.
         let at_once = kind == Kind::Shm && self.next_ticket.is_multiple_of(2);
         let arrival = Arrival {
-            parcel,
+            parcel: *parcel,
             from: hop(from, kind),
             ticket: (!at_once).then_some(ticket),
         };

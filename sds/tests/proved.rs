@@ -11,7 +11,7 @@ use fipa_sds::{
     Change, ContactDirectory, Directory, Entry, Exchange, ExchangeDirectory, MergedDirectory, Mts,
     Present, StaticDirectory, Subscriber,
 };
-use fipa_transport::{Incarnation, Location, Mandate, Principal};
+use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 
 /// Offset between the number of a gateway and that of its agent.
 const fn agent_of(gateway: u64) -> Incarnation {
@@ -168,6 +168,27 @@ fn a_proved_claim_precedes_an_earlier_one_without_proof() {
     assert_eq!(bench.holder("rover"), Some(2));
     bench.tell(2, &[], 0);
     assert_eq!(bench.holder("rover"), Some(1));
+}
+
+/// Registrations are public, so another gateway can announce one for an agent of its own, also before the real one.
+#[test]
+fn the_sender_of_a_letter_is_the_agent_that_its_peer_vouches_for() {
+    let mut bench = Bench::new(vec![present(1, certified(&[])), present(2, certified(&[]))]);
+    let registration = Incarnation::from_u64(77);
+    bench.tell_as(1, registration, &["stray"], 5);
+    bench.tell_as(2, registration, &["crane"], 5);
+    let directory = bench.exchange.directory();
+    let sender = |name: &str, gateway| {
+        let peer = PeerId::of(certificate(gateway), None);
+        let entry = directory.sender(registration, name, &peer)?;
+        Some(entry.name.to_string())
+    };
+    assert_eq!(sender("crane", 2).as_deref(), Some("crane"));
+    // It does not matter which name the other gateway writes into its letters.
+    assert_eq!(sender("stray", 1).as_deref(), Some("stray"));
+    assert_eq!(sender("crane", 1).as_deref(), Some("stray"));
+    assert_eq!(sender("stray", 2), None);
+    assert_eq!(sender("crane", 3), None);
 }
 
 #[test]

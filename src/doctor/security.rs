@@ -187,15 +187,14 @@ mod tests {
     fn assert_clock_comes_first(now: SystemTime, config: &Config) {
         let mut checks = Vec::new();
         examine(now, config, &mut checks);
-        let shown = fipa_acl::Time::from_system_time(now).unwrap();
-        let clock = format!(
-            "the clock of this host shows {}: set it if it is wrong",
-            shown.to_rfc3339().unwrap()
-        );
+        let shown = fipa_acl::Time::from_system_time(now).ok();
+        let shown = shown.and_then(fipa_acl::Time::to_rfc3339);
+        let clock =
+            shown.map(|it| format!("the clock of this host shows {it}: set it if it is wrong"));
         for check in checks {
-            let advice = check.advice.unwrap();
-            let (first, then) = advice.split_once("; if it is right, ").unwrap();
-            assert_eq!(first, clock);
+            let advice = check.advice.unwrap_or_default();
+            let (first, then) = advice.split_once("; if it is right, ").unwrap_or_default();
+            assert_eq!(Some(first), clock.as_deref());
             assert!(then.contains("`fipa keys renew`"), "{then}");
         }
     }

@@ -705,7 +705,7 @@ impl Core {
         }
         if from.is_remote() {
             parcel.stream.realm = match parcel.body {
-                Body::Letter(_) | Body::Predecessor => Realm::of(&from.principal),
+                Body::Letter(_) | Body::Predecessor => self.principals.realm(&from),
                 // About letters of agents of this host.
                 Body::Report(_) | Body::Credit => Realm::UNPROVED,
             };

@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use fipa_sds::{Entry, Reach, Role, View};
-use fipa_transport::{Hop, Incarnation, Introduction, Principal};
+use fipa_transport::{Hop, Incarnation, Introduction, Principal, Realm};
 
 use crate::Map;
 
@@ -35,6 +35,8 @@ pub(super) struct Principals {
 #[derive(Debug)]
 struct Service {
     principal: Principal,
+    /// The realm of the senders that it vouches for. A renewed certificate keeps it.
+    realm: Realm,
     name: Arc<str>,
     /// Number of open connections with it.
     connections: usize,
@@ -63,8 +65,13 @@ impl Principals {
         if !peer.hop.is_remote() || !incarnation.is_known() || !self.accepts(peer, view) {
             return;
         }
+        let is_proved = |it: Principal| matches!(it, Principal::Certificate(_));
+        let before = self.services.get(&incarnation);
+        let renewed = before.filter(|it| is_proved(it.principal) && it.name == peer.name);
+        let realm = renewed.filter(|_| is_proved(peer.hop.principal));
         let service = Service {
             principal: peer.hop.principal,
+            realm: realm.map_or(Realm::of(&peer.hop.principal), |it| it.realm),
             name: Arc::clone(&peer.name),
             connections: 1,
         };
@@ -149,6 +156,13 @@ impl Principals {
     /// Returns the principal of this service.
     pub(super) fn of_service(&self, service: Incarnation) -> Option<Principal> {
         self.services.get(&service).map(|it| it.principal)
+    }
+
+    /// Returns the realm of the senders whose letters come on this link.
+    pub(super) fn realm(&self, from: &Hop) -> Realm {
+        let service = self.services.get(&from.location.incarnation());
+        let service = service.filter(|it| it.principal == from.principal);
+        service.map_or_else(|| Realm::of(&from.principal), |it| it.realm)
     }
 
     fn make_room(&mut self) {
@@ -379,6 +393,9 @@ mod tests {
             principals.check_service(&hop(SERVICE, CREX), true, &no_agents()),
             Ok(())
         );
+        // Copies of letters that came with the former certificate are recognized.
+        assert_eq!(principals.realm(&hop(SERVICE, CREX)), Realm::of(&ROVER));
+        assert_eq!(principals.realm(&hop(SERVICE + 1, CREX)), Realm::of(&CREX));
     }
 
     #[test]
