@@ -66,7 +66,7 @@ fn now() -> Now {
 fn dispatched(core: &mut Core) -> Option<(AttemptId, Location, Parcel)> {
     loop {
         match core.poll_action()? {
-            Action::Heard { .. } => {}
+            Action::Heard { .. } | Action::HeardAgain { .. } | Action::Taken { .. } => {}
             Action::Refresh { number } => core.handle_refreshed(now(), number),
             Action::Dispatch {
                 attempt,

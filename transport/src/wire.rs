@@ -497,7 +497,7 @@ mod tests {
 
     #[test]
     fn the_header_has_no_padding() {
-        assert_eq!(HEADER_LEN, 72);
+        assert_eq!(HEADER_LEN, 80);
     }
 
     #[test]

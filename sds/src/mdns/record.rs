@@ -448,7 +448,7 @@ mod tests {
             registered: UNIX_EPOCH + Duration::from_millis(1_795_172_400_123),
             source: Source::Mdns,
             reach: Reach::Remote { gateway },
-            peer: PeerId::THIS_HOST,
+            peer: PeerId::of_ip([10, 0, 0, 2].into()),
             role: Role::Agent,
         }
     }
@@ -753,13 +753,13 @@ mod tests {
                 name: name.into(),
                 agent_type,
                 incarnation: Incarnation::from_u64(incarnation),
+                peer: PeerId::of(Principal::Unproved, locations.first()),
                 locations,
                 reach: Reach::Remote { gateway: mts.incarnation },
                 mts,
                 description,
                 registered: time_of_millis(millis),
                 source: Source::Mdns,
-                peer: PeerId::THIS_HOST,
                 role: match Members::new(
                     members.iter().map(String::as_str),
                     members.first().filter(|_| led).map(|name| name.as_str().into()),

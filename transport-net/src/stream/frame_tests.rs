@@ -261,7 +261,7 @@ fn bytes_that_are_not_a_frame_are_refused_at_once() {
     assert_eq!(refused(&header(VERSION, 77, 0)), FrameError::Kind(77));
     for (kind, len) in [
         (HELLO, MAX_HELLO as u64 + 1),
-        (PARCEL, 71),
+        (PARCEL, 79),
         (PARCEL, (1 << 20) + PARCEL_ALLOWANCE + 1),
         (PARCEL, u64::MAX),
         (ANSWER, MAX_ANSWER as u64 + 1),
@@ -271,8 +271,8 @@ fn bytes_that_are_not_a_frame_are_refused_at_once() {
         let error = refused(&header(VERSION, kind, len));
         assert!(matches!(error, FrameError::Length { .. }), "{kind} {len}");
     }
-    let mut parcel = header(VERSION, PARCEL, 72);
-    parcel.extend([0; 72]);
+    let mut parcel = header(VERSION, PARCEL, 80);
+    parcel.extend([0; 80]);
     assert_eq!(refused(&parcel), FrameError::Parcel(WireError::Name));
 }
 
