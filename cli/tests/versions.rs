@@ -12,7 +12,7 @@ use common::Host;
 use fipa_testbed::{frame, until};
 
 /// The beginning of a goodbye of this release.
-const ANSWER: &[u8] = b"fipa\x02\x06";
+const ANSWER: &[u8] = b"fipa\x03\x06";
 
 const TOLD: [&str; 3] = [
     "the peer has version 9 of the protocol and this host has version 3",

@@ -20,7 +20,7 @@ pub fn frame(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
 #[must_use]
 pub fn frame_header(kind: u8, id: u64, body_len: u64) -> [u8; 24] {
     let mut header = [0; 24];
-    header[..5].copy_from_slice(b"fipa\x02");
+    header[..5].copy_from_slice(b"fipa\x03");
     header[5] = kind;
     header[8..16].copy_from_slice(&id.to_le_bytes());
     header[16..].copy_from_slice(&body_len.to_le_bytes());

@@ -389,7 +389,7 @@ fn a_peer_that_must_prove_its_identity_gets_no_unencrypted_bytes() {
     let told = assert_refused(&to, &plain);
     assert!(told.contains("set security.keys there"), "{told}");
     // A legacy peer's letter, and frames.
-    for first in [&b"\xfe\x10"[..], b"fipa\x02\x01\0\0", b"<?xml", b"garbage"] {
+    for first in [&b"\xfe\x10"[..], b"fipa\x03\x01\0\0", b"<?xml", b"garbage"] {
         let address = to.location().address().to_owned();
         let mut stream = TcpStream::connect(address).unwrap();
         stream.write_all(first).unwrap();

@@ -68,7 +68,7 @@ fn stranger(to: &Party) -> UdpSocket {
 }
 
 fn hello(number: u64, cookie: [u8; 16]) -> Vec<u8> {
-    let mut bytes = b"fipa\x02\x01\0\0".to_vec();
+    let mut bytes = b"fipa\x03\x01\0\0".to_vec();
     bytes.extend([0; 8]);
     bytes.extend(number.to_le_bytes());
     bytes.extend(cookie);
@@ -104,7 +104,7 @@ fn a_flood_of_garbage_blocks_no_peer_and_leaves_no_state() {
         for _ in 0..400 {
             let mut bytes: Vec<u8> = (0..random.usize(0..200)).map(|_| random.u8(..)).collect();
             if random.bool() && bytes.len() > 6 {
-                bytes[..5].copy_from_slice(b"fipa\x02");
+                bytes[..5].copy_from_slice(b"fipa\x03");
                 bytes[5] %= 8;
             }
             // Datagrams beyond the receive buffer are lost.
@@ -159,7 +159,7 @@ fn introduced(to: &Party, incarnation: u64) -> (UdpSocket, u64) {
 
 /// A data packet of a connection.
 fn packet(to: u64, number: u64, frames: &[u8]) -> Vec<u8> {
-    let mut bytes = b"fipa\x02\x06\0\0".to_vec();
+    let mut bytes = b"fipa\x03\x06\0\0".to_vec();
     bytes.extend(to.to_le_bytes());
     bytes.extend(number.to_le_bytes());
     bytes.extend(frames);

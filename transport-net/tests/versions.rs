@@ -149,7 +149,7 @@ fn the_sender_learns_which_version_the_peer_answered_with() {
         assert_eq!(error.fault, TransportErrorKind::Incompatible, "{error}");
         assert_names_versions(&error.to_string(), version);
         let heard = peer.join().unwrap();
-        assert_eq!(heard[..6], *b"fipa\x02\x01", "the hello of this side");
+        assert_eq!(heard[..6], *b"fipa\x03\x01", "the hello of this side");
     }
 }
 
@@ -188,7 +188,7 @@ fn versions_are_told_over_tls() {
     let error = not_sent(&party, 1, &to);
     assert_eq!(error.fault, TransportErrorKind::Incompatible, "{error}");
     assert_names_versions(&error.to_string(), 1);
-    assert!(heard.join().unwrap().unwrap().starts_with(b"fipa\x02"));
+    assert!(heard.join().unwrap().unwrap().starts_with(b"fipa\x03"));
 }
 
 #[test]

@@ -90,7 +90,7 @@ impl Host {
     /// Starts an echo agent and waits until it is registered.
     pub(crate) fn echo(&self, name: &str) -> Running {
         let running = self.start(&["echo", name]);
-        let expected = format!("agent {name} ");
+        let expected = format!("agent {} ", fipa_acl::escape_name(name));
         assert!(running.ready.starts_with(&expected), "{}", running.ready);
         running
     }

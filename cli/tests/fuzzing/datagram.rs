@@ -39,7 +39,7 @@ pub(crate) async fn raw(to: SocketAddr, script: Script) -> u64 {
 }
 
 fn header(kind: u8, to: u64) -> Vec<u8> {
-    let mut bytes = b"fipa\x02".to_vec();
+    let mut bytes = b"fipa\x03".to_vec();
     bytes.extend([kind, 0, 0]);
     bytes.extend(to.to_le_bytes());
     bytes

@@ -53,7 +53,7 @@ const COMMON_LEN: usize = 8;
 
 pub(crate) const MAGIC: [u8; 4] = *b"fipa";
 /// The version of the frames of this side.
-pub(crate) const VERSION: u8 = 2;
+pub(crate) const VERSION: u8 = 3;
 
 const HELLO: u8 = 1;
 const PARCEL: u8 = 2;

@@ -56,7 +56,7 @@ pub(crate) const BITMAP: usize = 32;
 pub(crate) const ANSWER_OVERHEAD: usize = 1 + 8 + 1;
 
 const MAGIC: [u8; 4] = *b"fipa";
-const VERSION: u8 = 2;
+const VERSION: u8 = 3;
 
 const HELLO: u8 = 1;
 const COOKIE: u8 = 2;
