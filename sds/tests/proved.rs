@@ -387,15 +387,6 @@ fn a_registration_that_another_neighbor_claims_stays_with_its_agent() {
     assert_eq!(agent(), None);
 }
 
-#[test]
-fn no_agent_has_the_incarnation_of_a_connected_gateway() {
-    let mut bench = Bench::new(vec![present(1, certified(&[])), present(2, certified(&[]))]);
-    bench.tell_as(2, Incarnation::from_u64(1), &["crex"], 0);
-    assert_eq!(bench.holder("crex"), None);
-    bench.tell(2, &["crex"], 0);
-    assert_eq!(bench.holder("crex"), Some(2));
-}
-
 /// Every gateway chooses the addresses that it lists, and its name.
 #[test]
 fn a_gateway_that_lists_the_address_of_another_does_not_replace_it() {

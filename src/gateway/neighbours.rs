@@ -465,6 +465,30 @@ mod tests {
 
     const GATEWAY: Incarnation = Incarnation::from_u64(7);
 
+    #[test]
+    fn an_agent_with_the_incarnation_of_a_connected_gateway_takes_nothing_from_it() {
+        let entry = |name: &str, reach| {
+            let directory = fipa_sds::MemoryDirectory::new(Mts::new("mts", GATEWAY));
+            let agent = Registration::new(name, GATEWAY, Vec::new());
+            let entry = directory.register(agent).unwrap();
+            Arc::new(Entry {
+                reach,
+                ..Entry::clone(&entry)
+            })
+        };
+        let elsewhere = Reach::Remote { gateway: GATEWAY };
+        let gateway = entry("crex-mts", elsewhere);
+        let found = |listed: Option<Arc<Entry>>, neighbour| {
+            unless_claimed(listed, neighbour).map(|it| it.name.to_string())
+        };
+        let claim = || Some(entry("stray", elsewhere));
+        assert_eq!(found(claim(), Some(&gateway)).as_deref(), Some("crex-mts"));
+        assert_eq!(found(claim(), None).as_deref(), Some("stray"));
+        let own = Some(entry("own", Reach::Local));
+        assert_eq!(found(own, Some(&gateway)).as_deref(), Some("own"));
+        assert_eq!(found(None, None), None);
+    }
+
     fn at(address: &str) -> Location {
         let location: Location = format!("tcp://{address}").parse().unwrap();
         location.with_incarnation(GATEWAY)

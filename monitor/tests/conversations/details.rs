@@ -726,21 +726,6 @@ fn the_cancel_protocol_is_a_subprotocol_where_the_file_says_so() {
 }
 
 #[test]
-fn an_agent_may_send_to_itself_in_its_role() {
-    let mut stage = stage_of(
-        r#"<scxml initial="1">
-        <state id="1"><transition performative="request" from="n" to="n" target="2"/></state>
-        <state id="2"><transition performative="inform" from="n" to="n" target="2"/>
-            <subprotocol name="fipa-request" from="n"/></state></scxml>"#,
-    );
-    stage.right(own("request ann>ann,ben"));
-    stage.right(own("inform ann>ben"));
-    stage.right(own("inform ben>ann"));
-    assert_eq!(stage.right(request("request ann>ben")), "requested");
-    assert_eq!(stage.monitor.len(), 2);
-}
-
-#[test]
 fn an_agent_may_name_others_with_its_first_message_in_a_role() {
     let mut stage = stage_of(
         r#"<scxml initial="1">
