@@ -1,6 +1,8 @@
 //! A received message.
 
-use std::sync::{Arc, OnceLock};
+#[cfg(feature = "protocols")]
+use std::sync::Arc;
+use std::sync::OnceLock;
 
 use bytes::Bytes;
 use fipa_acl::{DecodeError, Letter, Message, MessageIndex, MessageView, Representation};
