@@ -23,22 +23,24 @@ fn check<'a>(report: &'a Value, name: &str) -> (&'a str, &'a str) {
     )
 }
 
+/// Starts a gateway of this name with these static peers. Returns it with its TCP address.
+fn up(host: &Host, name: &str, peers: &[(&str, &str)]) -> (Running, String) {
+    let peers = peers
+        .iter()
+        .map(|(name, at)| format!("{name} = [\"tcp://{at}\"]"));
+    let peers: Vec<String> = peers.collect();
+    let peers = format!("discovery.static={{ {} }}", peers.join(", "));
+    let name = format!("mts.name={name}");
+    let gateway = host.start(&["--set", &name, "--set", &peers, "up", "--json"]);
+    let address = gateway.tcp_address();
+    (gateway, address)
+}
+
 /// The gateways of the agents `arm` of two hosts, which both show the conflict. A third host keeps the
 /// agent that it knew first, although the other one was registered before.
 #[test]
 fn a_name_of_two_hosts_stays_with_the_agent_that_is_known_and_both_doctors_show_it() {
     let [far, near, third] = [Host::new(), Host::new(), Host::new()];
-    let up = |host: &Host, name: &str, peers: &[(&str, &str)]| {
-        let peers = peers
-            .iter()
-            .map(|(name, at)| format!("{name} = [\"tcp://{at}\"]"));
-        let peers: Vec<String> = peers.collect();
-        let peers = format!("discovery.static={{ {} }}", peers.join(", "));
-        let name = format!("mts.name={name}");
-        let gateway = host.start(&["--set", &name, "--set", &peers, "up", "--json"]);
-        let address = gateway.tcp_address();
-        (gateway, address)
-    };
     let _arms = (far.echo("arm"), near.echo("arm"));
     let (_near_gateway, near_at) = up(&near, "near", &[]);
     let (_third_gateway, third_at) = up(&third, "third", &[("near", &near_at)]);
@@ -287,16 +289,6 @@ fn a_runtime_directory_with_room_is_fine_and_stays_as_it_is() {
 #[test]
 fn two_gateways_of_one_name_are_shown_on_both_hosts_and_a_restarted_one_is_not() {
     let [near, far, other] = [Host::new(), Host::new(), Host::new()];
-    let up = |host: &Host, name: &str, peers: &[&str]| {
-        let peers = peers.iter().enumerate();
-        let peers = peers.map(|(number, at)| format!("peer{number} = [\"tcp://{at}\"]"));
-        let peers: Vec<String> = peers.collect();
-        let peers = format!("discovery.static={{ {} }}", peers.join(", "));
-        let name = format!("mts.name={name}");
-        let gateway = host.start(&["--set", &name, "--set", &peers, "up", "--json"]);
-        let address = gateway.tcp_address();
-        (gateway, address)
-    };
     let checks = |host: &Host, name: &str| {
         let report = host.run(&["doctor", "--json"]).done_json();
         let checks = report["checks"].as_array().unwrap().iter();
@@ -306,7 +298,7 @@ fn two_gateways_of_one_name_are_shown_on_both_hosts_and_a_restarted_one_is_not()
     };
     let (_near_gateway, near_at) = up(&near, "twin", &[]);
     let (_other_gateway, other_at) = up(&other, "other", &[]);
-    let (far_gateway, far_at) = up(&far, "twin", &[&near_at, &other_at]);
+    let (far_gateway, far_at) = up(&far, "twin", &[("near", &near_at), ("other", &other_at)]);
     for (host, own, others) in [(&near, &near_at, &far_at), (&far, &far_at, &near_at)] {
         let found = until_some("the doctor shows the name", || {
             checks(host, "names of gateways").pop()
@@ -324,7 +316,7 @@ fn two_gateways_of_one_name_are_shown_on_both_hosts_and_a_restarted_one_is_not()
         );
     }
     far_gateway.signal("-KILL");
-    let (_far_gateway, _) = up(&far, "twin", &[&other_at]);
+    let (_far_gateway, _) = up(&far, "twin", &[("other", &other_at)]);
     until("the restarted gateway is connected", || {
         let connections = checks(&other, "connections with other gateways");
         connections

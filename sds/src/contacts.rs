@@ -145,7 +145,7 @@ impl Contacts {
 impl ContactDirectory {
     /// Maximum number of contacts.
     pub const MAX_CONTACTS: usize = 8_192;
-    /// Maximum number of contacts of one host. A platform with more agents has an address of its own for them.
+    /// Maximum number of contacts of one host.
     pub const MAX_OF_HOST: usize = 2_048;
     /// Time without a letter in either direction after which an agent of another host may take over the name.
     pub const SILENCE: Duration = Duration::from_secs(60);

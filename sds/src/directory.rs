@@ -38,6 +38,14 @@ pub trait Directory: Send + Sync {
         })
     }
 
+    /// Returns the entry of this name and incarnation, also if another name holds the incarnation.
+    fn registered_as(&self, incarnation: Incarnation, name: &str) -> Option<Arc<Entry>> {
+        let holder = self.by_incarnation(incarnation);
+        let holder = holder.filter(|holder| *holder.name == *name);
+        let entry = holder.or_else(|| self.known(name))?;
+        (entry.incarnation == incarnation).then_some(entry)
+    }
+
     /// Returns the entry of the agent of this name and registration whose letter `peer` handed to this host.
     ///
     /// Other hosts choose the registrations that they announce. So the entry that holds the registration counts

@@ -10,8 +10,7 @@ use rustix::process::geteuid;
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::user_dir::user_in;
-use crate::user_dir::user_name;
+use crate::user_dir::{user_in, user_name};
 
 const AREA: Area = Area("domain");
 const CHECK: &str = "domains of other users";

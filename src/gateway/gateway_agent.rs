@@ -221,14 +221,7 @@ impl GatewayAgent {
         fill: impl FnOnce(fipa_acl::MessageBuilder) -> fipa_acl::MessageBuilder,
     ) {
         let name = message.sender().map(AgentId::name);
-        let is_asker =
-            |entry: &Arc<Entry>| entry.incarnation == sender && Some(&*entry.name) == name;
-        let listed = self.view.by_incarnation(sender);
-        let neighbours = self.neighbours.all().into_iter();
-        let mut all = listed.into_iter().chain(neighbours.map(|it| it.entry));
-        let asker = all.find(is_asker);
-        let named = || name.and_then(|name| self.view.known(name));
-        let Some(to) = asker.or_else(|| named().filter(is_asker)) else {
+        let Some(to) = name.and_then(|name| self.view.registered_as(sender, name)) else {
             log_limit::info!("dropping a reply: its requester is no longer registered");
             return;
         };

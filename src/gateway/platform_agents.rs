@@ -235,10 +235,7 @@ impl PlatformAgents {
             submission.receivers = vec![Arc::clone(&answer.to)];
             return Some(self.service.mts.send(submission));
         }
-        let holder = self.view.by_incarnation(registration);
-        let holder = holder.filter(|holder| *holder.name == *answer.to);
-        let to = holder.or_else(|| self.view.known(&answer.to));
-        let Some(to) = to.filter(|to| to.incarnation == registration) else {
+        let Some(to) = self.view.registered_as(registration, &answer.to) else {
             log_limit::info!("dropping a reply: its requester is no longer registered");
             return None;
         };

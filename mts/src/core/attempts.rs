@@ -285,11 +285,11 @@ impl AttemptTable {
             return (FailureReason::NoSuchAgent, None);
         };
         let location = lost.locations.first();
-        let attempt = |fault, why| {
+        let attempt = |why| {
             location.map(|location| Attempt {
                 via: location.kind(),
                 location: location.clone(),
-                error: TransportError::new(fault, why),
+                error: TransportError::new(TransportErrorKind::Unreachable, why),
             })
         };
         if lost.source == Source::Contact {
@@ -299,15 +299,13 @@ impl AttemptTable {
                 "the gateway forgot this agent at {time}, because it knows as many of that host as it can; it can be \
                  answered after it sends another letter"
             );
-            let attempt = attempt(TransportErrorKind::Unreachable, why);
-            return (FailureReason::NoSuchAgent, attempt);
+            return (FailureReason::NoSuchAgent, attempt(why));
         }
         let why = format!(
             "the connection with the gateway {} ended without a farewell, and has not been restored since",
             lost.mts.shown()
         );
-        let attempt = attempt(TransportErrorKind::Unreachable, why);
-        (FailureReason::Unreachable, attempt)
+        (FailureReason::Unreachable, attempt(why))
     }
 
     /// Requests a refresh of the directory, and returns its number.

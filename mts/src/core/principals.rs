@@ -65,13 +65,17 @@ impl Principals {
         if !peer.hop.is_remote() || !incarnation.is_known() || !self.accepts(peer, view) {
             return;
         }
-        let is_proved = |it: Principal| matches!(it, Principal::Certificate(_));
-        let before = self.services.get(&incarnation);
-        let renewed = before.filter(|it| is_proved(it.principal) && it.name == peer.name);
-        let realm = renewed.filter(|_| is_proved(peer.hop.principal));
+        let realm = match (self.services.get(&incarnation), peer.hop.principal) {
+            (Some(known), Principal::Certificate(_))
+                if known.name == peer.name && known.realm != Realm::UNPROVED =>
+            {
+                known.realm
+            }
+            (_, principal) => Realm::of(&principal),
+        };
         let service = Service {
             principal: peer.hop.principal,
-            realm: realm.map_or(Realm::of(&peer.hop.principal), |it| it.realm),
+            realm,
             name: Arc::clone(&peer.name),
             connections: 1,
         };
