@@ -314,13 +314,11 @@ impl Demultiplexer {
 
     /// Waits for the next message of no led conversation.
     pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {
-        self.change(|state| state.is_read = true);
         self.next(endpoint, Reader::Others).await
     }
 
     /// Returns the next message of no led conversation, if one is available now.
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
-        self.change(|state| state.is_read = true);
         loop {
             if let Some(set_aside) = self.change(|state| state.take(Reader::Others)) {
                 return Ok(Some(set_aside));
@@ -375,13 +373,14 @@ impl Demultiplexer {
         loop {
             // Created before the check, so that no change after the check is missed.
             let room = self.room.notified();
-            let (set_aside, arrived, has_room) = self.change(|state| {
-                let set_aside = state.take(reader);
-                (set_aside, state.arrived(reader), state.has_room())
+            let set_aside = self.change(|state| match state.take(reader) {
+                Some(set_aside) => Ok(set_aside),
+                None => Err((state.arrived(reader), state.has_room())),
             });
-            if let Some(set_aside) = set_aside {
-                return Ok(set_aside);
-            }
+            let (arrived, has_room) = match set_aside {
+                Ok(set_aside) => return Ok(set_aside),
+                Err(waiting) => waiting,
+            };
             tokio::select! {
                 biased;
                 () = arrived.notified() => {}
@@ -398,10 +397,17 @@ impl Demultiplexer {
 
     /// Hands a message to its reader: returns it if that is the caller, and otherwise sets it aside.
     fn put(&self, endpoint: &Endpoint, received: Incoming, caller: Reader<'_>) -> Option<Incoming> {
-        let leads = received.sender.is_known() && self.state.lock().leads(&received);
+        let is_known = received.sender.is_known();
+        let put = self.change(|state| match is_known && state.leads(&received) {
+            true => Err(received),
+            false => Ok(state.put(received, None, caller)),
+        });
+        let received = match put {
+            Ok(own) => return own,
+            Err(received) => received,
+        };
         // Outside of the lock, because a miss reads the files of the directory.
-        let registered = leads.then(|| received.registered(endpoint.domain.directory()));
-        let registered = registered.flatten();
+        let registered = received.registered(endpoint.domain.directory());
         self.change(|state| state.put(received, registered.as_deref(), caller))
     }
 }
@@ -433,6 +439,7 @@ impl State {
     }
 
     fn take(&mut self, reader: Reader<'_>) -> Option<Incoming> {
+        self.is_read |= matches!(reader, Reader::Others);
         self.queue(reader)?.pop_front()
     }
 
