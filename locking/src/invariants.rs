@@ -2,7 +2,7 @@
 //!
 //! | number | invariant | checked by |
 //! |---|---|---|
-//! | 1 | Fences strictly rise over all lives of an owner with the same state file. | [`History`] |
+//! | 1 | Fences strictly rise over all lives of an owner that did not forget them; no fence is granted twice. | [`History`] |
 //! | 2 | The owner has at most one live grant. | [`History`] |
 //! | 3 | The owner admits a fence if and only if it is that of the live grant. | [`History`] |
 //! | 4 | At no time do two agents hold the resource. | [`History`] |
@@ -13,6 +13,7 @@
 //! | 9 | While a grant is live, the owner sends no agree and no token. | [`History`] |
 //! | 10 | Every open request ends after the last fault. | the model and the simulation |
 //! | 11 | Each other agent overtakes a request at most once. | the simulation |
+//! | 12 | A device that is not the owner admits no fence after one of a later grant. | the model |
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -41,6 +42,8 @@ pub struct History {
     resource: Resource,
     owner: Peer,
     highest: (u64, u64),
+    /// All fences that were granted.
+    fences: BTreeSet<Fence>,
     live: Option<Live>,
     /// Reports that were received and neither granted nor released.
     confirmed: BTreeSet<(Peer, Conversation)>,
@@ -69,6 +72,7 @@ impl History {
             resource,
             owner,
             highest: (0, 0),
+            fences: BTreeSet::new(),
             live: None,
             confirmed: BTreeSet::new(),
             released: BTreeMap::new(),
@@ -91,6 +95,13 @@ impl History {
         self.live = None;
         self.confirmed.clear();
         self.released.clear();
+    }
+
+    /// Records that the owner has forgotten its earlier lives, as its operator told it to. Its fences only
+    /// differ from the earlier ones then.
+    pub fn owner_forgot(&mut self) {
+        self.highest = (0, 0);
+        self.left = (0, 0);
     }
 
     /// Records that a registration of an agent has ended, so that its conversations do not count any
@@ -157,6 +168,9 @@ impl History {
         if let Some(fence) = &grant.fence {
             if fence.position() <= self.highest {
                 self.break_invariant(1, format!("{fence} follows {:?}", self.highest));
+            }
+            if !self.fences.insert(fence.clone()) {
+                self.break_invariant(1, format!("{fence} is granted twice"));
             }
             self.highest = self.highest.max(fence.position());
             // The owner reports to itself without messages.
@@ -241,6 +255,14 @@ impl History {
         }
         if self.held.len() > 1 {
             self.break_invariant(4, format!("held at the same time: {:?}", self.held));
+        }
+    }
+
+    /// Records that a device admits a fence of grant `number` after one of grant `last`.
+    pub fn admitted_by_device(&mut self, fence: &Fence, number: usize, last: Option<usize>) {
+        if last.is_some_and(|last| number < last) {
+            let text = format!("a device admits {fence} after the fence of a later grant");
+            self.break_invariant(12, text);
         }
     }
 

@@ -3,7 +3,7 @@ use std::time::Instant;
 use stateright::{Checker, Model};
 
 use super::graph::Graph;
-use super::system::{Faults, State, Step, System, Time};
+use super::system::{Faults, Memory, State, Step, System, Time};
 use crate::Kind;
 use crate::faults::Fault;
 
@@ -18,6 +18,7 @@ fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
         faults,
         probes: false,
         lease: 4,
+        memory: Memory::NoClock,
         fault: Fault::None,
     }
 }
@@ -69,6 +70,8 @@ const NONE: Faults = Faults {
     pauses: 0,
     restarts: 0,
     withdrawals: 0,
+    moves: 0,
+    commands: 0,
 };
 
 #[test]
@@ -218,6 +221,12 @@ fn chosen() {
             "pauses" => model.faults.pauses = number(),
             "restarts" => model.faults.restarts = number(),
             "withdrawals" => model.faults.withdrawals = number(),
+            "moves" => model.faults.moves = number(),
+            "commands" => model.faults.commands = number(),
+            "clocks" => model.memory = Memory::Clocks,
+            "clock2" => model.memory = Memory::SecondClock,
+            "forgets" => model.memory = Memory::Forgets,
+            "file-only" => model.fault = Fault::FileOnly,
             "stateright" => stateright = true,
             _ => panic!("FIPA_LOCKS_MODEL: unknown word {word}"),
         }
