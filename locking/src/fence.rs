@@ -241,7 +241,11 @@ mod tests {
     #[test]
     fn fences_are_text() {
         for (owner, resource, text) in [
-            ("crane@bay", "dock 1", "7.42.5a31c0e4d2b19f07@crane@bay#dock 1"),
+            (
+                "crane@bay",
+                "dock 1",
+                "7.42.5a31c0e4d2b19f07@crane@bay#dock 1",
+            ),
             ("a#b%23", "#c%", "7.42.5a31c0e4d2b19f07@a%23b%2523##c%"),
         ] {
             let owner = Peer::new(owner, 1).unwrap();
@@ -277,7 +281,9 @@ mod tests {
     fn a_device_admits_no_lower_and_no_foreign_fence() {
         let fence = |text: &str| {
             let (position, names) = text.split_once('@').unwrap();
-            format!("{position}.{RUN}@{names}").parse::<Fence>().unwrap()
+            format!("{position}.{RUN}@{names}")
+                .parse::<Fence>()
+                .unwrap()
         };
         let mut admission = Admission::new("crane", "bay").unwrap();
         assert_eq!(admission.highest(), None);

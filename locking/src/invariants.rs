@@ -2,7 +2,7 @@
 //!
 //! | number | invariant | checked by |
 //! |---|---|---|
-//! | 1 | Fences strictly rise over all lives of an owner that did not forget them; no fence is granted twice. | [`History`] |
+//! | 1 | Fences strictly rise over all lives of an owner with its state file, and on another host above those that agents have held; no fence is granted twice. | [`History`] |
 //! | 2 | The owner has at most one live grant. | [`History`] |
 //! | 3 | The owner admits a fence if and only if it is that of the live grant. | [`History`] |
 //! | 4 | At no time do two agents hold the resource. | [`History`] |
@@ -42,6 +42,8 @@ pub struct History {
     resource: Resource,
     owner: Peer,
     highest: (u64, u64),
+    /// Highest fence that an agent has held.
+    seen: (u64, u64),
     /// All fences that were granted.
     fences: BTreeSet<Fence>,
     live: Option<Live>,
@@ -54,6 +56,8 @@ pub struct History {
     held: BTreeMap<Peer, Fence>,
     /// Highest fence that an agent held and holds no more.
     left: (u64, u64),
+    /// Whether the owner has forgotten a life.
+    forgot: bool,
     violation: Option<Violation>,
 }
 
@@ -72,6 +76,7 @@ impl History {
             resource,
             owner,
             highest: (0, 0),
+            seen: (0, 0),
             fences: BTreeSet::new(),
             live: None,
             confirmed: BTreeSet::new(),
@@ -79,6 +84,7 @@ impl History {
             handled: None,
             held: BTreeMap::new(),
             left: (0, 0),
+            forgot: false,
             violation: None,
         }
     }
@@ -97,11 +103,18 @@ impl History {
         self.released.clear();
     }
 
-    /// Records that the owner has forgotten its earlier lives, as its operator told it to. Its fences only
-    /// differ from the earlier ones then.
+    /// Records that the owner's next life is on another host, and knows only the fences that agents have
+    /// held.
+    pub fn owner_moved(&mut self) {
+        self.highest = self.seen;
+    }
+
+    /// Records that the owner has forgotten its earlier lives, as its operator told it to. Its fences then
+    /// differ from those of earlier lives, and have no order with them; holders of an earlier life do not
+    /// count.
     pub fn owner_forgot(&mut self) {
+        self.forgot = true;
         self.highest = (0, 0);
-        self.left = (0, 0);
     }
 
     /// Records that a registration of an agent has ended, so that its conversations do not count any
@@ -246,8 +259,12 @@ impl History {
         if before.as_ref() == Some(fence) {
             return;
         }
+        self.seen = self.seen.max(fence.position());
         if let Some(before) = before {
             self.left = self.left.max(before.position());
+        }
+        if self.forgot {
+            return;
         }
         if fence.position() <= self.left {
             let text = format!("{agent} holds {fence} after {:?} has ended", self.left);

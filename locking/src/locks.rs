@@ -542,7 +542,9 @@ impl<A: Algorithm> Locks<A> {
         match entry.seen.get_mut(fence.owner()) {
             Some(seen) if seen.run() != fence.run() && fence.epoch() <= seen.epoch() => {}
             Some(seen) if fence.position() > seen.position() => *seen = fence.clone(),
-            None if count < MAX_SEEN => drop(entry.seen.insert(fence.owner().into(), fence.clone())),
+            None if count < MAX_SEEN => {
+                drop(entry.seen.insert(fence.owner().into(), fence.clone()))
+            }
             Some(_) | None => {}
         }
     }
@@ -910,8 +912,10 @@ impl<A: Algorithm> Locks<A> {
                 self.remember(&fence);
                 let entry = self.resources.get(resource);
                 let seen = entry.and_then(|entry| entry.seen.get(fence.owner()));
-                if let Some(seen) = seen.filter(|seen| seen.run() != fence.run()).cloned() {
-                    // The owner does not know of the run of that fence.
+                let is_late = entry.is_some_and(|entry| entry.owner.as_ref() != Some(from));
+                let is_unknown = |seen: &&Fence| is_late || seen.run() != fence.run();
+                if let Some(seen) = seen.filter(is_unknown).cloned() {
+                    // The owner's present life may not know of this fence.
                     self.tell(now, &seen, resource, out);
                 }
             }

@@ -199,7 +199,10 @@ fn a_silent_legacy_holder_is_replaced_only_by_force() {
     owner.receive("agent3", OWN, "agent3_1", confirm(9_000));
     assert_eq!(owner.sent(), []);
     owner.locks.force(owner.now, &bay(), &mut owner.out);
-    assert_eq!(fence_in(&owner.sent()).to_string(), "1.1.0000000000000000@agent1#bay");
+    assert_eq!(
+        fence_in(&owner.sent()).to_string(),
+        "1.1.0000000000000000@agent1#bay"
+    );
 }
 
 /// In Suzuki-Kasami legacy agents send no reports: the token is the report.
@@ -502,7 +505,10 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
     assert!(!owner.sent().iter().any(of_lock));
     // The waiter is probed, and answers.
     owner.pass(1);
-    assert_eq!(fence_in(&owner.sent()).to_string(), "2.1.0000000000000000@agent1#bay");
+    assert_eq!(
+        fence_in(&owner.sent()).to_string(),
+        "2.1.0000000000000000@agent1#bay"
+    );
 }
 
 #[test]

@@ -159,10 +159,7 @@ fn bad_messages_are_errors() {
     let message = seen(Performative::Inform, "rsc");
     assert_eq!(error(&message, basic), DecodeError::Parts(1));
     let message = seen(Performative::Inform, "rsc\n1.1@crane#rsc");
-    assert_eq!(
-        error(&message, basic),
-        DecodeError::Fence(FenceError::Form)
-    );
+    assert_eq!(error(&message, basic), DecodeError::Fence(FenceError::Form));
     let message = seen(Performative::Request, "rsc\n1.1.5a31c0e4d2b19f07@crane#rsc");
     assert_eq!(
         error(&message, basic),

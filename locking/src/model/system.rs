@@ -7,8 +7,8 @@ use stateright::{Model, Property};
 use crate::faults::Fault;
 use crate::invariants::History;
 use crate::{
-    Act, Action, Admission, AnyAlgorithm, ClaimId, Content, Dialect, Event, Fence, Kind, LockMessage, Locks,
-    Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
+    Act, Action, Admission, AnyAlgorithm, ClaimId, Content, Dialect, Event, Fence, Kind,
+    LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
 };
 
 /// The time of each state. It exceeds every span, so that no time before it is cut off at 0.
@@ -622,6 +622,7 @@ impl Model for System {
             Step::Move => {
                 state.left.moves -= 1;
                 state.host = 1 - state.host;
+                state.history.owner_moved();
                 self.restart_owner(state);
             }
             Step::Command(grant) => {
