@@ -514,6 +514,7 @@ async fn an_owner_grants_above_the_fence_of_a_device() {
         };
         assert_eq!(next.epoch(), 200_000_000_001);
         assert_eq!(next.run(), low.run());
+        until_async("the bay is free", || bay.status().holder.is_none()).await;
         bay.release().await;
         // The file has the epoch.
         let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
