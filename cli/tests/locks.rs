@@ -130,7 +130,7 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
         ("resource", "bay"),
         ("owner", "crane"),
         ("holder", "arm"),
-        ("fence", &fence),
+        ("fence", fence.as_str()),
     ] {
         assert_eq!(listed[key], value, "{listed}");
     }

@@ -167,7 +167,8 @@ async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Fail
     let silence = owned.silence();
     if !silence.is_zero() {
         // Rounded up to seconds.
-        let seconds = Duration::from_secs(silence.as_millis().div_ceil(1_000) as u64);
+        let seconds =
+            Duration::from_secs(silence.as_secs() + u64::from(silence.subsec_nanos() > 0));
         output::text(&format!(
             "it grants nothing for {}, because a lock of an earlier run may be in use\n",
             humantime::format_duration(seconds)
