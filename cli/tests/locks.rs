@@ -11,7 +11,7 @@ use common::{Host, Running};
 use fipa_testbed::until;
 
 fn own(host: &Host, options: &[&str]) -> Running {
-    let own = host.start(&[&["own", "bay", "--agent", "crane"], options].concat());
+    let own = host.start(&[&["own", "bay", "--agent", "crane", "--forget"], options].concat());
     let ready = format!("bay is owned by crane in domain {}", host.domain);
     assert!(own.ready.starts_with(&ready), "{}", own.ready);
     own
@@ -26,6 +26,17 @@ fn hold(host: &Host, options: &[&str], script: &str) -> (Running, String, Proces
     let holder = host.start(&arguments);
     let (fence, process) = split(&holder.ready);
     (holder, fence, process)
+}
+
+/// Returns number, epoch and run of a fence of the crane.
+fn parts(fence: &str) -> (String, String, String) {
+    let fence = fence.trim().trim_start_matches("fence ");
+    let position = fence.strip_suffix("@crane#bay").unwrap();
+    let parts: Vec<&str> = position.split('.').collect();
+    let [epoch, number, run] = parts[..] else {
+        panic!("{fence} has no run");
+    };
+    (number.to_owned(), epoch.to_owned(), run.to_owned())
 }
 
 fn split(line: &str) -> (String, Process) {
@@ -79,13 +90,14 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     let host = Host::new();
     let mut crane = own(&host, &["--lease", "10min"]);
     let (holder, stale, left) = hold(&host, &["--agent", "rover"], HOLD);
-    assert_eq!(stale, "1.1@crane#bay");
-    assert_eq!(crane.line(), "granted to rover, fence 1.1@crane#bay");
+    let (number, epoch, run) = parts(&stale);
+    assert_eq!(number, "1");
+    assert_eq!(crane.line(), format!("granted to rover, fence {stale}"));
     assert_eq!(command(&host, &stale), "agree");
     assert!(
         crane
             .line()
-            .starts_with("admitted with 1.1@crane#bay: (request")
+            .starts_with(&format!("admitted with {stale}: (request"))
     );
 
     let late = host.run(&["lock", "bay", "--within", "300ms", "--", "true"]);
@@ -97,13 +109,14 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     let waiting = waiting.join().unwrap();
     // Long before the end of the lease.
     let (fence, _left_too) = split(&waiting.ready);
-    assert_eq!(fence, "1.2@crane#bay");
-    assert_eq!(crane.line(), "ended with rover, fence 1.1@crane#bay");
-    assert_eq!(crane.line(), "granted to arm, fence 1.2@crane#bay");
+    assert_eq!(fence, format!("{epoch}.2.{run}@crane#bay"));
+    assert_eq!(crane.line(), format!("ended with rover, fence {stale}"));
+    assert_eq!(crane.line(), format!("granted to arm, fence {fence}"));
     // The command of the killed holder goes on, and its fence is refused.
     assert!(left.is_running());
     assert_eq!(command(&host, &stale), "refuse");
-    assert!(crane.line().starts_with("refused: the fence 1.1@crane#bay"));
+    let refused = format!("refused: the fence {stale}");
+    assert!(crane.line().starts_with(&refused));
     assert_eq!(command(&host, &fence), "agree");
     assert_eq!(
         host.run(&["lock", "bay", "--within", "0s", "--", "true"])
@@ -117,16 +130,13 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
         ("resource", "bay"),
         ("owner", "crane"),
         ("holder", "arm"),
-        ("fence", "1.2@crane#bay"),
+        ("fence", fence.as_str()),
     ] {
         assert_eq!(listed[key], value, "{listed}");
     }
     assert!(listed["lease_ms"].as_u64().unwrap() <= 600_000);
     let table = host.run(&["locks"]).done();
-    assert!(
-        table.contains("1.2@crane#bay") && table.contains("arm"),
-        "{table}"
-    );
+    assert!(table.contains(&fence) && table.contains("arm"), "{table}");
 }
 
 /// The owner may be an agent of another host.
@@ -134,7 +144,7 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
 fn the_name_of_the_owner_in_the_environment_is_no_command() {
     let host = Host::new();
     let owner = "crane;touch injected;`touch injected`&#";
-    let _crane = host.start(&["own", "bay", "--agent", owner]);
+    let _crane = host.start(&["own", "bay", "--agent", owner, "--forget"]);
     let printed = host.run(&[
         "lock",
         "bay",
@@ -163,10 +173,9 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
     assert!(soon.contains("fipa own RESOURCE"), "{soon}");
     let crane = own(&host, &[]);
     let run = |arguments: &[&str]| host.run(&[&["lock", "bay", "--"], arguments].concat());
-    assert_eq!(
-        run(&["sh", "-c", "echo $FIPA_FENCE"]).done(),
-        "1.1@crane#bay\n"
-    );
+    let fence = || run(&["sh", "-c", "echo $FIPA_FENCE"]).done();
+    let first = fence();
+    assert_eq!(parts(&first).0, "1", "{first}");
     assert_eq!(run(&["sh", "-c", "exit 7"]).code, Some(7));
     assert_eq!(run(&["sh", "-c", "kill -KILL $$"]).code, Some(137));
     assert!(
@@ -189,10 +198,11 @@ fn exit_codes_are_those_of_the_command_and_of_env() {
     assert_eq!(code, Some(0));
     // The epoch rises, and no lock is live, so the next run grants at once.
     let _crane = own(&host, &[]);
-    assert_eq!(
-        run(&["sh", "-c", "echo $FIPA_FENCE"]).done(),
-        "2.1@crane#bay\n"
-    );
+    let second = fence();
+    let ((_, before, earlier), (number, epoch, run)) = (parts(&first), parts(&second));
+    assert_eq!(number, "1");
+    let number = |text: &str| text.parse::<u64>().unwrap();
+    assert!(number(&before) < number(&epoch) && earlier != run);
     let nowhere = host
         .run(&["own", "dock", "--state-dir", "/dev/null"])
         .failed(1);
@@ -206,8 +216,9 @@ fn the_end_of_a_command_is_reported_as_a_release() {
     for grant in 1..=10 {
         host.run(&["lock", "bay", "--agent", "rover", "--", "true"])
             .done();
-        let fence = format!("fence 1.{grant}@crane#bay");
-        assert_eq!(crane.line(), format!("granted to rover, {fence}"));
+        let granted = crane.line();
+        let fence = granted.strip_prefix("granted to rover, ").unwrap();
+        assert_eq!(parts(fence).0, grant.to_string());
         assert_eq!(crane.line(), format!("released by rover, {fence}"));
     }
 }

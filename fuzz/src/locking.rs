@@ -32,8 +32,9 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
     let number = u32::from(input.byte());
     let resource = input.one_of(&["bay", "bay", "bay", "dock"]);
     let fence = format!(
-        "{}.{number}@{}#{resource}",
+        "{}.{number}.{:016x}@{}#{resource}",
         input.byte() % 3,
+        input.byte() % 2,
         input.one_of(&["crane", "arm"])
     );
     let text = match (act, input.below(3)) {
@@ -48,6 +49,7 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
             "22 serialization::archive 17 0 0 {} {resource} 0 0 1 0 0 0 3 arm {number} 0 0 1 0 5 rover",
             resource.len()
         ),
+        (Performative::Inform, 1) => format!("{resource}\n{fence}"),
         (Performative::Inform, 0) => format!("{resource}\n{fence}\n{number}"),
         (Performative::Confirm, 0) => format!("{resource}\n{fence}"),
         (Performative::Refuse, 0) => format!("{resource}\nnot-live"),
@@ -74,9 +76,10 @@ fn message(input: &mut Input<'_>, kind: Kind, from: &Peer) -> Option<Message> {
         Performative::Propagate,
         Performative::QueryIf,
     ]);
-    let protocol = match input.below(4) {
+    let protocol = match input.below(5) {
         0 => codec::DISCOVER,
         1 => codec::PROBE,
+        2 => codec::FENCES,
         _ => kind.protocol(),
     };
     let mut builder = Message::builder(act.clone())
@@ -110,6 +113,7 @@ pub fn play(bytes: &[u8]) {
     now = Options::default().claim;
     locks.handle_timeout(now, &mut out);
     let mut last: Option<Fence> = None;
+    let mut raised = None;
     while !input.is_empty() {
         match input.below(10) {
             0 => {
@@ -159,7 +163,18 @@ pub fn play(bytes: &[u8]) {
                         last = Some(fence);
                     }
                 }
+                Action::Event(Event::Raised { resource, epoch }) => {
+                    assert_eq!(resource, bay());
+                    raised = Some(epoch);
+                }
                 Action::Event(_) => {}
+            }
+        }
+        if let Some(epoch) = raised {
+            // The store takes a while.
+            if input.below(2) == 0 {
+                raised = None;
+                locks.stored(now, &bay(), epoch, &mut out);
             }
         }
         let owner = locks

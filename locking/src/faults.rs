@@ -19,6 +19,15 @@ pub(crate) enum Fault {
     ReuseFence,
     /// A restarted owner counts from the epoch of its life before.
     KeepEpoch,
+    /// An owner without a file begins with the first epoch, and nothing but the file raises it: fences
+    /// without run, clock and reports.
+    FileOnly,
+    /// An owner ignores the fences that agents and devices report.
+    AskNobody,
+    /// An owner without a file, a clock and a report begins with the first epoch.
+    BeginAnyway,
+    /// The runs of an owner have the same bits.
+    SameRun,
     /// The owner agrees while a grant is live.
     IgnoreGate,
     /// A request that was withdrawn is granted by a late report.

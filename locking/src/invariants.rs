@@ -2,7 +2,7 @@
 //!
 //! | number | invariant | checked by |
 //! |---|---|---|
-//! | 1 | Fences strictly rise over all lives of an owner with the same state file. | [`History`] |
+//! | 1 | Fences strictly rise over all lives of an owner with its state file, and on another host above those that agents have held; no fence is granted twice. | [`History`] |
 //! | 2 | The owner has at most one live grant. | [`History`] |
 //! | 3 | The owner admits a fence if and only if it is that of the live grant. | [`History`] |
 //! | 4 | At no time do two agents hold the resource. | [`History`] |
@@ -13,6 +13,7 @@
 //! | 9 | While a grant is live, the owner sends no agree and no token. | [`History`] |
 //! | 10 | Every open request ends after the last fault. | the model and the simulation |
 //! | 11 | Each other agent overtakes a request at most once. | the simulation |
+//! | 12 | A device that is not the owner admits no fence after one of a later grant. | the model |
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -41,6 +42,10 @@ pub struct History {
     resource: Resource,
     owner: Peer,
     highest: (u64, u64),
+    /// Highest fence that an agent has held.
+    seen: (u64, u64),
+    /// All fences that were granted.
+    fences: BTreeSet<Fence>,
     live: Option<Live>,
     /// Reports that were received and neither granted nor released.
     confirmed: BTreeSet<(Peer, Conversation)>,
@@ -51,6 +56,8 @@ pub struct History {
     held: BTreeMap<Peer, Fence>,
     /// Highest fence that an agent held and holds no more.
     left: (u64, u64),
+    /// Whether the owner has forgotten a life.
+    forgot: bool,
     violation: Option<Violation>,
 }
 
@@ -69,12 +76,15 @@ impl History {
             resource,
             owner,
             highest: (0, 0),
+            seen: (0, 0),
+            fences: BTreeSet::new(),
             live: None,
             confirmed: BTreeSet::new(),
             released: BTreeMap::new(),
             handled: None,
             held: BTreeMap::new(),
             left: (0, 0),
+            forgot: false,
             violation: None,
         }
     }
@@ -91,6 +101,20 @@ impl History {
         self.live = None;
         self.confirmed.clear();
         self.released.clear();
+    }
+
+    /// Records that the owner's next life is on another host, and knows only the fences that agents have
+    /// held.
+    pub fn owner_moved(&mut self) {
+        self.highest = self.seen;
+    }
+
+    /// Records that the owner has forgotten its earlier lives, as its operator told it to. Its fences then
+    /// differ from those of earlier lives, and have no order with them; holders of an earlier life do not
+    /// count.
+    pub fn owner_forgot(&mut self) {
+        self.forgot = true;
+        self.highest = (0, 0);
     }
 
     /// Records that a registration of an agent has ended, so that its conversations do not count any
@@ -157,6 +181,9 @@ impl History {
         if let Some(fence) = &grant.fence {
             if fence.position() <= self.highest {
                 self.break_invariant(1, format!("{fence} follows {:?}", self.highest));
+            }
+            if !self.fences.insert(fence.clone()) {
+                self.break_invariant(1, format!("{fence} is granted twice"));
             }
             self.highest = self.highest.max(fence.position());
             // The owner reports to itself without messages.
@@ -232,8 +259,12 @@ impl History {
         if before.as_ref() == Some(fence) {
             return;
         }
+        self.seen = self.seen.max(fence.position());
         if let Some(before) = before {
             self.left = self.left.max(before.position());
+        }
+        if self.forgot {
+            return;
         }
         if fence.position() <= self.left {
             let text = format!("{agent} holds {fence} after {:?} has ended", self.left);
@@ -241,6 +272,14 @@ impl History {
         }
         if self.held.len() > 1 {
             self.break_invariant(4, format!("held at the same time: {:?}", self.held));
+        }
+    }
+
+    /// Records that a device admits a fence of grant `number` after one of grant `last`.
+    pub fn admitted_by_device(&mut self, fence: &Fence, number: usize, last: Option<usize>) {
+        if last.is_some_and(|last| number < last) {
+            let text = format!("a device admits {fence} after the fence of a later grant");
+            self.break_invariant(12, text);
         }
     }
 

@@ -69,7 +69,7 @@ mod state_file;
 pub use algorithm::{
     Algorithm, AnyAlgorithm, Context, Gate, Kind, Member, RicartAgrawala, Step, SuzukiKasami,
 };
-pub use fence::{Admission, Fence, FenceError};
+pub use fence::{Admission, Fence, FenceError, NotAdmitted};
 pub use holder::{Holder, HolderStep};
 pub use locks::{Action, ClaimId, Event, Failure, LockStatus, Locks};
 pub use message::{Act, Content, Dialect, LockMessage, Refusal, Token};

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use crate::algorithm::{Context, Member, Step};
+use crate::faults::fault;
 use crate::holder::{Holder, HolderStep};
 use crate::owner::{Ending, Grant, Owner, OwnerStep};
 use crate::probes::{ProbeStep, Probes};
@@ -16,6 +17,8 @@ use crate::{
 const MAX_MEMBERS: usize = 4096;
 /// Maximum number of resources that messages of other agents add.
 const MAX_FOREIGN: usize = 4096;
+/// Maximum number of owners of a resource whose fences are kept.
+const MAX_SEEN: usize = 16;
 /// Number of ended registrations whose late messages are recognized.
 const MAX_GONE: usize = 256;
 
@@ -84,6 +87,20 @@ pub enum Event {
         resource: Resource,
         /// The other agent.
         by: Peer,
+    },
+    /// This agent does not own the resource: no state file, clock, agent or device says which epoch is
+    /// higher than those of its earlier lives.
+    NoMemory {
+        /// The resource.
+        resource: Resource,
+    },
+    /// An owner's epoch has to rise. The caller stores [`OwnerState::raised`], and then calls
+    /// [`Locks::stored`]. The owner grants nothing before.
+    Raised {
+        /// The resource.
+        resource: Resource,
+        /// The new epoch.
+        epoch: u64,
     },
     /// This owner granted a resource.
     Granted {
@@ -187,6 +204,8 @@ pub struct Locks<A> {
 struct Entry<A> {
     owner: Option<Peer>,
     owned: Option<Owned>,
+    /// Highest fence of each owner that this agent or a device of it has seen.
+    seen: BTreeMap<Arc<str>, Fence>,
     /// The gate that the algorithm was told.
     gate: Gate,
     algorithm: A,
@@ -201,6 +220,7 @@ struct Owned {
     core: Owner,
     /// End of the time in which an existing owner may contradict.
     claim_until: Option<Millis>,
+    needs_report: bool,
 }
 
 /// The claim of this agent that takes part in the algorithm.
@@ -436,18 +456,29 @@ impl<A: Algorithm> Locks<A> {
             return;
         }
         let silence = state.silence().max(options.claim);
-        let core = Owner::new(
+        let mut core = Owner::new(
             me.clone(),
             resource.clone(),
-            state.epoch(),
+            state,
             lease,
             now,
             silence,
             options.fault,
         );
+        // A life of this name in this process, or one whose fences this agent has held.
+        if let Some(fence) = entry.seen.get(me.shared_name()) {
+            core.seen(now, fence);
+        }
+        let mut needs_report = state.needs_report();
+        if fault!(options.fault, BeginAnyway) {
+            needs_report = false;
+        }
+        // An owner that needs a report is no owner before it has one.
+        let claim = if needs_report { silence } else { options.claim };
         entry.owned = Some(Owned {
             core,
-            claim_until: Some(now.saturating_add(options.claim)),
+            claim_until: Some(now.saturating_add(claim)),
+            needs_report,
         });
         if entry.owner.is_none() {
             entry.owner = Some(me);
@@ -468,9 +499,92 @@ impl<A: Algorithm> Locks<A> {
             return true;
         };
         let was_silent = owned.core.gate() == Gate::Closed;
+        if let Some(last) = owned.core.last() {
+            self.remember(&last);
+        }
         self.owner_lost(now, resource, &self.me.clone(), true, out);
         self.settle(now, out);
         !was_silent
+    }
+
+    /// Continues with an epoch that the caller has written and synced, after [`Event::Raised`].
+    pub fn stored(&mut self, now: Millis, resource: &Resource, epoch: u64, out: &mut Actions) {
+        self.at_owner(resource, out, |core, steps| core.stored(now, epoch, steps));
+        self.settle(now, out);
+    }
+
+    /// Records a fence that a device of this agent has admitted. With `tell`, tells its owner: the device
+    /// refuses a grant of it for this fence ([`NotAdmitted::OtherRun`](crate::NotAdmitted::OtherRun)).
+    ///
+    /// An owner that starts asks for the highest recorded fence, in order to grant higher ones.
+    pub fn saw(&mut self, now: Millis, fence: &Fence, tell: bool, out: &mut Actions) {
+        let Ok(resource) = Resource::new(fence.resource()) else {
+            return;
+        };
+        self.entry(&resource);
+        self.remember(fence);
+        if tell {
+            self.tell(now, fence, &resource, out);
+        }
+        self.settle(now, out);
+    }
+
+    /// Keeps a fence if it is the highest one of its owner. Of two runs with the same epoch, it keeps the
+    /// first one, as a device does.
+    fn remember(&mut self, fence: &Fence) {
+        let entry = Resource::new(fence.resource())
+            .ok()
+            .and_then(|resource| self.resources.get_mut(&resource));
+        let Some(entry) = entry else {
+            return;
+        };
+        let count = entry.seen.len();
+        match entry.seen.get_mut(fence.owner()) {
+            Some(seen) if seen.run() != fence.run() && fence.epoch() <= seen.epoch() => {}
+            Some(seen) if fence.position() > seen.position() => *seen = fence.clone(),
+            None if count < MAX_SEEN => {
+                drop(entry.seen.insert(fence.owner().into(), fence.clone()))
+            }
+            Some(_) | None => {}
+        }
+    }
+
+    /// Tells an owner the highest fence of it that was seen here.
+    fn tell_seen(&mut self, now: Millis, owner: &Peer, resource: &Resource, out: &mut Actions) {
+        let entry = self.resources.get(resource);
+        let seen = entry.and_then(|entry| entry.seen.get(owner.shared_name()));
+        if let Some(fence) = seen.cloned() {
+            self.report_to(now, owner.clone(), &fence, resource, out);
+        }
+    }
+
+    /// Tells a fence to its owner.
+    fn tell(&mut self, now: Millis, fence: &Fence, resource: &Resource, out: &mut Actions) {
+        if fence.owner() == self.me.name() {
+            self.at_owner(resource, out, |core, _| core.seen(now, fence));
+        } else if let Some(owner) = self.owner_of(resource).cloned()
+            && owner.name() == fence.owner()
+        {
+            self.report_to(now, owner, fence, resource, out);
+        }
+    }
+
+    fn report_to(
+        &mut self,
+        now: Millis,
+        owner: Peer,
+        fence: &Fence,
+        resource: &Resource,
+        out: &mut Actions,
+    ) {
+        let dialect = self.members.get(&owner).map(|member| member.dialect);
+        if dialect == Some(Dialect::Own) {
+            let act = Act::Seen {
+                fence: fence.clone(),
+            };
+            let conversation = self.side_conversation("fence", now);
+            self.send(owner, resource, conversation, act, out);
+        }
     }
 
     /// Whether a command with this fence is carried out: only with the fence of the live grant of this
@@ -629,6 +743,9 @@ impl<A: Algorithm> Locks<A> {
                     Act::Query { .. } | Act::Owned | Act::Contested => {
                         self.discover(now, from, resource, conversation, act, out);
                     }
+                    Act::Seen { fence } => {
+                        self.at_owner(resource, out, |core, _| core.seen(now, fence));
+                    }
                     Act::Confirm { .. } | Act::Renew { .. } | Act::Release => {
                         self.for_owner(now, from, resource, conversation, act, out);
                     }
@@ -670,6 +787,9 @@ impl<A: Algorithm> Locks<A> {
             None => {
                 if *act == Act::Owned {
                     self.learn_owner(now, resource, from, out);
+                } else if (*act == Act::Query { claim: true }) {
+                    // The owner may have started without its state file.
+                    self.tell_seen(now, from, resource, out);
                 }
                 return;
             }
@@ -773,6 +893,10 @@ impl<A: Algorithm> Locks<A> {
             && holder.conversation() == conversation
         {
             let mut steps = Vec::new();
+            let seen = match act {
+                Act::Granted { fence, .. } if fence.owner() == from.name() => Some(fence.clone()),
+                _ => None,
+            };
             match act {
                 Act::Granted {
                     fence,
@@ -783,6 +907,17 @@ impl<A: Algorithm> Locks<A> {
                     holder.refused(now, *reason, *asked, &mut steps);
                 }
                 _ => {}
+            }
+            if let Some(fence) = seen {
+                self.remember(&fence);
+                let entry = self.resources.get(resource);
+                let seen = entry.and_then(|entry| entry.seen.get(fence.owner()));
+                let is_late = entry.is_some_and(|entry| entry.owner.as_ref() != Some(from));
+                let is_unknown = |seen: &&Fence| is_late || seen.run() != fence.run();
+                if let Some(seen) = seen.filter(is_unknown).cloned() {
+                    // The owner's present life may not know of this fence.
+                    self.tell(now, &seen, resource, out);
+                }
             }
             self.perform_holder(now, resource, steps, out);
         } else if matches!(act, Act::Granted { .. }) {
@@ -1002,6 +1137,10 @@ impl<A: Algorithm> Locks<A> {
         entry.owner = Some(peer.clone());
         entry.algorithm.owner_changed();
         self.touched.insert(resource.clone());
+        self.tell_seen(now, peer, resource, out);
+        let Some(entry) = self.resources.get_mut(resource) else {
+            return;
+        };
         if let Some(current) = &entry.current
             && matches!(current.phase, Phase::Discovering { .. })
         {
@@ -1298,6 +1437,15 @@ impl<A: Algorithm> Locks<A> {
         if owned.claim_until.is_none_or(|until| now < until) {
             return;
         }
+        if owned.needs_report && !owned.core.has_report() {
+            entry.owned = None;
+            let me = self.me.clone();
+            out.push(Action::Event(Event::NoMemory {
+                resource: resource.clone(),
+            }));
+            self.owner_lost(now, resource, &me, true, out);
+            return;
+        }
         owned.claim_until = None;
         entry.owner = Some(self.me.clone());
         out.push(Action::Event(Event::Owning {
@@ -1440,6 +1588,7 @@ impl<A: Algorithm> Locks<A> {
             .or_insert_with(|| Entry {
                 owner: None,
                 owned: None,
+                seen: BTreeMap::new(),
                 gate: Gate::Open,
                 algorithm: A::new(kind, me.clone(), false),
                 waiting: VecDeque::new(),
@@ -1473,6 +1622,10 @@ impl<A: Algorithm> Locks<A> {
                     conversation,
                     act,
                 } => self.send(to, resource, conversation, act, out),
+                OwnerStep::Store(epoch) => {
+                    let resource = resource.clone();
+                    out.push(Action::Event(Event::Raised { resource, epoch }));
+                }
                 OwnerStep::Began(grant) => {
                     let resource = resource.clone();
                     out.push(Action::Event(Event::Granted { resource, grant }));

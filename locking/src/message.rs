@@ -60,6 +60,11 @@ pub enum Act {
     Owned,
     /// The receiver must not own the resource, because the sender does.
     Contested,
+    /// The sender, or a device of it, has seen this fence of the receiver.
+    Seen {
+        /// The highest fence that was seen.
+        fence: Fence,
+    },
     /// Ricart-Agrawala: asks for permission to enter.
     Request {
         /// Lamport clock of the request. Lower clocks, then lower agents, enter first.

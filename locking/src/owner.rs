@@ -7,11 +7,17 @@
 //! * A grant to a legacy agent has neither fence nor end. It ends with the agent's report, with the
 //!   proof that the agent has ended, or by [`Owner::force`].
 //! * After a start, the owner grants nothing while a grant of an earlier life may be live.
+//! * A report of a fence of another life raises the epoch before the next grant, which waits until the
+//!   new epoch is stored. A live grant goes on: a report is not proved, so it must end no grant.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use crate::faults::{Fault, fault};
-use crate::{Act, Conversation, Dialect, Fence, Gate, Millis, Peer, Refusal, Resource};
+use crate::{Act, Conversation, Dialect, Fence, Gate, Millis, OwnerState, Peer, Refusal, Resource};
+
+/// Highest epoch that a report can have. The clock reaches it in nine million years, and the epochs above
+/// are left to the restarts that follow a false report.
+const MAX_REPORTED: u64 = 1 << 48;
 
 /// The owner's state for one resource.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -19,9 +25,19 @@ pub struct Owner {
     me: Peer,
     resource: Resource,
     epoch: u64,
+    /// Random bits of this life.
+    run: u64,
+    /// Epoch of the last life that the state file of this life knows.
+    before: u64,
+    /// Highest reported epoch of another life.
+    reported: Option<u64>,
+    /// Epoch that has to be stored before the next grant.
+    storing: Option<u64>,
     /// Number of the last grant.
     number: u64,
     lease: Millis,
+    /// Time before which a grant of a life elsewhere may be live.
+    absent_until: Option<Millis>,
     /// Time before which a grant of an earlier life may be live.
     silent_until: Option<Millis>,
     live: Option<Grant>,
@@ -94,6 +110,8 @@ pub enum OwnerStep {
         /// The act.
         act: Act,
     },
+    /// Store this epoch, and call [`Owner::stored`].
+    Store(u64),
     /// A grant begins.
     Began(Grant),
     /// A grant ends.
@@ -110,7 +128,7 @@ impl Owner {
     pub(crate) fn new(
         me: Peer,
         resource: Resource,
-        epoch: u64,
+        life: &OwnerState,
         lease: Millis,
         now: Millis,
         silence: Millis,
@@ -120,16 +138,25 @@ impl Owner {
         if fault!(fault, GrantAfterRestart) {
             silence = 0;
         }
-        let mut epoch = epoch;
+        let mut epoch = life.epoch();
         if fault!(fault, KeepEpoch) {
             epoch = 1;
+        }
+        let mut run = life.run();
+        if fault!(fault, SameRun) || fault!(fault, FileOnly) {
+            run = 0;
         }
         Self {
             me,
             resource,
             epoch,
+            run,
+            before: life.before(),
+            reported: None,
+            storing: None,
             number: 0,
             lease,
+            absent_until: (life.absence() > 0).then(|| now.saturating_add(life.absence())),
             silent_until: (silence > 0).then(|| now.saturating_add(silence)),
             live: None,
             unproved: None,
@@ -162,7 +189,7 @@ impl Owner {
     /// Agents that the owner lets pass in the algorithm.
     #[must_use]
     pub fn gate(&self) -> Gate {
-        if self.live.is_some() || self.silent_until.is_some() {
+        if self.live.is_some() || self.silent_until.is_some() || self.storing.is_some() {
             Gate::Closed
         } else if self.unproved.is_some() {
             Gate::Own
@@ -175,7 +202,54 @@ impl Owner {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Millis> {
         let expires = self.live.as_ref().and_then(|grant| grant.expires);
-        expires.into_iter().chain(self.silent_until).min()
+        expires
+            .into_iter()
+            .chain(self.silent_until)
+            .chain(self.absent_until)
+            .min()
+    }
+
+    /// Time in which the owner grants nothing, because a grant of an earlier life may be live.
+    #[must_use]
+    pub fn silence(&self, now: Millis) -> Millis {
+        self.silent_until
+            .map_or(0, |until| until.saturating_sub(now))
+    }
+
+    /// Whether the owner knows a fence of another life.
+    pub(crate) fn has_report(&self) -> bool {
+        self.reported.is_some()
+    }
+
+    /// The last fence of this life.
+    pub(crate) fn last(&self) -> Option<Fence> {
+        let position = (self.epoch, self.number);
+        (self.number > 0).then(|| Fence::new(&self.me, &self.resource, position, self.run))
+    }
+
+    /// Handles a report of a fence of this owner that another agent or a device has seen.
+    pub(crate) fn seen(&mut self, now: Millis, fence: &Fence) {
+        let is_of_another_life = fence.owner() == self.me.name()
+            && fence.resource() == self.resource.as_str()
+            && fence.run() != self.run;
+        let is_deaf = fault!(self.fault, AskNobody) || fault!(self.fault, FileOnly);
+        if !is_of_another_life || fence.epoch() > MAX_REPORTED || is_deaf {
+            return;
+        }
+        self.reported = self.reported.max(Some(fence.epoch()));
+        // Lives on this host are in the file, with their leases.
+        if fence.epoch() > self.before && self.absent_until.is_some_and(|until| now < until) {
+            self.silent_until = self.silent_until.max(self.absent_until);
+        }
+    }
+
+    /// Handles the end of storing an epoch.
+    pub(crate) fn stored(&mut self, now: Millis, epoch: u64, out: &mut Vec<OwnerStep>) {
+        if self.storing == Some(epoch) {
+            self.storing = None;
+            self.epoch = epoch;
+        }
+        self.handle_timeout(now, out);
     }
 
     /// Handles a report that an agent has entered. `asked` is absent in those of legacy agents.
@@ -343,6 +417,9 @@ impl Owner {
         if over(self.silent_until) {
             self.silent_until = None;
         }
+        if over(self.absent_until) {
+            self.absent_until = None;
+        }
         if over(self.live.as_ref().and_then(|live| live.expires)) {
             if let Some(live) = &self.live {
                 self.unproved = Some((live.holder.clone(), live.conversation.clone()));
@@ -381,15 +458,24 @@ impl Owner {
     }
 
     fn grant_next(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
-        if self.live.is_some() || self.silent_until.is_some() {
+        let gate = self.gate();
+        if gate == Gate::Closed {
             return;
         }
-        let gate = self.gate();
-        let next = self
-            .queue
-            .iter()
-            .position(|waiter| gate.lets_pass(waiter.dialect()));
-        let Some(waiter) = next.and_then(|next| self.queue.remove(next)) else {
+        let mut queue = self.queue.iter();
+        let Some(next) = queue.position(|waiter| gate.lets_pass(waiter.dialect())) else {
+            return;
+        };
+        let is_fenced = self.queue.get(next).is_some_and(|it| it.asked.is_some());
+        if let Some(reported) = self.reported.filter(|epoch| *epoch >= self.epoch)
+            && is_fenced
+        {
+            let epoch = reported.saturating_add(1);
+            self.storing = Some(epoch);
+            out.push(OwnerStep::Store(epoch));
+            return;
+        }
+        let Some(waiter) = self.queue.remove(next) else {
             return;
         };
         let mut grant = Grant {
@@ -402,7 +488,8 @@ impl Owner {
             if !fault!(self.fault, ReuseFence) || self.number == 0 {
                 self.number += 1;
             }
-            let fence = Fence::new(&self.me, &self.resource, self.epoch, self.number);
+            let position = (self.epoch, self.number);
+            let fence = Fence::new(&self.me, &self.resource, position, self.run);
             grant.fence = Some(fence.clone());
             grant.expires = Some(now.saturating_add(self.lease));
             out.push(Self::granted(
@@ -455,6 +542,7 @@ impl Owner {
         for time in expires
             .into_iter()
             .chain(&mut self.silent_until)
+            .chain(&mut self.absent_until)
             .chain(asked)
         {
             *time = time.saturating_sub(by);

@@ -5,40 +5,62 @@ use std::str::FromStr;
 
 use crate::Millis;
 
+/// Time in which an owner without memory grants nothing, if its lease is not longer.
+const MIN_SILENCE: Millis = 15_000;
+
 /// State of an owner that has to survive its restarts.
 ///
-/// A start reads the file (or takes [`first`](Self::first) if there is none), computes
-/// [`next_life`](Self::next_life), and writes and syncs that before it calls
-/// [`Locks::own`](crate::Locks::own). After [`Locks::disown`](crate::Locks::disown) it writes
+/// A start reads the file, computes [`next_life`](Self::next_life) with
+/// [`with_run`](Self::with_run) and [`with_clock`](Self::with_clock), and writes and syncs that before it
+/// calls [`Locks::own`](crate::Locks::own). Without a file it begins with
+/// [`without_memory`](Self::without_memory), and writes the file when
+/// [`needs_report`](Self::needs_report) is false. After an [`Event::Raised`](crate::Event::Raised) it writes
+/// [`raised`](Self::raised), and after [`Locks::disown`](crate::Locks::disown) it writes
 /// [`closed`](Self::closed) if no grant was live.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct OwnerState {
     epoch: u64,
     lease: Millis,
     silence: Millis,
+    /// Epoch of the last life of which this state knows.
+    before: u64,
+    run: u64,
+    /// Time after the start in which grants of a life elsewhere may be live.
+    absence: Millis,
+    needs_report: bool,
 }
 
 impl OwnerState {
     const HEAD: &str = "fipa-locking owner 1";
 
-    /// State of an owner without a file: no life before.
+    /// State of an owner that has had no life before, and whose fences no device has seen.
     #[must_use]
     pub fn first() -> Self {
         Self {
             epoch: 0,
             lease: 0,
             silence: 0,
+            before: 0,
+            run: 0,
+            absence: 0,
+            needs_report: false,
         }
     }
 
-    /// State of a life without a file. `epoch` has to rise from life to life, as the time of day does.
-    /// The owner is silent for `lease`, which has to be that of its earlier lives, too.
+    /// State of a life without a file, whose leases are at most `lease`. Those of earlier lives should not
+    /// have been longer: the owner is silent for `lease`, and for at least 15 s.
+    ///
+    /// The life has an epoch from the clock ([`with_clock`](Self::with_clock)), or from the reports of the
+    /// agents and devices that have seen fences of earlier lives.
     #[must_use]
-    pub fn volatile(epoch: u64, lease: Millis) -> Self {
+    pub fn without_memory(lease: Millis) -> Self {
         Self {
-            epoch,
-            lease,
-            silence: lease,
+            // A crash during the silence leaves grants of lives before that may still be live.
+            lease: lease.max(MIN_SILENCE),
+            silence: lease.max(MIN_SILENCE),
+            absence: lease.max(MIN_SILENCE),
+            needs_report: true,
+            ..Self::first()
         }
     }
 
@@ -50,6 +72,39 @@ impl OwnerState {
             // A crash during the silence leaves grants of the life before that may still be live.
             lease: lease.max(self.lease),
             silence: self.lease,
+            before: self.epoch,
+            run: 0,
+            absence: lease.max(MIN_SILENCE),
+            needs_report: false,
+        }
+    }
+
+    /// Sets the random bits of this life. Each life needs others.
+    #[must_use]
+    pub fn with_run(self, run: u64) -> Self {
+        Self { run, ..self }
+    }
+
+    /// Raises the epoch to the time of day in seconds since 1970. `None` if the clock was not set.
+    #[must_use]
+    pub fn with_clock(self, seconds: Option<u64>) -> Self {
+        match seconds {
+            Some(seconds) => Self {
+                epoch: self.epoch.max(seconds),
+                needs_report: false,
+                ..self
+            },
+            None => self,
+        }
+    }
+
+    /// State of this life after an [`Event::Raised`](crate::Event::Raised).
+    #[must_use]
+    pub fn raised(self, epoch: u64) -> Self {
+        Self {
+            epoch: self.epoch.max(epoch),
+            needs_report: false,
+            ..self
         }
     }
 
@@ -69,11 +124,48 @@ impl OwnerState {
         self.epoch
     }
 
+    /// Random bits of this life.
+    #[must_use]
+    pub fn run(&self) -> u64 {
+        self.run
+    }
+
     /// Time after the start in which grants of earlier lives may be live: the longest lease of these
     /// lives, or 0.
     #[must_use]
     pub fn silence(&self) -> Millis {
         self.silence
+    }
+
+    /// Whether neither a file nor a clock says which epoch is higher than those of earlier lives. The owner
+    /// then grants only after an agent or a device has told it of a fence.
+    #[must_use]
+    pub fn needs_report(&self) -> bool {
+        self.needs_report
+    }
+
+    /// Epoch of the last life of which this state knows.
+    pub(crate) fn before(&self) -> u64 {
+        self.before
+    }
+
+    /// Time after the start in which grants of a life elsewhere may be live.
+    pub(crate) fn absence(&self) -> Millis {
+        self.absence
+    }
+
+    /// Replaces the minimum of the silence, for tests with short leases.
+    #[cfg(test)]
+    pub(crate) fn with_absence(self, absence: Millis) -> Self {
+        match self.needs_report {
+            true => Self {
+                silence: absence,
+                lease: absence,
+                absence,
+                ..self
+            },
+            false => Self { absence, ..self },
+        }
     }
 }
 
@@ -95,7 +187,8 @@ impl fmt::Display for OwnerState {
 pub enum OwnerStateError {
     /// The file is not a state file of this version, or it is incomplete.
     #[error(
-        "line {0} of the owner's state file is not valid; restore the file, since fences have to rise"
+        "line {0} of the owner's state file is not valid; restore the file or remove it, and the owner \
+         starts without memory"
     )]
     Line(usize),
 }
@@ -117,7 +210,7 @@ impl FromStr for OwnerState {
         let state = Self {
             epoch: number(2, "epoch")?,
             lease: number(3, "lease")?,
-            silence: 0,
+            ..Self::first()
         };
         match (lines.next(), text.ends_with('\n')) {
             (None, true) => Ok(state),
@@ -145,6 +238,30 @@ mod tests {
         assert_eq!((third.epoch(), third.silence()), (3, 100));
         let fourth = stored(third.closed()).next_life(10);
         assert_eq!((fourth.epoch(), fourth.silence()), (4, 0));
+    }
+
+    #[test]
+    fn an_epoch_is_above_the_file_and_the_clock() {
+        let file = stored(OwnerState::first().next_life(100));
+        let life = |clock| stored(file).next_life(100).with_clock(clock);
+        assert_eq!(life(None).epoch(), 2);
+        assert_eq!(life(Some(1)).epoch(), 2);
+        assert_eq!(life(Some(1_800_000_000)).epoch(), 1_800_000_000);
+        let raised = stored(life(None).raised(7));
+        assert_eq!(raised.next_life(100).epoch(), 8);
+    }
+
+    #[test]
+    fn a_life_without_memory_is_silent_and_needs_a_clock_or_a_report() {
+        let life = OwnerState::without_memory(100);
+        assert_eq!((life.silence(), life.needs_report()), (15_000, true));
+        assert_eq!(OwnerState::without_memory(20_000).silence(), 20_000);
+        assert!(!life.raised(7).needs_report());
+        let life = life.with_clock(Some(1_800_000_000));
+        assert!(!life.needs_report());
+        // A crash during the silence.
+        let next = stored(life).next_life(100).with_clock(None);
+        assert_eq!((next.epoch(), next.silence()), (1_800_000_001, 15_000));
     }
 
     #[test]

@@ -199,7 +199,10 @@ fn a_silent_legacy_holder_is_replaced_only_by_force() {
     owner.receive("agent3", OWN, "agent3_1", confirm(9_000));
     assert_eq!(owner.sent(), []);
     owner.locks.force(owner.now, &bay(), &mut owner.out);
-    assert_eq!(fence_in(&owner.sent()).to_string(), "1.1@agent1#bay");
+    assert_eq!(
+        fence_in(&owner.sent()).to_string(),
+        "1.1.0000000000000000@agent1#bay"
+    );
 }
 
 /// In Suzuki-Kasami legacy agents send no reports: the token is the report.
@@ -366,7 +369,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
     assert_eq!(agent.sent(), []);
     // A grant that crosses the withdrawal is released at once.
     let granted = Act::Granted {
-        fence: "1.1@agent1#bay".parse().unwrap(),
+        fence: "1.1.0000000000000000@agent1#bay".parse().unwrap(),
         lease: 15_000,
         asked: 200,
     };
@@ -494,7 +497,7 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
         .own(0, &bay(), &stored.next_life(15_000), &mut owner.out);
     owner.receive("agent2", OWN, "agent2_0", confirm(1));
     // An earlier fence is refused at once.
-    let earlier = "1.7@agent1#bay".parse().unwrap();
+    let earlier = "1.7.0000000000000000@agent1#bay".parse().unwrap();
     assert!(!owner.locks.admit(0, &bay(), &earlier));
     owner.pass(14_999);
     owner.receive("agent2", OWN, "agent2_0", confirm(2));
@@ -502,7 +505,10 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
     assert!(!owner.sent().iter().any(of_lock));
     // The waiter is probed, and answers.
     owner.pass(1);
-    assert_eq!(fence_in(&owner.sent()).to_string(), "2.1@agent1#bay");
+    assert_eq!(
+        fence_in(&owner.sent()).to_string(),
+        "2.1.0000000000000000@agent1#bay"
+    );
 }
 
 #[test]
@@ -654,9 +660,9 @@ fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
     agent.receive("agent1", OWN, "agent2_0", Act::Agree { clock: 1 });
     agent.now = 14_250;
     agent.sent();
-    let fence: Fence = "1.1@agent1#bay".parse().unwrap();
+    let fence: Fence = "1.1.0000000000000000@agent1#bay".parse().unwrap();
     let granted = |asked| Act::Granted {
-        fence: "1.1@agent1#bay".parse().unwrap(),
+        fence: "1.1.0000000000000000@agent1#bay".parse().unwrap(),
         lease: 15_000,
         asked,
     };

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::{Agent, Background};
 use crate::locks::{
-    self, LockError, LockOptions, OwnError, OwnOptions, OwnerEvent, ResourceStatus,
+    self, Device, LockError, LockOptions, OwnError, OwnOptions, OwnerEvent, ResourceStatus,
 };
 
 /// A lock; see [`crate::locks::Lock`], whose methods it has. Dropping it releases the resources.
@@ -99,6 +99,14 @@ impl Agent {
         let owned = self.runtime.block_on(self.agent.own(resource, options))?;
         let runtime = self.runtime.clone();
         Ok(Owned { owned, runtime })
+    }
+
+    /// See [`crate::Agent::device`].
+    ///
+    /// # Errors
+    /// See [`crate::Agent::device`].
+    pub fn device(&self, owner: &str, resource: &str) -> Result<Device, LockError> {
+        self.agent.device(owner, resource)
     }
 
     fn acquired(&self, lock: Result<locks::Lock, LockError>) -> Result<Lock, LockError> {

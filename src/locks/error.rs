@@ -138,6 +138,17 @@ pub enum OwnError {
         /// The name of the owner.
         owner: String,
     },
+    /// The owner may have granted fences before, and nothing says which: there is no state file, the clock was
+    /// not set, and no agent or device that is connected has seen one.
+    #[error(
+        "nothing says which fences of {resource:?} earlier runs have granted: there is no state file, the \
+         clock is not set, and no agent or device has seen one; set the clock, restore the file, or start \
+         with `forget` if there was no earlier run"
+    )]
+    NoMemory {
+        /// The resource.
+        resource: String,
+    },
     /// This agent owns the resource already.
     #[error("this agent owns {resource:?} already")]
     Here {

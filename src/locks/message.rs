@@ -27,6 +27,19 @@ pub enum AdmitError {
     /// The message has too many fences.
     #[error("the message has more than {MAX_FENCES} fences")]
     TooMany,
+    /// The device has admitted a fence of another run of the owner. The fence is old, or the owner has
+    /// started without knowing of that run; then lock the resource again.
+    #[error(
+        "the fence {fence} of {resource:?} is of another run of the owner than {highest}, which was admitted"
+    )]
+    OtherRun {
+        /// The fence.
+        fence: Fence,
+        /// The highest fence that the device has admitted.
+        highest: Fence,
+        /// The resource.
+        resource: String,
+    },
     /// The fence is older than the present grant: its lock was lost or released.
     #[error("the fence {fence} of {resource:?} is stale; the lock was lost or released")]
     Stale {
@@ -90,8 +103,8 @@ mod tests {
     #[test]
     fn fences_survive_a_message() {
         let fences = [
-            fence("1.2@crane#bay"),
-            fence("3.4@the 100% %20 crane#bay 1"),
+            fence("1.2.5a31c0e4d2b19f07@crane#bay"),
+            fence("3.4.5a31c0e4d2b19f07@the 100% %20 crane#bay 1"),
         ];
         let empty = || Message::builder(Performative::Request);
         let message = with_fences(empty(), fences.iter()).build().unwrap();
@@ -107,12 +120,15 @@ mod tests {
             fences_of(&message.build().unwrap())
         };
         assert_eq!(
-            read("1.2@#b".into()),
+            read("1.2.5a31c0e4d2b19f07@#b".into()),
             Err(FenceError::Name(fipa_locking::NameError::Empty).into())
         );
         assert_eq!(read(String::new()), Err(FenceError::Form.into()));
-        assert_eq!(read("1.1@a#b ".repeat(65)), Err(AdmitError::TooMany));
-        let long = format!("1.1@{}#bay", "x".repeat(10_000));
+        assert_eq!(
+            read("1.1.5a31c0e4d2b19f07@a#b ".repeat(65)),
+            Err(AdmitError::TooMany)
+        );
+        let long = format!("1.1.5a31c0e4d2b19f07@{}#bay", "x".repeat(10_000));
         assert!(matches!(read(long), Err(AdmitError::Fence(_))));
     }
 }

@@ -38,6 +38,7 @@
 //! aside without reading them receives no renewals, and loses its locks.
 
 mod clock;
+mod device;
 mod error;
 mod greetings;
 mod lock;
@@ -51,7 +52,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 pub use fipa_locking::{
-    Admission, Ending, Fence, FenceError, Kind as Algorithm, NameError, OptionsError,
+    Admission, Ending, Fence, FenceError, Kind as Algorithm, NameError, NotAdmitted, OptionsError,
     OwnerStateError, Refusal,
 };
 
@@ -59,6 +60,7 @@ use fipa_locking::{LockStatus, Options, Resource};
 
 use crate::agent::Agent;
 
+pub use self::device::Device;
 pub use self::error::{LockError, OwnError};
 pub use self::lock::Lock;
 pub use self::message::{AdmitError, FENCE, fences_of, with_fences};
@@ -238,8 +240,17 @@ impl Agent {
     ///
     /// # Errors
     /// If the state file cannot be written, unless [`OwnOptions::volatile`] is set; if another agent
-    /// owns the resource; if an option is out of bounds.
+    /// owns the resource; if an option is out of bounds; [`OwnError::NoMemory`].
     pub async fn own(&self, resource: &str, options: OwnOptions) -> Result<Owned, OwnError> {
         Owned::begin(Arc::clone(&self.core), Resource::new(resource)?, options).await
+    }
+
+    /// Returns a check of the fences that `owner` grants for a resource, for a device of this agent. The
+    /// owner itself checks fences with [`Owned`].
+    ///
+    /// # Errors
+    /// If the name of the resource is not valid, or the agent was deregistered.
+    pub fn device(&self, owner: &str, resource: &str) -> Result<Device, LockError> {
+        Device::begin(&self.core, owner, resource)
     }
 }

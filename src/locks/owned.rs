@@ -3,12 +3,13 @@
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use fipa_acl::{ErrorChain, Message};
 use fipa_locking::{Ending, Fence, Grant, Options, OwnerState, Resource};
 use fipa_sds::{Entry, RegisterError, Role};
-use fipa_transport::log_limit;
+use fipa_transport::{Incarnation, log_limit};
+use parking_lot::Mutex;
 
 use super::shell::{self, Shared};
 use super::state_file::StateFile;
@@ -33,10 +34,18 @@ pub struct OwnOptions {
     /// Directory of the state files. By default `FIPA_STATE_DIR`, else `fipa` in `XDG_STATE_HOME`, else
     /// `~/.local/state/fipa`.
     pub state_dir: Option<PathBuf>,
-    /// Whether to do without a state file. The fences then rise with the time of day, so they are safe
-    /// only while it is not set back. After each start the owner grants nothing for one lease, which has
-    /// to be that of its earlier runs, too.
+    /// Whether to do without a state file. Each start is then one without a file.
+    ///
+    /// An owner that starts without a file grants nothing for one lease, and for at least 15 s. Earlier runs
+    /// should not have had a longer lease. Its fences rise with the time of day, and above those that agents
+    /// and devices ([`Device`](super::Device)) report.
     pub volatile: bool,
+    /// Whether an owner without a file grants at once, because no lock of an earlier run is in use and no
+    /// device has seen its fences: the first start. It changes nothing if there is a file.
+    ///
+    /// Without it, an owner without a file whose clock shows a time before this release, and to which no
+    /// agent or device reports a fence, cannot own the resource ([`OwnError::NoMemory`]).
+    pub forget: bool,
 }
 
 impl Default for OwnOptions {
@@ -45,6 +54,7 @@ impl Default for OwnOptions {
             lease: Duration::from_millis(Options::default().lease),
             state_dir: None,
             volatile: false,
+            forget: false,
         }
     }
 }
@@ -105,6 +115,8 @@ pub(super) enum Holding {
     Preparing,
     Owner,
     Refused(String),
+    /// No fence is known to be higher than those of earlier runs.
+    NoMemory,
     /// The agent was deregistered.
     Closed,
 }
@@ -123,14 +135,15 @@ pub struct Owned {
 struct Files {
     /// The entry of the directory, if the name of the resource permits one.
     listed: Option<Coalition>,
-    state: Option<StateFile>,
+    state: Option<Arc<Mutex<StateFile>>>,
+    life: OwnerState,
 }
 
 impl Files {
     fn close(self, none_was_live: bool) {
         drop(self.listed);
         if let Some(state) = self.state {
-            state.end(none_was_live);
+            state.lock().end(none_was_live);
         }
     }
 }
@@ -162,11 +175,10 @@ impl Owned {
             prepare(&agent, &resource, &options)
         });
         let files = prepared.await.map_err(LockError::from)??;
-        let life = match &files.state {
-            Some(file) => file.state(),
-            None => OwnerState::volatile(time_of_day(), lease),
-        };
+        let life = files.life;
+        let file = files.state.as_ref().map(Arc::downgrade);
         owned.files = Some(files);
+        owned.shared.raise_in(&owned.core, &owned.resource, file);
         owned.shared.own(&owned.core, &owned.resource, &life, lease);
         let decided = holding.wait_for(|now| *now != Holding::Preparing).await;
         let decided = decided.map_or(Holding::Closed, |now| now.clone());
@@ -175,6 +187,9 @@ impl Owned {
             Holding::Refused(owner) => Err(OwnError::Taken {
                 resource: owned.resource.as_str().to_owned(),
                 owner,
+            }),
+            Holding::NoMemory => Err(OwnError::NoMemory {
+                resource: owned.resource.as_str().to_owned(),
             }),
             Holding::Preparing | Holding::Closed => Err(LockError::Closed.into()),
         }
@@ -214,6 +229,15 @@ impl Owned {
                 owner: owner.to_owned(),
                 resource,
             },
+        })
+    }
+
+    /// Returns the time in which the owner grants nothing, because a lock of an earlier run may be in use.
+    #[must_use]
+    pub fn silence(&self) -> Duration {
+        self.shared.read(|locks, now| {
+            let core = locks.owner(&self.resource);
+            Duration::from_millis(core.map_or(0, |core| core.silence(now)))
         })
     }
 
@@ -282,6 +306,12 @@ impl fmt::Debug for Owned {
 /// Writes the state file and the entry of the directory. Blocks.
 fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Result<Files, OwnError> {
     let domain = &core.endpoint.domain;
+    let lease = clock::millis(options.lease);
+    let (run, seconds) = (Incarnation::random().as_u64(), clock::time_of_day());
+    let without_file = match options.forget {
+        true => OwnerState::first().next_life(lease),
+        false => OwnerState::without_memory(lease),
+    };
     let state = match options.volatile {
         true => None,
         false => Some(StateFile::begin(
@@ -291,9 +321,17 @@ fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Resul
                 &core.endpoint.name,
                 resource.as_str(),
             ],
-            clock::millis(options.lease),
+            lease,
+            without_file,
+            seconds,
         )?),
     };
+    let life = match &state {
+        Some(file) => file.state(),
+        None => without_file.with_clock(seconds),
+    };
+    let life = life.with_run(run);
+    let state = state.map(|file| Arc::new(Mutex::new(file)));
     let listing = RegisterOptions {
         agent_type: TYPE.to_owned(),
         description: String::new(),
@@ -316,7 +354,11 @@ fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Resul
             None
         }
     };
-    Ok(Files { listed, state })
+    Ok(Files {
+        listed,
+        state,
+        life,
+    })
 }
 
 fn entry_name(resource: &Resource) -> String {
@@ -353,10 +395,4 @@ pub(super) fn listed_owner(
 ) -> Option<Arc<Entry>> {
     let entry = directory.lookup(&entry_name(resource))?;
     listed(directory, &entry).map(|(_, owner)| owner)
-}
-
-/// Returns the time of day in milliseconds since 1970.
-fn time_of_day() -> u64 {
-    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    clock::millis(now.unwrap_or_default())
 }

@@ -300,7 +300,7 @@ mod tests {
     fn an_answer_is_read_as_it_was_written() {
         let status = ResourceStatus {
             holder: Some("rover".to_owned()),
-            fence: "1.2@crane#bay".parse().ok(),
+            fence: "1.2.5a31c0e4d2b19f07@crane#bay".parse().ok(),
             expires: Some(Duration::from_millis(1_500)),
             waiters: vec!["arm".to_owned()],
             waiting: 1,

@@ -5,30 +5,32 @@
 
 use std::any::Any;
 use std::collections::{HashMap, HashSet, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
-    Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Kind,
+    Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Fence, Kind,
     LockMessage, Locks, Millis, Peer, Resource, codec,
 };
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Entry, Reach, Role, Watch};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
+use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 
 use super::clock::{Timer, millis, now};
 use super::greetings::Greetings;
 use super::owned::{Holding, OwnerEvent};
+use super::state_file::StateFile;
 use super::{LockError, LockOptions, report};
-use crate::DirectoryView;
 use crate::agent::AgentCore;
 use crate::demultiplexer::ReaderKey;
 use crate::incoming::Incoming;
 use crate::lock_slot::{self, Running, Slot};
 use crate::protocol::{PartnerEvent, PartnerWatch};
+use crate::{DirectoryView, background};
 
 /// Maximum number of events that wait for the application of an owner. Beyond it, the earliest is
 /// dropped.
@@ -36,6 +38,9 @@ const MAX_EVENTS: usize = 256;
 
 /// Maximum number of messages that are handled before the departure of an agent.
 const MAX_WAITING: usize = 1024;
+
+/// Pause before the state of an owner is written again.
+const STORE_AGAIN: Duration = Duration::from_secs(1);
 
 /// Minimum deadline of the letters of a basic algorithm, which repeats nothing. A receiver that has ended
 /// is reported before.
@@ -163,6 +168,8 @@ struct OwnedState {
     changed: Arc<Notify>,
     /// After the end: whether no grant was live.
     none_was_live: Option<bool>,
+    /// Epochs that have to be stored.
+    raised: watch::Sender<u64>,
 }
 
 impl State {
@@ -209,6 +216,12 @@ impl State {
             Event::Owning { resource } => self.holds(&resource, Holding::Owner),
             Event::OwningRefused { resource, by } => {
                 self.holds(&resource, Holding::Refused(by.name().to_owned()));
+            }
+            Event::NoMemory { resource } => self.holds(&resource, Holding::NoMemory),
+            Event::Raised { resource, epoch } => {
+                if let Some(owned) = self.owned.get(&resource) {
+                    owned.raised.send_replace(epoch);
+                }
             }
             Event::Contested { resource, by } => {
                 log_limit::warn!(
@@ -376,6 +389,7 @@ impl Shared {
             events: VecDeque::new(),
             changed: Arc::new(Notify::new()),
             none_was_live: state.is_closed.then_some(false),
+            raised: watch::Sender::new(0),
         };
         state.owned.insert(resource.clone(), reserved);
         Some(receiver)
@@ -395,6 +409,58 @@ impl Shared {
                     .core
                     .own_with_lease(now, resource, life, lease, actions);
             }
+        });
+    }
+
+    /// Starts a task that stores the epochs of a reserved resource, until its ownership ends. An owner
+    /// without a file has nothing to store.
+    pub(super) fn raise_in(
+        self: &Arc<Self>,
+        core: &Arc<AgentCore>,
+        resource: &Resource,
+        file: Option<Weak<Mutex<StateFile>>>,
+    ) {
+        let Some(mut raised) = self
+            .state
+            .lock()
+            .owned
+            .get(resource)
+            .map(|owned| owned.raised.subscribe())
+        else {
+            return;
+        };
+        let runtime = &core.endpoint.domain.inner.service.runtime;
+        let (shared, agent) = (Arc::downgrade(self), Arc::downgrade(core));
+        let resource = resource.clone();
+        let handle = runtime.clone();
+        runtime.spawn(async move {
+            while raised.changed().await.is_ok() {
+                let epoch = *raised.borrow_and_update();
+                if let Some(file) = &file
+                    && !store(&handle, file, epoch).await
+                {
+                    return;
+                }
+                let (Some(shared), Some(agent)) = (shared.upgrade(), agent.upgrade()) else {
+                    return;
+                };
+                shared.act(&agent, |state, now, actions| {
+                    state.core.stored(now, &resource, epoch, actions);
+                });
+            }
+        });
+    }
+
+    /// Records a fence that a device of this agent has admitted, or tells it its owner.
+    pub(super) fn saw(&self, core: &AgentCore, owner: Option<&Peer>, fence: &Fence, tell: bool) {
+        self.act(core, |state, now, actions| {
+            if let (Some(owner), Ok(resource)) = (owner, Resource::new(fence.resource())) {
+                state
+                    .core
+                    .owner_known(now, &resource, owner, Dialect::Own, actions);
+                state.note(owner);
+            }
+            state.core.saw(now, fence, tell, actions);
         });
     }
 
@@ -715,6 +781,26 @@ impl Task {
         self.shared.act(&self.core, |_, _, actions| {
             actions.push(Action::Send { to: agent, message });
         });
+    }
+}
+
+/// Stores an epoch, and tries again until it is stored. Returns whether the ownership goes on.
+async fn store(runtime: &Handle, file: &Weak<Mutex<StateFile>>, epoch: u64) -> bool {
+    loop {
+        let Some(file) = file.upgrade() else {
+            return false;
+        };
+        let stored = background::run(runtime, move |_| file.lock().raise(epoch)).await;
+        match stored {
+            Ok(Ok(())) => return true,
+            Ok(Err(error)) => log_limit::error!(
+                %error, "cannot write the state of an owner; it grants nothing meanwhile"
+            ),
+            Err(error) => log_limit::error!(
+                %error, "cannot write the state of an owner; it grants nothing meanwhile"
+            ),
+        }
+        tokio::time::sleep(STORE_AGAIN).await;
     }
 }
 

@@ -68,10 +68,15 @@ pub(super) struct StateFile {
 
 impl StateFile {
     /// Begins a life whose leases are at most `lease`: raises the epoch, and syncs the file. Blocks.
+    ///
+    /// Without a file, the life begins with `without_file`. If that life needs a report, the file is written
+    /// when [`raise`](Self::raise) has an epoch: otherwise the next start would take it for a memory.
     pub(super) fn begin(
         directory: Option<&Path>,
         names: [&str; 3],
         lease: Millis,
+        without_file: OwnerState,
+        seconds: Option<u64>,
     ) -> Result<Self, StateFileError> {
         let directory = match directory {
             Some(directory) => directory.to_owned(),
@@ -97,16 +102,22 @@ impl StateFile {
                 TryLockError::Error(source) => return Err(failed(source)),
             }
         }
-        let before = match fs::read_to_string(&path) {
-            Ok(text) => text.parse().map_err(|source| StateFileError::Content {
-                path: path.clone(),
-                source,
-            })?,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => OwnerState::first(),
+        let life = match fs::read_to_string(&path) {
+            Ok(text) => {
+                let before: OwnerState =
+                    text.parse().map_err(|source| StateFileError::Content {
+                        path: path.clone(),
+                        source,
+                    })?;
+                before.next_life(lease)
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => without_file,
             Err(source) => return Err(failed(source)),
         };
-        let state = before.next_life(lease);
-        write(&path, &state).map_err(failed)?;
+        let state = life.with_clock(seconds);
+        if !state.needs_report() {
+            write(&path, &state).map_err(failed)?;
+        }
         Ok(Self {
             state,
             path,
@@ -119,9 +130,17 @@ impl StateFile {
         self.state
     }
 
+    /// Raises the epoch of this life, and syncs the file. Blocks.
+    pub(super) fn raise(&mut self, epoch: u64) -> io::Result<()> {
+        let state = self.state.raised(epoch);
+        write(&self.path, &state)?;
+        self.state = state;
+        Ok(())
+    }
+
     /// Ends the life. The next life grants at once if no grant is live now. Blocks.
-    pub(super) fn end(self, none_is_live: bool) {
-        if !none_is_live {
+    pub(super) fn end(&mut self, none_is_live: bool) {
+        if !none_is_live || self.state.needs_report() {
             return;
         }
         if let Err(error) = write(&self.path, &self.state.closed()) {
@@ -185,7 +204,32 @@ mod tests {
     const NAMES: [&str; 3] = ["default", "crane", "bay/../1"];
 
     fn begin(directory: &Path, lease: Millis) -> StateFile {
-        StateFile::begin(Some(directory), NAMES, lease).unwrap()
+        let first = OwnerState::first().next_life(lease);
+        StateFile::begin(Some(directory), NAMES, lease, first, None).unwrap()
+    }
+
+    #[test]
+    fn a_file_is_written_when_the_epoch_is_known() {
+        let directory = tempfile::tempdir().unwrap();
+        let begin = |seconds| {
+            let unknown = OwnerState::without_memory(100);
+            StateFile::begin(Some(directory.path()), NAMES, 100, unknown, seconds).unwrap()
+        };
+        // Neither a clock nor a report: the next start has no memory either.
+        for _ in 0..2 {
+            let mut life = begin(None);
+            assert!(life.state().needs_report() && !life.path.exists());
+            life.end(true);
+        }
+        let mut life = begin(None);
+        life.raise(8).unwrap();
+        drop(life);
+        let life = begin(None);
+        assert_eq!((life.state().epoch(), life.state().silence()), (9, 15_000));
+        drop(life);
+        assert_eq!(begin(Some(1_800_000_000)).state().epoch(), 1_800_000_000);
+        // The clock was set back.
+        assert_eq!(begin(Some(7)).state().epoch(), 1_800_000_001);
     }
 
     #[test]
@@ -195,12 +239,14 @@ mod tests {
         assert_eq!((first.state().epoch(), first.state().silence()), (1, 0));
         // A crash: the file is not closed.
         drop(first);
-        let second = begin(directory.path(), 50);
+        let mut second = begin(directory.path(), 50);
         assert_eq!((second.state().epoch(), second.state().silence()), (2, 100));
         second.end(true);
-        let third = begin(directory.path(), 50);
+        drop(second);
+        let mut third = begin(directory.path(), 50);
         assert_eq!((third.state().epoch(), third.state().silence()), (3, 0));
         third.end(false);
+        drop(third);
         let fourth = begin(directory.path(), 50);
         assert_eq!((fourth.state().epoch(), fourth.state().silence()), (4, 50));
         let path = directory
@@ -213,15 +259,19 @@ mod tests {
     fn a_file_in_use_a_damaged_one_and_a_read_only_directory_are_errors() {
         let directory = tempfile::tempdir().unwrap();
         let first = begin(directory.path(), 100);
-        let second = StateFile::begin(Some(directory.path()), NAMES, 100);
+        let again = |directory: &Path| {
+            let life = OwnerState::first().next_life(100);
+            StateFile::begin(Some(directory), NAMES, 100, life, None)
+        };
+        let second = again(directory.path());
         assert!(matches!(second, Err(StateFileError::InUse { .. })));
         fs::write(&first.path, "epoch 7\n").unwrap();
         drop(first);
-        let damaged = StateFile::begin(Some(directory.path()), NAMES, 100);
+        let damaged = again(directory.path());
         assert!(matches!(damaged, Err(StateFileError::Content { .. })));
         let no_directory = directory.path().join("file");
         fs::write(&no_directory, "").unwrap();
-        let refused = StateFile::begin(Some(&no_directory), NAMES, 100);
+        let refused = again(&no_directory);
         assert!(matches!(refused, Err(StateFileError::Io { .. })));
     }
 

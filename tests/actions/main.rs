@@ -507,9 +507,27 @@ async fn a_goal_runs_only_with_the_fence_of_the_live_lock() {
     let (here, there) = two(&patient()).await;
     let robot = here.register("crex").await.unwrap();
     let crane = here.register("crane").await.unwrap();
-    let bay = crane.own("bay", OwnOptions::default()).await.unwrap();
+    let bay = crane
+        .own(
+            "bay",
+            OwnOptions {
+                forget: true,
+                ..OwnOptions::default()
+            },
+        )
+        .await
+        .unwrap();
     let gate = here.register("gate").await.unwrap();
-    let other = gate.own("door", OwnOptions::default()).await.unwrap();
+    let other = gate
+        .own(
+            "door",
+            OwnOptions {
+                forget: true,
+                ..OwnOptions::default()
+            },
+        )
+        .await
+        .unwrap();
     let ran = Arc::new(AtomicUsize::new(0));
     let counter = Arc::clone(&ran);
     let action = Action::new("enter").fenced_by(Admission::new("crane", "bay").unwrap());

@@ -201,6 +201,7 @@ async fn a_guarded_counter_loses_no_increment_when_holders_are_killed_and_stoppe
             lease: LEASE,
             state_dir: Some(files.path().to_owned()),
             volatile: false,
+            forget: true,
         };
         let counter = Arc::new(keeper.own("counter", options).await.unwrap());
         let ends = Arc::new(AtomicBool::new(false));

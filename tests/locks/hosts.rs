@@ -168,6 +168,7 @@ fn two_hosts(family: Family) {
             lease: LEASE,
             state_dir: Some(files.path().to_owned()),
             volatile: false,
+            forget: true,
         };
         let counter = keeper.own("counter", options).await.unwrap();
         (domain, Arc::new(keeper), Arc::new(counter))

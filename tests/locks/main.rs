@@ -76,6 +76,7 @@ fn kept(directory: &TempDir, lease: Duration) -> OwnOptions {
         lease,
         state_dir: Some(directory.path().to_owned()),
         volatile: false,
+        forget: true,
     }
 }
 
@@ -174,7 +175,9 @@ async fn a_command_is_admitted_with_the_fence_of_the_live_grant_only() {
         assert!(bay.admit(live));
         for names in ["arm#bay", "crane#dock"] {
             let (epoch, number) = live.position();
-            let foreign: Fence = format!("{epoch}.{number}@{names}").parse().unwrap();
+            let run = live.run();
+            let text = format!("{epoch}.{number}.{run:016x}@{names}");
+            let foreign: Fence = text.parse().unwrap();
             assert!(!bay.admit(&foreign), "{foreign}");
             let message = with_fences(request(&rover, "crane"), [&foreign]);
             let checked = bay.check(&message.build().unwrap());
@@ -408,7 +411,7 @@ async fn the_fences_of_an_owner_rise_over_its_restarts() {
         let rover = agent(&domain, "rover").await;
         let lease = Duration::from_millis(300);
         let mut last: Option<Fence> = None;
-        for life in 1..=4 {
+        for life in 0..4 {
             let crane = agent(&domain, "crane").await;
             let bay = crane.own("bay", kept(&files, lease)).await.unwrap();
             if let Some(last) = &last {
@@ -416,9 +419,12 @@ async fn the_fences_of_an_owner_rise_over_its_restarts() {
             }
             let lock = rover.lock("bay").await.unwrap();
             let fence = lock.fence().unwrap().clone();
-            assert_eq!(fence.position(), (life, 1));
+            assert_eq!(fence.number(), 1);
+            assert!(
+                last.is_none_or(|last| last.epoch() < fence.epoch() && last.run() != fence.run())
+            );
             last = Some(fence);
-            if life % 2 == 0 {
+            if life % 2 == 1 {
                 lock.release();
                 until_async("the bay is free", || bay.status().holder.is_none()).await;
                 bay.release().await;
@@ -427,6 +433,94 @@ async fn the_fences_of_an_owner_rise_over_its_restarts() {
                 drop(bay);
             }
         }
+    })
+    .await;
+}
+
+/// The second host has no state file of the owner. The waits are those of an owner without memory: 15 s.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fence_never_comes_back_on_another_host() {
+    watched(async {
+        let (here, there) = two(&config(&[])).await;
+        let [first, second] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+        let [rover, arm] = [agent(&here, "rover").await, agent(&here, "arm").await];
+        let gate = agent(&here, "gate").await;
+        let device = gate.device("crane", "bay").unwrap();
+        let lease = Duration::from_secs(1);
+        let crane = agent(&there, "crane").await;
+        let bay = crane.own("bay", kept(&first, lease)).await.unwrap();
+        let lock = rover.lock("bay").await.unwrap();
+        let stale = lock.fence().unwrap().clone();
+        let late = lock.guard(request(&rover, "crane")).build().unwrap();
+        assert_eq!(device.check(&late), Ok(stale.clone()));
+        // The owner ends while the grant is live.
+        drop(bay);
+        drop(crane);
+
+        let crane = agent(&here, "crane").await;
+        let moved = OwnOptions {
+            forget: false,
+            ..kept(&second, lease)
+        };
+        let bay = crane.own("bay", moved).await.unwrap();
+        assert!(bay.silence() > Duration::from_secs(10), "{bay:?}");
+        let lock = arm.lock("bay").await.unwrap();
+        let live = lock.fence().unwrap().clone();
+        assert!(live.epoch() > stale.epoch() && live.run() != stale.run());
+        assert!(matches!(
+            bay.check(&late),
+            Err(AdmitError::Stale { fence, .. }) if fence == stale
+        ));
+        let command = lock.guard(request(&arm, "crane")).build().unwrap();
+        assert_eq!(bay.check(&command), Ok(live.clone()));
+        assert_eq!(device.check(&command), Ok(live.clone()));
+        assert!(matches!(
+            device.check(&late),
+            Err(AdmitError::OtherRun { fence, highest, .. }) if fence == stale && highest == live
+        ));
+        assert_eq!(device.highest(), Some(live));
+    })
+    .await;
+}
+
+/// The device has seen an epoch that the owner's clock and file do not reach.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_owner_grants_above_the_fence_of_a_device() {
+    watched(async {
+        let (here, there) = two(&config(&[])).await;
+        let files = tempfile::tempdir().unwrap();
+        let crane = agent(&here, "crane").await;
+        let rover = agent(&there, "rover").await;
+        let gate = agent(&there, "gate").await;
+        let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
+        let device = gate.device("crane", "bay").unwrap();
+        let ahead = "200000000000.7.00000000000000aa@crane#bay";
+        let ahead: Fence = ahead.parse().unwrap();
+        device.admit(&ahead).unwrap();
+        let lock = rover.lock("bay").await.unwrap();
+        let low = lock.fence().unwrap().clone();
+        // The live grant goes on, and the device refuses it.
+        assert!(matches!(
+            device.admit(&low),
+            Err(AdmitError::OtherRun { highest, .. }) if highest == ahead
+        ));
+        lock.release();
+        let next = loop {
+            let lock = rover.lock("bay").await.unwrap();
+            let fence = lock.fence().unwrap().clone();
+            if device.admit(&fence).is_ok() {
+                break fence;
+            }
+        };
+        assert_eq!(next.epoch(), 200_000_000_001);
+        assert_eq!(next.run(), low.run());
+        until_async("the bay is free", || bay.status().holder.is_none()).await;
+        bay.release().await;
+        // The file has the epoch.
+        let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
+        let lock = rover.lock("bay").await.unwrap();
+        assert_eq!(lock.fence().unwrap().position(), (200_000_000_002, 1));
+        drop((lock, bay));
     })
     .await;
 }
@@ -454,12 +548,14 @@ async fn an_owner_needs_its_state_file_and_its_resource() {
         // The same call works without a file.
         let volatile = OwnOptions {
             volatile: true,
+            forget: true,
             lease: Duration::from_millis(200),
             ..no_directory
         };
         let bay = crane.own("bay", volatile).await.unwrap();
         let lock = crane.lock("bay").await.unwrap();
-        assert!(lock.fence().unwrap().epoch() > 1_000_000_000_000);
+        // The time of day.
+        assert!(lock.fence().unwrap().epoch() > 1_000_000_000);
         let again = crane.own("bay", kept(&files, FOREVER)).await;
         assert!(matches!(again, Err(OwnError::Here { .. })), "{again:?}");
         let other = agent(&there, "arm").await;

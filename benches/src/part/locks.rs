@@ -228,7 +228,13 @@ impl Locking {
         let mut owning = JoinSet::new();
         for resource in resources {
             let agent = self.agent.clone();
-            owning.spawn(async move { agent.own(&resource, OwnOptions::default()).await });
+            owning.spawn(async move {
+                let options = OwnOptions {
+                    forget: true,
+                    ..OwnOptions::default()
+                };
+                agent.own(&resource, options).await
+            });
         }
         while let Some(owned) = owning.join_next().await {
             let owned = owned.map_err(chain_text)?;

@@ -28,11 +28,16 @@ use crate::report::Failure;
 /// live grant (`fipa send --fence`), and refused otherwise. The directory lists the agent under the name
 /// lock:RESOURCE, too.
 ///
-/// The epoch of the fences is in a file, in FIPA_STATE_DIR, XDG_STATE_HOME/fipa or ~/.local/state/fipa. It
-/// is raised at each start, so a fence of an earlier run is never valid again.
+/// The epoch of the fences is in a file, in FIPA_STATE_DIR, XDG_STATE_HOME/fipa or ~/.local/state/fipa. Each
+/// start raises it above the file, the time of day, and the fences that agents and devices report, so a
+/// fence of an earlier run is never valid again, on any host.
+///
+/// Without the file, the owner grants nothing for one lease, and for at least 15s. If the clock is not set,
+/// either, and no agent or device has seen a fence, it does not start. Use --forget for the first start.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
+  fipa own bay --forget                the first start: grant at once
   fipa own bay
   fipa own bay --agent crane --lease 5s
   fipa own bay --volatile              without a state file
@@ -56,9 +61,14 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR", conflicts_with = "volatile")]
     state_dir: Option<PathBuf>,
 
-    /// Use no state file: fences rise with the time of day, and each start waits for one lease
+    /// Use no state file: each start is one without a file
     #[arg(long)]
     volatile: bool,
+
+    /// Without a state file, grant at once: no lock of an earlier run is in use, and no device knows a fence
+    /// of one
+    #[arg(long)]
+    forget: bool,
 
     #[command(flatten)]
     group: Group,
@@ -120,6 +130,7 @@ async fn own(arguments: Arguments, config: &Config) -> Result<(), Failure> {
             lease: arguments.lease,
             state_dir: arguments.state_dir,
             volatile: arguments.volatile,
+            forget: arguments.forget,
         };
         agent.own(&resource, options).await
     };
@@ -153,6 +164,16 @@ async fn serve(agent: &Agent, owned: &Owned, config: &Config) -> Result<(), Fail
         escape_name(agent.name()),
         config.domain
     ))?;
+    let silence = owned.silence();
+    if !silence.is_zero() {
+        // Rounded up to seconds.
+        let seconds =
+            Duration::from_secs(silence.as_secs() + u64::from(silence.subsec_nanos() > 0));
+        output::text(&format!(
+            "it grants nothing for {}, because a lock of an earlier run may be in use\n",
+            humantime::format_duration(seconds)
+        ))?;
+    }
     let mut answers = Answers::new(agent);
     loop {
         tokio::select! {
@@ -242,6 +263,12 @@ fn not_owned(error: &OwnError, resource: &str) -> Failure {
             problem,
             place,
             "give a directory with --state-dir, or use no file with --volatile",
+        ),
+        OwnError::NoMemory { .. } => Failure::failed(
+            problem,
+            place,
+            "set the clock, or copy the state file of the earlier host; if no lock of an earlier run is in \
+             use and no device knows its fences, use --forget",
         ),
         OwnError::Taken { .. } => Failure::failed(
             problem,

@@ -5,6 +5,7 @@
 //! | `Query` | `query-if` | `dlm_discover` | resource |
 //! | `Owned` | `inform` | `dlm_discover` | resource |
 //! | `Contested` * | `refuse` | `dlm_discover` | resource |
+//! | `Seen` * | `inform` | `fipa-fence` | resource, fence |
 //! | `Probe` | `request` | `dlm_probe` | empty |
 //! | `Alive` | `confirm` | `dlm_probe` | empty |
 //! | `Request` | `request` | `ricart_agrawala…` | clock, resource |
@@ -50,6 +51,9 @@ pub const BOOST_TOKEN: &str = "suzuki_kasami::Token";
 /// Protocol of discovery.
 pub const DISCOVER: &str = "dlm_discover";
 
+/// Protocol of reports about fences, between agents of this library only.
+pub const FENCES: &str = "fipa-fence";
+
 /// Protocol of probes.
 pub const PROBE: &str = "dlm_probe";
 
@@ -67,7 +71,7 @@ const CLAIM: &str = "claim";
 #[non_exhaustive]
 pub enum DecodeError {
     /// The protocol is not one of locks, or not the one of this group.
-    #[error("the protocol is not {DISCOVER}, {PROBE} or {0}")]
+    #[error("the protocol is not {DISCOVER}, {PROBE}, {FENCES} or {0}")]
     Protocol(Kind),
     /// The protocol has no such message.
     #[error("the protocol has no message with performative {0}")]
@@ -156,6 +160,10 @@ fn parts(message: &LockMessage, kind: Kind) -> (Performative, &'static str, Stri
         Act::Query { .. } => (Performative::QueryIf, DISCOVER, resource.to_string()),
         Act::Owned => (Performative::Inform, DISCOVER, resource.to_string()),
         Act::Contested => (Performative::Refuse, DISCOVER, resource.to_string()),
+        Act::Seen { fence } => {
+            let content = format!("{resource}\n{fence}");
+            (Performative::Inform, FENCES, content)
+        }
         Act::Request { clock } => {
             let content = format!("{clock}\n{resource}");
             (Performative::Request, protocol, content)
@@ -196,7 +204,7 @@ fn parts(message: &LockMessage, kind: Kind) -> (Performative, &'static str, Stri
 #[must_use]
 pub fn is_lock_protocol(protocol: &str) -> bool {
     let mut kinds = Kind::ALL.iter().map(|kind| kind.protocol());
-    protocol == DISCOVER || protocol == PROBE || kinds.any(|name| name == protocol)
+    [DISCOVER, PROBE, FENCES].contains(&protocol) || kinds.any(|name| name == protocol)
 }
 
 /// Reads a message of an agent of a group that uses `kind`.
@@ -238,6 +246,20 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
                 _ => return Err(wrong()),
             },
         },
+        FENCES => {
+            if *message.performative() != Performative::Inform {
+                return Err(wrong());
+            }
+            let (resource, fence) = text
+                .split_once('\n')
+                .ok_or_else(|| DecodeError::Parts(text.split('\n').count()))?;
+            Content::Lock {
+                resource: Resource::new(resource)?,
+                act: Act::Seen {
+                    fence: fence.parse()?,
+                },
+            }
+        }
         _ if protocol == kind.protocol() => {
             let (resource, act) = algorithm(message, text, kind, dialect)?.ok_or_else(wrong)?;
             Content::Lock { resource, act }

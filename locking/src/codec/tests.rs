@@ -155,6 +155,16 @@ fn bad_messages_are_errors() {
     );
     let cfp = recorded(Performative::Cfp, protocol, "a_1", "", "rsc");
     assert_eq!(error(&cfp, basic), DecodeError::Performative("cfp".into()));
+    let seen = |performative, content: &str| recorded(performative, FENCES, "a_1", "", content);
+    let message = seen(Performative::Inform, "rsc");
+    assert_eq!(error(&message, basic), DecodeError::Parts(1));
+    let message = seen(Performative::Inform, "rsc\n1.1@crane#rsc");
+    assert_eq!(error(&message, basic), DecodeError::Fence(FenceError::Form));
+    let message = seen(Performative::Request, "rsc\n1.1.5a31c0e4d2b19f07@crane#rsc");
+    assert_eq!(
+        error(&message, basic),
+        DecodeError::Performative("request".into())
+    );
     let token = |content: &str| {
         recorded(
             Performative::Propagate,
@@ -187,9 +197,10 @@ fn name() -> impl Strategy<Value = String> {
 
 fn act() -> impl Strategy<Value = (Kind, Act)> {
     let number = 0..=i32::MAX as u64;
-    let fence = (name(), any::<u64>(), any::<u64>()).prop_map(|(owner, epoch, number)| {
+    let position = (any::<u64>(), any::<u64>());
+    let fence = (name(), position, any::<u64>()).prop_map(|(owner, position, run)| {
         let owner = crate::Peer::new(&owner, 0).unwrap();
-        Fence::new(&owner, &Resource::new("bay").unwrap(), epoch, number)
+        Fence::new(&owner, &Resource::new("bay").unwrap(), position, run)
     });
     let fence = fence.boxed();
     let agents = proptest::collection::btree_map(name().prop_map(Arc::from), number.clone(), 0..4);
@@ -221,6 +232,7 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
             .prop_map(|(kind, asked)| (kind, Act::Confirm { asked: Some(asked) })),
         (kind.clone(), fence.clone(), any::<u64>())
             .prop_map(|(kind, fence, asked)| (kind, Act::Renew { fence, asked })),
+        (kind.clone(), fence.clone()).prop_map(|(kind, fence)| (kind, Act::Seen { fence })),
         (kind.clone(), fence, any::<u64>(), any::<u64>()).prop_map(
             |(kind, fence, lease, asked)| (
                 kind,
@@ -262,7 +274,7 @@ proptest! {
     #[test]
     fn no_text_makes_the_readers_panic(text in ".{0,80}", performative in 0..22_usize) {
         for kind in Kind::ALL {
-            for protocol in [kind.protocol(), DISCOVER, PROBE] {
+            for protocol in [kind.protocol(), DISCOVER, PROBE, FENCES] {
                 let performative = Performative::STANDARD[performative].clone();
                 for language in [BOOST_TOKEN, TOKEN] {
                     let message = recorded(performative.clone(), protocol, "a_1", language, &text);

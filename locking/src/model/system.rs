@@ -7,8 +7,8 @@ use stateright::{Model, Property};
 use crate::faults::Fault;
 use crate::invariants::History;
 use crate::{
-    Act, Action, AnyAlgorithm, ClaimId, Content, Dialect, Event, Fence, Kind, LockMessage, Locks,
-    Millis, Options, OwnerState, Peer, Resource,
+    Act, Action, Admission, AnyAlgorithm, ClaimId, Content, Dialect, Event, Fence, Kind,
+    LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
 };
 
 /// The time of each state. It exceeds every span, so that no time before it is cut off at 0.
@@ -31,6 +31,23 @@ pub(super) struct Faults {
     pub(super) pauses: u8,
     pub(super) restarts: u8,
     pub(super) withdrawals: u8,
+    /// Restarts of the owner on the other host, which has a state file of its own.
+    pub(super) moves: u8,
+    /// Commands that reach a device, with the fence of any grant.
+    pub(super) commands: u8,
+}
+
+/// What an owner knows at its start, beside its state file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Memory {
+    /// Each host has a clock.
+    Clocks,
+    /// The clock of the second host is set, that of the first is not.
+    SecondClock,
+    /// No clock is set.
+    NoClock,
+    /// No clock is set, and an owner without a file was told to forget its earlier lives.
+    Forgets,
 }
 
 #[derive(Debug, Clone)]
@@ -43,6 +60,7 @@ pub(super) struct System {
     /// Whether the owner probes. Otherwise no agent does.
     pub(super) probes: bool,
     pub(super) lease: Millis,
+    pub(super) memory: Memory,
     pub(super) fault: Fault,
 }
 
@@ -51,8 +69,16 @@ pub(super) struct State {
     agents: Vec<Agent>,
     network: BTreeSet<(Peer, Peer, LockMessage)>,
     history: History,
-    /// State file of the owner.
-    file: OwnerState,
+    /// State files of the owner on two hosts, and its host.
+    files: [Option<OwnerState>; 2],
+    host: usize,
+    /// Number of the owner's lives.
+    lives: u64,
+    /// Fences in the order of their grants, while commands are left.
+    grants: Vec<Fence>,
+    /// A device of agent 1, and the latest grant of which it has admitted a fence.
+    device: Admission,
+    admitted: Option<usize>,
     ticks: u8,
     left: Faults,
     /// Registrations that have ended, and the agents that have no proof of it.
@@ -85,6 +111,8 @@ pub(super) enum Step {
     Return(u8),
     Pause(u8),
     Restart,
+    Move,
+    Command(usize),
 }
 
 impl Step {
@@ -96,6 +124,8 @@ impl Step {
                 | Self::Crash(_)
                 | Self::Pause(_)
                 | Self::Restart
+                | Self::Move
+                | Self::Command(_)
                 | Self::Withdraw(_)
         )
     }
@@ -140,17 +170,23 @@ impl System {
     fn initial(&self) -> State {
         let count = self.claims.len() as u8;
         let agents: Vec<_> = (0..count).map(|agent| self.agent(agent, 1)).collect();
-        let file = OwnerState::first().next_life(self.lease);
+        let device = Admission::new(name(0), resource().as_str()).unwrap();
         let mut state = State {
             history: History::new(resource(), agents[0].me.clone()),
             agents,
             network: BTreeSet::new(),
-            file,
+            files: [Some(OwnerState::first()), None],
+            host: 0,
+            lives: 0,
+            grants: Vec::new(),
+            device,
+            admitted: None,
             ticks: 0,
             left: self.faults,
             unnoticed: BTreeSet::new(),
         };
         let peers: Vec<_> = state.agents.iter().map(|agent| agent.me.clone()).collect();
+        let life = self.life(&mut state);
         for agent in 0..count {
             let mut out = Vec::new();
             let locks = state.locks(agent);
@@ -158,7 +194,7 @@ impl System {
                 locks.join(NOW, peer, Dialect::Own, &mut out);
             }
             if agent == 0 {
-                locks.own(NOW, &resource(), &file, &mut out);
+                locks.own(NOW, &resource(), &life, &mut out);
             } else {
                 locks.owner_known(NOW, &resource(), &peers[0], Dialect::Own, &mut out);
             }
@@ -172,6 +208,68 @@ impl System {
                 .any(|action| matches!(action, Action::Event(Event::Owning { .. })))
         );
         state
+    }
+
+    /// Begins a life of the owner, and writes its state file.
+    fn life(&self, state: &mut State) -> OwnerState {
+        state.lives += 1;
+        let absence = match self.faults.moves {
+            0 => 0,
+            _ => self.lease,
+        };
+        let file = state.files[state.host].as_ref();
+        let file = file.map(|file| file.to_string().parse::<OwnerState>().unwrap());
+        let forgets = self.memory == Memory::Forgets || self.fault == Fault::FileOnly;
+        let life = match file {
+            Some(file) => file.next_life(self.lease).with_absence(absence),
+            None if forgets => {
+                if self.memory == Memory::Forgets {
+                    state.history.owner_forgot();
+                }
+                let first = OwnerState::first().next_life(self.lease);
+                first.with_absence(absence)
+            }
+            None => OwnerState::without_memory(self.lease).with_absence(absence),
+        };
+        let has_clock = match self.memory {
+            Memory::Clocks => self.fault != Fault::FileOnly,
+            Memory::SecondClock => state.host == 1,
+            Memory::NoClock | Memory::Forgets => false,
+        };
+        let life = life
+            .with_run(state.lives)
+            .with_clock(has_clock.then_some(state.lives));
+        if !life.needs_report() {
+            state.files[state.host] = Some(life);
+        }
+        life
+    }
+
+    /// Ends the owner's life, and begins the next one.
+    fn restart_owner(&self, state: &mut State) {
+        self.end(state, 0);
+        self.again(state, 0);
+        state.history.owner_restarted(state.agents[0].me.clone());
+        let life = self.life(state);
+        self.call(state, 0, |locks, out| {
+            locks.own(NOW, &resource(), &life, out)
+        });
+    }
+
+    /// A command with the fence of a grant reaches the device.
+    fn command(&self, state: &mut State, grant: usize) {
+        let fence = state.grants[grant].clone();
+        let (seen, tell) = match state.device.check(&fence) {
+            Ok(()) => {
+                let last = state.admitted;
+                state.history.admitted_by_device(&fence, grant, last);
+                state.admitted = last.max(Some(grant));
+                (fence, false)
+            }
+            Err(NotAdmitted::OtherRun { highest }) => (highest, true),
+            Err(_) => return,
+        };
+        self.call(state, 1, |locks, out| locks.saw(NOW, &seen, tell, out));
     }
 
     /// Performs the actions of an agent.
@@ -194,6 +292,17 @@ impl System {
                 Action::Event(event) => {
                     let agent = &mut state.agents[usize::from(agent)];
                     match event {
+                        Event::Granted { grant, .. } if self.faults.commands > 0 => {
+                            state.grants.extend(grant.fence);
+                        }
+                        Event::Raised { resource, epoch } => {
+                            let file = &mut state.files[state.host];
+                            let life = file.unwrap_or(OwnerState::without_memory(self.lease));
+                            *file = Some(life.with_absence(self.lease).raised(epoch));
+                            self.call(state, 0, |locks, out| {
+                                locks.stored(NOW, &resource, epoch, out);
+                            });
+                        }
                         Event::Acquired { claim } if agent.claim == Some(claim) => {
                             agent.acquired = true;
                         }
@@ -428,6 +537,12 @@ impl Model for System {
         if left.restarts > 0 {
             actions.push(Step::Restart);
         }
+        if left.moves > 0 {
+            actions.push(Step::Move);
+        }
+        if left.commands > 0 {
+            actions.extend((0..state.grants.len()).map(Step::Command));
+        }
         for (peer, agent) in &state.unnoticed {
             actions.push(Step::Notice(peer.clone(), *agent));
         }
@@ -502,15 +617,17 @@ impl Model for System {
             Step::Return(number) => self.again(state, number),
             Step::Restart => {
                 state.left.restarts -= 1;
-                self.end(state, 0);
-                self.again(state, 0);
-                state.history.owner_restarted(state.agents[0].me.clone());
-                let file: OwnerState = state.file.to_string().parse().ok()?;
-                state.file = file.next_life(self.lease);
-                let file = state.file;
-                self.call(state, 0, |locks, out| {
-                    locks.own(NOW, &resource(), &file, out)
-                });
+                self.restart_owner(state);
+            }
+            Step::Move => {
+                state.left.moves -= 1;
+                state.host = 1 - state.host;
+                state.history.owner_moved();
+                self.restart_owner(state);
+            }
+            Step::Command(grant) => {
+                state.left.commands -= 1;
+                self.command(state, grant);
             }
         }
         Self::observe(state);

@@ -3,7 +3,7 @@ use std::time::Instant;
 use stateright::{Checker, Model};
 
 use super::graph::Graph;
-use super::system::{Faults, State, Step, System, Time};
+use super::system::{Faults, Memory, State, Step, System, Time};
 use crate::Kind;
 use crate::faults::Fault;
 
@@ -18,6 +18,7 @@ fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
         faults,
         probes: false,
         lease: 4,
+        memory: Memory::NoClock,
         fault: Fault::None,
     }
 }
@@ -69,6 +70,8 @@ const NONE: Faults = Faults {
     pauses: 0,
     restarts: 0,
     withdrawals: 0,
+    moves: 0,
+    commands: 0,
 };
 
 #[test]
@@ -134,6 +137,55 @@ fn a_holder_pauses() {
     }
 }
 
+/// The hosts have state files of their own. Without a clock, the agent that has held a fence reports it.
+#[test]
+fn an_owner_starts_on_another_host_and_comes_back() {
+    for kind in EXTENDED {
+        for memory in [Memory::Clocks, Memory::SecondClock] {
+            let faults = Faults { moves: 2, ..NONE };
+            holds(&System {
+                memory,
+                lease: 2,
+                ..system(kind, &[0, 2], Time::Prompt, faults)
+            });
+        }
+        holds(&without_clock(kind));
+    }
+}
+
+fn without_clock(kind: Kind) -> System {
+    let faults = Faults {
+        moves: 1,
+        losses: 1,
+        ..NONE
+    };
+    System {
+        lease: 2,
+        ..system(kind, &[0, 2], Time::Prompt, faults)
+    }
+}
+
+/// An owner without a state file was told to forget fences that are in use.
+fn forgetful(kind: Kind) -> System {
+    let faults = Faults {
+        moves: 1,
+        commands: 2,
+        ..NONE
+    };
+    System {
+        memory: Memory::Forgets,
+        lease: 2,
+        ..system(kind, &[0, 2], Time::Prompt, faults)
+    }
+}
+
+#[test]
+fn a_device_admits_one_of_two_runs_with_the_same_epoch() {
+    for kind in EXTENDED {
+        holds(&forgetful(kind));
+    }
+}
+
 /// The checker of `stateright` explores the same states and finds no counterexample either.
 #[test]
 fn stateright_agrees() {
@@ -165,6 +217,12 @@ fn mistakes_are_found() {
         probes: true,
         ..free(3, 3, NONE)
     };
+    let ricart = Kind::RicartAgrawalaExtended;
+    let moves = |moves, memory| System {
+        memory,
+        lease: 2,
+        ..prompt(ricart, &[0, 2], Faults { moves, ..NONE })
+    };
     for (fault, model, broken) in [
         (Fault::RenewByProbe, probed, 4),
         (Fault::CountFromArrival, free(2, 2, NONE), 4),
@@ -174,6 +232,10 @@ fn mistakes_are_found() {
             prompt(Kind::RicartAgrawalaExtended, &[0, 2], restarts),
             1,
         ),
+        (Fault::FileOnly, moves(1, Memory::Clocks), 1),
+        (Fault::AskNobody, moves(2, Memory::SecondClock), 1),
+        (Fault::BeginAnyway, without_clock(ricart), 5),
+        (Fault::SameRun, forgetful(ricart), 1),
         (Fault::ReleaseByName, prompt(basic, &[0, 2], duplicates), 6),
         (Fault::DropDeferred, prompt(basic, &[0, 1, 1], NONE), 10),
         (Fault::ReuseFence, prompt(basic, &[0, 2], NONE), 1),
@@ -218,6 +280,15 @@ fn chosen() {
             "pauses" => model.faults.pauses = number(),
             "restarts" => model.faults.restarts = number(),
             "withdrawals" => model.faults.withdrawals = number(),
+            "moves" => model.faults.moves = number(),
+            "commands" => model.faults.commands = number(),
+            "clocks" => model.memory = Memory::Clocks,
+            "clock2" => model.memory = Memory::SecondClock,
+            "forgets" => model.memory = Memory::Forgets,
+            "file-only" => model.fault = Fault::FileOnly,
+            "ask-nobody" => model.fault = Fault::AskNobody,
+            "begin-anyway" => model.fault = Fault::BeginAnyway,
+            "same-run" => model.fault = Fault::SameRun,
             "stateright" => stateright = true,
             _ => panic!("FIPA_LOCKS_MODEL: unknown word {word}"),
         }

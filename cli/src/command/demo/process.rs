@@ -317,6 +317,7 @@ async fn execute(
                 lease: LEASE,
                 // No file is left behind.
                 volatile: true,
+                forget: true,
                 ..OwnOptions::default()
             };
             let owned = agent.own(&resource, options).await;
