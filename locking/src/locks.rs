@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use crate::algorithm::{Context, Member, Step};
+use crate::faults::fault;
+use crate::greeted::Greeted;
 use crate::holder::{Holder, HolderStep};
 use crate::owner::{Ending, Grant, Owner, OwnerStep};
 use crate::probes::{ProbeStep, Probes};
@@ -171,6 +173,7 @@ pub struct Locks<A> {
     options: Options,
     members: BTreeMap<Peer, Member>,
     gone: VecDeque<Peer>,
+    greeted: Greeted,
     resources: BTreeMap<Resource, Entry<A>>,
     claims: BTreeMap<ClaimId, Claim>,
     probes: Probes,
@@ -257,6 +260,7 @@ impl<A: Algorithm> Locks<A> {
             options,
             members: BTreeMap::new(),
             gone: VecDeque::new(),
+            greeted: Greeted::default(),
             resources: BTreeMap::new(),
             claims: BTreeMap::new(),
             probes: Probes::default(),
@@ -316,7 +320,11 @@ impl<A: Algorithm> Locks<A> {
         let busy = self.resources.get(resource).is_some_and(|entry| {
             entry.current.is_some() || !entry.waiting.is_empty() || entry.gate == Gate::Closed
         });
-        let within = if busy { 0 } else { self.options.retry };
+        let greeting = self.greeted.poll_timeout().unwrap_or(now);
+        let round = greeting
+            .saturating_sub(now)
+            .saturating_add(self.options.retry);
+        let within = if busy { 0 } else { round };
         let claim = self.claim(now, std::slice::from_ref(resource), Some(within), out);
         if busy {
             // Before a message is sent.
@@ -523,6 +531,22 @@ impl<A: Algorithm> Locks<A> {
         self.settle(now, out);
     }
 
+    /// Has the first request of this agent wait for a message of another agent, which the caller has asked for a sign
+    /// of life. It waits for [`Options::retry`] from the first call on at most. Agents that use locks answer,
+    /// and become members.
+    ///
+    /// Suzuki-Kasami needs no such wait: only the agent that has the token enters.
+    pub fn expect(&mut self, now: Millis, peer: &Peer) {
+        let is_needed = !self.kind.has_token()
+            && *peer != self.me
+            && !self.members.contains_key(peer)
+            && !self.gone.contains(peer)
+            && !fault!(self.options.fault, AwaitNoAnswer);
+        if is_needed {
+            self.greeted.expect(now, self.options.retry, peer);
+        }
+    }
+
     /// Removes a member whose registration has ended: its process ended, or it has left. Its grants
     /// end at once, and its late messages are ignored. The caller has to have a proof.
     pub fn depart(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
@@ -533,6 +557,7 @@ impl<A: Algorithm> Locks<A> {
             }
         }
         self.members.remove(peer);
+        self.no_longer_expect(peer);
         let resources: Vec<_> = self.resources.keys().cloned().collect();
         for resource in resources {
             self.member_lost(now, &resource, peer, true, out);
@@ -570,6 +595,9 @@ impl<A: Algorithm> Locks<A> {
 
     /// Handles the end of all timeouts that are due.
     pub fn handle_timeout(&mut self, now: Millis, out: &mut Actions) {
+        if self.greeted.handle_timeout(now) {
+            self.touched.extend(self.resources.keys().cloned());
+        }
         let due: Vec<_> = self
             .timers
             .iter()
@@ -600,7 +628,11 @@ impl<A: Algorithm> Locks<A> {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Millis> {
         let timer = self.timers.first().map(|(due, _)| *due);
-        timer.into_iter().chain(self.probes.poll_timeout()).min()
+        timer
+            .into_iter()
+            .chain(self.probes.poll_timeout())
+            .chain(self.greeted.poll_timeout())
+            .min()
     }
 
     fn dispatch(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
@@ -850,6 +882,7 @@ impl<A: Algorithm> Locks<A> {
         if *peer == self.me || self.gone.contains(peer) {
             return false;
         }
+        self.no_longer_expect(peer);
         if let Some(member) = self.members.get_mut(peer) {
             member.suspected = false;
             if dialect == Dialect::Own {
@@ -893,6 +926,13 @@ impl<A: Algorithm> Locks<A> {
             self.touched.insert(resource);
         }
         true
+    }
+
+    /// An expected agent has answered or has left.
+    fn no_longer_expect(&mut self, peer: &Peer) {
+        if self.greeted.no_longer_expect(peer) {
+            self.touched.extend(self.resources.keys().cloned());
+        }
     }
 
     fn suspect(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
@@ -1083,6 +1123,9 @@ impl<A: Algorithm> Locks<A> {
         if entry.current.is_some() {
             return;
         }
+        if entry.owner.is_some() && self.greeted.poll_timeout().is_some() {
+            return;
+        }
         let Some(claim) = entry.waiting.pop_front() else {
             return;
         };
@@ -1097,6 +1140,7 @@ impl<A: Algorithm> Locks<A> {
             next: retry,
         };
         entry.current = Some(Current { claim, phase });
+        self.greeted.end();
         self.next_conversation = self.next_conversation.saturating_add(1);
         self.at_algorithm(now, resource, out, |algorithm, context, steps| {
             algorithm.request(context, &conversation, steps);
@@ -1165,6 +1209,18 @@ impl<A: Algorithm> Locks<A> {
         self.perform(now, resource, steps, out);
     }
 
+    /// Ends the request of this agent, and has its claim request the resource again.
+    fn ask_again(&mut self, now: Millis, resource: &Resource, out: &mut Actions) {
+        let current = self.resources.get(resource);
+        let current = current.and_then(|entry| entry.current.as_ref());
+        let Some(claim) = current.map(|current| current.claim) else {
+            return;
+        };
+        self.end_current(now, resource, out);
+        self.entry(resource).waiting.push_front(claim);
+        self.touched.insert(resource.clone());
+    }
+
     fn perform_holder(
         &mut self,
         now: Millis,
@@ -1216,12 +1272,8 @@ impl<A: Algorithm> Locks<A> {
                         entry.owner = None;
                     }
                 }
-                HolderStep::Refused(_) => {
-                    // The grant ended before this agent could use it. The claim asks again.
-                    self.end_current(now, resource, out);
-                    self.entry(resource).waiting.push_front(id);
-                    self.touched.insert(resource.clone());
-                }
+                // The grant ended before this agent could use it.
+                HolderStep::Refused(_) => self.ask_again(now, resource, out),
             }
         }
     }
@@ -1548,6 +1600,7 @@ impl<A: Algorithm> Locks<A> {
                     self.send(to, resource, conversation, act, out);
                 }
                 Step::Entered => self.entered(now, resource, out),
+                Step::Again => self.ask_again(now, resource, out),
             }
         }
     }
@@ -1609,6 +1662,7 @@ impl<A: Algorithm> Locks<A> {
     pub(crate) fn rebase(&mut self, by: Millis) {
         let back = |time: &mut Millis| *time = time.saturating_sub(by);
         self.probes.rebase(by);
+        self.greeted.rebase(by);
         for claim in self.claims.values_mut() {
             claim.deadline.iter_mut().for_each(back);
         }

@@ -161,6 +161,8 @@ pub enum Step {
     },
     /// The request of this agent has entered.
     Entered,
+    /// End the request of this agent, and begin it again in another conversation.
+    Again,
 }
 
 /// A distributed algorithm at one agent, for one resource.
