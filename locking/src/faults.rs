@@ -29,6 +29,8 @@ pub(crate) enum Fault {
     AwaitNoAnswer,
     /// The agreement of an agent of `distributed_locking` that has not asked this agent yet counts always.
     TrustStranger,
+    /// An agent forgets the clocks of the requests that it answered before its first request.
+    ForgetClock,
     /// The agent asks and answers like one of `distributed_locking`: it asks no newcomer, and its clock advances with
     /// each message.
     Foreign,

@@ -155,6 +155,8 @@ pub struct LockStatus {
     pub grant: Option<Grant>,
     /// Agents that wait for a grant, at the owner.
     pub waiters: Vec<Peer>,
+    /// At the owner: another agent that claims the resource.
+    pub rival: Option<Peer>,
     /// Whether this agent holds the resource.
     pub is_held: bool,
     /// Number of claims of this agent that wait for the resource.
@@ -178,6 +180,8 @@ pub struct Locks<A> {
     claims: BTreeMap<ClaimId, Claim>,
     probes: Probes,
     timers: BTreeSet<(Millis, Resource)>,
+    /// Highest clock of the requests that were answered while there was no state for their resource.
+    clock: u64,
     next_conversation: u64,
     next_claim: u64,
     /// Messages of this agent to itself. Empty between calls.
@@ -204,6 +208,8 @@ struct Owned {
     core: Owner,
     /// End of the time in which an existing owner may contradict.
     claim_until: Option<Millis>,
+    /// Another agent that claims the resource.
+    rival: Option<Peer>,
 }
 
 /// The claim of this agent that takes part in the algorithm.
@@ -265,6 +271,7 @@ impl<A: Algorithm> Locks<A> {
             claims: BTreeMap::new(),
             probes: Probes::default(),
             timers: BTreeSet::new(),
+            clock: 0,
             next_conversation: options.first_conversation,
             next_claim: 0,
             local: VecDeque::new(),
@@ -456,6 +463,7 @@ impl<A: Algorithm> Locks<A> {
         entry.owned = Some(Owned {
             core,
             claim_until: Some(now.saturating_add(options.claim)),
+            rival: None,
         });
         if entry.owner.is_none() {
             entry.owner = Some(me);
@@ -517,6 +525,7 @@ impl<A: Algorithm> Locks<A> {
                 waiters: core
                     .map(|core| core.waiters().cloned().collect())
                     .unwrap_or_default(),
+                rival: entry.owned.as_ref().and_then(|owned| owned.rival.clone()),
                 is_held,
                 claims: entry.waiting.len() + usize::from(current.is_some() && !is_held),
             }
@@ -706,6 +715,10 @@ impl<A: Algorithm> Locks<A> {
                 return;
             }
         };
+        let owns = matches!(act, Act::Owned | Act::Contested);
+        if let Some(owned) = entry.owned.as_mut().filter(|_| owns && established) {
+            owned.rival = Some(from.clone());
+        }
         let contested = || {
             Action::Event(Event::Contested {
                 resource: resource.clone(),
@@ -836,6 +849,9 @@ impl<A: Algorithm> Locks<A> {
         if !self.resources.contains_key(resource) {
             match act {
                 Act::Request { clock } if !self.kind.has_token() => {
+                    if !fault!(self.options.fault, ForgetClock) {
+                        self.clock = self.clock.max(*clock);
+                    }
                     let agree = Act::Agree { clock: *clock };
                     self.send(from.clone(), resource, conversation.clone(), agree, out);
                     return;
@@ -966,6 +982,12 @@ impl<A: Algorithm> Locks<A> {
         out: &mut Actions,
     ) {
         self.touched.insert(resource.clone());
+        let owned = self.resources.get_mut(resource);
+        if let Some(owned) = owned.and_then(|entry| entry.owned.as_mut())
+            && gone
+        {
+            owned.rival.take_if(|rival| rival == peer);
+        }
         self.at_owner(resource, out, |core, steps| {
             core.lost(now, peer, gone, steps)
         });
@@ -1578,6 +1600,7 @@ impl<A: Algorithm> Locks<A> {
             gate: entry.gate,
             lease: self.options.lease,
             retry: self.options.retry,
+            clock: self.clock,
             fault: self.options.fault,
         };
         call(&mut entry.algorithm, &context, steps);

@@ -126,6 +126,8 @@ pub struct Context<'a> {
     pub lease: Millis,
     /// Time after which a request without an answer is repeated.
     pub retry: Millis,
+    /// Highest clock of the requests that were answered while there was no state for their resource.
+    pub clock: u64,
     pub(crate) fault: Fault,
 }
 

@@ -75,10 +75,13 @@ impl RicartAgrawala {
     /// this agent.
     fn may_be_a_rival(&self, context: &Context<'_>, from: &Peer, clock: u64) -> bool {
         let own = self.own.as_ref();
-        // An agent of `distributed_locking` agrees with the higher one of both clocks and 2.
+        // An agent of `distributed_locking` agrees with the higher one of both clocks and 2. Of two requests with
+        // the same clock, that of the lower agent is earlier.
         let is_later = own.is_some_and(|own| {
-            let highest = own.clock.saturating_add(2);
-            !own.entered && own.clock < MAX_CLOCK && clock > highest
+            let least = own
+                .clock
+                .saturating_add(if self.me < *from { 2 } else { 3 });
+            !own.entered && own.clock < MAX_CLOCK && clock >= least
         });
         is_later
             && context.dialect(from) == Dialect::Legacy
@@ -128,6 +131,8 @@ impl Algorithm for RicartAgrawala {
     }
 
     fn request(&mut self, context: &Context<'_>, conversation: &Conversation, out: &mut Vec<Step>) {
+        // An agent that was told that it may enter before this one precedes it.
+        self.clock = self.clock.max(context.clock);
         self.clock = (self.clock + 1).min(MAX_CLOCK);
         let mut own = OwnRequest {
             conversation: conversation.clone(),

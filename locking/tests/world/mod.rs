@@ -407,7 +407,11 @@ impl World {
         }
         let agent = self.rng.usize(..self.setup.agents);
         let alive = self.agents[agent].locks.is_some();
-        let kind = if self.setup.kills_only { 2 } else { self.rng.u8(..6) };
+        let kind = if self.setup.kills_only {
+            2
+        } else {
+            self.rng.u8(..6)
+        };
         match kind {
             0 | 1 if alive => {
                 let pause = self.rng.u64(1..1_500);
