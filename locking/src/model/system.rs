@@ -49,7 +49,8 @@ pub(super) struct System {
     pub(super) foreign_owner: bool,
     /// A further agent of that kind.
     pub(super) foreigner: Option<u8>,
-    /// Whether grants before an open request are counted.
+    /// Whether grants before an open request are counted. Then messages arrive in one order, agent 1 is killed while
+    /// it holds, and the others make their first request after that.
     pub(super) turns: bool,
 }
 
@@ -510,7 +511,8 @@ impl Model for System {
             return;
         }
         let left = state.left;
-        for (to, from, message) in &state.network {
+        let deliverable = if self.turns { 1 } else { usize::MAX };
+        for (to, from, message) in state.network.iter().take(deliverable) {
             let (to, from, message) = (to.clone(), from.clone(), message.clone());
             if left.losses > 0 {
                 actions.push(Step::Lose(to.clone(), from.clone(), message.clone()));
