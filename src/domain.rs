@@ -16,7 +16,7 @@ use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::routes::{self, Report};
 use crate::service::{Role, Service};
-use crate::{AgentId, Config, background};
+use crate::{AgentId, Config, background, lock_slot};
 
 /// The membership of this process in a domain. The processes of one domain on one host find each
 /// other.
@@ -40,6 +40,11 @@ pub(crate) struct Inner {
     /// Maximum length of a letter, in bytes.
     pub(crate) max_letter: u64,
     pub(crate) rules: Rules,
+    #[cfg_attr(
+        not(feature = "locks"),
+        expect(dead_code, reason = "there are no locks")
+    )]
+    pub(crate) locking: lock_slot::Neighbors,
 }
 
 impl Drop for Inner {
@@ -145,6 +150,7 @@ impl Domain {
                 deadline,
                 max_letter: config.transport.shm.max_letter,
                 rules,
+                locking: lock_slot::Neighbors::default(),
             }),
         })
     }

@@ -2,7 +2,7 @@
 //! The locks are in `locks`.
 
 use std::any::Any;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 use fipa_acl::Message;
 use fipa_locking::{Kind, Options, codec};
@@ -26,6 +26,25 @@ pub(crate) fn is_for_locks(incoming: &Incoming) -> bool {
 
 fn is_lock_protocol(name: &str) -> bool {
     name == STATUS_PROTOCOL || codec::is_lock_protocol(name)
+}
+
+/// The agents of this membership whose locks run. They know each other without letters.
+#[derive(Default)]
+pub(crate) struct Neighbors(Mutex<Vec<Weak<dyn Any + Send + Sync>>>);
+
+impl Neighbors {
+    /// Adds an agent, and returns those that were added before it and have not ended. Their type is that of the
+    /// module `agent`.
+    pub(crate) fn add(
+        &self,
+        agent: Weak<dyn Any + Send + Sync>,
+    ) -> Vec<Arc<dyn Any + Send + Sync>> {
+        let mut agents = self.0.lock();
+        agents.retain(|agent| agent.strong_count() > 0);
+        let before = agents.iter().filter_map(Weak::upgrade).collect();
+        agents.push(agent);
+        before
+    }
 }
 
 /// The locks of an agent, from its first call that needs them.

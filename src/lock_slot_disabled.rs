@@ -9,6 +9,9 @@ impl LockSlot {
     pub(crate) fn close(&self) {}
 }
 
+#[derive(Default)]
+pub(crate) struct Neighbors(());
+
 pub(crate) fn is_for_locks(_incoming: &Incoming) -> bool {
     false
 }

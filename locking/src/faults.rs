@@ -32,6 +32,19 @@ pub(crate) enum Fault {
     IgnoreGate,
     /// A request that was withdrawn is granted by a late report.
     GrantWithdrawn,
+    /// A request in the basic form of Ricart-Agrawala does not reach agents that join during it.
+    AskNoNewcomer,
+    /// The first request does not wait for answers to greetings.
+    AwaitNoAnswer,
+    /// The agreement of an agent of `distributed_locking` that has not asked this agent yet counts always.
+    TrustStranger,
+    /// An agent forgets the clocks of the requests that it answered before its first request.
+    ForgetClock,
+    /// The agent asks and answers like one of `distributed_locking`: it asks no newcomer, and its clock advances with
+    /// each message.
+    Foreign,
+    /// The owner takes a token back as it is.
+    TakeWhole,
 }
 
 #[cfg(test)]

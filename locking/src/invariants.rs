@@ -12,7 +12,7 @@
 //! | 8 | A claim of several resources holds all or none. | [`all_or_none`] |
 //! | 9 | While a grant is live, the owner sends no agree and no token. | [`History`] |
 //! | 10 | Every open request ends after the last fault. | the model and the simulation |
-//! | 11 | Each other agent overtakes a request at most once. | the simulation |
+//! | 11 | After a request has reached all members, and while no process is killed or cut off, each other agent gets at most one grant before it, or two with a token. | [`Turns`] |
 //! | 12 | A device that is not the owner admits no fence after one of a later grant. | the model |
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -54,6 +54,8 @@ pub struct History {
     /// The message that the owner handles.
     handled: Option<(Peer, LockMessage)>,
     held: BTreeMap<Peer, Fence>,
+    /// Agents that hold the resource without a fence.
+    inside: BTreeSet<Peer>,
     /// Highest fence that an agent held and holds no more.
     left: (u64, u64),
     /// Whether the owner has forgotten a life.
@@ -83,6 +85,7 @@ impl History {
             released: BTreeMap::new(),
             handled: None,
             held: BTreeMap::new(),
+            inside: BTreeSet::new(),
             left: (0, 0),
             forgot: false,
             violation: None,
@@ -283,8 +286,93 @@ impl History {
         }
     }
 
+    /// Records whether an agent holds the resource of an owner that gives no fences.
+    pub fn holds_unfenced(&mut self, agent: &Peer, holds: bool) {
+        if !holds {
+            self.inside.remove(agent);
+        } else if self.inside.insert(agent.clone()) && self.inside.len() > 1 {
+            let text = format!("held at the same time without fences: {:?}", self.inside);
+            self.break_invariant(4, text);
+        }
+    }
+
+    /// Records the highest number of grants that an agent got before a request of another.
+    pub fn overtaken(&mut self, turns: &Turns, bound: u64) {
+        if turns.highest > bound {
+            let text = format!("an agent got {} grants before another", turns.highest);
+            self.break_invariant(11, text);
+        }
+    }
+
     fn break_invariant(&mut self, number: u8, text: String) {
         self.violation.get_or_insert(Violation { number, text });
+    }
+}
+
+/// The grants of one resource that precede open requests.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
+pub struct Turns {
+    open: BTreeMap<Peer, Open>,
+    highest: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Open {
+    /// Members that have not received the request.
+    unreached: BTreeSet<Peer>,
+    /// Grants of the other agents, by name, since the request has reached all members.
+    grants: BTreeMap<String, u64>,
+}
+
+impl Turns {
+    /// Records a request, and the members that it has to reach.
+    pub fn requested(&mut self, by: &Peer, unreached: BTreeSet<Peer>) {
+        let grants = BTreeMap::new();
+        self.open.insert(by.clone(), Open { unreached, grants });
+    }
+
+    /// Records that a request has reached a member.
+    pub fn reached(&mut self, by: &Peer, member: &Peer) {
+        if let Some(open) = self.open.get_mut(by) {
+            open.unreached.remove(member);
+        }
+    }
+
+    /// Records a grant.
+    pub fn granted(&mut self, to: &Peer) {
+        self.open.remove(to);
+        let reached = self.open.values_mut();
+        for open in reached.filter(|open| open.unreached.is_empty()) {
+            let grants = open.grants.entry(to.name().to_owned()).or_default();
+            *grants += 1;
+            self.highest = self.highest.max(*grants);
+        }
+    }
+
+    /// Records the end of a request without a grant.
+    pub fn ended(&mut self, by: &Peer) {
+        self.open.remove(by);
+    }
+
+    /// Records that a process is killed or cut off. The grants count from here on.
+    pub fn disturbed(&mut self) {
+        for open in self.open.values_mut() {
+            open.grants.clear();
+        }
+    }
+
+    /// Records that a registration has ended.
+    pub fn departed(&mut self, peer: &Peer) {
+        self.open.remove(peer);
+        for open in self.open.values_mut() {
+            open.unreached.remove(peer);
+        }
+    }
+
+    /// The highest number of grants that an agent got before a request of another.
+    #[must_use]
+    pub fn highest(&self) -> u64 {
+        self.highest
     }
 }
 

@@ -54,6 +54,7 @@ mod algorithm;
 pub mod codec;
 mod faults;
 mod fence;
+mod greeted;
 mod holder;
 pub mod invariants;
 mod locks;

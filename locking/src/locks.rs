@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::algorithm::{Context, Member, Step};
 use crate::faults::fault;
+use crate::greeted::Greeted;
 use crate::holder::{Holder, HolderStep};
 use crate::owner::{Ending, Grant, Owner, OwnerStep};
 use crate::probes::{ProbeStep, Probes};
@@ -170,6 +171,8 @@ pub struct LockStatus {
     pub grant: Option<Grant>,
     /// Agents that wait for a grant, at the owner.
     pub waiters: Vec<Peer>,
+    /// At the owner: another agent that claims the resource.
+    pub rival: Option<Peer>,
     /// Whether this agent holds the resource.
     pub is_held: bool,
     /// Number of claims of this agent that wait for the resource.
@@ -188,10 +191,13 @@ pub struct Locks<A> {
     options: Options,
     members: BTreeMap<Peer, Member>,
     gone: VecDeque<Peer>,
+    greeted: Greeted,
     resources: BTreeMap<Resource, Entry<A>>,
     claims: BTreeMap<ClaimId, Claim>,
     probes: Probes,
     timers: BTreeSet<(Millis, Resource)>,
+    /// Highest clock of the requests that were answered while there was no state for their resource.
+    clock: u64,
     next_conversation: u64,
     next_claim: u64,
     /// Messages of this agent to itself. Empty between calls.
@@ -221,6 +227,8 @@ struct Owned {
     /// End of the time in which an existing owner may contradict.
     claim_until: Option<Millis>,
     needs_report: bool,
+    /// Another agent that claims the resource.
+    rival: Option<Peer>,
 }
 
 /// The claim of this agent that takes part in the algorithm.
@@ -277,10 +285,12 @@ impl<A: Algorithm> Locks<A> {
             options,
             members: BTreeMap::new(),
             gone: VecDeque::new(),
+            greeted: Greeted::default(),
             resources: BTreeMap::new(),
             claims: BTreeMap::new(),
             probes: Probes::default(),
             timers: BTreeSet::new(),
+            clock: 0,
             next_conversation: options.first_conversation,
             next_claim: 0,
             local: VecDeque::new(),
@@ -336,7 +346,11 @@ impl<A: Algorithm> Locks<A> {
         let busy = self.resources.get(resource).is_some_and(|entry| {
             entry.current.is_some() || !entry.waiting.is_empty() || entry.gate == Gate::Closed
         });
-        let within = if busy { 0 } else { self.options.retry };
+        let greeting = self.greeted.poll_timeout().unwrap_or(now);
+        let round = greeting
+            .saturating_sub(now)
+            .saturating_add(self.options.retry);
+        let within = if busy { 0 } else { round };
         let claim = self.claim(now, std::slice::from_ref(resource), Some(within), out);
         if busy {
             // Before a message is sent.
@@ -479,6 +493,7 @@ impl<A: Algorithm> Locks<A> {
             core,
             claim_until: Some(now.saturating_add(claim)),
             needs_report,
+            rival: None,
         });
         if entry.owner.is_none() {
             entry.owner = Some(me);
@@ -623,6 +638,7 @@ impl<A: Algorithm> Locks<A> {
                 waiters: core
                     .map(|core| core.waiters().cloned().collect())
                     .unwrap_or_default(),
+                rival: entry.owned.as_ref().and_then(|owned| owned.rival.clone()),
                 is_held,
                 claims: entry.waiting.len() + usize::from(current.is_some() && !is_held),
             }
@@ -637,6 +653,22 @@ impl<A: Algorithm> Locks<A> {
         self.settle(now, out);
     }
 
+    /// Has the first request of this agent wait for a message of another agent, which the caller has asked for a sign
+    /// of life. It waits for [`Options::retry`] from the first call on at most. Agents that use locks answer,
+    /// and become members.
+    ///
+    /// Suzuki-Kasami needs no such wait: only the agent that has the token enters.
+    pub fn expect(&mut self, now: Millis, peer: &Peer) {
+        let is_needed = !self.kind.has_token()
+            && *peer != self.me
+            && !self.members.contains_key(peer)
+            && !self.gone.contains(peer)
+            && !fault!(self.options.fault, AwaitNoAnswer);
+        if is_needed {
+            self.greeted.expect(now, self.options.retry, peer);
+        }
+    }
+
     /// Removes a member whose registration has ended: its process ended, or it has left. Its grants
     /// end at once, and its late messages are ignored. The caller has to have a proof.
     pub fn depart(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
@@ -647,6 +679,7 @@ impl<A: Algorithm> Locks<A> {
             }
         }
         self.members.remove(peer);
+        self.no_longer_expect(peer);
         let resources: Vec<_> = self.resources.keys().cloned().collect();
         for resource in resources {
             self.member_lost(now, &resource, peer, true, out);
@@ -684,6 +717,9 @@ impl<A: Algorithm> Locks<A> {
 
     /// Handles the end of all timeouts that are due.
     pub fn handle_timeout(&mut self, now: Millis, out: &mut Actions) {
+        if self.greeted.handle_timeout(now) {
+            self.touched.extend(self.resources.keys().cloned());
+        }
         let due: Vec<_> = self
             .timers
             .iter()
@@ -714,7 +750,11 @@ impl<A: Algorithm> Locks<A> {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Millis> {
         let timer = self.timers.first().map(|(due, _)| *due);
-        timer.into_iter().chain(self.probes.poll_timeout()).min()
+        timer
+            .into_iter()
+            .chain(self.probes.poll_timeout())
+            .chain(self.greeted.poll_timeout())
+            .min()
     }
 
     fn dispatch(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
@@ -794,6 +834,10 @@ impl<A: Algorithm> Locks<A> {
                 return;
             }
         };
+        let owns = matches!(act, Act::Owned | Act::Contested);
+        if let Some(owned) = entry.owned.as_mut().filter(|_| owns && established) {
+            owned.rival = Some(from.clone());
+        }
         let contested = || {
             Action::Event(Event::Contested {
                 resource: resource.clone(),
@@ -939,6 +983,9 @@ impl<A: Algorithm> Locks<A> {
         if !self.resources.contains_key(resource) {
             match act {
                 Act::Request { clock } if !self.kind.has_token() => {
+                    if !fault!(self.options.fault, ForgetClock) {
+                        self.clock = self.clock.max(*clock);
+                    }
                     let agree = Act::Agree { clock: *clock };
                     self.send(from.clone(), resource, conversation.clone(), agree, out);
                     return;
@@ -985,6 +1032,7 @@ impl<A: Algorithm> Locks<A> {
         if *peer == self.me || self.gone.contains(peer) {
             return false;
         }
+        self.no_longer_expect(peer);
         if let Some(member) = self.members.get_mut(peer) {
             member.suspected = false;
             if dialect == Dialect::Own {
@@ -1030,6 +1078,13 @@ impl<A: Algorithm> Locks<A> {
         true
     }
 
+    /// An expected agent has answered or has left.
+    fn no_longer_expect(&mut self, peer: &Peer) {
+        if self.greeted.no_longer_expect(peer) {
+            self.touched.extend(self.resources.keys().cloned());
+        }
+    }
+
     fn suspect(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
         if let Some(member) = self.members.get_mut(peer) {
             member.suspected = true;
@@ -1061,6 +1116,12 @@ impl<A: Algorithm> Locks<A> {
         out: &mut Actions,
     ) {
         self.touched.insert(resource.clone());
+        let owned = self.resources.get_mut(resource);
+        if let Some(owned) = owned.and_then(|entry| entry.owned.as_mut())
+            && gone
+        {
+            owned.rival.take_if(|rival| rival == peer);
+        }
         self.at_owner(resource, out, |core, steps| {
             core.lost(now, peer, gone, steps)
         });
@@ -1222,6 +1283,9 @@ impl<A: Algorithm> Locks<A> {
         if entry.current.is_some() {
             return;
         }
+        if entry.owner.is_some() && self.greeted.poll_timeout().is_some() {
+            return;
+        }
         let Some(claim) = entry.waiting.pop_front() else {
             return;
         };
@@ -1236,6 +1300,7 @@ impl<A: Algorithm> Locks<A> {
             next: retry,
         };
         entry.current = Some(Current { claim, phase });
+        self.greeted.end();
         self.next_conversation = self.next_conversation.saturating_add(1);
         self.at_algorithm(now, resource, out, |algorithm, context, steps| {
             algorithm.request(context, &conversation, steps);
@@ -1304,6 +1369,18 @@ impl<A: Algorithm> Locks<A> {
         self.perform(now, resource, steps, out);
     }
 
+    /// Ends the request of this agent, and has its claim request the resource again.
+    fn ask_again(&mut self, now: Millis, resource: &Resource, out: &mut Actions) {
+        let current = self.resources.get(resource);
+        let current = current.and_then(|entry| entry.current.as_ref());
+        let Some(claim) = current.map(|current| current.claim) else {
+            return;
+        };
+        self.end_current(now, resource, out);
+        self.entry(resource).waiting.push_front(claim);
+        self.touched.insert(resource.clone());
+    }
+
     fn perform_holder(
         &mut self,
         now: Millis,
@@ -1355,12 +1432,8 @@ impl<A: Algorithm> Locks<A> {
                         entry.owner = None;
                     }
                 }
-                HolderStep::Refused(_) => {
-                    // The grant ended before this agent could use it. The claim asks again.
-                    self.end_current(now, resource, out);
-                    self.entry(resource).waiting.push_front(id);
-                    self.touched.insert(resource.clone());
-                }
+                // The grant ended before this agent could use it.
+                HolderStep::Refused(_) => self.ask_again(now, resource, out),
             }
         }
     }
@@ -1679,6 +1752,7 @@ impl<A: Algorithm> Locks<A> {
             gate: entry.gate,
             lease: self.options.lease,
             retry: self.options.retry,
+            clock: self.clock,
             fault: self.options.fault,
         };
         call(&mut entry.algorithm, &context, steps);
@@ -1701,6 +1775,7 @@ impl<A: Algorithm> Locks<A> {
                     self.send(to, resource, conversation, act, out);
                 }
                 Step::Entered => self.entered(now, resource, out),
+                Step::Again => self.ask_again(now, resource, out),
             }
         }
     }
@@ -1762,6 +1837,7 @@ impl<A: Algorithm> Locks<A> {
     pub(crate) fn rebase(&mut self, by: Millis) {
         let back = |time: &mut Millis| *time = time.saturating_sub(by);
         self.probes.rebase(by);
+        self.greeted.rebase(by);
         for claim in self.claims.values_mut() {
             claim.deadline.iter_mut().for_each(back);
         }

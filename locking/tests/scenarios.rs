@@ -67,6 +67,13 @@ impl Agent {
             .handle(self.now, &peer(from), &message, &mut self.out);
     }
 
+    /// The other owner of the bay.
+    fn rival(&self) -> Option<String> {
+        let mut all = self.locks.status(self.now);
+        let rival = all.find(|it| it.resource == bay())?.rival?;
+        Some(rival.name().to_owned())
+    }
+
     fn lock(&mut self, within: Option<Millis>) -> ClaimId {
         self.locks.lock(self.now, &bay(), within, &mut self.out)
     }
@@ -265,6 +272,112 @@ fn a_lock_at_a_legacy_owner_has_no_fence() {
     assert_eq!(agent.locks.remaining(0, claim), None);
     agent.locks.release(0, claim, &mut agent.out);
     assert_eq!(agent.sent(), [to("agent1", "agent2_0", Act::Release)]);
+}
+
+/// The member joins while the owner has not agreed.
+#[test]
+fn an_agent_that_joins_during_a_request_is_asked() {
+    for kind in [Kind::RicartAgrawala, Kind::RicartAgrawalaExtended] {
+        for dialect in [LEGACY, OWN] {
+            let mut agent = Agent::new("agent2", kind);
+            agent
+                .locks
+                .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+            agent.lock(None);
+            agent.sent();
+            agent
+                .locks
+                .join(0, &peer("agent0"), dialect, &mut agent.out);
+            let request = Act::Request { clock: 1 };
+            assert_eq!(agent.sent(), [to("agent0", "agent2_0", request)]);
+            agent.receive("agent1", LEGACY, "agent2_0", Act::Agree { clock: 3 });
+            assert_eq!(agent.events(), [], "{kind}");
+            agent.receive("agent0", dialect, "agent2_0", Act::Agree { clock: 3 });
+            assert!(matches!(&agent.events()[..], [Event::Acquired { .. }]));
+        }
+    }
+}
+
+/// An agent of `distributed_locking` that has an open request with a later clock, and does not know this one, agrees
+/// and enters.
+#[test]
+fn a_legacy_agent_that_has_not_asked_is_asked_again_with_a_later_clock() {
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+    agent.locks.join(0, &peer("agent3"), LEGACY, &mut agent.out);
+    agent.lock(None);
+    agent.receive("agent1", LEGACY, "agent2_0", Act::Agree { clock: 3 });
+    agent.sent();
+    // Its clock was 7.
+    agent.receive("agent3", LEGACY, "agent2_0", Act::Agree { clock: 9 });
+    let request = Act::Request { clock: 10 };
+    let again = |receiver| to(receiver, "agent2_1", request.clone());
+    assert_eq!(agent.sent(), [again("agent1"), again("agent3")]);
+    agent.receive("agent1", LEGACY, "agent2_1", Act::Agree { clock: 12 });
+    agent.receive("agent3", LEGACY, "agent2_0", Act::Agree { clock: 9 });
+    assert_eq!(agent.events(), []);
+    // After its use. It is not asked a third time.
+    agent.receive("agent3", LEGACY, "agent2_1", Act::Agree { clock: 20 });
+    assert!(matches!(&agent.events()[..], [Event::Acquired { .. }]));
+}
+
+/// The first request waits for the answers of the agents that were greeted, or for one second.
+#[test]
+fn the_first_request_waits_for_answers_to_greetings() {
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    agent.locks.expect(0, &peer("agent3"));
+    agent.locks.expect(0, &peer("agent4"));
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.lock(None);
+    assert_eq!(agent.sent(), []);
+    let alive = |conversation| LockMessage {
+        conversation: Conversation::parse(conversation),
+        dialect: OWN,
+        content: Content::Alive,
+    };
+    let heard = alive("agent2_probe_0");
+    let out = &mut agent.out;
+    agent.locks.handle(0, &peer("agent3"), &heard, out);
+    assert_eq!(agent.sent(), []);
+    // Agent 4 uses no locks.
+    agent.pass(999);
+    assert_eq!(agent.sent(), []);
+    agent.pass(1);
+    let receivers: Vec<_> = agent.sent().into_iter().map(|(to, ..)| to).collect();
+    assert_eq!(receivers, ["agent1", "agent3"]);
+
+    // All have answered or left. Then nothing waits for those that start later.
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    agent.locks.expect(0, &peer("agent3"));
+    agent.locks.expect(0, &peer("agent4"));
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.lock(None);
+    agent.locks.depart(0, &peer("agent4"), &mut agent.out);
+    assert_eq!(agent.sent(), []);
+    let out = &mut agent.out;
+    agent.locks.handle(0, &peer("agent3"), &heard, out);
+    let receivers: Vec<_> = agent.sent().into_iter().map(|(to, ..)| to).collect();
+    assert_eq!(receivers, ["agent1", "agent3"]);
+    agent.locks.expect(0, &peer("agent5"));
+    assert_ne!(agent.locks.poll_timeout(), Some(1_000));
+
+    // The round of `try_lock` begins after the wait.
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    agent.locks.expect(0, &peer("agent4"));
+    agent
+        .locks
+        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.locks.try_lock(0, &bay(), &mut agent.out);
+    agent.pass(1_999);
+    assert_eq!(agent.events(), []);
+    agent.pass(1);
+    assert!(matches!(&agent.events()[..], [Event::Failed { .. }]));
 }
 
 /// The recorded race of `distributed_locking`: another agent has queued our request in the token before it reached
@@ -484,6 +597,25 @@ fn a_second_owner_is_refused_and_both_are_told() {
     assert_eq!(second.events(), [refused]);
     assert!(second.locks.owner(&bay()).is_none());
     assert!(first.locks.owner(&bay()).is_some());
+    // It has given up.
+    assert_eq!(first.rival(), None);
+}
+
+/// Two networks join.
+#[test]
+fn two_established_owners_name_each_other() {
+    let mut first = Agent::owner("agent1", Kind::default(), &[]);
+    assert_eq!(first.rival(), None);
+    first.receive("agent2", OWN, "agent2_announce_0", Act::Owned);
+    let contested = Event::Contested {
+        resource: bay(),
+        by: peer("agent2"),
+    };
+    assert_eq!(first.events(), [contested]);
+    assert_eq!(first.rival().as_deref(), Some("agent2"));
+    let now = first.now;
+    first.locks.depart(now, &peer("agent2"), &mut first.out);
+    assert_eq!(first.rival(), None);
 }
 
 #[test]

@@ -32,6 +32,7 @@ fn simulate(kind: Kind, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
             agents: 2 + (seed % 7) as usize,
             resources: 1 + (seed % 2) as usize,
             faults,
+            kills_only: false,
             checked: false,
             claims: 6,
         };
@@ -79,6 +80,7 @@ fn the_messages_fit_the_protocols_that_agents_enforce() {
                 resources: 1 + (seed % 2) as usize,
                 // Basic algorithms are for members that never crash.
                 faults: kind.is_extended(),
+                kills_only: false,
                 checked: true,
                 claims: 6,
             };
@@ -103,6 +105,7 @@ fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
                 agents: 3 + (seed % 6) as usize,
                 resources: 1,
                 faults: false,
+                kills_only: false,
                 checked: false,
                 claims: 10,
             };
@@ -110,9 +113,37 @@ fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
             world
                 .run()
                 .unwrap_or_else(|error| panic!("{kind}, seed {seed}: {error}"));
-            highest = highest.max(world.overtaken);
+            highest = highest.max(world.turns.highest());
         }
         assert!(highest <= bound, "{kind}: overtaken {highest} times");
+        assert!(highest > 0, "{kind}: the agents do not compete");
+    }
+}
+
+/// The same while agents are killed, also those that hold the resource, and return. The grants are counted from the
+/// last kill on.
+#[test]
+fn each_agent_overtakes_a_request_of_an_agent_that_was_killed_a_bounded_number_of_times() {
+    for kind in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+        let mut highest = 0;
+        for seed in seeds(60) {
+            let setup = Setup {
+                kind,
+                agents: 3 + (seed % 3) as usize,
+                resources: 1,
+                faults: true,
+                kills_only: true,
+                checked: false,
+                claims: 60,
+            };
+            let mut world = World::new(setup, seed);
+            world
+                .run()
+                .unwrap_or_else(|error| panic!("{kind}, seed {seed}: {error}"));
+            let overtaken = world.turns.highest();
+            assert!(overtaken <= 2, "{kind}, seed {seed}: {overtaken} times");
+            highest = highest.max(overtaken);
+        }
         assert!(highest > 0, "{kind}: the agents do not compete");
     }
 }
@@ -127,6 +158,7 @@ fn the_number_of_messages_is_the_minimum() {
                 agents,
                 resources: 1,
                 faults: false,
+                kills_only: false,
                 checked: true,
                 claims: 0,
             };

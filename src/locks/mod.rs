@@ -33,8 +33,9 @@
 //! have a fence that the owner refuses. [`Lock::is_held`] is advisory for effects that the owner does not
 //! guard.
 //!
-//! The first call of an agent that needs locks starts them: a task that answers the messages of other
-//! agents. Messages of locks never reach [`Agent::receive`]. An agent that sets 1,024 received messages
+//! [`Agent::use_locks`], or the first call of an agent that needs locks, starts them: a task that answers the messages
+//! of other agents. With Ricart-Agrawala, the first request waits until the agents that the directory lists have
+//! answered a greeting, or for [`LockOptions::retry`]. Messages of locks never reach [`Agent::receive`]. An agent that sets 1,024 received messages
 //! aside without reading them receives no renewals, and loses its locks.
 
 mod clock;
@@ -81,8 +82,8 @@ pub struct LockOptions {
     pub probe_interval: Duration,
     /// Time without an answer to a probe after which an agent is left out (2 s).
     pub probe_timeout: Duration,
-    /// Time after which a request without an answer is repeated, and the round of
-    /// [`Agent::try_lock`] (1 s).
+    /// Time after which a request without an answer is repeated, the round of [`Agent::try_lock`], and with
+    /// Ricart-Agrawala the maximum wait for the answers to greetings before the first request (1 s).
     pub retry: Duration,
     /// Whether agents of legacy platforms and static peers are asked whether they use locks (`false`).
     /// Agents of the C++ library `distributed_locking` then take part from the start, otherwise from
@@ -118,10 +119,11 @@ impl LockOptions {
 }
 
 impl Agent {
-    /// Sets the options of this agent's locks. They are the defaults otherwise.
+    /// Sets the options of this agent's locks, and starts them. From then on, the agent answers the requests of
+    /// others. Without this call, the first one that needs locks starts them with the defaults.
     ///
     /// # Errors
-    /// If a time is zero or longer than a day, or if the agent has used locks already.
+    /// If the agent has been deregistered, if a time is zero or longer than a day, or if the agent has used locks already.
     pub fn use_locks(&self, options: LockOptions) -> Result<(), LockError> {
         shell::set(&self.core, options)
     }

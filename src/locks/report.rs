@@ -5,7 +5,7 @@
 //!
 //! ```json
 //! { "version": 1, "locks": [ { "resource": text, "holder": name, "fence": text, "expires_ms": number,
-//!                              "waiters": [ name ], "waiting": number } ] }
+//!                              "waiters": [ name ], "waiting": number, "contested_by": name } ] }
 //! ```
 
 use std::collections::BTreeMap;
@@ -54,6 +54,8 @@ pub struct ResourceStatus {
     pub waiters: Vec<String>,
     /// The number of these agents.
     pub waiting: usize,
+    /// The name of another agent that claims the resource. Each admits its own fences only.
+    pub contested_by: Option<String>,
     /// Whether the agent that was asked holds the resource.
     pub is_held: bool,
 }
@@ -69,6 +71,7 @@ impl ResourceStatus {
             expires: None,
             waiters: Vec::new(),
             waiting: 0,
+            contested_by: None,
             is_held: false,
         }
     }
@@ -86,6 +89,7 @@ impl ResourceStatus {
             expires: expires.map(|at| Duration::from_millis(at.saturating_sub(now))),
             waiters: status.waiters.iter().map(name).collect(),
             waiting: status.waiters.len(),
+            contested_by: status.rival.as_ref().map(name),
             is_held: status.is_held,
         }
     }
@@ -107,6 +111,8 @@ struct Row {
     waiters: Vec<String>,
     #[serde(default)]
     waiting: usize,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    contested_by: Option<String>,
 }
 
 /// The error of an answer.
@@ -172,6 +178,7 @@ fn row(status: ResourceStatus) -> Row {
             .map(|expires| Millis::try_from(expires.as_millis()).unwrap_or(Millis::MAX)),
         waiting: status.waiting,
         waiters,
+        contested_by: status.contested_by,
     }
 }
 
@@ -196,6 +203,7 @@ fn read(content: &[u8], owner: &str) -> Result<Vec<ResourceStatus>, ReportError>
             expires: row.expires_ms.map(Duration::from_millis),
             waiters: row.waiters,
             waiting: row.waiting,
+            contested_by: row.contested_by,
             is_held: false,
         })
     };
@@ -304,6 +312,7 @@ mod tests {
             expires: Some(Duration::from_millis(1_500)),
             waiters: vec!["arm".to_owned()],
             waiting: 1,
+            contested_by: Some("barge".to_owned()),
             is_reported: true,
             ..ResourceStatus::unknown("bay", Some("crane".to_owned()))
         };

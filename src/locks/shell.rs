@@ -46,8 +46,8 @@ const STORE_AGAIN: Duration = Duration::from_secs(1);
 /// is reported before.
 const UNREPEATED: Duration = Duration::from_secs(600);
 
-/// Sets the options of an agent's locks, before they are started.
-pub(super) fn set(core: &AgentCore, options: LockOptions) -> Result<(), LockError> {
+/// Sets the options of an agent's locks, and starts them.
+pub(super) fn set(core: &Arc<AgentCore>, options: LockOptions) -> Result<(), LockError> {
     let (kind, legacy_peers) = (options.algorithm, options.legacy_peers);
     let options = options.core();
     options.check()?;
@@ -57,7 +57,8 @@ pub(super) fn set(core: &AgentCore, options: LockOptions) -> Result<(), LockErro
     }
     slot.options = Some((kind, options));
     slot.legacy_peers = legacy_peers;
-    Ok(())
+    drop(slot);
+    start(core).map(drop)
 }
 
 /// Returns the running locks of an agent.
@@ -89,8 +90,19 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
     // A later registration of the name begins its conversations with higher numbers.
     let time = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     options.first_conversation = millis(time.unwrap_or_default());
+    let mut locks = Locks::new(me.clone(), kind, options);
+    // Before the first request, so that it waits for the answers to the greetings.
+    let directory = endpoint.domain.directory();
+    directory.refresh();
+    let listed = directory.entries();
+    let greeted = listed
+        .iter()
+        .filter(|entry| is_greeted(core, legacy_peers, entry));
+    for agent in greeted.filter_map(|entry| peer_of(entry)) {
+        locks.expect(now(), &agent);
+    }
     let shared = Arc::new(Shared {
-        state: Mutex::new(State::new(Locks::new(me, kind, options))),
+        state: Mutex::new(State::new(locks)),
         sending: Mutex::new(()),
         changed: Notify::new(),
         kind,
@@ -105,6 +117,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         }),
     });
     drop(slot);
+    meet_neighbors(core, &me, &shared);
     let task = Task {
         // From here on, no message and no change of the directory is missed.
         messages: core.demultiplexer.serve(Box::new(lock_slot::is_of_locks)),
@@ -119,6 +132,33 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
     };
     runtime.spawn(task.run());
     Ok(shared)
+}
+
+/// Has the agents of this membership that use locks know each other.
+fn meet_neighbors(core: &Arc<AgentCore>, me: &Peer, shared: &Shared) {
+    let this = Arc::downgrade(core);
+    for other in core.endpoint.domain.inner.locking.add(this) {
+        let Ok(other) = other.downcast::<AgentCore>() else {
+            continue;
+        };
+        let Some(of_other) = started(&other) else {
+            continue;
+        };
+        let them = of_other.read(|locks, _| locks.me().clone());
+        of_other.meet(&other, me);
+        shared.meet(core, &them);
+    }
+}
+
+/// Whether an agent of the directory is asked for a sign of life. Those of this membership are not: they know each
+/// other when they start their locks.
+fn is_greeted(core: &AgentCore, greets_legacy_peers: bool, entry: &Entry) -> bool {
+    let is_registered = entry.incarnation.is_known();
+    let own = core.endpoint.domain.inner.service.own.incarnation;
+    entry.role == Role::Agent
+        && !entry.is_platform_agent()
+        && (is_registered || greets_legacy_peers)
+        && !(is_registered && entry.mts.incarnation == own)
 }
 
 /// The locks of an agent, shared by its calls and its task.
@@ -333,6 +373,14 @@ impl Shared {
         if let Err(error) = sent {
             tracing::debug!(%error, to = %escape_name(to.name()), "cannot send a message of a lock");
         }
+    }
+
+    /// Makes an agent of this library a member.
+    fn meet(&self, core: &AgentCore, peer: &Peer) {
+        self.act(core, |state, now, actions| {
+            state.core.join(now, peer, Dialect::Own, actions);
+            state.note(peer);
+        });
     }
 
     /// Begins a claim, and returns its state.
@@ -739,11 +787,7 @@ impl Task {
 
     /// Asks an agent for a sign of life, or has it wait. One that uses locks answers, and becomes a member.
     fn greet(&mut self, entry: &Entry) {
-        let may_use_locks = entry.role == Role::Agent
-            && !entry.is_platform_agent()
-            && entry.incarnation != self.core.endpoint.incarnation
-            && (entry.incarnation.is_known() || self.greets_legacy_peers);
-        if may_use_locks
+        if is_greeted(&self.core, self.greets_legacy_peers, entry)
             && let Some(agent) = peer_of(entry)
             && self
                 .greetings

@@ -1,6 +1,9 @@
 //! An agent of the C++ library `distributed_locking` behind a real socket, with the messages of its recorded
 //! conversations.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
 use fipa::locks::{Algorithm, LockOptions};
 use fipa::{
     Agent, AgentId, Config, Domain, Envelope, EnvelopeParams, Gateway, Kind, Letter, Message,
@@ -12,7 +15,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 
 use super::support::config;
-use super::{FOREVER, kept, options, watched};
+use super::{FOREVER, TURNS, kept, options, watched};
 
 /// The host of our agents, and the C++ agent `agent2`.
 struct Stage {
@@ -232,6 +235,68 @@ async fn we_lock_a_resource_of_an_agent_of_the_cpp_library() {
                 false => ["rover", "disconfirm", &conversation, "rsc"],
             };
             stage.hears(left).await;
+        }
+    })
+    .await;
+}
+
+/// An agent that uses locks answers before its first request.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_uses_locks_answers_before_its_first_request() {
+    watched(async {
+        let stage = Stage::new().await;
+        let algorithm = Algorithm::RicartAgrawala;
+        let protocol = algorithm.protocol();
+        let _rover = stage.agent("rover", algorithm).await;
+        let request = ["request", protocol, "agent2_0", "7\nrsc"];
+        stage.say(&["rover"], request).await;
+        stage.hears(["rover", "agree", "agent2_0", "7\nrsc"]).await;
+    })
+    .await;
+}
+
+/// agent2 owns the resource, and agrees to each request at once.
+#[tokio::test(flavor = "multi_thread")]
+async fn agents_of_one_process_exclude_each_other_at_a_foreign_owner() {
+    watched(async {
+        let stage = Stage::new().await;
+        let algorithm = Algorithm::RicartAgrawala;
+        let protocol = algorithm.protocol();
+        let (rover, arm) = tokio::join!(
+            stage.agent("rover", algorithm),
+            stage.agent("arm", algorithm)
+        );
+        let is_used = AtomicBool::new(false);
+        let uses = async |agent: &Agent| {
+            for _ in 0..TURNS {
+                let lock = agent.lock("rsc").await.unwrap();
+                assert!(!is_used.swap(true, Ordering::SeqCst));
+                tokio::time::sleep(Duration::from_millis(20)).await;
+                is_used.store(false, Ordering::SeqCst);
+                lock.release();
+            }
+        };
+        let owns = async {
+            loop {
+                let [sender, act, conversation, content] = stage.heard().await;
+                let answer = match act.as_str() {
+                    "query-if" => ["inform", "dlm_discover", &conversation, "rsc"],
+                    "request" => {
+                        let (clock, _) = content.split_once('\n').unwrap();
+                        let clock = clock.parse::<u64>().unwrap() + 2;
+                        let agree = format!("{clock}\nrsc");
+                        let agree = ["agree", protocol, &conversation, &agree];
+                        stage.say(&[&sender], agree).await;
+                        continue;
+                    }
+                    _ => continue,
+                };
+                stage.say(&[&sender], answer).await;
+            }
+        };
+        tokio::select! {
+            _ = async { tokio::join!(uses(&rover), uses(&arm)) } => {}
+            () = owns => {}
         }
     })
     .await;

@@ -28,7 +28,7 @@ Examples:
   fipa locks --watch
 
 Columns:
-  OWNER    agent that grants the resource
+  OWNER    agent that grants the resource, and another one that also claims it
   HOLDER   agent that holds it; - if it is free, ? if the owner does not answer
   FENCE    fence of the grant
   LEASE    remaining time of the grant, unless the holder extends it
@@ -37,7 +37,8 @@ Columns:
 JSON:
   { \"domain\": text, \"locks\": [ { \"resource\", \"owner\": name, \"answered\": whether the owner answered,
     \"holder\": name or null, \"fence\": text or null, \"lease_ms\": number or null,
-    \"waiters\": [ name ] at most 16, \"waiting\": number } ] }
+    \"waiters\": [ name ] at most 16, \"waiting\": number,
+    \"contested_by\": name or null } ] }
 
 With --watch, the list is printed again when a grant, an owner or a waiting agent changes; with --json,
 each list is on a line of its own.")]
@@ -128,6 +129,7 @@ fn lasting(
     Option<String>,
     Option<Fence>,
     Vec<String>,
+    Option<String>,
 ) {
     (
         status.resource.clone(),
@@ -136,6 +138,7 @@ fn lasting(
         status.holder.clone(),
         status.fence.clone(),
         status.waiters.clone(),
+        status.contested_by.clone(),
     )
 }
 
@@ -170,6 +173,10 @@ fn cells(status: &ResourceStatus) -> [String; 6] {
         Some(name) => escape_name(name).into_owned(),
         None => none.to_owned(),
     };
+    let mut owner = name(&status.owner);
+    if let Some(rival) = &status.contested_by {
+        owner += &format!("\ncontested by {}", escape_name(rival));
+    }
     let lease = status.expires.map(|left| {
         let whole = Duration::from_secs(left.as_secs());
         humantime::format_duration(whole).to_string()
@@ -185,7 +192,7 @@ fn cells(status: &ResourceStatus) -> [String; 6] {
     }
     [
         escape(&status.resource).into_owned(),
-        name(&status.owner),
+        owner,
         name(&status.holder),
         name(&status.fence.as_ref().map(ToString::to_string)),
         lease.unwrap_or_else(|| none.to_owned()),
@@ -206,5 +213,6 @@ fn in_json(status: &ResourceStatus) -> Value {
         "lease_ms": status.expires.map(|left| u64::try_from(left.as_millis()).unwrap_or(u64::MAX)),
         "waiters": status.waiters,
         "waiting": status.waiting,
+        "contested_by": status.contested_by,
     })
 }

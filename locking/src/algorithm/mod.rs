@@ -126,6 +126,8 @@ pub struct Context<'a> {
     pub lease: Millis,
     /// Time after which a request without an answer is repeated.
     pub retry: Millis,
+    /// Highest clock of the requests that were answered while there was no state for their resource.
+    pub clock: u64,
     pub(crate) fault: Fault,
 }
 
@@ -161,6 +163,8 @@ pub enum Step {
     },
     /// The request of this agent has entered.
     Entered,
+    /// End the request of this agent, and begin it again in another conversation.
+    Again,
 }
 
 /// A distributed algorithm at one agent, for one resource.

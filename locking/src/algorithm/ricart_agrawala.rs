@@ -5,12 +5,17 @@
 //!
 //! After a request has reached all members, each other agent enters at most once before it: the clock
 //! of its next request is higher.
+//!
+//! A member that joins during a request is asked, too, in both forms. Agents of this library thus exclude each
+//! other as soon as one of them knows the other. An agent of `distributed_locking` asks only those that it knows when
+//! it begins its request, and agrees to an earlier request of any other agent. Such a request is
+//! recognized by the clock of the agreement, and this agent then asks again, with a later clock.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Algorithm, Context, Kind, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Gate, Millis, Peer};
+use crate::{Act, Conversation, Dialect, Gate, Millis, Peer};
 
 /// Maximum clock: `distributed_locking` reads a 32-bit integer. Clocks that have reached it are equal,
 /// and the order is that of the agents.
@@ -25,6 +30,8 @@ pub struct RicartAgrawala {
     clock: u64,
     own: Option<OwnRequest>,
     deferred: BTreeMap<Peer, Deferred>,
+    /// Members of `distributed_locking` that have asked this agent, or were asked again.
+    acquainted: BTreeSet<Peer>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -64,6 +71,24 @@ impl RicartAgrawala {
         }
     }
 
+    /// Whether the agent that agrees may have an open request later than that of this agent, without having asked
+    /// this agent.
+    fn may_be_a_rival(&self, context: &Context<'_>, from: &Peer, clock: u64) -> bool {
+        let own = self.own.as_ref();
+        // An agent of `distributed_locking` agrees with the higher one of both clocks and 2. Of two requests with
+        // the same clock, that of the lower agent is earlier.
+        let is_later = own.is_some_and(|own| {
+            let least = own
+                .clock
+                .saturating_add(if self.me < *from { 2 } else { 3 });
+            !own.entered && own.clock < MAX_CLOCK && clock >= least
+        });
+        is_later
+            && context.dialect(from) == Dialect::Legacy
+            && !self.acquainted.contains(from)
+            && !fault!(context.fault, TrustStranger)
+    }
+
     fn agree(&self, to: Peer, conversation: Conversation) -> Step {
         let clock = self.clock;
         Step::Send {
@@ -101,10 +126,13 @@ impl Algorithm for RicartAgrawala {
             clock: 0,
             own: None,
             deferred: BTreeMap::new(),
+            acquainted: BTreeSet::new(),
         }
     }
 
     fn request(&mut self, context: &Context<'_>, conversation: &Conversation, out: &mut Vec<Step>) {
+        // An agent that was told that it may enter before this one precedes it.
+        self.clock = self.clock.max(context.clock);
         self.clock = (self.clock + 1).min(MAX_CLOCK);
         let mut own = OwnRequest {
             conversation: conversation.clone(),
@@ -141,6 +169,12 @@ impl Algorithm for RicartAgrawala {
         match *act {
             Act::Request { clock } => {
                 self.clock = self.clock.max(clock.min(MAX_CLOCK));
+                if fault!(context.fault, Foreign) {
+                    self.clock += 2;
+                }
+                if context.dialect(from) == Dialect::Legacy {
+                    self.acquainted.insert(from.clone());
+                }
                 let known = self.deferred.get(from);
                 if known.is_some_and(|known| known.clock > clock) {
                     // A late copy of a request before the one that waits.
@@ -166,7 +200,13 @@ impl Algorithm for RicartAgrawala {
             Act::Agree { clock } => {
                 self.clock = self.clock.max(clock.min(MAX_CLOCK));
                 let own = self.own.as_ref();
-                if own.is_some_and(|own| own.conversation == *conversation) {
+                if own.is_none_or(|own| own.conversation != *conversation) {
+                    return;
+                }
+                if self.may_be_a_rival(context, from, clock) {
+                    self.acquainted.insert(from.clone());
+                    out.push(Step::Again);
+                } else {
                     self.no_longer_awaited(from, out);
                 }
             }
@@ -186,9 +226,10 @@ impl Algorithm for RicartAgrawala {
 
     fn owner_changed(&mut self) {}
 
-    fn joined(&mut self, _: &Context<'_>, peer: &Peer, out: &mut Vec<Step>) {
+    fn joined(&mut self, context: &Context<'_>, peer: &Peer, out: &mut Vec<Step>) {
         if let Some(own) = &mut self.own
-            && self.extended
+            && (self.extended || !fault!(context.fault, AskNoNewcomer))
+            && !fault!(context.fault, Foreign)
             && !own.entered
             && own.awaited.insert(peer.clone())
         {
@@ -199,6 +240,7 @@ impl Algorithm for RicartAgrawala {
     fn lost(&mut self, _: &Context<'_>, peer: &Peer, gone: bool, out: &mut Vec<Step>) {
         if gone {
             self.deferred.remove(peer);
+            self.acquainted.remove(peer);
         }
         if self.extended || gone {
             self.no_longer_awaited(peer, out);

@@ -7,7 +7,9 @@
 //!
 //! In the extended form the token goes from the owner to one agent and back. The owner makes a token of
 //! a new generation when that agent is gone, when its grant has ended without the token's return, or
-//! when it asks again. Tokens of older generations are discarded.
+//! when it asks again. Tokens of older generations are discarded. The owner keeps a copy of the token that it has sent,
+//! and changes the copy when an agent has another registration, or asks again. What returns changes the copy in
+//! the number of the agent that had the token, and in nothing else: the owner knows all requests itself.
 //!
 //! **Overtaking.** After a request has reached the agent that passes the token on next (in the extended
 //! form: the owner), each other agent enters at most once before it, in addition to the agent that has
@@ -18,6 +20,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use super::{Algorithm, Context, Kind, Step};
+use crate::faults::fault;
 use crate::{Act, Conversation, Dialect, Gate, Millis, Peer, Token};
 
 /// Maximum number of a request: `distributed_locking` reads a 32-bit integer.
@@ -272,14 +275,24 @@ impl SuzukiKasami {
             return;
         }
         if let Some(away) = self.away.take() {
-            let mut token = away.token;
-            if !away.gone {
-                // The agent had its turn. If it had not, it asks again.
-                let name = away.to.shared_name().clone();
-                token.last.insert(name, away.number);
-            }
+            // The agent had its turn. If it had not, it asks again.
+            let token = self.after_turn(away, None);
             self.renew(context, token, out);
         }
+    }
+
+    /// Returns the token after the turn of the agent that had it, with the number that the agent has put into it.
+    fn after_turn(&self, away: Away, number: Option<u64>) -> Token {
+        let mut token = away.token;
+        let name = away.to.shared_name();
+        let latest = self.requests.get(name);
+        let is_present = !away.gone && latest.is_none_or(|latest| latest.peer == away.to);
+        // Another registration of the name counts its requests from 1.
+        if is_present {
+            let number = number.unwrap_or(0).min(MAX_NUMBER).max(away.number);
+            token.last.insert(name.clone(), number);
+        }
+        token
     }
 
     fn renew(&mut self, context: &Context<'_>, token: Token, out: &mut Vec<Step>) {
@@ -318,9 +331,13 @@ impl SuzukiKasami {
         let mut token = token.clone();
         if let Some(away) = self.away.take() {
             // An agent of distributed_locking that does not want the token leaves its number as it was.
-            let last = token.last.entry(away.to.shared_name().clone());
-            let last = last.or_default();
-            *last = away.number.max(*last);
+            let number = token.last.get(away.to.shared_name()).copied();
+            if fault!(context.fault, TakeWhole) {
+                let number = number.unwrap_or(0).max(away.number);
+                token.last.insert(away.to.shared_name().clone(), number);
+            } else {
+                token = self.after_turn(away, number);
+            }
         }
         if let Some(served) = token.last.get(self.me.shared_name()) {
             // A registration before this one used higher numbers.

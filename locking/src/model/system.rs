@@ -5,10 +5,10 @@ use std::collections::BTreeSet;
 use stateright::{Model, Property};
 
 use crate::faults::Fault;
-use crate::invariants::History;
+use crate::invariants::{History, Turns};
 use crate::{
-    Act, Action, Admission, AnyAlgorithm, ClaimId, Content, Dialect, Event, Fence, Kind,
-    LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
+    Act, Action, Admission, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Fence,
+    Kind, LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
 };
 
 /// The time of each state. It exceeds every span, so that no time before it is cut off at 0.
@@ -62,6 +62,14 @@ pub(super) struct System {
     pub(super) lease: Millis,
     pub(super) memory: Memory,
     pub(super) fault: Fault,
+    /// Whether agent 0 is like one of `distributed_locking`: it owns the resource without fences. Then the others start
+    /// in steps of their own, with a directory that lists those that have started.
+    pub(super) foreign_owner: bool,
+    /// A further agent of that kind.
+    pub(super) foreigner: Option<u8>,
+    /// Whether grants before an open request are counted. Then messages arrive in one order, agent 1 is killed while
+    /// it holds, and the others make their first request after that.
+    pub(super) turns: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -83,6 +91,9 @@ pub(super) struct State {
     left: Faults,
     /// Registrations that have ended, and the agents that have no proof of it.
     unnoticed: BTreeSet<(Peer, u8)>,
+    /// Registrations, and the agents whose directory does not list them yet.
+    unlisted: BTreeSet<(Peer, u8)>,
+    turns: Turns,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -104,6 +115,7 @@ pub(super) enum Step {
     Deliver(Peer, Peer, LockMessage),
     Tick,
     Notice(Peer, u8),
+    List(Peer, u8),
     Resume(u8),
     Lose(Peer, Peer, LockMessage),
     Duplicate(Peer, Peer, LockMessage),
@@ -149,7 +161,24 @@ impl System {
             discovery: 4,
             claim: 1,
             first_conversation: 0,
-            fault: self.fault,
+            fault: match self.is_foreign(agent) {
+                true => Fault::Foreign,
+                false => self.fault,
+            },
+        }
+    }
+
+    fn is_foreign(&self, agent: u8) -> bool {
+        (self.foreign_owner && agent == 0) || self.foreigner == Some(agent)
+    }
+
+    fn dialect(&self, peer: &Peer) -> Dialect {
+        let is = (0..)
+            .take(self.claims.len())
+            .find(|agent| name(*agent) == peer.name());
+        match is.is_some_and(|agent| self.is_foreign(agent)) {
+            true => Dialect::Legacy,
+            false => Dialect::Own,
         }
     }
 
@@ -169,8 +198,13 @@ impl System {
 
     fn initial(&self) -> State {
         let count = self.claims.len() as u8;
-        let agents: Vec<_> = (0..count).map(|agent| self.agent(agent, 1)).collect();
         let device = Admission::new(name(0), resource().as_str()).unwrap();
+        let mut agents: Vec<_> = (0..count).map(|agent| self.agent(agent, 1)).collect();
+        if self.foreign_owner {
+            for agent in agents.iter_mut().skip(1) {
+                agent.locks = None;
+            }
+        }
         let mut state = State {
             history: History::new(resource(), agents[0].me.clone()),
             agents,
@@ -184,7 +218,12 @@ impl System {
             ticks: 0,
             left: self.faults,
             unnoticed: BTreeSet::new(),
+            unlisted: BTreeSet::new(),
+            turns: Turns::default(),
         };
+        if self.foreign_owner {
+            return state;
+        }
         let peers: Vec<_> = state.agents.iter().map(|agent| agent.me.clone()).collect();
         let life = self.life(&mut state);
         for agent in 0..count {
@@ -290,6 +329,10 @@ impl System {
                     }
                 }
                 Action::Event(event) => {
+                    if let (true, Event::Acquired { .. }) = (self.turns, &event) {
+                        state.turns.granted(&from);
+                        state.history.overtaken(&state.turns, 1);
+                    }
                     let agent = &mut state.agents[usize::from(agent)];
                     match event {
                         Event::Granted { grant, .. } if self.faults.commands > 0 => {
@@ -343,8 +386,17 @@ impl System {
         if agent == 0 {
             state.history.owner_receives(from, message);
         }
+        if let Content::Lock {
+            act: Act::Request { .. } | Act::RequestToken { .. },
+            ..
+        } = message.content
+        {
+            state.turns.reached(from, to);
+        }
+        let mut message = message.clone();
+        message.dialect = self.dialect(from);
         self.call(state, agent as u8, |locks, out| {
-            locks.handle(NOW, from, message, out);
+            locks.handle(NOW, from, &message, out);
         });
     }
 
@@ -381,6 +433,7 @@ impl System {
         ended.paused = false;
         let peer = ended.me.clone();
         state.history.holds(&peer, None);
+        state.turns.departed(&peer);
         state.network.retain(|(to, _, _)| *to != peer);
         for other in (0..count).filter(|other| *other != agent) {
             if state.agents[usize::from(other)].locks.is_some() {
@@ -398,6 +451,9 @@ impl System {
             left,
             ..self.agent(agent, registration)
         };
+        if self.foreign_owner {
+            return self.start_among_strangers(state, agent);
+        }
         let peers: Vec<_> = state
             .agents
             .iter()
@@ -418,7 +474,57 @@ impl System {
         });
     }
 
-    fn observe(state: &mut State) {
+    /// The agent knows the agent that owns the resource, and its directory lists the others.
+    fn start_among_strangers(&self, state: &mut State, agent: u8) {
+        let (owner, me) = (
+            state.agents[0].me.clone(),
+            state.agents[usize::from(agent)].me.clone(),
+        );
+        let others = (1..).zip(state.agents.iter().skip(1));
+        let others: Vec<_> = others
+            .filter(|(other, of)| *other != agent && of.locks.is_some())
+            .map(|(other, of)| (other, of.me.clone()))
+            .collect();
+        self.call(state, agent, |locks, out| {
+            locks.join(NOW, &owner, Dialect::Legacy, out);
+        });
+        for (other, peer) in others {
+            self.list(state, &peer, agent);
+            state.unlisted.insert((me.clone(), other));
+        }
+    }
+
+    /// The directory of an agent lists another one.
+    fn list(&self, state: &mut State, peer: &Peer, agent: u8) {
+        let dialect = self.dialect(peer);
+        if self.is_foreign(agent) {
+            // It asks all agents that it knows, and greets none.
+            self.call(state, agent, |locks, out| {
+                locks.join(NOW, peer, dialect, out)
+            });
+            return;
+        }
+        let is_member = state.locks(agent).is_member(peer);
+        if !is_member {
+            state.locks(agent).expect(NOW, peer);
+            let conversation = Conversation::new(format!("{}_probe", name(agent)).into(), 0);
+            let message = LockMessage {
+                conversation,
+                dialect: Dialect::Own,
+                content: Content::Probe,
+            };
+            let to = peer.clone();
+            self.perform(state, agent, vec![Action::Send { to, message }]);
+        }
+    }
+
+    fn observe(&self, state: &mut State) {
+        if self.foreign_owner {
+            for agent in &state.agents {
+                state.history.holds_unfenced(&agent.me, agent.acquired);
+            }
+            return;
+        }
         let (held, not): (Vec<_>, Vec<_>) = state
             .agents
             .iter()
@@ -442,6 +548,21 @@ impl System {
             .agents
             .iter()
             .all(|agent| agent.locks.is_none() || (agent.claim.is_none() && agent.left == 0))
+    }
+
+    /// Where grants are counted, the others begin after the crash.
+    fn may_lock(&self, state: &State, agent: u8) -> bool {
+        !self.turns || agent == 1 || state.left.crashes == 0
+    }
+
+    /// Where grants are counted, the agent that holds first is killed.
+    fn may_release(&self, state: &State, agent: u8) -> bool {
+        !self.turns || agent != 1 || state.left.crashes == 0
+    }
+
+    /// A crash of an agent that holds the resource. Other crashes have their own configurations.
+    fn may_crash(&self, agent: &Agent) -> bool {
+        !self.turns || agent.acquired
     }
 }
 
@@ -499,7 +620,8 @@ impl Model for System {
             return;
         }
         let left = state.left;
-        for (to, from, message) in &state.network {
+        let deliverable = if self.turns { 1 } else { usize::MAX };
+        for (to, from, message) in state.network.iter().take(deliverable) {
             let (to, from, message) = (to.clone(), from.clone(), message.clone());
             if left.losses > 0 {
                 actions.push(Step::Lose(to.clone(), from.clone(), message.clone()));
@@ -522,12 +644,16 @@ impl Model for System {
                 continue;
             }
             match (agent.claim, agent.acquired) {
-                (None, _) if agent.left > 0 => actions.push(Step::Lock(number)),
-                (Some(_), true) => actions.push(Step::Release(number)),
+                (None, _) if agent.left > 0 && self.may_lock(state, number) => {
+                    actions.push(Step::Lock(number));
+                }
+                (Some(_), true) if self.may_release(state, number) => {
+                    actions.push(Step::Release(number));
+                }
                 (Some(_), false) if left.withdrawals > 0 => actions.push(Step::Withdraw(number)),
                 _ => {}
             }
-            if number > 0 && left.crashes > 0 {
+            if number > 0 && left.crashes > 0 && self.may_crash(agent) {
                 actions.push(Step::Crash(number));
             }
             if left.pauses > 0 && agent.acquired {
@@ -546,6 +672,9 @@ impl Model for System {
         for (peer, agent) in &state.unnoticed {
             actions.push(Step::Notice(peer.clone(), *agent));
         }
+        for (peer, agent) in &state.unlisted {
+            actions.push(Step::List(peer.clone(), *agent));
+        }
         let may_pass = match self.time {
             Time::Free(ticks) => state.ticks < ticks,
             Time::Prompt => state.network.iter().all(|(to, ..)| state.is_paused(to)),
@@ -560,11 +689,22 @@ impl Model for System {
         let state = &mut next;
         match step {
             Step::Lock(number) => {
+                let owner = self.foreign_owner.then(|| state.agents[0].me.clone());
                 let agent = &mut state.agents[usize::from(number)];
                 agent.left -= 1;
                 let mut actions = Vec::new();
                 let locks = agent.locks.as_mut()?;
+                if let Some(owner) = owner {
+                    locks.owner_known(NOW, &resource(), &owner, Dialect::Legacy, &mut actions);
+                }
                 agent.claim = Some(locks.lock(NOW, &resource(), None, &mut actions));
+                if self.turns {
+                    let me = agent.me.clone();
+                    let others = state.agents.iter().filter(|other| other.locks.is_some());
+                    let others = others.map(|other| other.me.clone());
+                    let unreached = others.filter(|other| *other != me).collect();
+                    state.turns.requested(&me, unreached);
+                }
                 self.perform(state, number, actions);
             }
             Step::Release(number) | Step::Withdraw(number) => {
@@ -574,6 +714,8 @@ impl Model for System {
                 let agent = &mut state.agents[usize::from(number)];
                 agent.acquired = false;
                 let claim = agent.claim.take()?;
+                let me = agent.me.clone();
+                state.turns.ended(&me);
                 self.call(state, number, |locks, out| locks.release(NOW, claim, out));
             }
             Step::Deliver(to, from, message) => {
@@ -602,6 +744,10 @@ impl Model for System {
                 }
                 self.call(state, number, |locks, out| locks.depart(NOW, &peer, out));
             }
+            Step::List(peer, number) => {
+                state.unlisted.remove(&(peer.clone(), number));
+                self.list(state, &peer, number);
+            }
             Step::Pause(number) => {
                 state.left.pauses -= 1;
                 state.agents[usize::from(number)].paused = true;
@@ -612,6 +758,7 @@ impl Model for System {
             }
             Step::Crash(number) => {
                 state.left.crashes -= 1;
+                state.turns.disturbed();
                 self.end(state, number);
             }
             Step::Return(number) => self.again(state, number),
@@ -630,7 +777,7 @@ impl Model for System {
                 self.command(state, grant);
             }
         }
-        Self::observe(state);
+        self.observe(state);
         Some(next)
     }
 

@@ -20,6 +20,18 @@ fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
         lease: 4,
         memory: Memory::NoClock,
         fault: Fault::None,
+        foreign_owner: false,
+        foreigner: None,
+        turns: false,
+    }
+}
+
+/// An owner of `distributed_locking`, and agents that start one after the other.
+fn strangers(kind: Kind, claims: &[u8], foreigner: Option<u8>) -> System {
+    System {
+        foreign_owner: true,
+        foreigner,
+        ..system(kind, claims, Time::Prompt, NONE)
     }
 }
 
@@ -50,7 +62,9 @@ fn explore(system: &System, limit: usize) -> Result<usize, (u8, String)> {
         let text = describe(system, &violation.to_string(), &path, &state);
         return Err((violation.number, text));
     }
+    // Where grants are counted, the scenario waits for its crash, which is a fault.
     if system.time == Time::Prompt
+        && !system.turns
         && let Some(id) = graph.stuck()
     {
         let (path, state) = graph.path(system, id);
@@ -247,6 +261,48 @@ fn mistakes_are_found() {
         let found = explore(&mutant, SMALL).err().map(|(number, _)| number);
         assert_eq!(found, Some(broken), "{fault:?}");
     }
+}
+
+/// Agents that start while others request a resource without fences, or hold it, never hold it together with them.
+#[test]
+fn agents_join_during_requests() {
+    let basic = Kind::RicartAgrawala;
+    holds(&strangers(basic, &[0, 1, 1], None));
+    holds(&strangers(basic, &[0, 1, 1], Some(1)));
+    holds(&strangers(basic, &[0, 1, 1], Some(2)));
+    for (fault, model) in [
+        (Fault::AskNoNewcomer, strangers(basic, &[0, 1, 1], None)),
+        (Fault::AwaitNoAnswer, strangers(basic, &[0, 1, 1], None)),
+        (Fault::ForgetClock, strangers(basic, &[0, 1, 1], None)),
+        (Fault::TrustStranger, strangers(basic, &[0, 1, 1], Some(2))),
+    ] {
+        let mutant = System { fault, ..model };
+        let found = explore(&mutant, SMALL).err().map(|(number, text)| {
+            println!("{text}");
+            number
+        });
+        assert_eq!(found, Some(4), "{fault:?}");
+    }
+}
+
+/// An agent that is killed while it holds, and returns, waits for one more grant of another agent at most. The
+/// other agent waits for the kill before its first request.
+#[test]
+fn an_agent_that_was_killed_and_returns_has_its_turn() {
+    let faults = Faults { crashes: 1, ..NONE };
+    let model = System {
+        turns: true,
+        lease: 2,
+        ..system(Kind::SuzukiKasamiExtended, &[0, 2, 3], Time::Prompt, faults)
+    };
+    holds(&model);
+    let fault = Fault::TakeWhole;
+    let mutant = System { fault, ..model };
+    let found = explore(&mutant, SMALL).err().map(|(number, text)| {
+        println!("{text}");
+        number
+    });
+    assert_eq!(found, Some(11), "{fault:?}");
 }
 
 /// Explores the configuration in `FIPA_LOCKS_MODEL`, for example

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use fastrand::Rng;
-use fipa_locking::invariants::{History, all_or_none};
+use fipa_locking::invariants::{History, Turns, all_or_none};
 use fipa_locking::{
     Act, Action, AnyAlgorithm, ClaimId, Content, Dialect, Event, Kind, LockMessage, Locks, Millis,
     Options, OwnerState, Peer, Resource,
@@ -24,6 +24,8 @@ pub(crate) struct Setup {
     /// Resource `n` belongs to agent `n`.
     pub(crate) resources: usize,
     pub(crate) faults: bool,
+    /// Whether the only faults are agents that are killed and return.
+    pub(crate) kills_only: bool,
     /// Whether monitors check all messages. Then messages keep their order, and none is repeated by the network.
     pub(crate) checked: bool,
     /// Claims of each agent.
@@ -49,9 +51,8 @@ pub(crate) struct World {
     log: Option<VecDeque<String>>,
     pub(crate) messages: u64,
     pub(crate) acquired: u64,
-    /// Entries of each agent, and the highest number of times that an agent overtook a request.
-    entries: Vec<u64>,
-    pub(crate) overtaken: u64,
+    /// The grants of the first resource.
+    pub(crate) turns: Turns,
 }
 
 struct Agent {
@@ -72,10 +73,6 @@ struct ActiveClaim {
     id: ClaimId,
     resources: Vec<Resource>,
     acquired: bool,
-    /// Members that have not received the request.
-    unreached: BTreeSet<usize>,
-    /// Entries of the other agents when the request had reached all members.
-    entries: Option<Vec<u64>>,
 }
 
 enum Occurrence {
@@ -139,8 +136,7 @@ impl World {
             log: std::env::var_os("FIPA_LOCKS_SEED").map(|_| VecDeque::new()),
             messages: 0,
             acquired: 0,
-            entries: vec![0; setup.agents],
-            overtaken: 0,
+            turns: Turns::default(),
         };
         for agent in 0..setup.agents {
             world.start(agent);
@@ -251,7 +247,7 @@ impl World {
         let from = self.agents[agent].me.clone();
         if let Some(monitor) = &mut self.agents[agent].monitor {
             monitor.check(self.now, &from, &to, &message);
-            let faulty = self.setup.faults && self.now < FAULTS_END;
+            let faulty = self.setup.faults && !self.setup.kills_only && self.now < FAULTS_END;
             if faulty && self.rng.u8(..100) < 5 {
                 return;
             }
@@ -268,7 +264,7 @@ impl World {
         if receiver.is_some_and(|to| self.cut.contains(&(agent, to))) {
             return;
         }
-        let faulty = self.setup.faults && self.now < FAULTS_END;
+        let faulty = self.setup.faults && !self.setup.kills_only && self.now < FAULTS_END;
         if faulty && self.rng.u8(..100) < 5 {
             return;
         }
@@ -287,18 +283,12 @@ impl World {
         match event {
             Event::Acquired { claim } => {
                 self.acquired += 1;
-                self.entries[agent] += 1;
-                let entries = self.entries.clone();
+                self.turns.granted(&self.agents[agent].me);
                 let Some(active) = &mut self.agents[agent].claim else {
                     panic!("{claim:?} is acquired, but not open");
                 };
                 assert_eq!(active.id, claim);
                 active.acquired = true;
-                if let Some(before) = &active.entries {
-                    for other in (0..entries.len()).filter(|other| *other != agent) {
-                        self.overtaken = self.overtaken.max(entries[other] - before[other]);
-                    }
-                }
                 if self.setup.claims > 0 {
                     let hold = self.rng.u64(1..600);
                     self.at(hold, Occurrence::Release(agent, claim));
@@ -308,6 +298,7 @@ impl World {
                 if self.is_open(agent, claim) =>
             {
                 self.agents[agent].claim = None;
+                self.turns.ended(&self.agents[agent].me);
                 self.claim_later(agent);
             }
             _ => {}
@@ -339,22 +330,23 @@ impl World {
             self.rng.shuffle(&mut resources);
             resources.truncate(1);
         }
-        let within = match self.setup.faults && self.rng.u8(..4) == 0 {
+        let with_deadlines = self.setup.faults && !self.setup.kills_only;
+        let within = match with_deadlines && self.rng.u8(..4) == 0 {
             true => Some(self.rng.u64(1..2_000)),
             false => None,
         };
         let mut out = Vec::new();
         let id = locks.lock_all(now, &resources, within, &mut out);
-        let unreached = (0..self.setup.agents)
-            .filter(|other| *other != agent)
-            .collect();
         of.claim = Some(ActiveClaim {
             id,
             resources,
             acquired: false,
-            unreached,
-            entries: None,
         });
+        let me = of.me.clone();
+        let others = self.agents.iter().filter(|other| other.locks.is_some());
+        let others = others.map(|other| other.me.clone());
+        let unreached = others.filter(|other| *other != me).collect();
+        self.turns.requested(&me, unreached);
         self.perform(agent, out);
     }
 
@@ -406,14 +398,7 @@ impl World {
         else {
             return;
         };
-        let entries = self.entries.clone();
-        let sender = self.agents.iter_mut().find(|agent| agent.me == *from);
-        if let Some(active) = sender.and_then(|sender| sender.claim.as_mut())
-            && active.unreached.remove(&agent)
-            && active.unreached.is_empty()
-        {
-            active.entries = Some(entries);
-        }
+        self.turns.reached(from, &self.agents[agent].me);
     }
 
     fn fault(&mut self) {
@@ -422,7 +407,12 @@ impl World {
         }
         let agent = self.rng.usize(..self.setup.agents);
         let alive = self.agents[agent].locks.is_some();
-        match self.rng.u8(..6) {
+        let kind = if self.setup.kills_only {
+            2
+        } else {
+            self.rng.u8(..6)
+        };
+        match kind {
             0 | 1 if alive => {
                 let pause = self.rng.u64(1..1_500);
                 self.agents[agent].paused_until = self.now + pause;
@@ -437,7 +427,9 @@ impl World {
             }
             _ => {}
         }
-        let pause = self.rng.u64(1..1_000);
+        // After a kill, some requests have time to be overtaken.
+        let longest = if self.setup.kills_only { 6_000 } else { 1_000 };
+        let pause = self.rng.u64(1..longest);
         self.at(pause, Occurrence::Fault);
     }
 
@@ -448,6 +440,8 @@ impl World {
         of.inbox.clear();
         of.paused_until = 0;
         of.claim = None;
+        self.turns.disturbed();
+        self.turns.departed(&ended);
         for history in &mut self.histories {
             history.holds(&ended, None);
         }
@@ -646,8 +640,6 @@ impl World {
             id,
             resources: vec![resource],
             acquired: false,
-            unreached: BTreeSet::new(),
-            entries: None,
         });
         self.perform(agent, out);
         // Shorter than a third of the lease, so that nothing is renewed.
