@@ -249,6 +249,7 @@ impl Gateway {
             refused_dials,
             namesakes,
             questions: Mutex::default(),
+            question_rates: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(gateway_agent.run()));
         let platform_agents = PlatformAgents {

@@ -884,6 +884,49 @@ fn the_agents_of_a_gateway_follow_its_location() {
     assert_eq!(entry.locations, [elsewhere]);
 }
 
+/// The peer decides how often its connections begin and end, and at which addresses.
+#[test]
+fn the_agents_of_a_gateway_that_moves_all_the_time_follow_at_a_rate() {
+    let mut world = World::new(2, 5);
+    for number in 0..300 {
+        world.join(0, &format!("agent_{number}"));
+    }
+    world.connect();
+    world.run(Duration::from_secs(2));
+    let mts = world.gateways[0].mts.clone();
+    let (mut now, exchange) = (world.now, &mut world.gateways[1].exchange);
+    let directory = exchange.directory();
+    assert_eq!(directory.entries().len(), 300);
+    let at = |port: u16| -> Vec<Location> {
+        let text = format!("tcp://10.0.0.99:{port}#0000000000000001");
+        vec![text.parse().unwrap()]
+    };
+    let is_moved_to = |now: Instant, port: u16, exchange: &mut Exchange| {
+        exchange.handle_neighbours(now, &[Present::unproved(mts.clone(), at(port))]);
+        directory.lookup("agent_0").unwrap().locations == at(port)
+    };
+    let moves = (1..=100).filter(|port| is_moved_to(now, *port, exchange));
+    let moves = moves.count();
+    // One from the former address, four from the other one.
+    assert_eq!(moves, 5);
+    while exchange.poll_letter(now).is_some() {}
+    // They follow to the last place.
+    let due = exchange.poll_timeout().unwrap();
+    assert!(now < due && due < now + Duration::from_secs(1));
+    now = due;
+    assert!(is_moved_to(now, 100, exchange));
+    // The wait ends with the connection.
+    assert!(is_moved_to(now + Duration::from_secs(9), 101, exchange));
+    now += Duration::from_secs(9);
+    while is_moved_to(now, 102, exchange) && is_moved_to(now, 103, exchange) {}
+    exchange.handle_neighbours(now, &[]);
+    assert!(
+        exchange
+            .poll_timeout()
+            .is_some_and(|due| due >= now + Exchange::MEMORY)
+    );
+}
+
 /// Links are disconnected and restored in random order; the gateways notice, or not.
 #[test]
 fn after_every_healing_all_agree_within_ten_seconds() {

@@ -22,7 +22,7 @@ use super::KnownPeers;
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::namesakes::Namesakes;
 use super::neighbours::Neighbours;
-use super::presence::Questions;
+use super::presence::{QuestionRates, Questions};
 use crate::contact;
 use crate::presence;
 use crate::routes;
@@ -51,6 +51,7 @@ pub(crate) struct GatewayAgent {
     pub(super) namesakes: Arc<Namesakes>,
     /// The questions of agents of this host about agents of other hosts.
     pub(super) questions: Mutex<Questions>,
+    pub(super) question_rates: Mutex<QuestionRates>,
 }
 
 impl GatewayAgent {

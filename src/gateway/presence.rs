@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, ErrorChain, Message, Performative};
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Role, Source};
-use fipa_transport::{Incarnation, log_limit};
+use fipa_transport::{Incarnation, PeerId, TokenBucket, log_limit};
 
 use super::gateway_agent::GatewayAgent;
 use crate::presence::{self, Answer, Asked, MAX_ASKED};
@@ -25,6 +25,33 @@ const IN_FLIGHT: Duration = Duration::from_millis(200);
 const MEMORY: Duration = Duration::from_secs(30);
 /// Maximum number of remembered questions.
 const MAX_QUESTIONS: usize = 4_096;
+
+/// Bytes of questions that one peer may send at once, and a second afterwards. Four questions of the largest size a
+/// second are more than a gateway asks that has no answer.
+const QUESTION_BYTES: f64 = 512.0 * 1024.0;
+const QUESTION_BYTES_PER_SECOND: f64 = 64.0 * 1024.0;
+
+/// The rates of the questions of other gateways: the letters to the gateway wait while one is answered.
+#[derive(Debug, Default)]
+pub(super) struct QuestionRates {
+    /// The peers that asked within the time in which a bucket fills.
+    peers: HashMap<PeerId, TokenBucket>,
+}
+
+impl QuestionRates {
+    /// Whether a question of this length is answered.
+    fn admits(&mut self, now: Instant, peer: &PeerId, len: usize) -> bool {
+        let memory = Duration::from_secs_f64(QUESTION_BYTES / QUESTION_BYTES_PER_SECOND);
+        if !self.peers.contains_key(peer) {
+            self.peers
+                .retain(|_, bucket| now.saturating_duration_since(bucket.asked()) < memory);
+        }
+        let bucket = self.peers.entry(peer.clone());
+        let bucket = bucket.or_insert_with(|| TokenBucket::new(QUESTION_BYTES, now));
+        let (rate, burst) = (QUESTION_BYTES_PER_SECOND, QUESTION_BYTES);
+        bucket.take_of(len as f64, rate, burst, now)
+    }
+}
 
 /// The questions of agents of this host that other gateways are to answer.
 #[derive(Debug, Default)]
@@ -169,7 +196,17 @@ impl GatewayAgent {
         let content = message.content().map(|content| &content[..]);
         let content = content.unwrap_or_default();
         let is_gateway = received.service == received.sender;
+        let now = Instant::now();
         match message.performative() {
+            Performative::QueryRef
+                if received.remote
+                    && !self
+                        .question_rates
+                        .lock()
+                        .admits(now, &received.peer, content.len()) =>
+            {
+                log_limit::info!(of: received.service, "ignored a question about agents: too many of one peer");
+            }
             Performative::QueryRef => match presence::read_question(content) {
                 // Another gateway asks about agents of this host.
                 Ok(asked) if received.remote && is_gateway => {
@@ -410,6 +447,25 @@ mod tests {
             id: id(registration),
             mts: id(gateway),
         }
+    }
+
+    #[test]
+    fn questions_of_one_peer_have_a_rate() {
+        let (mut rates, now) = (QuestionRates::default(), Instant::now());
+        let peer = |last: u8| PeerId::of_ip([10, 0, 0, last].into());
+        let largest = 64 << 10;
+        let admitted = |rates: &mut QuestionRates, now, last| {
+            let asked = (0..100).filter(|_| rates.admits(now, &peer(last), largest));
+            asked.count()
+        };
+        assert_eq!(admitted(&mut rates, now, 1), 8);
+        assert_eq!(admitted(&mut rates, now, 2), 8, "another peer");
+        assert_eq!(admitted(&mut rates, now + Duration::from_secs(2), 1), 2);
+        for last in 3..=255 {
+            rates.admits(now, &peer(last), largest);
+        }
+        rates.admits(now + Duration::from_secs(60), &peer(0), largest);
+        assert_eq!(rates.peers.len(), 1, "the others are forgotten");
     }
 
     fn here(registrations: &[u64]) -> Answer {

@@ -48,6 +48,8 @@ pub(crate) struct Inbox {
     recent: usize,
     /// With a keyed hash, because untrusted peers choose these keys, tens of thousands of them.
     senders: HashMap<(Realm, Incarnation), SenderState>,
+    /// Number of senders of each certificate.
+    certified: HashMap<Realm, usize>,
     /// Streams that were told that the queue is full and wait for a credit, in order.
     waiting: VecDeque<(Stream, Location)>,
     /// Failure messages in the queue, which do not count against its bound.
@@ -67,6 +69,11 @@ struct SenderState {
 /// Maximum number of senders of one agent. A sender is kept until every letter of it has passed its
 /// deadline, so this bounds the number of incarnations that may send within an hour.
 const MAX_SENDERS: usize = 65_536;
+/// Number of these places for which certificates compete: each may take another one while it has fewer senders than
+/// are free there, so one alone gets half of them, and the next one less. Its holder may invent senders.
+const CERTIFIED_SENDERS: usize = MAX_SENDERS / 2;
+/// Number of senders that each certificate may have while any place is free.
+const SENDERS_OF_SMALL: usize = 256;
 /// Maximum number of streams that wait for a credit. Further streams get none, and retry after a
 /// pause.
 const MAX_WAITING: usize = 4096;
@@ -83,6 +90,7 @@ impl Inbox {
             bytes_bound: config.queue_bytes,
             recent: config.lane,
             senders: HashMap::new(),
+            certified: HashMap::new(),
             waiting: VecDeque::new(),
             failures: 0,
             next_sweep: None,
@@ -237,10 +245,10 @@ impl Inbox {
         if self.next_sweep.is_none_or(|due| due <= now) {
             self.forget_old(now);
         }
-        if self.senders.len() >= MAX_SENDERS {
+        if !self.has_place(stream.realm) {
             return Err(Answer::failed(
                 FailureReason::Refused,
-                format!("{MAX_SENDERS} senders have written within the longest deadline"),
+                "too many senders have written within the longest deadline",
             ));
         }
         let mut state = SenderState {
@@ -250,7 +258,26 @@ impl Inbox {
         };
         state.take(sequence, self.recent);
         self.senders.insert((stream.realm, stream.sender), state);
+        if stream.realm != Realm::UNPROVED {
+            *self.certified.entry(stream.realm).or_default() += 1;
+        }
         Ok(())
+    }
+
+    /// Whether there is a place for another sender of this realm.
+    fn has_place(&self, realm: Realm) -> bool {
+        if self.senders.len() >= MAX_SENDERS {
+            return false;
+        }
+        if realm == Realm::UNPROVED {
+            return true;
+        }
+        let of_realm = self.certified.get(&realm).copied().unwrap_or_default();
+        if of_realm < SENDERS_OF_SMALL {
+            return true;
+        }
+        let taken: usize = self.certified.values().sum();
+        of_realm < CERTIFIED_SENDERS.saturating_sub(taken)
     }
 
     /// Drops senders that can no longer have a letter in transit.
@@ -260,6 +287,12 @@ impl Inbox {
         let memory = MAX_DEADLINE * 2;
         self.senders
             .retain(|_, taken| now.saturating_duration_since(taken.seen) < memory);
+        self.certified.clear();
+        for (realm, _) in self.senders.keys() {
+            if *realm != Realm::UNPROVED {
+                *self.certified.entry(*realm).or_default() += 1;
+            }
+        }
         self.next_sweep = Some(now + Duration::from_secs(60));
     }
 }
@@ -411,6 +444,33 @@ mod tests {
         let forgotten = MAX_DEADLINE.as_secs() * 2;
         assert_eq!(offer(MAX_SENDERS, forgotten), Answer::Accepted);
         assert!(!refused(offer(7, forgotten)));
+    }
+
+    #[test]
+    fn a_certificate_that_invents_senders_leaves_places_for_others() {
+        let mut inbox = inbox(2 * MAX_SENDERS);
+        let now = Instant::now();
+        let mut is_accepted = |realm: u64, sender: usize| {
+            let mut parcel = parcel(1, 0);
+            parcel.stream.realm = Realm::from_u64(realm);
+            parcel.stream.sender = Incarnation::from_u64(1 + sender as u64);
+            let hop = (Kind::Shm, &back());
+            inbox.accept(now, &parcel, Letter::default(), hop, None) == Answer::Accepted
+        };
+        let of_certificate = |realm, is_accepted: &mut dyn FnMut(u64, usize) -> bool| {
+            (0..2 * MAX_SENDERS)
+                .take_while(|sender| is_accepted(realm, *sender))
+                .count()
+        };
+        assert_eq!(of_certificate(7, &mut is_accepted), CERTIFIED_SENDERS / 2);
+        let of_next = of_certificate(8, &mut is_accepted);
+        assert!((1000..=CERTIFIED_SENDERS / 4).contains(&of_next));
+        for realm in 100..200 {
+            assert!(is_accepted(realm, 0), "a certificate with one sender");
+        }
+        for sender in 0..CERTIFIED_SENDERS / 2 {
+            assert!(is_accepted(0, sender), "an agent of this host");
+        }
     }
 
     #[test]

@@ -13,8 +13,8 @@ use fipa_transport::{Hop, Incarnation, Introduction, Principal, Realm};
 
 use crate::Map;
 
-/// Maximum number of services. Of those without a connection, the earliest connected is evicted
-/// first.
+/// Maximum number of services. Of those without a connection, the earliest connected one of the principal that has
+/// most of them is evicted first: a principal that invents services evicts only its own.
 const MAX_SERVICES: usize = 4096;
 /// Maximum number of registrations of one principal: a principal that invents senders evicts only
 /// its own.
@@ -170,13 +170,22 @@ impl Principals {
     }
 
     fn make_room(&mut self) {
-        let services = &mut self.services;
-        if services.len() < MAX_SERVICES {
+        if self.services.len() < MAX_SERVICES {
             return;
         }
-        let is_idle =
-            |known: &Incarnation| services.get(known).is_none_or(|it| it.connections == 0);
-        if let Some(place) = self.order.iter().position(is_idle)
+        let mut idle: Map<Principal, usize> = Map::default();
+        for known in self.services.values().filter(|it| it.connections == 0) {
+            *idle.entry(known.principal).or_default() += 1;
+        }
+        let Some((most, _)) = idle.into_iter().max_by_key(|(_, services)| *services) else {
+            return;
+        };
+        let services = &mut self.services;
+        let is_evicted = |known: &Incarnation| {
+            let known = services.get(known);
+            known.is_none_or(|it| it.connections == 0 && it.principal == most)
+        };
+        if let Some(place) = self.order.iter().position(is_evicted)
             && let Some(oldest) = self.order.remove(place)
         {
             services.remove(&oldest);
@@ -416,6 +425,26 @@ mod tests {
         }
         assert_eq!(hear(100, CREX), Err(PrincipalError::Sender));
         assert!(principals.senders.len() <= MAX_SENDERS + 1);
+    }
+
+    #[test]
+    fn invented_services_displace_those_of_the_same_principal_only() {
+        let mut principals = Principals::default();
+        let directory = no_agents();
+        let rover = peer("rover", ROVER);
+        principals.introduced(&rover, &directory);
+        principals.parted(&rover);
+        for service in 0..MAX_SERVICES as u64 {
+            let invented = Introduction {
+                hop: hop(1000 + service, CREX),
+                ..peer("crex", CREX)
+            };
+            principals.introduced(&invented, &directory);
+            principals.parted(&invented);
+        }
+        assert!(!principals.accepts(&peer("crex", CREX), &directory));
+        principals.introduced(&peer("crex", CREX), &directory);
+        assert!(principals.accepts(&rover, &directory));
     }
 
     #[test]

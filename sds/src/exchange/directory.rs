@@ -320,12 +320,12 @@ impl ExchangeDirectory {
         self.table.touch();
     }
 
-    /// Sets new locations of the gateway and all its agents.
-    pub(super) fn relocate(&self, sender: &Sender, locations: &[Location]) {
+    /// Sets new locations of the gateway and all its agents. Returns the number of these agents.
+    pub(super) fn relocate(&self, sender: &Sender, locations: &[Location]) -> usize {
         let origin = self.origin(sender.gateway);
         let mut lists = self.lists.lock();
         let Some(list) = lists.get_mut(&sender.gateway) else {
-            return;
+            return 0;
         };
         list.sender = sender.clone();
         let mut updates: Vec<Update> = Vec::new();
@@ -337,7 +337,9 @@ impl ExchangeDirectory {
             });
             updates.push((origin, Arc::clone(name), Some(Arc::clone(entry))));
         }
+        let agents = updates.len();
         self.update(&mut lists, updates);
+        agents
     }
 
     /// Drops agents of the gateway that another directory knows, unless they are proved. Returns

@@ -60,6 +60,8 @@ pub struct Exchange {
     directory: Arc<ExchangeDirectory>,
     /// Gateways whose certificate is no longer trusted.
     withdrawn: HashMap<Incarnation, Principal>,
+    /// Time until which the changes of locations have used up the rate of a peer, if it is not over.
+    relocated_until: HashMap<PeerId, Instant>,
     /// The agents of neighbors that fell silent, the latest last.
     lost: VecDeque<LostGateway>,
     random: u64,
@@ -136,6 +138,17 @@ struct Logged {
     with_previous: bool,
 }
 
+/// Returns the time at which the agents of this peer may get other locations, if they may not now.
+fn relocation_due(
+    relocated_until: &HashMap<PeerId, Instant>,
+    peer: &PeerId,
+    now: Instant,
+) -> Option<Instant> {
+    let until = relocated_until.get(peer)?;
+    let due = until.checked_sub(Exchange::RELOCATIONS_AHEAD)?;
+    (due > now).then_some(due)
+}
+
 /// A gateway that is connected, or was until recently.
 #[derive(Debug)]
 struct Neighbor {
@@ -159,6 +172,8 @@ struct Neighbor {
     /// Time at which to request all entries, if necessary, and time of the last request.
     ask: Option<Instant>,
     asked: Option<Instant>,
+    /// Time at which its agents get its present locations, if that waits.
+    relocation_due: Option<Instant>,
     /// Time at which this gateway last started to send all entries.
     told: Option<Instant>,
     /// Whether a list that exceeds the share was logged.
@@ -221,6 +236,11 @@ impl Exchange {
     /// Maximum number of lost agents. Beyond it, the lists of the peers with most are cut.
     pub const MAX_LOST: usize = 1024;
 
+    /// Time that a peer uses up for each agent that gets other locations. Its connections decide how often they
+    /// change, and the change of thousands of agents takes long.
+    const RELOCATION: Duration = Duration::from_millis(1);
+    /// Time that a peer may use up in advance.
+    const RELOCATIONS_AHEAD: Duration = Duration::from_secs(1);
     /// Time for which changes are collected before they are sent.
     const GATHERING: Duration = Duration::from_millis(50);
     /// Maximum jitter of that time.
@@ -250,6 +270,7 @@ impl Exchange {
             early: VecDeque::new(),
             directory: Arc::default(),
             withdrawn: HashMap::new(),
+            relocated_until: HashMap::new(),
             lost: VecDeque::new(),
             random: seed,
         }
@@ -359,6 +380,7 @@ impl Exchange {
                 }
             } else if neighbor.gone.is_none() {
                 neighbor.gone = Some(now);
+                neighbor.relocation_due = None;
             }
         }
         for Present {
@@ -376,9 +398,19 @@ impl Exchange {
                     (known.stored, known.staged) = (None, None);
                     known.request_all(now);
                 }
+                known.relocation_due = None;
                 if known.locations != *locations {
-                    known.locations.clone_from(locations);
-                    self.directory.relocate(&known.sender(), locations);
+                    let peer = known.sender().peer;
+                    match relocation_due(&self.relocated_until, &peer, now) {
+                        Some(due) => known.relocation_due = Some(due),
+                        None => {
+                            known.locations.clone_from(locations);
+                            let agents = self.directory.relocate(&known.sender(), locations);
+                            self.relocated_until.retain(|_, until| *until > now);
+                            let until = self.relocated_until.entry(peer).or_insert(now);
+                            *until += Self::RELOCATION * u32::try_from(agents).unwrap_or(u32::MAX);
+                        }
+                    }
                 }
                 continue;
             }
@@ -706,7 +738,10 @@ impl Exchange {
             .filter_map(Neighbor::incomplete_until);
         let forgotten = self.lost.front().map(|lost| lost.until);
         let own = self.own.renew.into_iter().chain(forgotten);
-        times.flatten().chain(incomplete).chain(own).min()
+        let relocations = self.neighbors.values();
+        let relocations = relocations.filter_map(|neighbor| neighbor.relocation_due);
+        let times = times.flatten().chain(incomplete).chain(relocations);
+        times.chain(own).min()
     }
 
     /// Returns the next letter to send: the neighbor and the content. The caller reports its result
@@ -973,6 +1008,7 @@ impl Neighbor {
             staged: None,
             ask: None,
             asked: None,
+            relocation_due: None,
             told: None,
             is_cut_reported: false,
         }
