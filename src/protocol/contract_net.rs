@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, AgentIdError, Message, MessageBuilder, Performative};
 
 use super::bids::{Bids, Next};
-use super::dialogue::{Dialogue, DialogueError, after, lost_by, name_of, only_delivered, settle, unreached};
+use super::dialogue::{
+    Dialogue, DialogueError, after, lost_by, name_of, only_delivered, settle, unreached,
+};
 use super::reachability::Reachability;
 use super::receivers::{expand, identified};
 use crate::agent::{Agent, AgentCore};

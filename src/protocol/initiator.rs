@@ -291,7 +291,9 @@ impl Request {
                 }
                 Err(DialogueError::TimedOut) => {
                     return Err(match self.violation.take() {
-                        Some((violation, message)) => DialogueError::Violation { violation, message },
+                        Some((violation, message)) => {
+                            DialogueError::Violation { violation, message }
+                        }
                         None => DialogueError::TimedOut,
                     });
                 }

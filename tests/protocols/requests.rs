@@ -39,7 +39,11 @@ async fn superfluous_messages_do_not_end_a_request() {
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
-    for act in [Performative::Agree, Performative::Agree, Performative::Propose] {
+    for act in [
+        Performative::Agree,
+        Performative::Agree,
+        Performative::Propose,
+    ] {
         answer(&arm, &first, act, "").await;
     }
     answer(&arm, &first, Performative::Inform, "lifted").await;
@@ -103,9 +107,15 @@ async fn a_confirmed_cancel_ends_a_request_although_its_wait_was_given_up() {
     let first = next_message(&arm).await.unwrap().into_message();
     answer(&arm, &first, Performative::Agree, "").await;
     let timed_out = request.cancel(Duration::from_millis(200)).await;
-    assert!(matches!(timed_out, Err(DialogueError::TimedOut)), "{timed_out:?}");
+    assert!(
+        matches!(timed_out, Err(DialogueError::TimedOut)),
+        "{timed_out:?}"
+    );
     let cancel = next_message(&arm).await.unwrap().into_message();
     answer(&arm, &cancel, Performative::Inform, "").await;
     let result = request.result().await;
-    assert!(matches!(result, Err(DialogueError::Cancelled(_))), "{result:?}");
+    assert!(
+        matches!(result, Err(DialogueError::Cancelled(_))),
+        "{result:?}"
+    );
 }
