@@ -475,10 +475,13 @@ pub enum TransportErrorKind {
     Unsupported,
     /// Loans and letters that are not received yet use up the memory. A later attempt may succeed.
     NoRoom,
+    /// The other side proves no identity that this side trusts. Another attempt at the location would end the
+    /// same way. In answers and reports to other services, it is [`Refused`](Self::Refused).
+    Distrusted,
 }
 
 impl TransportErrorKind {
-    /// All faults. The position is the code on the wire, so new ones go last.
+    /// All faults with a code. The position is the code on the wire, so new ones go last.
     pub(crate) const CODES: [Self; 13] = [
         Self::Unreachable,
         Self::WrongIncarnation,
@@ -516,6 +519,7 @@ impl TransportErrorKind {
             Self::Inexpressible => "the peer's dialect cannot express it",
             Self::Unsupported => "unsupported transport",
             Self::NoRoom => "no memory",
+            Self::Distrusted => "not trusted",
         }
     }
 }

@@ -238,8 +238,8 @@ impl Delivery {
         handed.find(|(incarnation, _)| *incarnation == location.incarnation())
     }
 
-    /// The reason when every attempt failed because of the letter itself: it is too large, or the
-    /// peer's dialect cannot express it.
+    /// The reason when every attempt failed for a cause that another attempt does not change: the letter is
+    /// too large, the peer's dialect cannot express it, or the peer is not trusted.
     pub(super) fn unfit(&self) -> Option<FailureReason> {
         let mut reason = None;
         for attempt in &self.progress.attempts {
@@ -247,6 +247,9 @@ impl Delivery {
                 TransportErrorKind::Inexpressible => reason = Some(FailureReason::Inexpressible),
                 TransportErrorKind::TooLarge => {
                     reason = reason.or(Some(FailureReason::TooLarge));
+                }
+                TransportErrorKind::Distrusted => {
+                    reason = reason.or(Some(FailureReason::Refused));
                 }
                 _ => return None,
             }
