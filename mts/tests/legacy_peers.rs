@@ -106,6 +106,27 @@ fn nested(content: &[u8]) -> Message {
     Message::decode(&payload).unwrap()
 }
 
+/// Only the beginning of such a letter arrives.
+#[test]
+fn the_sender_of_a_letter_that_its_transport_refuses_gets_a_failure_message() {
+    let mut core = core(true, &[("cpp-sender", OLD_PEER)]);
+    let letter = recorded(LETTER);
+    let message = letter.payload().to_bytes();
+    let cut = Letter::new(letter.envelope(), message.slice(..message.len() / 2));
+    let reason = "the letter exceeds max_letter";
+    let refused = Unframed::refused(cut, Kind::Udt, legacy(HERE), reason);
+    core.handle_unframed(now(), Duration::from_secs(5), &mut refused.unwrap());
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    assert_eq!(location.to_string(), OLD_PEER);
+    let failure = message_of(&parcel);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "cpp-sender");
+    let nested = nested(failure.content().unwrap());
+    assert_eq!(nested.receivers()[0].name(), "echo");
+    let text = String::from_utf8(nested.content().unwrap().to_vec()).unwrap();
+    assert!(text.contains(reason), "{text}");
+}
+
 #[test]
 fn the_sender_of_an_undeliverable_recorded_letter_gets_a_failure_message_in_its_dialect() {
     // Only the letter itself has the location of its sender.

@@ -155,6 +155,12 @@ pub trait Sink: Send + Sync {
     /// receiver.
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource);
 
+    /// Handles a letter of a legacy peer that the transport has refused for this reason, of which only
+    /// the beginning has arrived: its envelope is complete, its message is not.
+    fn refused_unframed(&self, letter: Letter, via: Kind, from: LegacySource, reason: &str) {
+        let _ = (letter, via, from, reason);
+    }
+
     /// Handles the end of an attempt.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);
 

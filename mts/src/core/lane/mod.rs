@@ -30,7 +30,7 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{Entry, Reach};
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Realm, Stream,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Realm, Signature, Stream,
     TransportError, TransportErrorKind,
 };
 
@@ -600,8 +600,8 @@ impl Lane {
     ///
     /// A letter that is too large for all of them waits for a while for a kind of transport that the
     /// directory does not show at present and that may return; later letters wait behind it. Kinds
-    /// within a host are excluded, because they do not lead to other hosts. A letter that a legacy
-    /// peer's dialect cannot express does not wait.
+    /// within a host are excluded, because they do not lead to other hosts. A letter to a legacy peer does
+    /// not wait: such a peer announces all its addresses at once.
     fn never_fits(
         &mut self,
         now: Instant,
@@ -613,8 +613,10 @@ impl Lane {
         let since = *delivery.progress.unfit_since.get_or_insert(now);
         let attempts = &delivery.progress.attempts;
         let mut order = table.config.order_for(&self.receiver).iter();
+        let is_legacy = |attempt: &Attempt| attempt.location.signature() != Signature::Frames;
         let waits = reason == FailureReason::TooLarge
             && now < since + KIND_PATIENCE
+            && !attempts.iter().all(is_legacy)
             && !order.all(|kind| {
                 kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
             });
