@@ -530,6 +530,54 @@ fn recorded_to(receiver: &str) -> Letter {
 }
 
 #[test]
+fn letters_of_a_legacy_peer_wait_for_a_receiver_that_stands_still() {
+    const LETTERS: usize = 5000;
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new(
+            "gateway",
+            Incarnation::from_u64(7),
+            vec![Kind::Shm, Kind::Tcp],
+        )
+    };
+    let mut core = Core::new(config, host_of("echo").view());
+    let begun = now();
+    let deadline = Duration::from_secs(60);
+    let mut under_way = Vec::new();
+    for number in 0..LETTERS {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new("cpp-sender").unwrap())
+            .receiver(AgentId::new("echo").unwrap())
+            .content(number.to_string())
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, begun.utc).unwrap();
+        let mut unframed = read(&core, letter, Kind::Tcp, HERE);
+        core.handle_unframed(begun, deadline, &mut unframed);
+        under_way.extend(std::iter::from_fn(|| dispatched(&mut core)));
+    }
+    // The receiver goes on.
+    let mut taken = Vec::new();
+    while !under_way.is_empty() {
+        for (attempt, location, parcel) in std::mem::take(&mut under_way) {
+            assert_eq!(location.kind(), Kind::Shm);
+            let content = message_of(&parcel).content().unwrap().to_vec();
+            taken.push(
+                String::from_utf8(content)
+                    .unwrap()
+                    .parse::<usize>()
+                    .unwrap(),
+            );
+            let accepted = Conclusion::Answered(Answer::Accepted);
+            core.handle_conclusion(begun, attempt, accepted);
+            under_way.extend(std::iter::from_fn(|| dispatched(&mut core)));
+        }
+    }
+    assert_eq!(taken, (0..LETTERS).collect::<Vec<_>>());
+    assert!(!core.has_open_letters());
+}
+
+#[test]
 fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
     let config = CoreConfig {
         forwards: true,

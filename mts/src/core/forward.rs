@@ -698,7 +698,8 @@ impl Core {
                 letter: letter.clone(),
             });
         let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
-        if !self.has_room_for_stranger(lane, letter.len()) {
+        let room = self.lanes.get(&lane);
+        if !room.is_some_and(|lane| lane.has_room_for_legacy(letter.len(), &self.table)) {
             let reason = FailureReason::QueueFull;
             self.unframed_undelivered(&entry.name, unframed, (reason, String::new()));
             self.table
