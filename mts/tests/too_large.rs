@@ -167,6 +167,22 @@ fn a_letter_to_a_peer_that_is_not_trusted_fails_at_once() {
     assert_eq!((reason, attempts.len()), (FailureReason::Refused, 2));
 }
 
+/// As that of a platform that has just started.
+#[test]
+fn an_earlier_error_of_the_same_address_does_not_prolong_a_permanent_one() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["tcp://192.0.2.1:1;fipa-services"]);
+    bench.send();
+    let (attempt, _) = bench.dispatched();
+    bench.fails(1, attempt, TransportErrorKind::Unreachable);
+    bench.core.handle_timeout(bench.at(1000));
+    let (attempt, _) = bench.dispatched();
+    bench.fails(1001, attempt, TransportErrorKind::Distrusted);
+    let outcome = bench.outcome().unwrap();
+    let reason = FailureReason::Refused;
+    assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
+}
+
 #[test]
 fn the_reason_at_the_deadline_is_the_size() {
     let mut bench = Bench::new();
