@@ -384,14 +384,18 @@ async fn fipa_services_gets_a_failure_in_its_dialect_for_a_letter_that_a_rule_re
 
 /// Makes a letter to the directory facilitator as JADE's proxy writes it.
 fn letter_of_jade(sender: &str, message: &[u8]) -> Vec<u8> {
-    let df = AgentId::new("df@jadetest").unwrap();
+    letter_of_jade_to(AgentId::new("df@jadetest").unwrap(), sender, message)
+}
+
+/// Makes a letter like [`letter_of_jade`] to this receiver.
+fn letter_of_jade_to(receiver: AgentId, sender: &str, message: &[u8]) -> Vec<u8> {
     let base = EnvelopeParams {
-        to: vec![df.clone()],
+        to: vec![receiver.clone()],
         from: Some(AgentId::new(sender).unwrap()),
         acl_representation: Some(Representation::String.into()),
         payload_length: Some(message.len() as u64),
         date: Some("20261120T111213456Z".parse().unwrap()),
-        intended_receivers: vec![df],
+        intended_receivers: vec![receiver],
         ..EnvelopeParams::default()
     };
     let envelope = Envelope {
@@ -474,5 +478,81 @@ async fn an_agent_of_jade_uses_the_directory_facilitator() {
     let (_, _, answer) = ask(register("rusty@rustap")).await;
     assert_eq!(text(&answer).matches("already-registered").count(), 1);
     assert!(rover.try_receive().unwrap().is_none());
+    host.gateway.close().await;
+}
+
+/// Makes the failure message of JADE's agent management system for a letter to an agent that does not
+/// exist.
+#[cfg(feature = "protocols")]
+fn failure_of_jade(lost: &Message) -> Vec<u8> {
+    let content = "((action (agent-identifier :name ams@jadetest) (ACLMessage)) \
+                   (MTS-error (agent-identifier :name echo@jadetest) \
+                   (internal-error \"Agent not found\")))";
+    let to = lost.sender().unwrap().clone();
+    let message = Message::builder(Performative::Failure)
+        .sender(AgentId::new("ams@jadetest").unwrap())
+        .receiver(to.clone())
+        .ontology("FIPA-Agent-Management")
+        .language("fipa-sl")
+        .protocol(lost.protocol().unwrap())
+        .conversation_id(lost.conversation_id().unwrap())
+        .in_reply_to(lost.reply_with().unwrap())
+        .content(content)
+        .build()
+        .unwrap();
+    let message = message.encode(Representation::String, Dialect::Jade);
+    letter_of_jade_to(to, "ams@jadetest", &message.unwrap())
+}
+
+#[cfg(feature = "protocols")]
+#[tokio::test(flavor = "multi_thread")]
+async fn a_call_for_proposals_does_not_wait_for_an_agent_that_a_legacy_peer_does_not_have() {
+    let host = Host::new("echo@jadetest", "jade").await;
+    let rover = host.domain.register("rover").await.unwrap();
+    let peer = async |act: Performative| {
+        let (_, _, lost) = read(&host.read_by_peer().await);
+        assert_eq!(*lost.performative(), act);
+        send_as_peer(&failure_of_jade(&lost), &host.address()).await;
+    };
+    // Without the report, each call would wait until the test fails.
+    let forever = Duration::from_secs(3600);
+    let cfp = rover.message(Performative::Cfp).content("carry");
+    let call = rover.contract_net(cfp, &["echo@jadetest"], forever);
+    let (net, ()) = tokio::join!(timeout(PATIENCE, call), peer(Performative::Cfp));
+    let net = net.unwrap().unwrap();
+    assert_eq!(net.bids().silent, ["echo@jadetest"]);
+    assert_eq!(net.bids().unreached, ["echo@jadetest"]);
+
+    // The agent ends between its proposal and the award.
+    let cfp = rover.message(Performative::Cfp).content("carry");
+    let call = rover.contract_net(cfp, &["echo@jadetest"], forever);
+    let proposes = async {
+        let (_, _, call) = read(&host.read_by_peer().await);
+        let echo = AgentId::new("echo@jadetest").unwrap();
+        let to = call.sender().unwrap().clone();
+        let bid = Message::builder(Performative::Propose)
+            .sender(echo)
+            .receiver(to.clone())
+            .protocol(call.protocol().unwrap())
+            .conversation_id(call.conversation_id().unwrap())
+            .in_reply_to(call.reply_with().unwrap())
+            .build()
+            .unwrap();
+        let bid = bid.encode(Representation::String, Dialect::Jade).unwrap();
+        let letter = letter_of_jade_to(to, "echo@jadetest", &bid);
+        send_as_peer(&letter, &host.address()).await;
+    };
+    let (net, ()) = tokio::join!(timeout(PATIENCE, call), proposes);
+    let mut net = net.unwrap().unwrap();
+    let bids = net.bids().proposals.clone();
+    assert_eq!(bids.len(), 1);
+    let award = timeout(PATIENCE, net.award(&bids, "", forever));
+    let (awarded, ()) = tokio::join!(award, peer(Performative::AcceptProposal));
+    let awarded = awarded.unwrap().unwrap();
+    let lost = matches!(
+        awarded[0].result,
+        Err(fipa::protocol::DialogueError::Undelivered(_))
+    );
+    assert!(lost, "{awarded:?}");
     host.gateway.close().await;
 }

@@ -7,6 +7,7 @@ mod common;
 
 use std::io::{BufRead as _, BufReader};
 use std::process::Stdio;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use common::{Host, Ran};
 use fipa::actions::{Action, Execution, ParameterDescription, Progress};
@@ -81,7 +82,12 @@ fn robot_process() {
         let fail = crex.offer(Action::new("fail"), |(): (), _: Execution| async {
             Err::<(), _>("no power")
         });
-        let _offers = (dock.unwrap(), drive.unwrap(), fail.unwrap());
+        let runs = AtomicU32::new(0);
+        let count = crex.offer(Action::new("count"), move |(): (), _: Execution| {
+            let run = runs.fetch_add(1, Ordering::Relaxed) + 1;
+            async move { Ok::<_, String>(run) }
+        });
+        let _offers = (dock.unwrap(), drive.unwrap(), fail.unwrap(), count.unwrap());
         println!("ready");
         std::future::pending::<()>().await;
     });
@@ -191,6 +197,24 @@ fn actions_are_listed_and_performed() {
         let failed = run(&host, arguments).failed(code);
         assert!(failed.contains(expected), "{arguments:?}: {failed}");
     }
+}
+
+#[test]
+fn a_goal_that_the_same_agent_sends_again_does_not_run_again() {
+    let host = Host::new();
+    let _robot = robot(&host);
+    for (agent, id, expected) in [
+        ("boss", "g-1", "1\n"),
+        ("boss", "g-1", "1\n"),
+        ("boss", "g-2", "2\n"),
+        ("other", "g-1", "3\n"),
+        ("boss", "g-1", "1\n"),
+    ] {
+        let goal = ["do", "crex", "count", "--agent", agent, "--id", id];
+        assert_eq!(run(&host, &goal).done(), expected, "{agent} {id}");
+    }
+    let alone = run(&host, &["do", "crex", "count", "--id", "g-1"]).failed(2);
+    assert!(alone.contains("--agent"), "{alone}");
 }
 
 #[test]

@@ -106,6 +106,27 @@ fn nested(content: &[u8]) -> Message {
     Message::decode(&payload).unwrap()
 }
 
+/// Only the beginning of such a letter arrives.
+#[test]
+fn the_sender_of_a_letter_that_its_transport_refuses_gets_a_failure_message() {
+    let mut core = core(true, &[("cpp-sender", OLD_PEER)]);
+    let letter = recorded(LETTER);
+    let message = letter.payload().to_bytes();
+    let cut = Letter::new(letter.envelope(), message.slice(..message.len() / 2));
+    let reason = "the letter exceeds max_letter";
+    let refused = Unframed::refused(cut, Kind::Udt, legacy(HERE), reason);
+    core.handle_unframed(now(), Duration::from_secs(5), &mut refused.unwrap());
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    assert_eq!(location.to_string(), OLD_PEER);
+    let failure = message_of(&parcel);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "cpp-sender");
+    let nested = nested(failure.content().unwrap());
+    assert_eq!(nested.receivers()[0].name(), "echo");
+    let text = String::from_utf8(nested.content().unwrap().to_vec()).unwrap();
+    assert!(text.contains(reason), "{text}");
+}
+
 #[test]
 fn the_sender_of_an_undeliverable_recorded_letter_gets_a_failure_message_in_its_dialect() {
     // Only the letter itself has the location of its sender.
@@ -506,6 +527,54 @@ fn recorded_to(receiver: &str) -> Letter {
     envelope.base.intended_receivers = envelope.base.to.clone();
     let payload = letter.payload().clone();
     Letter::new(envelope.encode_standard().unwrap(), payload)
+}
+
+#[test]
+fn letters_of_a_legacy_peer_wait_for_a_receiver_that_stands_still() {
+    const LETTERS: usize = 5000;
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new(
+            "gateway",
+            Incarnation::from_u64(7),
+            vec![Kind::Shm, Kind::Tcp],
+        )
+    };
+    let mut core = Core::new(config, host_of("echo").view());
+    let begun = now();
+    let deadline = Duration::from_secs(60);
+    let mut under_way = Vec::new();
+    for number in 0..LETTERS {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new("cpp-sender").unwrap())
+            .receiver(AgentId::new("echo").unwrap())
+            .content(number.to_string())
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, begun.utc).unwrap();
+        let mut unframed = read(&core, letter, Kind::Tcp, HERE);
+        core.handle_unframed(begun, deadline, &mut unframed);
+        under_way.extend(std::iter::from_fn(|| dispatched(&mut core)));
+    }
+    // The receiver goes on.
+    let mut taken = Vec::new();
+    while !under_way.is_empty() {
+        for (attempt, location, parcel) in std::mem::take(&mut under_way) {
+            assert_eq!(location.kind(), Kind::Shm);
+            let content = message_of(&parcel).content().unwrap().to_vec();
+            taken.push(
+                String::from_utf8(content)
+                    .unwrap()
+                    .parse::<usize>()
+                    .unwrap(),
+            );
+            let accepted = Conclusion::Answered(Answer::Accepted);
+            core.handle_conclusion(begun, attempt, accepted);
+            under_way.extend(std::iter::from_fn(|| dispatched(&mut core)));
+        }
+    }
+    assert_eq!(taken, (0..LETTERS).collect::<Vec<_>>());
+    assert!(!core.has_open_letters());
 }
 
 #[test]

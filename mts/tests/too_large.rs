@@ -1,5 +1,5 @@
 //! A letter that is too large for one route waits for another that the directory does not show at
-//! present. A letter that is too long without its content is neither sent nor taken.
+//! present. An error that no repetition changes ends a letter. A letter that is too long without its content is neither sent nor taken.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -82,7 +82,11 @@ impl Bench {
     }
 
     fn is_too_large(&mut self, ms: u64, attempt: AttemptId) {
-        let error = TransportError::new(TransportErrorKind::TooLarge, "");
+        self.fails(ms, attempt, TransportErrorKind::TooLarge);
+    }
+
+    fn fails(&mut self, ms: u64, attempt: AttemptId, fault: TransportErrorKind) {
+        let error = TransportError::new(fault, "");
         let conclusion = Conclusion::NotSent(error);
         self.core
             .handle_conclusion(self.at(ms), attempt, conclusion);
@@ -128,6 +132,54 @@ fn a_letter_too_large_for_every_route_fails_at_once() {
     }
     let outcome = bench.outcome().unwrap();
     let reason = FailureReason::TooLarge;
+    assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
+}
+
+/// A legacy peer announces all its addresses at once.
+#[test]
+fn a_letter_too_large_for_a_legacy_peer_fails_at_once() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["tcp://192.0.2.1:1;fipa-services"]);
+    bench.send();
+    let (attempt, kind) = bench.dispatched();
+    assert_eq!(kind, Kind::Tcp);
+    bench.is_too_large(1, attempt);
+    let outcome = bench.outcome().unwrap();
+    let reason = FailureReason::TooLarge;
+    assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
+}
+
+/// A repetition would not change a certificate that is not trusted. The other addresses are tried.
+#[test]
+fn a_letter_to_a_peer_that_is_not_trusted_fails_at_once() {
+    let mut bench = Bench::new();
+    let routes = ["udp://192.0.2.1:1", "tcp://192.0.2.1:1"];
+    bench.reached_by(0, &routes);
+    bench.send();
+    for _ in routes {
+        let (attempt, _) = bench.dispatched();
+        bench.fails(1, attempt, TransportErrorKind::Distrusted);
+    }
+    let outcome = bench.outcome().unwrap();
+    let Outcome::Failed { reason, attempts } = outcome else {
+        panic!("{outcome}");
+    };
+    assert_eq!((reason, attempts.len()), (FailureReason::Refused, 2));
+}
+
+/// As that of a platform that has just started.
+#[test]
+fn an_earlier_error_of_the_same_address_does_not_prolong_a_permanent_one() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["tcp://192.0.2.1:1;fipa-services"]);
+    bench.send();
+    let (attempt, _) = bench.dispatched();
+    bench.fails(1, attempt, TransportErrorKind::Unreachable);
+    bench.core.handle_timeout(bench.at(1000));
+    let (attempt, _) = bench.dispatched();
+    bench.fails(1001, attempt, TransportErrorKind::Distrusted);
+    let outcome = bench.outcome().unwrap();
+    let reason = FailureReason::Refused;
     assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
 }
 

@@ -301,7 +301,7 @@ impl GoalHandle<'_> {
     /// # Errors
     /// If the robot is gone, or does not answer within `patience`.
     pub async fn cancel(&mut self, patience: Duration) -> Result<bool, ActionError> {
-        Ok(self.request.stop(patience).await?)
+        Ok(self.request.cancel(patience).await?)
     }
 }
 

@@ -359,7 +359,7 @@ macro_rules! blocking {
 blocking! { Request:
     fn agreed() -> bool;
     #[last] fn result() -> Message;
-    #[last] fn cancel(patience: Duration) -> ();
+    fn cancel(patience: Duration) -> bool;
 }
 
 blocking! { Subscription:

@@ -146,7 +146,7 @@ impl Auction {
         }
         let call = self.message(Performative::Cfp, price);
         let sent = self.dialogue.send(call, due).await?;
-        bids.silent.extend(unreached(&sent).map(str::to_owned));
+        unreached(&sent).for_each(|name| bids.miss(name));
         self.lose(unreached(&sent));
         let names = self.bidders.iter().map(|bidder| bidder.name().to_owned());
         let mut called: Vec<String> = names.collect();
@@ -163,6 +163,14 @@ impl Auction {
                     bids.lose(&agent);
                     if self.dialogue.all_gone() {
                         break;
+                    }
+                    continue;
+                }
+                Next::Unreached(agent) => {
+                    if let Some(at) = called.iter().position(|name| *name == agent) {
+                        called.swap_remove(at);
+                        self.lose([agent.as_str()].into_iter());
+                        bids.miss(&agent);
                     }
                     continue;
                 }

@@ -5,7 +5,7 @@ use std::time::Instant;
 use fipa_acl::{Message, Performative};
 use fipa_monitor::Violation;
 
-use super::dialogue::{Dialogue, DialogueError};
+use super::dialogue::{Dialogue, DialogueError, lost_by};
 
 /// Maximum number of violations that are kept per call.
 const MAX_VIOLATIONS: usize = 64;
@@ -20,6 +20,9 @@ pub struct Bids {
     pub refusals: Vec<Message>,
     /// The names of the agents that did not answer in time, could not be reached, or are gone.
     pub silent: Vec<String>,
+    /// The names of the agents that the call did not reach: of those in `silent`, the ones for which a
+    /// message transport service has reported a failure, for example because they do not exist.
+    pub unreached: Vec<String>,
     /// The names of the agents that are gone: of those in `silent`, the ones that received the call and
     /// then left or died.
     pub gone: Vec<String>,
@@ -48,8 +51,7 @@ impl Bids {
                 Err(DialogueError::TimedOut | DialogueError::Unreachable { .. }) => {
                     Ok(Next::TimedOut)
                 }
-                // The outcomes of the call already have its receiver.
-                Err(DialogueError::Undelivered(_)) => continue,
+                Err(DialogueError::Undelivered(report)) => Ok(Next::Unreached(lost_by(&report))),
                 Err(DialogueError::Violation { violation, .. }) => {
                     if self.violations.len() < MAX_VIOLATIONS {
                         self.violations.push(*violation);
@@ -67,6 +69,12 @@ impl Bids {
         self.gone.push(agent.to_owned());
     }
 
+    /// Adds an agent that the call did not reach.
+    pub(super) fn miss(&mut self, agent: &str) {
+        self.silent.push(agent.to_owned());
+        self.unreached.push(agent.to_owned());
+    }
+
     pub(super) fn add(&mut self, answer: Message) {
         match answer.performative() {
             Performative::Propose => self.proposals.push(answer),
@@ -81,6 +89,9 @@ pub(super) enum Next {
     Answer(Box<Message>, bool),
     /// This agent is gone.
     Gone(String),
+    /// A message transport service reports that this agent did not get the call. The outcomes of the
+    /// call may already have said so.
+    Unreached(String),
     /// The time of the call is over.
     TimedOut,
 }

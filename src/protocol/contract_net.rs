@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, AgentIdError, Message, MessageBuilder, Performative};
 
 use super::bids::{Bids, Next};
-use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, settle, unreached};
+use super::dialogue::{
+    Dialogue, DialogueError, after, lost_by, name_of, only_delivered, settle, unreached,
+};
 use super::reachability::Reachability;
 use super::receivers::{expand, identified};
 use crate::agent::{Agent, AgentCore};
@@ -15,7 +17,8 @@ use crate::delivery::{Sent, deliveries};
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have
-    /// answered, at most for `patience`. Receivers that cannot be reached, or are gone, count as silent.
+    /// answered, at most for `patience`. Receivers that cannot be reached, or are gone, count as silent, and
+    /// are not waited for.
     ///
     /// The receivers are [`AgentId`]s or names. A pattern or a coalition among them stands for the agents known now, which
     /// [`ContractNet::called`] returns. A name that is given twice counts once.
@@ -271,7 +274,10 @@ impl ContractNet {
                     (agent, Err(gone))
                 }
                 Err(DialogueError::TimedOut | DialogueError::Unreachable { .. }) => break,
-                Err(DialogueError::Undelivered(_)) => continue,
+                // Of an acceptance. Other reports name agents that do not work.
+                Err(DialogueError::Undelivered(report)) => {
+                    (lost_by(&report), Err(DialogueError::Undelivered(report)))
+                }
                 Err(other) => return Err(other),
             };
             if let Some(at) = working.iter().position(|name| *name == agent) {
@@ -322,6 +328,13 @@ impl ContractNet {
                     }
                     continue;
                 }
+                Next::Unreached(agent) => {
+                    if let Some(at) = called.iter().position(|name| *name == agent) {
+                        called.swap_remove(at);
+                        self.lose([agent.as_str()].into_iter());
+                    }
+                    continue;
+                }
             };
             let from = name_of(&answer);
             if over {
@@ -367,7 +380,7 @@ impl ContractNet {
     fn lose<'n>(&mut self, names: impl Iterator<Item = &'n str>) {
         for name in names {
             self.open.retain(|open| open.name() != name);
-            self.bids.silent.push(name.to_owned());
+            self.bids.miss(name);
         }
     }
 }

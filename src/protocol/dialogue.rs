@@ -11,7 +11,7 @@ use fipa_acl::{
 use fipa_monitor::{
     Header, Library, Monitor, Policy, Unchecked, Verdict, Violation, ViolationKind,
 };
-use fipa_mts::letter_for;
+use fipa_mts::{DeliveryFailure, letter_for};
 use fipa_transport::{FailureReason, Incarnation, Outcome, log_limit};
 
 use super::partners::PartnerEvent;
@@ -40,7 +40,8 @@ pub enum DialogueError {
     /// The other side did not understand a message. Holds its `not-understood`.
     #[error("the other side did not understand a message: {0}")]
     NotUnderstood(Box<Message>),
-    /// The initiator cancelled the conversation. Holds its `cancel`.
+    /// The initiator cancelled the conversation. Holds its `cancel`, and on the initiator's side the
+    /// confirmation.
     #[error("the initiator cancelled: {0}")]
     Cancelled(Box<Message>),
     /// A message was not delivered.
@@ -792,6 +793,12 @@ pub(super) fn unreached(deliveries: &Deliveries) -> impl Iterator<Item = &str> {
     let failed = |delivery: &&Delivery| !delivery.outcome.is_success();
     let failed = deliveries.0.iter().filter(failed);
     failed.map(|delivery| &*delivery.receiver)
+}
+
+/// Returns the name of the agent that a report says did not get its letter.
+pub(super) fn lost_by(report: &Message) -> String {
+    let lost = DeliveryFailure::read(report).and_then(|failure| failure.receiver);
+    lost.unwrap_or_else(|| name_of(report))
 }
 
 /// Returns the name of the sender.

@@ -4,10 +4,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_monitor::Violation;
 
-#[cfg(feature = "actions")]
-use super::dialogue::DialogueState;
-use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
+use super::dialogue::{Dialogue, DialogueError, DialogueState, Interpreted, after, only_delivered};
 use super::reachability::Reachability;
 use super::receivers::single;
 use crate::agent::{Agent, AgentCore};
@@ -111,15 +110,55 @@ pub enum Decision {
 }
 
 /// A request or query. Dropping it does not cancel it; further answers go to [`Agent::receive`].
+///
+/// A message of the other side that violates the protocol, for example a second `agree`, does not end
+/// the wait for the right one. If none arrives in time, the error is the first violation.
 #[derive(Debug)]
 #[must_use = "result() returns the answer"]
 pub struct Request {
     dialogue: Dialogue,
     receivers: Vec<AgentId>,
     due: Option<Instant>,
-    /// A message that arrived before the caller asked for it.
-    early: Option<Message>,
     agreed: bool,
+    /// The end of the request, if it arrived before the caller asked for it. It stays, so that each call
+    /// returns it.
+    end: Option<End>,
+    /// The first message that violated the protocol.
+    violation: Option<(Box<Violation>, Box<Message>)>,
+}
+
+/// The end of a request.
+#[derive(Debug, Clone)]
+enum End {
+    /// An `inform`, `refuse` or `failure`.
+    Answer(Message),
+    NotUnderstood(Message),
+    Undelivered(Message),
+    /// The other side has confirmed the cancel.
+    Cancelled(Message),
+}
+
+impl End {
+    fn into_result(self) -> Result<Message, DialogueError> {
+        Err(match self {
+            Self::Answer(message) => match message.performative() {
+                Performative::Refuse => DialogueError::Refused(Box::new(message)),
+                Performative::Failure => DialogueError::Failed(Box::new(message)),
+                _ => return Ok(message),
+            },
+            Self::NotUnderstood(message) => DialogueError::NotUnderstood(Box::new(message)),
+            Self::Undelivered(message) => DialogueError::Undelivered(Box::new(message)),
+            Self::Cancelled(message) => DialogueError::Cancelled(Box::new(message)),
+        })
+    }
+}
+
+/// The effect of a message on a request.
+enum Progress {
+    Agreed,
+    Ended,
+    /// The other side does not cancel.
+    GoesOn,
 }
 
 impl Request {
@@ -137,8 +176,9 @@ impl Request {
             dialogue,
             receivers,
             due,
-            early: None,
             agreed: false,
+            end: None,
+            violation: None,
         })
     }
 
@@ -160,72 +200,107 @@ impl Request {
     /// # Errors
     /// If the other side refuses, fails, is gone, or does not answer in time.
     pub async fn agreed(&mut self) -> Result<bool, DialogueError> {
-        if !self.agreed && self.early.is_none() {
-            let message = self.dialogue.receive(self.due).await?.message;
-            match message.performative() {
-                Performative::Agree => self.agreed = true,
-                Performative::Refuse => return Err(DialogueError::Refused(Box::new(message))),
-                Performative::Failure => return Err(DialogueError::Failed(Box::new(message))),
-                _ => self.early = Some(message),
-            }
+        while !self.agreed && self.end.is_none() {
+            self.progress(self.due).await?;
         }
-        Ok(self.agreed)
+        match &self.end {
+            Some(end) if !self.agreed => end.clone().into_result().map(|_| false),
+            _ => Ok(self.agreed),
+        }
     }
 
     /// Waits for the result, an `inform`.
     ///
     /// # Errors
-    /// If the other side refuses, fails, is gone, or does not answer in time.
+    /// If the other side refuses, fails, is gone, or does not answer in time, or if the request was
+    /// cancelled ([`DialogueError::Cancelled`]).
     pub async fn result(mut self) -> Result<Message, DialogueError> {
         self.finished().await
     }
 
     /// Waits for the result like [`result`](Self::result). Dropping the future loses no message.
     pub(crate) async fn finished(&mut self) -> Result<Message, DialogueError> {
-        self.agreed().await?;
-        if let Some(early) = self.early.take() {
-            return match early.performative() {
-                Performative::Failure => Err(DialogueError::Failed(Box::new(early))),
-                _ => Ok(early),
-            };
-        }
-        let message = self.dialogue.receive(self.due).await?.message;
-        match message.performative() {
-            Performative::Failure => Err(DialogueError::Failed(Box::new(message))),
-            _ => Ok(message),
+        loop {
+            if let Some(end) = &self.end {
+                return end.clone().into_result();
+            }
+            self.progress(self.due).await?;
         }
     }
 
-    /// Cancels the request and waits for the confirmation of the other side.
+    /// Cancels the request, waits for the answer of the other side, and returns true if it has cancelled.
+    /// Returns false if the request has ended in the meantime or goes on; [`result`](Self::result) then
+    /// returns its result.
     ///
     /// # Errors
-    /// If the other side does not cancel ([`DialogueError::Failed`]), or does not answer within
-    /// `patience`.
-    pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
-        self.dialogue.cancel(self.receivers, after(patience)).await
-    }
-
-    /// Cancels like [`cancel`](Self::cancel), and returns whether the other side has cancelled.
-    /// Otherwise the request has ended or goes on, and [`finished`](Self::finished) returns its result.
-    #[cfg(feature = "actions")]
-    pub(crate) async fn stop(&mut self, patience: Duration) -> Result<bool, DialogueError> {
-        if self.early.is_some() {
-            return Ok(false);
+    /// If the other side is gone, or does not answer within `patience`. [`result`](Self::result) can
+    /// still wait.
+    pub async fn cancel(&mut self, patience: Duration) -> Result<bool, DialogueError> {
+        if self.end.is_some() {
+            return Ok(matches!(self.end, Some(End::Cancelled(_))));
         }
         let due = after(patience);
         let cancel = self.dialogue.agent().message(Performative::Cancel);
         let cancel = cancel.receivers(self.receivers.clone());
         only_delivered(&self.dialogue.send(cancel, due).await?)?;
-        let crossed = match self.dialogue.receive(due).await {
-            Ok(answer) if answer.meaning.state == DialogueState::Cancelled => return Ok(true),
-            // The other side does not cancel.
-            Ok(answer) if !answer.meaning.over => return Ok(false),
-            Ok(answer) => answer.message,
-            // The result crossed the cancel.
-            Err(DialogueError::Cancelled(message)) => *message,
-            Err(error) => return Err(error),
-        };
-        self.early = Some(crossed);
-        Ok(false)
+        loop {
+            match self.progress(due).await? {
+                // It was sent before the cancel arrived.
+                Progress::Agreed => {}
+                Progress::GoesOn => return Ok(false),
+                Progress::Ended => {
+                    return match &self.end {
+                        Some(End::Cancelled(_)) => Ok(true),
+                        // The result crossed the cancel.
+                        Some(End::Answer(_)) => Ok(false),
+                        Some(end) => end.clone().into_result().map(|_| false),
+                        None => Ok(false),
+                    };
+                }
+            }
+        }
+    }
+
+    /// Waits for the next message that has an effect.
+    async fn progress(&mut self, due: Option<Instant>) -> Result<Progress, DialogueError> {
+        loop {
+            let end = match self.dialogue.receive(due).await {
+                Ok(received) if received.meaning.void => continue,
+                Ok(Interpreted { message, meaning }) => match message.performative() {
+                    _ if meaning.state == DialogueState::Cancelled => End::Cancelled(message),
+                    Performative::Agree => {
+                        self.agreed = true;
+                        return Ok(Progress::Agreed);
+                    }
+                    Performative::Failure if !meaning.over => return Ok(Progress::GoesOn),
+                    _ => End::Answer(message),
+                },
+                // A message that crossed the cancel.
+                Err(DialogueError::Cancelled(message)) => match message.performative() {
+                    Performative::Agree => {
+                        self.agreed = true;
+                        return Ok(Progress::Agreed);
+                    }
+                    _ => End::Answer(*message),
+                },
+                Err(DialogueError::NotUnderstood(message)) => End::NotUnderstood(*message),
+                Err(DialogueError::Undelivered(message)) => End::Undelivered(*message),
+                Err(DialogueError::Violation { violation, message }) => {
+                    self.violation.get_or_insert((violation, message));
+                    continue;
+                }
+                Err(DialogueError::TimedOut) => {
+                    return Err(match self.violation.take() {
+                        Some((violation, message)) => {
+                            DialogueError::Violation { violation, message }
+                        }
+                        None => DialogueError::TimedOut,
+                    });
+                }
+                Err(other) => return Err(other),
+            };
+            self.end = Some(end);
+            return Ok(Progress::Ended);
+        }
     }
 }

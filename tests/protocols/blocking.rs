@@ -60,7 +60,7 @@ fn a_request_is_answered_and_another_cancelled() {
             let mut request = rover.request(lift, PATIENCE).unwrap();
             assert!(!request.conversation_id().is_empty());
             assert!(request.agreed().unwrap());
-            request.cancel(PATIENCE).unwrap();
+            assert!(request.cancel(PATIENCE).unwrap());
         },
     );
     assert!(asked > 0);

@@ -11,6 +11,7 @@ mod blocking;
 mod moved;
 mod openings;
 mod proxies;
+mod requests;
 mod selling;
 mod shares;
 #[path = "../support/mod.rs"]
@@ -178,7 +179,8 @@ async fn missing_and_invalid_answers_are_errors() {
     let late = next_message(&rover).await.unwrap().into_message();
     assert_eq!(*late.performative(), Performative::Agree);
 
-    let request = rover.request(lift(), PATIENCE).await.unwrap();
+    // No right answer follows the invalid one.
+    let request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     let invalid = arm.reply(&first, Performative::Propose).build().unwrap();
     arm.send(invalid).await.unwrap();
@@ -290,7 +292,7 @@ async fn a_request_is_cancelled() {
         let lift = to(&rover, Performative::Request, &arm, "lift");
         let mut request = rover.request(lift, PATIENCE).await.unwrap();
         assert!(request.agreed().await.unwrap());
-        request.cancel(PATIENCE).await.unwrap();
+        assert!(request.cancel(PATIENCE).await.unwrap());
     };
     let participant = async {
         let first = next_message(&arm).await.unwrap();
@@ -342,6 +344,7 @@ async fn a_contract_net_with_several_participants() {
         let bids = net.bids().clone();
         assert_eq!(bids.refusals.len(), 1, "{bids:?}");
         assert_eq!(bids.silent, ["unknown"]);
+        assert_eq!(bids.unreached, ["unknown"]);
         let cheap = bids.proposals.iter().find(|bid| text(bid) == "10");
         let cheap = cheap.unwrap().clone();
         let results = net.award(&[cheap], "", PATIENCE).await.unwrap();

@@ -240,6 +240,10 @@ impl Sink for Filter {
         self.sink.arrived_unframed(letter, via, from);
     }
 
+    fn refused_unframed(&self, letter: Letter, via: Kind, from: LegacySource, reason: &str) {
+        self.sink.refused_unframed(letter, via, from, reason);
+    }
+
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
         let fault = self.shared.pending.lock().remove(&attempt);
         let conclusion = if fault.is_some() { lost() } else { conclusion };

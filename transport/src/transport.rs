@@ -155,6 +155,12 @@ pub trait Sink: Send + Sync {
     /// receiver.
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource);
 
+    /// Handles a letter of a legacy peer that the transport has refused for this reason, of which only
+    /// the beginning has arrived: its envelope is complete, its message is not.
+    fn refused_unframed(&self, letter: Letter, via: Kind, from: LegacySource, reason: &str) {
+        let _ = (letter, via, from, reason);
+    }
+
     /// Handles the end of an attempt.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);
 
@@ -475,10 +481,13 @@ pub enum TransportErrorKind {
     Unsupported,
     /// Loans and letters that are not received yet use up the memory. A later attempt may succeed.
     NoRoom,
+    /// The other side proves no identity that this side trusts. Another attempt at the location would end the
+    /// same way. In answers and reports to other services, it is [`Refused`](Self::Refused).
+    Distrusted,
 }
 
 impl TransportErrorKind {
-    /// All faults. The position is the code on the wire, so new ones go last.
+    /// All faults with a code. The position is the code on the wire, so new ones go last.
     pub(crate) const CODES: [Self; 13] = [
         Self::Unreachable,
         Self::WrongIncarnation,
@@ -516,6 +525,7 @@ impl TransportErrorKind {
             Self::Inexpressible => "the peer's dialect cannot express it",
             Self::Unsupported => "unsupported transport",
             Self::NoRoom => "no memory",
+            Self::Distrusted => "not trusted",
         }
     }
 }

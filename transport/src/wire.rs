@@ -372,7 +372,12 @@ pub fn write_outcome(outcome: &Outcome) -> Bytes {
     } in included
     {
         out.put_u8(kind_code(*via));
-        out.put_u8(position(&TransportErrorKind::CODES, &error.fault));
+        let fault = match error.fault {
+            // Earlier releases refuse a report with an unknown code.
+            TransportErrorKind::Distrusted => TransportErrorKind::Refused,
+            fault => fault,
+        };
+        out.put_u8(position(&TransportErrorKind::CODES, &fault));
         for text in [
             location.to_string().as_str(),
             truncated(&error.detail, 1024),

@@ -9,7 +9,7 @@ use fipa::actions::{
     ActionDescription, ActionError, Goal, GoalHandle, GoalStatus, ProgressUpdates, Robot, Term,
     Type,
 };
-use fipa::{AgentId, Config};
+use fipa::{AgentId, Config, RegisterOptions};
 use fipa_acl::escape;
 use fipa_content::{Arguments as TermArguments, FunctionalTerm, Number, Parameter, Printer};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -39,6 +39,7 @@ Examples:
   fipa do crex dock 'target=(pose :x 1.5 :y 0.2 :yaw 3.1)'
   fipa do crex dock target.x=1.5 target.y=0.2 target.yaw=3.1
   fipa do crex lift --deadline 30s --json
+  fipa do crex lift --agent operator --id lift-17
 
 Values are texts, numbers, true, false, or any value in FIPA-SL. A value with a unit after a blank is
 accepted if the unit is that of the parameter. `fipa actions ROBOT` shows the parameters.
@@ -69,9 +70,14 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FENCE")]
     fence: Option<String>,
 
-    /// Id of the goal. A goal that is sent again with its id does not run again [default: a new one]
-    #[arg(long, value_name = "ID")]
+    /// Id of the goal. A goal that the same agent sends again with its id does not run again: the command shows
+    /// its progress and outcome. Needs `--agent` [default: a new one]
+    #[arg(long, value_name = "ID", requires = "agent")]
     id: Option<String>,
+
+    /// Name of the agent that sends the goal [default: a random, unused name]
+    #[arg(long, value_name = "NAME")]
+    agent: Option<AgentId>,
 
     /// Print JSON, one object on a line
     #[arg(long)]
@@ -96,7 +102,13 @@ async fn perform(arguments: &Arguments, config: &Config) -> Result<(), Failure> 
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
     let done = async {
-        let agent = asking(&domain, "do", config).await?;
+        let agent = match &arguments.agent {
+            Some(id) => {
+                let options = RegisterOptions::default();
+                membership::register(&domain, id.name(), options, config).await?
+            }
+            None => asking(&domain, "do", config).await?,
+        };
         let robot = agent.robot(arguments.robot.clone());
         let report = |error: &ActionError| failed(error, &arguments.robot, config);
         let accepted = async {

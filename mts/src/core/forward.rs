@@ -163,6 +163,34 @@ impl Unframed {
         })
     }
 
+    /// Parses the envelope of a letter that the transport has refused for this reason. Its message may be
+    /// incomplete. Its sender gets a failure message for each receiver.
+    ///
+    /// # Errors
+    /// Fails when the envelope cannot be parsed.
+    pub fn refused(
+        letter: Letter,
+        via: Kind,
+        from: LegacySource,
+        reason: &str,
+    ) -> Result<Self, DecodeError> {
+        let mut names = stamp::receivers(&letter, MAX_UNFRAMED_RECEIVERS)?;
+        names.truncate(MAX_UNFRAMED_RECEIVERS);
+        let names = names.into_iter();
+        Ok(Self {
+            receivers: names.map(|it| Receiver::Unknown(it.into())).collect(),
+            failed: Failed::of_envelope(&letter).map(Arc::new),
+            letter,
+            via,
+            from,
+            is_counted: false,
+            sender: None,
+            is_contact: false,
+            fault: Some(reason.to_owned()),
+            parts: None,
+        })
+    }
+
     /// The content, if it is apart from the other bytes of the letter.
     #[must_use]
     pub fn content(&self) -> &Bytes {
@@ -670,7 +698,8 @@ impl Core {
                 letter: letter.clone(),
             });
         let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
-        if !self.has_room_for_stranger(lane, letter.len()) {
+        let room = self.lanes.get(&lane);
+        if !room.is_some_and(|lane| lane.has_room_for_legacy(letter.len(), &self.table)) {
             let reason = FailureReason::QueueFull;
             self.unframed_undelivered(&entry.name, unframed, (reason, String::new()));
             self.table

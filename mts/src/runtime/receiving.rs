@@ -3,7 +3,7 @@
 use std::sync::Weak;
 use std::sync::atomic::Ordering;
 
-use fipa_acl::Letter;
+use fipa_acl::{DecodeError, Letter};
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
     LegacySource, LoanedContent, Location, Parcel, Sink, Verdict, log_limit, quota_address,
@@ -50,7 +50,7 @@ impl Sink for TransportSink {
             return;
         };
         shared.directory.refresh();
-        let mut unframed = match Unframed::read(letter, via, from, &*shared.directory) {
+        let unframed = match Unframed::read(letter, via, from, &*shared.directory) {
             Ok(unframed) => {
                 let unframed = unframed.read_by(&shared.reader);
                 match shared.shared_content(unframed.content()) {
@@ -58,25 +58,18 @@ impl Sink for TransportSink {
                     None => unframed,
                 }
             }
-            Err(error) => {
-                log_limit::warn!(of: quota_address(from.address), %error, "dropping an unframed letter: its envelope is malformed");
-                return;
-            }
+            Err(error) => return malformed(from, &error),
         };
-        loop {
-            let mut state = shared.lock();
-            if shared.closed.load(Ordering::Acquire) {
-                return;
-            }
-            let deadline = state.unframed_deadline;
-            let now = state.clocks.now();
-            state.core.handle_unframed(now, deadline, &mut unframed);
-            if unframed.is_handled() {
-                shared.carry_out(state);
-                return;
-            }
-            // A thread that waits for the lock precedes the next portion.
-            shared.carry_out_then(state, MutexGuard::unlock_fair);
+        handle_unframed(&shared, unframed);
+    }
+
+    fn refused_unframed(&self, letter: Letter, via: Kind, from: LegacySource, reason: &str) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        match Unframed::refused(letter, via, from, reason) {
+            Ok(unframed) => handle_unframed(&shared, unframed),
+            Err(error) => malformed(from, &error),
         }
     }
 
@@ -156,6 +149,28 @@ impl Sink for TransportSink {
         state.core.handle_parted(now, peer);
         shared.carry_out(state);
     }
+}
+
+fn handle_unframed(shared: &Shared, mut unframed: Unframed) {
+    loop {
+        let mut state = shared.lock();
+        if shared.closed.load(Ordering::Acquire) {
+            return;
+        }
+        let deadline = state.unframed_deadline;
+        let now = state.clocks.now();
+        state.core.handle_unframed(now, deadline, &mut unframed);
+        if unframed.is_handled() {
+            shared.carry_out(state);
+            return;
+        }
+        // A thread that waits for the lock precedes the next portion.
+        shared.carry_out_then(state, MutexGuard::unlock_fair);
+    }
+}
+
+fn malformed(from: LegacySource, error: &DecodeError) {
+    log_limit::warn!(of: quota_address(from.address), %error, "dropping an unframed letter: its envelope is malformed");
 }
 
 fn closing() -> Verdict {

@@ -26,6 +26,8 @@ use super::HttpEndpoint;
 use super::request;
 use super::response::{Response, ResponseReader};
 use super::socket::Socket;
+#[cfg(feature = "secure")]
+use super::tls::HandshakeError;
 use super::url::{PATH, Url};
 use crate::end;
 use crate::legacy::dialect::translate;
@@ -145,7 +147,8 @@ impl HttpSender {
     /// proved an identity before that is no longer trusted, and proves no other one.
     fn not_opened(&self, error: TransportError) -> Conclusion {
         #[cfg(feature = "secure")]
-        if error.fault == TransportErrorKind::Refused && self.endpoint.proved.is_withdrawn(&self.to)
+        if error.fault == TransportErrorKind::Distrusted
+            && self.endpoint.proved.is_withdrawn(&self.to)
         {
             let detail = format!(
                 "the trust in the certificate of the platform was withdrawn: {}",
@@ -191,10 +194,9 @@ impl HttpSender {
         if let Some(security) = &self.endpoint.tls {
             let patience = endpoint.limits().handshake_timeout;
             let secured = super::tls::connect(security, stream, _url, patience).await;
-            let stream = secured.map_err(|what| {
+            let stream = secured.map_err(|HandshakeError { fault, what }| {
                 count(&endpoint.tally().dial_failures);
-                let detail = format!("{peer}: {what}");
-                TransportError::new(TransportErrorKind::Refused, detail)
+                TransportError::new(fault, format_args!("{peer}: {what}"))
             })?;
             self.endpoint.proved.add(&self.to, stream.proof().clone());
             return Ok(Socket::Tls(Box::new(stream)));

@@ -7,6 +7,7 @@
 use std::net::IpAddr;
 use std::time::Duration;
 
+use fipa_transport::TransportErrorKind;
 use rustls::CertificateError;
 use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
@@ -39,23 +40,41 @@ pub(super) async fn accept(
     Ok((Guarded::new(stream.into(), proof.clone()), proof))
 }
 
+/// The error of a handshake with a platform that this side has dialed.
+pub(super) struct HandshakeError {
+    pub(super) fault: TransportErrorKind,
+    pub(super) what: String,
+}
+
 /// Performs the handshake with the platform at this address, which must prove its identity.
 pub(super) async fn connect(
     security: &Security,
     stream: TcpStream,
     url: &Url,
     patience: Duration,
-) -> Result<Stream, String> {
+) -> Result<Stream, HandshakeError> {
+    let refused = |what: String| HandshakeError {
+        fault: TransportErrorKind::Refused,
+        what,
+    };
+    let distrusted = |what: String| HandshakeError {
+        fault: TransportErrorKind::Distrusted,
+        what,
+    };
     let config = security.platform_client();
-    let config = config.map_err(|error| error.to_string())?;
-    let name = server_name(url)?;
+    let config = config.map_err(|error| refused(error.to_string()))?;
+    let name = server_name(url).map_err(distrusted)?;
     let connector = TlsConnector::from(config);
     let handshake = timeout(patience, connector.connect(name.clone(), stream)).await;
-    let handshake = handshake.map_err(|_| overdue(patience))?;
-    let stream = handshake.map_err(|error| advice(&error))?;
+    let handshake = handshake.map_err(|_| refused(overdue(patience)))?;
+    let stream = handshake.map_err(|error| match of_tls(&error) {
+        Some(rustls::Error::InvalidCertificate(_)) => distrusted(advice(&error)),
+        _ => refused(advice(&error)),
+    })?;
     let presented = stream.get_ref().1.peer_certificates();
     let trust = security.trust_in_server(presented, &name);
-    let trust = trust.ok_or("its certificate is no longer trusted")?;
+    let trust =
+        trust.ok_or_else(|| distrusted("its certificate is no longer trusted".to_owned()))?;
     Ok(Guarded::new(stream.into(), trust.into()))
 }
 
@@ -72,9 +91,12 @@ fn overdue(patience: Duration) -> String {
     format!("TLS handshake not complete within {patience:?} (handshake_timeout)")
 }
 
+fn of_tls(error: &std::io::Error) -> Option<&rustls::Error> {
+    error.get_ref().and_then(|it| it.downcast_ref())
+}
+
 fn advice(error: &std::io::Error) -> String {
-    let of_tls = error.get_ref().and_then(|it| it.downcast_ref());
-    match of_tls {
+    match of_tls(error) {
         Some(rustls::Error::InvalidCertificate(CertificateError::UnknownIssuer)) => {
             "its certificate is neither trusted (`fipa keys trust`) nor from an authority in \
              transport.https.authorities"

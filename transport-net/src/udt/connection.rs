@@ -4,6 +4,7 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use fipa_transport::{
     AttemptId, Conclusion, TransportError, TransportErrorKind, log_limit, quota_address,
 };
@@ -324,6 +325,11 @@ impl Connection {
     /// Returns the next letter that has arrived.
     pub(crate) fn poll_arrived(&mut self) -> Option<Arrived> {
         self.receiver_mut()?.poll_arrived()
+    }
+
+    /// Returns the beginning of the next letter that is too large.
+    pub(crate) fn poll_too_large(&mut self) -> Option<Bytes> {
+        self.receiver_mut()?.poll_too_large()
     }
 
     /// Returns the next conclusion.

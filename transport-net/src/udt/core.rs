@@ -52,6 +52,8 @@ pub(crate) type Access = Box<dyn Fn(IpAddr) -> bool + Send>;
 pub(crate) enum CoreEvent {
     /// A letter has arrived from this address.
     Arrived(Arrived, SocketAddr),
+    /// The beginning of a letter that is too large has arrived from this address.
+    TooLarge(Bytes, SocketAddr),
     Concluded(AttemptId, Conclusion),
 }
 
@@ -72,6 +74,8 @@ pub(crate) struct Core {
     outbox: VecDeque<Outbound>,
     /// Conclusions of connections that have ended, and of letters that could not be translated.
     concluded: VecDeque<(AttemptId, Conclusion)>,
+    /// Letters of connections that have ended. The peers have got acknowledgments for them.
+    arrived: VecDeque<CoreEvent>,
     rate_limits: PeerRateLimits,
     byte_budget: ByteBudget,
     counters: UdtCounters,
@@ -122,6 +126,7 @@ impl Core {
             untranslated: Untranslated::default(),
             outbox: VecDeque::new(),
             concluded: VecDeque::new(),
+            arrived: VecDeque::new(),
             rate_limits: PeerRateLimits::default(),
             byte_budget: ByteBudget::default(),
             counters: UdtCounters::default(),
@@ -391,22 +396,23 @@ impl Core {
         if let Some((attempt, conclusion)) = self.concluded.pop_front() {
             return Some(CoreEvent::Concluded(attempt, conclusion));
         }
+        // They came before those of a later connection of the same peer.
+        if let Some(arrived) = self.arrived.pop_front() {
+            return Some(arrived);
+        }
         let counters = &mut self.counters;
         self.connections.poll_eventful(|_, entry| {
             if let Some((attempt, conclusion)) = entry.connection.poll_concluded() {
                 counters.letters_out += 1;
                 return Some(CoreEvent::Concluded(attempt, conclusion));
             }
-            let arrived = entry.connection.poll_arrived()?;
-            let path = entry.connection.path()?;
-            counters.letters_in += 1;
-            Some(CoreEvent::Arrived(arrived, path.remote))
+            next_arrival(&mut entry.connection, counters)
         })
     }
 
     /// Whether there are events to deliver.
     pub(crate) fn has_events(&self) -> bool {
-        !self.concluded.is_empty() || self.connections.has_events()
+        !self.concluded.is_empty() || !self.arrived.is_empty() || self.connections.has_events()
     }
 
     /// Returns the next removed connection, so that its sockets can be closed.
@@ -602,6 +608,10 @@ impl Core {
             self.counters.letters_out += 1;
             self.concluded.push_back(concluded);
         }
+        // libudt sends its shutdown as soon as the last letter is acknowledged.
+        while let Some(arrived) = next_arrival(&mut entry.connection, &mut self.counters) {
+            self.arrived.push_back(arrived);
+        }
         let (concluded, shutdown) = entry.connection.end(end, now);
         self.concluded.extend(concluded);
         // Bounded by the number of connections.
@@ -646,6 +656,17 @@ impl Core {
             }
         }
     }
+}
+
+/// Returns the next letter that has arrived over a connection, or the beginning of one that is too large.
+fn next_arrival(connection: &mut Connection, counters: &mut UdtCounters) -> Option<CoreEvent> {
+    let from = connection.path()?.remote;
+    if let Some(beginning) = connection.poll_too_large() {
+        return Some(CoreEvent::TooLarge(beginning, from));
+    }
+    let arrived = connection.poll_arrived()?;
+    counters.letters_in += 1;
+    Some(CoreEvent::Arrived(arrived, from))
 }
 
 /// The number that the cookie of a peer depends on.

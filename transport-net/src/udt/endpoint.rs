@@ -81,6 +81,17 @@ impl Protocol for Core {
     fn deliver(event: CoreEvent, sink: &dyn Sink, with: &WithProtocol<'_, Self>) {
         match event {
             CoreEvent::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
+            CoreEvent::TooLarge(beginning, from) => {
+                // Without its envelope, no sender can be told.
+                if let Ok((letter, signature)) = letter::standard(&beginning) {
+                    let source = LegacySource {
+                        address: from.ip().to_canonical(),
+                        signature,
+                    };
+                    let reason = "the letter is too large for UDT (max_letter)";
+                    sink.refused_unframed(letter, Kind::Udt, source, reason);
+                }
+            }
             // The reservation of the memory ends when the sink has the letter.
             CoreEvent::Arrived(arrived, from) => match letter::standard(&arrived.bytes) {
                 Ok((letter, signature)) => {

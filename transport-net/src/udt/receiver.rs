@@ -40,6 +40,9 @@ const HELD_OVERHEAD: usize = 128;
 /// it has less memory.
 pub(crate) const WINDOW: u32 = 8192;
 
+/// Number of bytes of a letter that is too large whose envelope is read for the failure message.
+const BEGINNING: usize = 64 << 10;
+
 /// The smallest window in an acknowledgment. Smaller ones could stop the peer for ever.
 const MIN_WINDOW: u32 = 2;
 
@@ -98,6 +101,8 @@ pub(crate) struct Receiver {
     /// No packets are accepted before this time.
     paused_until: Option<Instant>,
     arrived: VecDeque<Arrived>,
+    /// The beginnings of letters that were larger than allowed.
+    too_large: VecDeque<Bytes>,
     /// Letters that were larger than allowed, and messages that were incomplete.
     pub(crate) refused: u64,
     acks: Acks,
@@ -175,6 +180,7 @@ impl Receiver {
             rate_limit,
             paused_until: None,
             arrived: VecDeque::new(),
+            too_large: VecDeque::new(),
             refused: 0,
             acks: Acks {
                 last_number: 0,
@@ -279,8 +285,14 @@ impl Receiver {
         self.arrived.pop_front()
     }
 
+    /// Returns the beginning of the next letter that was larger than allowed: its sender gets a failure
+    /// message.
+    pub(crate) fn poll_too_large(&mut self) -> Option<Bytes> {
+        self.too_large.pop_front()
+    }
+
     pub(crate) fn has_arrived(&self) -> bool {
-        !self.arrived.is_empty()
+        !self.arrived.is_empty() || !self.too_large.is_empty()
     }
 
     /// Whether parts of a letter have arrived.
@@ -388,6 +400,9 @@ impl Receiver {
                 max = self.limits.max_letter,
                 "a letter exceeds max_letter and is dropped"
             );
+            let beginning = letter.bytes.iter().chain(payload).take(BEGINNING);
+            let beginning: Vec<u8> = beginning.copied().collect();
+            self.too_large.push_back(beginning.into());
             self.letter = None;
             self.refused += 1;
             return;
@@ -774,6 +789,8 @@ mod tests {
         receiver.handle_data(&tail, now).unwrap();
         assert_eq!(letters(&mut receiver), [&fits[..]]);
         assert_eq!(receiver.refused, 1);
+        assert_eq!(receiver.poll_too_large().unwrap(), large[..BEGINNING]);
+        assert_eq!(receiver.poll_too_large(), None);
     }
 
     #[test]

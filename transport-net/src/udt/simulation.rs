@@ -63,6 +63,8 @@ struct Simulation {
     count: u64,
     /// The numbers of the letters that arrived.
     arrived: [Vec<u64>; 2],
+    /// The beginnings of letters that were too large.
+    too_large: [Vec<Bytes>; 2],
     concluded: [HashMap<AttemptId, Vec<Conclusion>>; 2],
     cut: bool,
     /// Packets of data that were sent by each side.
@@ -121,6 +123,7 @@ impl Simulation {
             busy: [now; 2],
             count: 0,
             arrived: Default::default(),
+            too_large: Default::default(),
             concluded: Default::default(),
             cut: false,
             data: [0; 2],
@@ -186,6 +189,10 @@ impl Simulation {
             CoreEvent::Concluded(attempt, conclusion) => {
                 let concluded = self.concluded[who].entry(attempt).or_default();
                 concluded.push(conclusion);
+            }
+            CoreEvent::TooLarge(beginning, from) => {
+                assert_eq!(from, address(1 - who));
+                self.too_large[who].push(beginning);
             }
             CoreEvent::Arrived(arrived, from) => {
                 assert_eq!(from, address(1 - who));
@@ -456,6 +463,56 @@ fn the_largest_letter_arrives_over_a_lossy_link() {
     let attempts = BTreeSet::from([1]);
     simulation.until_concluded(A, &attempts);
     assert_eq!(simulation.check(A, &attempts), 1);
+}
+
+#[test]
+fn letters_that_arrive_together_with_the_end_of_their_connection_are_delivered() {
+    let conditions = LinkConditions {
+        delay: (100, 100),
+        ..FAIR
+    };
+    let mut simulation = Simulation::new(1, conditions, &UdtLimits::default());
+    simulation.send(A, 0, 10).unwrap();
+    simulation.until_concluded(A, &BTreeSet::from([0]));
+    for number in 1..8 {
+        simulation.send(A, number, 10).unwrap();
+    }
+    let now = simulation.now;
+    simulation.cores[A].close(now);
+    while let Some(transmit) = simulation.cores[A].poll_transmit(now) {
+        simulation.transmit(A, &transmit);
+    }
+    // The last letters and the shutdown are read before an event is delivered.
+    simulation.now += Duration::from_millis(1);
+    simulation.step();
+    assert_eq!(simulation.arrived[B], (0..8).collect::<Vec<_>>());
+    assert_eq!(simulation.cores[B].counters().connections, 0);
+    assert_eq!(simulation.cores[B].counters().letters_in, 8);
+}
+
+#[test]
+fn the_beginning_of_a_letter_that_is_too_large_is_reported() {
+    let mut simulation = Simulation::new(1, FAIR, &UdtLimits::default());
+    simulation.cores[B] = core(
+        B,
+        1,
+        &UdtLimits {
+            max_letter: 100_000,
+            ..UdtLimits::default()
+        },
+        simulation.now,
+    );
+    for (number, len) in [(1, 100_001), (2, 100_000)] {
+        simulation.send(A, number, len).unwrap();
+    }
+    simulation.until_concluded(A, &BTreeSet::from([1, 2]));
+    assert_eq!(simulation.arrived[B], [2]);
+    let [beginning] = &simulation.too_large[B][..] else {
+        panic!("{:?}", simulation.too_large[B]);
+    };
+    let sent = letter(1, 100_001).concat();
+    assert_eq!(*beginning, sent[..beginning.len()]);
+    assert!(beginning.len() >= 1024);
 }
 
 #[test]

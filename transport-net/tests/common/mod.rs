@@ -148,6 +148,8 @@ pub(crate) struct Record {
     pub(crate) unframed: Vec<(Letter, Kind)>,
     pub(crate) concluded: HashMap<AttemptId, Vec<Conclusion>>,
     pub(crate) introduced: Vec<Introduction>,
+    /// Beginnings of letters that the transport has refused.
+    pub(crate) refused: Vec<Letter>,
 }
 
 pub(crate) struct Recorder {
@@ -229,6 +231,10 @@ impl Sink for Recorder {
             "the peers of the tests are on loopback, not at {from:?}"
         );
         self.record.lock().unframed.push((letter, via));
+    }
+
+    fn refused_unframed(&self, letter: Letter, _: Kind, _: LegacySource, _: &str) {
+        self.record.lock().refused.push(letter);
     }
 
     fn accepts(&self, _: &Introduction) -> bool {

@@ -423,6 +423,24 @@ fn a_receiver_that_restarts_unnoticed_is_reached_again() {
 }
 
 #[test]
+fn the_sender_of_a_letter_that_is_too_large_is_known() {
+    let Some(program) = peer() else { return };
+    let party = party();
+    let mut sender = Sender::new(program, party.location());
+    sender.send(&letter(text(1, 10_000_000)));
+    sender.send(&letter(text(2, 10)));
+    sender.finish();
+    assert_eq!(arrived(&party, 1), [text(2, 10)]);
+    let record = party.sink.record.lock();
+    let [refused] = &record.refused[..] else {
+        panic!("{} letters were refused", record.refused.len());
+    };
+    let envelope = refused.parse_envelope().unwrap().effective();
+    assert!(envelope.from.is_some(), "{envelope:?}");
+    assert_eq!(envelope.intended_receivers.len(), 1);
+}
+
+#[test]
 fn a_killed_sender_leaves_nothing_and_can_return() {
     let Some(program) = peer() else { return };
     let party = party();

@@ -238,15 +238,23 @@ impl Delivery {
         handed.find(|(incarnation, _)| *incarnation == location.incarnation())
     }
 
-    /// The reason when every attempt failed because of the letter itself: it is too large, or the
-    /// peer's dialect cannot express it.
+    /// The reason when the last attempt at every location failed for a cause that another attempt does not
+    /// change: the letter is too large, the peer's dialect cannot express it, or the peer is not trusted.
     pub(super) fn unfit(&self) -> Option<FailureReason> {
         let mut reason = None;
-        for attempt in &self.progress.attempts {
+        let attempts = &self.progress.attempts;
+        for (index, attempt) in attempts.iter().enumerate() {
+            let mut later = attempts.iter().skip(index + 1);
+            if later.any(|later| later.location == attempt.location) {
+                continue;
+            }
             match attempt.error.fault {
                 TransportErrorKind::Inexpressible => reason = Some(FailureReason::Inexpressible),
                 TransportErrorKind::TooLarge => {
                     reason = reason.or(Some(FailureReason::TooLarge));
+                }
+                TransportErrorKind::Distrusted => {
+                    reason = reason.or(Some(FailureReason::Refused));
                 }
                 _ => return None,
             }

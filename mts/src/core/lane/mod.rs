@@ -30,7 +30,7 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{Entry, Reach};
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Realm, Stream,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Realm, Signature, Stream,
     TransportError, TransportErrorKind,
 };
 
@@ -50,6 +50,9 @@ use super::work;
 /// that does not.
 const MOVES_WITHIN: Duration = Duration::from_secs(1);
 const HELD_BACK: usize = 4;
+/// A lane of legacy peers' letters holds this many times the letters of another one. Its length bounds the time of
+/// one visit.
+const OF_LEGACY_PEERS: usize = 16;
 /// Number of consecutive attempts without room that count as a failure of the route.
 const CONGESTED_TRIES: u32 = 25;
 /// Minimum expected throughput, which extends the timeout of large letters, and limits repetitions of their content.
@@ -257,6 +260,15 @@ impl Lane {
         let config = &table.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
+    }
+
+    /// Whether there is room for another letter of a legacy peer with this many bytes. Such a peer cannot be held
+    /// back, and a letter that is refused is lost for it, so bytes are the limit.
+    pub(crate) fn has_room_for_legacy(&self, len: usize, table: &AttemptTable) -> bool {
+        let config = &table.config;
+        let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
+        let is_long = self.letters.len() >= config.lane.saturating_mul(OF_LEGACY_PEERS);
+        !is_long && (fits || self.letters.is_empty()) && self.fits_into_custody(len, table)
     }
 
     /// Whether another letter of this process with this many bytes can wait in the lane. While letters leave the
@@ -600,8 +612,8 @@ impl Lane {
     ///
     /// A letter that is too large for all of them waits for a while for a kind of transport that the
     /// directory does not show at present and that may return; later letters wait behind it. Kinds
-    /// within a host are excluded, because they do not lead to other hosts. A letter that a legacy
-    /// peer's dialect cannot express does not wait.
+    /// within a host are excluded, because they do not lead to other hosts. A letter to a legacy peer does
+    /// not wait: such a peer announces all its addresses at once.
     fn never_fits(
         &mut self,
         now: Instant,
@@ -613,8 +625,10 @@ impl Lane {
         let since = *delivery.progress.unfit_since.get_or_insert(now);
         let attempts = &delivery.progress.attempts;
         let mut order = table.config.order_for(&self.receiver).iter();
+        let is_legacy = |attempt: &Attempt| attempt.location.signature() != Signature::Frames;
         let waits = reason == FailureReason::TooLarge
             && now < since + KIND_PATIENCE
+            && !attempts.iter().all(is_legacy)
             && !order.all(|kind| {
                 kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
             });
