@@ -61,11 +61,11 @@ impl Fault {
     pub(crate) const NO: Self = Self;
 }
 
-/// Whether the core makes this mistake: never outside of tests.
+/// Whether the core makes one of these mistakes: never outside of tests.
 macro_rules! fault {
-    ($fault:expr, $name:ident) => {{
+    ($fault:expr, $($name:ident)|+) => {{
         #[cfg(test)]
-        let is = $fault == crate::faults::Fault::$name;
+        let is = matches!($fault, $(crate::faults::Fault::$name)|+);
         #[cfg(not(test))]
         let is = {
             let crate::faults::Fault = $fault;

@@ -143,7 +143,7 @@ impl Owner {
             epoch = 1;
         }
         let mut run = life.run();
-        if fault!(fault, SameRun) || fault!(fault, FileOnly) {
+        if fault!(fault, SameRun | FileOnly) {
             run = 0;
         }
         Self {
@@ -232,7 +232,7 @@ impl Owner {
         let is_of_another_life = fence.owner() == self.me.name()
             && fence.resource() == self.resource.as_str()
             && fence.run() != self.run;
-        let is_deaf = fault!(self.fault, AskNobody) || fault!(self.fault, FileOnly);
+        let is_deaf = fault!(self.fault, AskNobody | FileOnly);
         if !is_of_another_life || fence.epoch() > MAX_REPORTED || is_deaf {
             return;
         }

@@ -1092,7 +1092,7 @@ fn after_not_understood(
         && is_cancel_answer(message)
         && (!told_apart || message.in_reply_to == party.cancel());
     // A message that was sent before the not-understood arrived changes nothing.
-    if !(answers && told_apart)
+    if (!answers || !told_apart)
         && !message.own
         && message.side != party.last
         && let Ok(NextState { state, .. }) = in_state(machine, party, party.resume, message)

@@ -75,7 +75,6 @@ impl Device {
                 AdmitError::OtherRun {
                     fence: fence.clone(),
                     highest,
-                    resource: resource.as_str().to_owned(),
                 }
             }
             NotAdmitted::Foreign => AdmitError::Missing {

@@ -29,16 +29,12 @@ pub enum AdmitError {
     TooMany,
     /// The device has admitted a fence of another run of the owner. The fence is old, or the owner has
     /// started without knowing of that run; then lock the resource again.
-    #[error(
-        "the fence {fence} of {resource:?} is of another run of the owner than {highest}, which was admitted"
-    )]
+    #[error("the fence {fence} is of another run of the owner than {highest}, which was admitted")]
     OtherRun {
         /// The fence.
         fence: Fence,
         /// The highest fence that the device has admitted.
         highest: Fence,
-        /// The resource.
-        resource: String,
     },
     /// The fence is older than the present grant: its lock was lost or released.
     #[error("the fence {fence} of {resource:?} is stale; the lock was lost or released")]

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use clap::Args;
-use fipa::locks::{Fence, ResourceStatus};
+use fipa::locks::ResourceStatus;
 use fipa::{Agent, Config, ErrorChain, Incarnation, RegisterOptions};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
@@ -119,27 +119,11 @@ async fn list(agent: &Agent, arguments: &Arguments, config: &Config) -> Result<(
     }
 }
 
-/// Returns the parts of a state whose change is printed.
-fn lasting(
-    status: &ResourceStatus,
-) -> (
-    String,
-    Option<String>,
-    bool,
-    Option<String>,
-    Option<Fence>,
-    Vec<String>,
-    Option<String>,
-) {
-    (
-        status.resource.clone(),
-        status.owner.clone(),
-        status.is_reported,
-        status.holder.clone(),
-        status.fence.clone(),
-        status.waiters.clone(),
-        status.contested_by.clone(),
-    )
+/// Returns a state without the remaining lease, whose change is not printed.
+fn lasting(status: &ResourceStatus) -> ResourceStatus {
+    let mut lasting = status.clone();
+    lasting.expires = None;
+    lasting
 }
 
 fn print(locks: &[ResourceStatus], arguments: &Arguments, config: &Config) -> Result<(), Failure> {

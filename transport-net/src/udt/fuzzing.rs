@@ -327,6 +327,7 @@ impl UdtPackets {
                                 || arrived.bytes.is_empty()
                         );
                     }
+                    CoreEvent::TooLarge(beginning, _) => assert!(beginning.len() <= 200_000),
                     CoreEvent::Concluded(attempt, conclusion) => {
                         assert!(attempt.0 < self.dispatched);
                         let twice = self.concluded.insert(attempt, conclusion);
