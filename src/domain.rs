@@ -16,6 +16,7 @@ use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::routes::{self, Report};
 use crate::service::{Role, Service};
+use crate::stated::Introductions;
 use crate::{AgentId, Config, background};
 
 /// The membership of this process in a domain. The processes of one domain on one host find each
@@ -40,6 +41,7 @@ pub(crate) struct Inner {
     /// Maximum length of a letter, in bytes.
     pub(crate) max_letter: u64,
     pub(crate) rules: Rules,
+    pub(crate) introductions: Introductions,
 }
 
 impl Drop for Inner {
@@ -145,6 +147,7 @@ impl Domain {
                 deadline,
                 max_letter: config.transport.shm.max_letter,
                 rules,
+                introductions: Introductions::default(),
             }),
         })
     }

@@ -267,6 +267,7 @@ fn heard(core: &mut Core) -> Vec<(String, String)> {
             name,
             agent,
             location,
+            ..
         } => {
             assert!(!agent.is_known());
             Some((name, location.to_string()))
@@ -384,6 +385,7 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_until_it_is_silent() {
                 name,
                 agent,
                 location,
+                ..
             } => {
                 let heard = contacts.heard(then.instant, &name, agent, location);
                 Some(if heard.is_ok() { "known" } else { "refused" })

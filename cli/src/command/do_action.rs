@@ -73,6 +73,9 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "ID")]
     id: Option<String>,
 
+    #[command(flatten)]
+    addresses: membership::Addresses,
+
     /// Print JSON, one object on a line
     #[arg(long)]
     json: bool,
@@ -97,7 +100,8 @@ async fn perform(arguments: &Arguments, config: &Config) -> Result<(), Failure> 
     let domain = membership::join(config).await?;
     let done = async {
         let agent = asking(&domain, "do", config).await?;
-        let robot = agent.robot(arguments.robot.clone());
+        let robot = arguments.addresses.of(&agent, &arguments.robot).await?;
+        let robot = agent.robot(robot);
         let report = |error: &ActionError| failed(error, &arguments.robot, config);
         let accepted = async {
             let goal = goal(arguments, &robot).await.map_err(|error| match error {
