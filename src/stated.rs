@@ -34,6 +34,9 @@ const MAX_WAITING_BYTES: usize = 64 << 20;
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
+/// Maximum length of an address that is remembered, in bytes.
+const MAX_ADDRESS: usize = 1024;
+
 /// Maximum number of identifiers whose introductions are remembered.
 const MAX_REMEMBERED: usize = 256;
 
@@ -51,6 +54,8 @@ struct Key {
 impl Key {
     fn of(id: &AgentId) -> Self {
         let addresses = id.addresses().iter().take(contact::MAX_ADDRESSES);
+        // A longer one is no location.
+        let addresses = addresses.filter(|it| it.len() <= MAX_ADDRESS);
         Self {
             name: id.name().to_owned(),
             addresses: addresses.cloned().collect(),
