@@ -45,6 +45,8 @@
 //! insecure = false                    # true: listen on the network without keys
 //! loopback = false                    # with keys: legacy peers on loopback prove their identity, too
 //! legacy_peers = []                   # with keys: addresses of legacy peers, which have no keys
+//! [contacts]
+//! networks = []                       # networks whose addresses in received identifiers are dialed
 //! [access]
 //! rate = 0                            # letters per second of one sender; 0: no limit
 //! allow = { "rover_.*" = ["arm performative=request"] }   # all others are refused (none by default)
@@ -82,6 +84,7 @@ use std::fmt;
 use std::net::IpAddr;
 use std::time::Duration;
 
+use fipa_mts::dial::Network;
 use fipa_transport::{Kind, Location};
 
 #[cfg(feature = "net")]
@@ -114,6 +117,8 @@ pub struct Config {
     pub discovery: Discovery,
     /// `[security]`: the keys, and the limits for peers on other hosts.
     pub security: Security,
+    /// `[contacts]`: the addresses in agent identifiers that the gateway dials.
+    pub contacts: Contacts,
     /// `[access]`: the rules for senders and receivers of letters.
     pub access: Access,
     /// `[monitor]`: the checks of messages against their protocols.
@@ -278,6 +283,18 @@ pub struct Security {
     /// `peer_bytes`: maximum number of bytes per second that each transport accepts from one address;
     /// also the maximum burst. 0: no limit.
     pub peer_bytes: u64,
+}
+
+/// `[contacts]`: the addresses in agent identifiers that the gateway dials for an agent that no directory lists.
+///
+/// It dials an address that the operator or a program of its host gave, and one on the host from which the identifier
+/// came or that took a letter within a day. Of the latter, loopback, link-local and multicast addresses, those of
+/// the gateway itself, and ports below 1024 except 80 and 443 are left out.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Contacts {
+    /// `networks`: networks whose addresses are dialed whoever stated them, for example `10.0.0.0/8`. At most 64.
+    pub networks: Vec<Network>,
 }
 
 /// `[access]`: the rules for senders and receivers of letters. The gateway applies them to the letters
@@ -488,6 +505,7 @@ impl Config {
                 peer_letters: 20_000,
                 peer_bytes: 256 << 20,
             },
+            contacts: Contacts::default(),
             access: Access::default(),
             monitor: Monitor {
                 check: Check::Off,

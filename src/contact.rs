@@ -11,7 +11,9 @@
 //! { "version": 1, "name": "echo@jade", "addresses": ["http://10.0.0.7:7778/acc"] }
 //! ```
 //!
-//! Gateways accept introductions from processes of their own host only.
+//! `"received": true` says that the identifier was decoded: the gateway then dials its addresses only within the rules
+//! of [`fipa_mts::dial`], and resolves host names once. Gateways accept introductions from processes of their own host
+//! only.
 
 use std::time::Duration;
 
@@ -76,11 +78,18 @@ struct Introduction {
     version: u32,
     name: String,
     addresses: Vec<String>,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    received: bool,
 }
 
-/// Introduces an agent of another platform to the gateway of this agent's host, at the addresses in
-/// its identifier; the gateway uses the first one for which it has a transport. Messages that reach
-/// the calling agent in the meantime are lost, so use an agent that serves no other purpose.
+/// Maximum number of addresses of an identifier that are used.
+pub(crate) const MAX_ADDRESSES: usize = Entry::MAX_LOCATIONS;
+
+/// Introduces an agent of another platform to the gateway of this agent's host, at the first
+/// addresses in its identifier, at most 8. The gateway uses those for which it has a transport, in their order: the next
+/// one after a letter was certainly not sent to the one before. Of a [received](AgentId::is_received) identifier it uses
+/// those that it may dial. Messages that reach the calling agent in the meantime are lost, so use an agent that serves
+/// no other purpose. [`Agent::send`] introduces receivers with addresses by itself.
 ///
 /// # Errors
 /// If the identifier has no address, an address is not usable, the gateway cannot be asked within
@@ -91,7 +100,12 @@ pub async fn introduce(
     id: &AgentId,
     patience: Duration,
 ) -> Result<(), IntroduceError> {
-    let addresses: Vec<String> = id.addresses().iter().map(|it| (**it).to_owned()).collect();
+    let addresses = id.addresses().iter().take(MAX_ADDRESSES);
+    let mut addresses: Vec<String> = addresses.map(|it| (**it).to_owned()).collect();
+    if id.is_received() {
+        // Its platform may have addresses of other protocols, too.
+        addresses.retain(|address| location(address).is_ok());
+    }
     if addresses.is_empty() {
         return Err(IntroduceError::NoAddress(id.name().to_owned()));
     }
@@ -102,12 +116,16 @@ pub async fn introduce(
         version: VERSION,
         name: id.name().to_owned(),
         addresses,
+        received: id.is_received(),
     };
     let content = serde_json::to_string(&introduction)
         .map_err(|error| AskError::NotUnderstood(error.to_string()))?;
     let answer = routes::ask(agent, gateway, (ONTOLOGY, Some(content)), patience).await?;
     match *answer.performative() {
-        Performative::Inform => Ok(()),
+        Performative::Inform => {
+            agent.domain().inner.introductions.accepted(id);
+            Ok(())
+        }
         _ => {
             let reason = answer.content().map(|bytes| &bytes[..]).unwrap_or_default();
             let reason = String::from_utf8_lossy(reason).into_owned();
@@ -131,12 +149,24 @@ pub fn location(text: &str) -> Result<Location, AddressError> {
     }
 }
 
-/// Reads an introduction: the name of the agent, and its locations.
+/// An introduction that was read.
+#[cfg(feature = "net")]
+#[derive(Debug)]
+pub(crate) struct Introduced {
+    /// The name of the agent.
+    pub(crate) name: String,
+    /// Its locations, the preferred one first.
+    pub(crate) locations: Vec<Location>,
+    /// Whether they come from a decoded identifier.
+    pub(crate) is_received: bool,
+}
+
+/// Reads an introduction.
 ///
 /// # Errors
 /// The reason why it is not one.
 #[cfg(feature = "net")]
-pub(crate) fn read(content: &[u8]) -> Result<(String, Vec<Location>), String> {
+pub(crate) fn read(content: &[u8]) -> Result<Introduced, String> {
     if content.len() > MAX_CONTENT {
         return Err(format!("the content has more than {MAX_CONTENT} bytes"));
     }
@@ -145,11 +175,15 @@ pub(crate) fn read(content: &[u8]) -> Result<(String, Vec<Location>), String> {
     if introduction.version != VERSION {
         return Err(format!("version {} is not supported", introduction.version));
     }
-    let locations = introduction.addresses.iter().take(Entry::MAX_LOCATIONS);
+    let locations = introduction.addresses.iter().take(MAX_ADDRESSES);
     let locations: Result<Vec<Location>, AddressError> =
         locations.map(|address| location(address)).collect();
     let locations = locations.map_err(|error| error.to_string())?;
-    Ok((introduction.name, locations))
+    Ok(Introduced {
+        name: introduction.name,
+        locations,
+        is_received: introduction.received,
+    })
 }
 
 #[cfg(test)]
@@ -170,8 +204,14 @@ mod tests {
     #[test]
     fn an_introduction_that_is_malformed_or_too_long_is_refused() {
         let good = r#"{"version":1,"name":"echo@jade","addresses":["http://10.0.0.7:7778/acc"]}"#;
-        let (name, locations) = read(good.as_bytes()).unwrap();
-        assert_eq!((name.as_str(), locations.len()), ("echo@jade", 1));
+        let read_good = read(good.as_bytes()).unwrap();
+        assert_eq!(
+            (read_good.name.as_str(), read_good.locations.len()),
+            ("echo@jade", 1)
+        );
+        assert!(!read_good.is_received);
+        let received = good.replace("]}", "],\"received\":true}");
+        assert!(read(received.as_bytes()).unwrap().is_received);
         for bad in [
             "",
             "{}",

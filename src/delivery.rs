@@ -3,11 +3,12 @@
 use std::fmt;
 use std::sync::Arc;
 
-use fipa_acl::escape_name;
+use fipa_acl::{AgentId, escape_name};
 use fipa_mts::Sending;
-use fipa_transport::Outcome;
+use fipa_transport::{FailureReason, Outcome};
 
 use crate::checks::Unsettled;
+use crate::stated::{Full, Waiting};
 
 /// The outcomes of a message, one [`Delivery`] per receiver.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -41,22 +42,68 @@ impl fmt::Display for Deliveries {
     }
 }
 
-/// A message that was sent.
+/// A message that was sent, or that waits for the introduction of its receivers.
 pub(crate) struct Sent {
-    sending: Sending,
+    way: Way,
     /// The checks that the outcomes concern.
     unsettled: Option<Unsettled>,
 }
 
+enum Way {
+    Sent(Sending),
+    Held {
+        receivers: Vec<Arc<str>>,
+        waiting: Result<Waiting, Full>,
+    },
+}
+
 impl Sent {
     pub(crate) fn new(sending: Sending, unsettled: Option<Unsettled>) -> Self {
-        Self { sending, unsettled }
+        let way = Way::Sent(sending);
+        Self { way, unsettled }
+    }
+
+    /// A message to these receivers that waits, unless too many messages do.
+    pub(crate) fn held(
+        receivers: &[AgentId],
+        waiting: Result<Waiting, Full>,
+        unsettled: Option<Unsettled>,
+    ) -> Self {
+        let receivers = receivers.iter().map(|it| it.name().into()).collect();
+        let way = Way::Held { receivers, waiting };
+        Self { way, unsettled }
+    }
+}
+
+impl Way {
+    async fn outcomes(self) -> Vec<(Arc<str>, Outcome)> {
+        let (receivers, waiting) = match self {
+            Self::Sent(sending) => return sending.outcomes().await,
+            Self::Held { receivers, waiting } => (receivers, waiting),
+        };
+        let reason = match waiting {
+            Err(Full) => FailureReason::QueueFull,
+            Ok(waiting) => match waiting.await {
+                Ok(sent) => {
+                    let mut all = Vec::new();
+                    for sending in sent {
+                        all.extend(sending.outcomes().await);
+                    }
+                    return all;
+                }
+                Err(_) => FailureReason::Closed,
+            },
+        };
+        let attempts = Vec::new();
+        let failed = Outcome::Failed { reason, attempts };
+        let failed = receivers.into_iter().map(|it| (it, failed.clone()));
+        failed.collect()
     }
 }
 
 /// Waits until every receiver has an outcome.
 pub(crate) async fn deliveries(sent: Sent) -> Deliveries {
-    let outcomes = sent.sending.outcomes().await.into_iter();
+    let outcomes = sent.way.outcomes().await.into_iter();
     let delivered = outcomes.map(|(receiver, outcome)| Delivery { receiver, outcome });
     let deliveries = Deliveries(delivered.collect());
     if let Some(unsettled) = sent.unsettled {

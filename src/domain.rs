@@ -16,6 +16,7 @@ use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::routes::{self, Report};
 use crate::service::{Role, Service};
+use crate::stated::Introductions;
 use crate::{AgentId, Config, background, lock_slot};
 
 /// The membership of this process in a domain. The processes of one domain on one host find each
@@ -45,6 +46,7 @@ pub(crate) struct Inner {
         expect(dead_code, reason = "there are no locks")
     )]
     pub(crate) locking: lock_slot::Neighbors,
+    pub(crate) introductions: Introductions,
 }
 
 impl Drop for Inner {
@@ -151,6 +153,7 @@ impl Domain {
                 max_letter: config.transport.shm.max_letter,
                 rules,
                 locking: lock_slot::Neighbors::default(),
+                introductions: Introductions::default(),
             }),
         })
     }

@@ -21,6 +21,7 @@ use crate::delivery_report;
 use crate::domain::Domain;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
+use crate::stated::HeldLetters;
 
 /// One registration of an agent of this process.
 pub(crate) struct Endpoint {
@@ -33,6 +34,8 @@ pub(crate) struct Endpoint {
     pub(crate) checks: Checks,
     /// The envelope of the latest letter.
     template: Mutex<EnvelopeTemplate>,
+    /// The letters that wait for the introduction of their receivers.
+    held: HeldLetters,
 }
 
 /// Whether a message is checked against its protocol before it is sent.
@@ -62,6 +65,7 @@ impl Endpoint {
             incarnation,
             unique_ids: AtomicU64::new(0),
             template: Mutex::default(),
+            held: HeldLetters::default(),
         }
     }
 
@@ -111,7 +115,8 @@ impl Endpoint {
         LetterDraft::new(message, content_len, SystemTime::now(), template)
     }
 
-    /// Sends a message. The letter is sent before this returns; dropping the result does not stop it.
+    /// Sends a message. The letter is sent before this returns, unless it waits for the introduction of a receiver;
+    /// dropping the result does not stop it.
     pub(crate) fn send(
         &self,
         message: &Message,
@@ -138,6 +143,13 @@ impl Endpoint {
             Checked::No => None,
         };
         let receivers = message.receivers();
+        if self.held.must_hold(&self.domain, receivers) {
+            let held = (letter, receivers);
+            let held = self
+                .held
+                .hold(&self.domain, self.incarnation, held, deadline);
+            return Ok(Sent::held(receivers, held, unsettled));
+        }
         let mts = self.mts();
         let sending = mts.send_to_agents(self.incarnation, letter, receivers, deadline);
         Ok(Sent::new(sending, unsettled))
@@ -225,6 +237,7 @@ impl Endpoint {
     /// Ends the registration and returns the letters that were not received.
     pub(crate) fn deregister(&self) -> Result<Vec<Received>, DeregisterError> {
         self.domain.inner.owner.check()?;
+        self.held.close();
         let service = &self.domain.inner.service;
         let removed = service.host.deregister(&self.name, self.incarnation);
         let unread = service.mts.deregister(self.incarnation);

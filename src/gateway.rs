@@ -10,6 +10,7 @@ mod exchange_queues;
 mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
+mod introductions;
 mod names;
 mod namesakes;
 mod neighbours;
@@ -29,8 +30,8 @@ use fipa_acl::{ErrorChain, escape};
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    Cancellation, ContactDirectory, ContactError, Directory, Entry, MergedDirectory, RegisterError,
-    Registration, Role as EntryRole, StaticDirectory, reserved_for,
+    Cancellation, ContactDirectory, ContactError, Directory, Entry, Heard, MergedDirectory,
+    RegisterError, Registration, Role as EntryRole, StaticDirectory, reserved_for,
 };
 use fipa_transport::{
     Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
@@ -45,6 +46,7 @@ use self::exchange::{Exchanging, Means};
 use self::gateway_agent::GatewayAgent;
 #[cfg(feature = "secure")]
 use self::guard::Guard;
+use self::introductions::Takers;
 use self::namesakes::Namesakes;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
@@ -250,8 +252,9 @@ impl Gateway {
             namesakes,
             questions: Mutex::default(),
             question_rates: Mutex::default(),
+            networks: config.contacts.networks.clone(),
         };
-        self.tasks.push(tokio::spawn(gateway_agent.run()));
+        self.tasks.push(tokio::spawn(Arc::new(gateway_agent).run()));
         let platform_agents = PlatformAgents {
             service: Arc::clone(&self.service),
             neighbours: Arc::clone(&self.neighbours),
@@ -624,6 +627,8 @@ struct KnownPeers {
     directory: Arc<ContactDirectory>,
     publisher: Mutex<Option<Arc<Publisher>>>,
     network: Mutex<Option<Arc<dyn Network>>>,
+    /// The platforms that have taken letters.
+    takers: Takers,
     /// Number of new agents in the directory so far.
     heard: AtomicU64,
     /// The number of them that are published. Locked while they are.
@@ -638,6 +643,31 @@ impl KnownPeers {
         name: &str,
         agent: Incarnation,
         location: Location,
+        host: Option<&str>,
+    ) -> Result<(), ContactError> {
+        self.record_with(name, agent, |directory| match host {
+            Some(host) => directory.heard_of_host(now, name, location, host),
+            None => directory.heard(now, name, agent, location),
+        })
+    }
+
+    /// Records an agent of another platform because an agent of this host wants to write to it.
+    fn introduce(
+        &self,
+        name: &str,
+        locations: Vec<Location>,
+        is_given: bool,
+    ) -> Result<(), ContactError> {
+        self.record_with(name, Incarnation::UNKNOWN, |directory| {
+            directory.introduce(Instant::now(), name, locations, is_given)
+        })
+    }
+
+    fn record_with(
+        &self,
+        name: &str,
+        agent: Incarnation,
+        record: impl FnOnce(&ContactDirectory) -> Result<Heard, ContactError>,
     ) -> Result<(), ContactError> {
         // An agent of a platform without a gateway, such as JADE, must not pass for one of a gateway.
         if let Some(gateway) = reserved_for(name).filter(|_| !agent.is_known())
@@ -645,7 +675,7 @@ impl KnownPeers {
         {
             return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()).into());
         }
-        let heard = self.directory.heard(now, name, agent, location)?;
+        let heard = record(&self.directory)?;
         if heard.is_new {
             self.heard.fetch_add(1, Ordering::AcqRel);
         }
@@ -663,8 +693,8 @@ impl KnownPeers {
 }
 
 impl Contacts for KnownPeers {
-    fn heard(&self, name: &str, agent: Incarnation, location: Location) {
-        if let Err(error) = self.record(Instant::now(), name, agent, location) {
+    fn heard(&self, name: &str, agent: Incarnation, location: Location, host: Option<&str>) {
+        if let Err(error) = self.record(Instant::now(), name, agent, location, host) {
             log_limit::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
         }
     }
@@ -673,8 +703,10 @@ impl Contacts for KnownPeers {
         self.directory.heard_again(Instant::now(), name);
     }
 
-    fn took(&self, name: &str) {
-        self.directory.took(Instant::now(), name);
+    fn took(&self, name: &str, location: &Location) {
+        let now = Instant::now();
+        self.directory.took(now, name);
+        self.takers.took(now, location);
     }
 
     fn publish(&self) {

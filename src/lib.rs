@@ -166,6 +166,7 @@ pub mod protocol;
 pub mod routes;
 mod sender_tasks;
 mod service;
+mod stated;
 mod user_dir;
 pub mod watch;
 

@@ -200,6 +200,28 @@ impl Service {
         self.locations.borrow().to_vec()
     }
 
+    /// Returns the current locations of the service as they are shown to people and to other platforms: each address
+    /// of a transport once, those for platforms such as JADE with their path.
+    #[cfg(feature = "net")]
+    pub(crate) fn shown_locations(&self) -> Vec<Location> {
+        let framed = self.locations();
+        let locations = self.locations.borrow();
+        let others = locations.iter().filter(|location| {
+            let same = |framed: &Location| {
+                framed.kind() == location.kind() && framed.address() == location.address()
+            };
+            location.signature() != Signature::Frames && !framed.iter().any(same)
+        });
+        let others = others.map(with_path);
+        let mut all = framed.clone();
+        for location in others.collect::<Vec<_>>() {
+            if !all.contains(&location) {
+                all.push(location);
+            }
+        }
+        all
+    }
+
     /// Returns the current locations of the service for directories, at most as many as an entry can
     /// have. The locations for legacy peers only are left out: services that confirm deliveries must
     /// not use them.
@@ -269,6 +291,23 @@ impl Service {
     }
 }
 
+/// Returns a location of HTTP with the path at which platforms write to a gateway.
+#[cfg(feature = "net")]
+fn with_path(location: &Location) -> Location {
+    let is_http = matches!(location.kind(), Kind::Http | Kind::Https);
+    let has_path = location.address().contains('/');
+    if !is_http || has_path {
+        return location.clone();
+    }
+    let address = format!("{}/acc", location.address());
+    let with = Location::new(location.kind(), &address);
+    let with = with.and_then(|with| with.with_signature(location.signature()));
+    with.map_or_else(
+        |_| location.clone(),
+        |with| with.with_incarnation(location.incarnation()),
+    )
+}
+
 /// Creates the access gate, if the configuration has access rules.
 fn gate(
     config: &Config,
@@ -306,6 +345,7 @@ fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> Co
         queue: config.mts.queue,
         queue_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
         lane_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
+        contact_networks: config.contacts.networks.clone(),
         ..CoreConfig::new(Arc::clone(&role.name), incarnation, order)
     }
 }

@@ -2,6 +2,7 @@
 
 use std::convert::Infallible;
 use std::fmt;
+use std::hash::{Hash, Hasher};
 use std::str::FromStr;
 
 use crate::escape;
@@ -12,12 +13,15 @@ use crate::word::{is_token, push_string_literal};
 ///
 /// Two identifiers are equal (`==`) if all their parts are equal. They identify the same agent if
 /// their names are equal ([`same_agent`](Self::same_agent)).
-#[derive(Clone, PartialEq, Eq, Hash)]
+///
+/// An identifier that was decoded is [received](Self::is_received). Its addresses are a claim of its sender.
+#[derive(Clone)]
 pub struct AgentId {
     name: String,
     addresses: Vec<String>,
     resolvers: Vec<Self>,
     user_defined: Vec<(String, String)>,
+    is_received: bool,
 }
 
 impl AgentId {
@@ -44,10 +48,13 @@ impl AgentId {
             addresses: Vec::new(),
             resolvers: Vec::new(),
             user_defined: Vec::new(),
+            is_received: false,
         })
     }
 
-    /// Appends a transport address. Earlier addresses are preferred.
+    /// Appends a transport address. Earlier addresses are preferred. The address of a
+    /// [received](Self::is_received) identifier counts as received, too: create a new identifier to give
+    /// an address of your own.
     ///
     /// # Errors
     /// The address is empty or has a NUL character.
@@ -92,6 +99,21 @@ impl AgentId {
         no_nul("user-defined value", &value)?;
         self.user_defined.push((name, value));
         Ok(self)
+    }
+
+    /// Marks the identifier as decoded from bytes or text; see [`is_received`](Self::is_received). All
+    /// decoders of this crate do so.
+    #[must_use]
+    pub fn received(mut self) -> Self {
+        self.is_received = true;
+        self
+    }
+
+    /// Whether the identifier was decoded, so that its addresses are not those of this program. A clone
+    /// has the same mark. The mark is not encoded, and does not take part in comparisons.
+    #[must_use]
+    pub fn is_received(&self) -> bool {
+        self.is_received
     }
 
     /// Name of the agent.
@@ -164,6 +186,27 @@ impl AgentId {
             push_string_literal(out, value);
         }
         out.push(')');
+    }
+}
+
+/// Compares all parts, but not the mark of [`AgentId::is_received`].
+impl PartialEq for AgentId {
+    fn eq(&self, other: &Self) -> bool {
+        self.name == other.name
+            && self.addresses == other.addresses
+            && self.resolvers == other.resolvers
+            && self.user_defined == other.user_defined
+    }
+}
+
+impl Eq for AgentId {}
+
+impl Hash for AgentId {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.name.hash(state);
+        self.addresses.hash(state);
+        self.resolvers.hash(state);
+        self.user_defined.hash(state);
     }
 }
 
@@ -291,6 +334,19 @@ mod tests {
         }
         let outer = AgentId::new("outer").unwrap();
         assert_eq!(outer.with_resolver(agent), Err(AgentIdError::TooDeep));
+    }
+
+    #[test]
+    fn the_mark_of_a_received_identifier_is_cloned_and_not_compared() {
+        use std::collections::HashSet;
+
+        let own = AgentId::new("bob").unwrap();
+        let received = own.clone().received();
+        assert!(!own.is_received() && received.is_received());
+        let further = received.clone().with_address("http://h/acc").unwrap();
+        assert!(further.is_received());
+        assert_eq!(own, received);
+        assert!(HashSet::from([own]).contains(&received));
     }
 
     #[test]

@@ -13,10 +13,11 @@ use fipa::{
     Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
     OpenError, Reach, RegisterError, RegisterOptions, Role, contact,
 };
+use fipa_acl::{escape, escape_name};
 use rustix::process::Signal;
 
 use crate::options;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 use crate::signals::Signals;
 
 /// Signals within this time after the first one count as the same request to end.
@@ -291,6 +292,58 @@ const INTRODUCTION_TIMEOUT: Duration = Duration::from_secs(5);
 /// Parses the address of an agent of another platform.
 pub(crate) fn address(text: &str) -> Result<String, contact::AddressError> {
     contact::location(text).map(|_| text.to_owned())
+}
+
+// The address of an agent of another platform. Not a doc comment: clap would print it as the help of the command.
+#[derive(Debug, Args)]
+pub(crate) struct Addresses {
+    /// Address of the agent, if it is an agent of another platform that is not in the directory, for example
+    /// http://10.0.0.7:7778/acc; repeatable: the next one is used after a letter was not sent to the one before
+    #[arg(long, value_name = "ADDRESS", value_parser = address)]
+    address: Vec<String>,
+}
+
+impl Addresses {
+    /// Whether an address is given.
+    pub(crate) fn is_given(&self) -> bool {
+        !self.address.is_empty()
+    }
+
+    /// Adds the addresses to the identifier of an agent, and introduces it to the gateway.
+    pub(crate) async fn of(&self, agent: &Agent, id: &AgentId) -> Result<AgentId, Failure> {
+        introduce(agent, id.clone(), &self.address).await
+    }
+}
+
+/// Maximum number of agents that a search introduces to the gateway.
+const MAX_FOUND: usize = 64;
+
+/// Introduces agents that a directory facilitator of another platform has listed to the gateway of this host, so that
+/// letters to their names reach them. Warns if the gateway refuses one.
+pub(crate) async fn introduce_found(agent: &Agent, found: impl Iterator<Item = &AgentId>) {
+    let directory = agent.domain().directory();
+    let unknown = found.filter(|id| {
+        let has_address = id
+            .addresses()
+            .iter()
+            .any(|it| contact::location(it).is_ok());
+        has_address && directory.lookup(id.name()).is_none()
+    });
+    let unknown: Vec<AgentId> = unknown.take(MAX_FOUND).cloned().collect();
+    let Some(gateway) = gateway(agent.domain()).filter(|_| !unknown.is_empty()) else {
+        return;
+    };
+    for id in unknown {
+        let introduced = contact::introduce(agent, &gateway, &id, INTRODUCTION_TIMEOUT).await;
+        if let Err(error) = introduced {
+            report::warn(&format!(
+                "letters to {} cannot be sent: {}",
+                escape_name(id.name()),
+                escape(&ErrorChain(&error).to_string())
+            ));
+            return;
+        }
+    }
 }
 
 /// Adds addresses to the identifier of an agent of another platform, and introduces the agent to the

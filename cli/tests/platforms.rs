@@ -166,8 +166,19 @@ fn an_agent_answers_a_platform_at_the_address_in_the_letter() {
     let (_gateway, http) = gateway(&host, &[]);
     let _echo = host.echo("echo@jadetest");
     // The entries of agents have no locations that only legacy peers may use.
-    let agents = host.run(&["agents", "--json"]).done_json().to_string();
-    assert!(!agents.contains("http://"), "{agents}");
+    let agents = host.run(&["agents", "--json"]).done_json();
+    for agent in agents["agents"].as_array().unwrap() {
+        let locations = agent["locations"].to_string();
+        assert!(!locations.contains("http://"), "{agents}");
+        let is_gateway = agent["role"] == "gateway";
+        let address = format!("http://{http}/acc");
+        assert_eq!(
+            agent["addresses"].to_string().contains(&address),
+            is_gateway
+        );
+    }
+    let routes = host.run(&["routes"]).done();
+    assert!(routes.contains(&format!("http://{http}/acc")), "{routes}");
     let platform = TcpListener::bind("127.0.0.1:0").unwrap();
     let here = platform.local_addr().unwrap().to_string();
     for request in REQUESTS {
@@ -339,6 +350,38 @@ fn an_agent_that_no_directory_lists_is_reached_at_a_stated_address() {
     assert_eq!(sent.receivers()[0].name(), "echo@jadetest");
     assert_eq!(sent.receivers()[0].addresses(), [address.as_str()]);
 
+    // Another address is tried after the one before did not take the letter, also with --count and --rate.
+    let closed = TcpListener::bind("127.0.0.1:0").unwrap();
+    let first = format!("http://{}/acc", closed.local_addr().unwrap());
+    drop(closed);
+    let two = [
+        "--address",
+        &address,
+        "--count",
+        "1",
+        "--rate",
+        "100",
+        "--deadline",
+        "60s",
+    ];
+    let reading = {
+        let platform = platform.try_clone().unwrap();
+        thread::spawn(move || {
+            let message = accept(&platform);
+            assert_eq!(message.receivers()[0].addresses().len(), 2);
+        })
+    };
+    let mut arguments = send("two@jadetest", &first, &[]);
+    arguments.extend(two.map(str::to_owned));
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let sent = host.run(&arguments).done();
+    assert!(sent.contains("\"delivered\":1,\"failed\":0"), "{sent}");
+    reading.join().unwrap();
+    for command in ["request", "subscribe", "ping", "do"] {
+        let help = host.run(&[command, "--help"]).done();
+        assert!(help.contains("--address"), "{command}");
+    }
+
     // The name of an agent that the directory lists cannot be taken by an address.
     let _arm = host.echo("arm_1");
     let error = run(send("arm_1", &address, &[])).failed(1);
@@ -453,4 +496,104 @@ fn the_agents_of_a_platform_are_listed_by_its_address_alone() {
     let mut names: Vec<&str> = names.map(|it| it["name"].as_str().unwrap()).collect();
     names.sort_unstable();
     assert_eq!(names, ["ams@jadetest", "df@jadetest", "echo@jadetest"]);
+}
+
+#[test]
+fn agents_that_a_foreign_directory_facilitator_lists_are_reached_by_their_names() {
+    let host = Host::new();
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    let (_gateway, http) = gateway(&host, &[]);
+    let answers = {
+        let (platform, here) = (platform.try_clone().unwrap(), here.clone());
+        thread::spawn(move || {
+            let request = accept(&platform);
+            let conversation = request.conversation_id().unwrap_or_default();
+            // Also an agent at a third host.
+            let answer = format!(
+                "(INFORM :sender (agent-identifier :name df@jade :addresses (sequence http://{here}/acc)) \
+                 :receiver (set (agent-identifier :name {})) :content \"((result (action \
+                 (agent-identifier :name df@jade) (search)) (sequence (df-agent-description :name \
+                 (agent-identifier :name df1@jade :addresses (sequence http://{here}/acc))) \
+                 (df-agent-description :name (agent-identifier :name x@evil :addresses \
+                 (sequence http://192.0.2.7:7778/acc))))))\" :language fipa-sl0 :ontology \
+                 fipa-agent-management :protocol fipa-request :conversation-id {conversation} :in-reply-to {})",
+                request.sender().unwrap().name(),
+                request.reply_with().unwrap_or("none"),
+            );
+            let to = request.sender().unwrap().name().to_owned();
+            post(&posted(&answer, &to, &http, &here), &http);
+            accept(&platform)
+        })
+    };
+    let address = format!("http://{here}/acc");
+    let search = [
+        "df",
+        "search",
+        "--df",
+        "df@jade",
+        "--address",
+        &address,
+        "--json",
+    ];
+    let ran = host.run(&search);
+    assert_eq!(ran.code, Some(0), "{ran:?}");
+    assert!(
+        ran.stderr.contains("letters to x@evil cannot be sent"),
+        "{ran:?}"
+    );
+    assert!(ran.stderr.contains("contacts.networks"), "{ran:?}");
+    let found: Value = serde_json::from_slice(&ran.stdout).unwrap();
+    assert_eq!(found["agents"].as_array().unwrap().len(), 2, "{found}");
+    let send = ["send", "--to", "df1@jade", "--content", "hello", "--json"];
+    let sent = host.run(&send).done_json();
+    assert_eq!(sent["deliveries"][0]["outcome"], "sent", "{sent}");
+    let message = answers.join().unwrap();
+    assert_eq!(message.receivers()[0].name(), "df1@jade");
+    let send = ["send", "--to", "x@evil", "--content", "hello", "--json"];
+    let (failed, _) = host.run(&send).failed_json();
+    assert_eq!(failed["deliveries"][0]["outcome"], "failed", "{failed}");
+}
+
+#[test]
+fn a_platform_finds_the_addresses_of_agents_in_the_answers_of_the_platform_agents() {
+    let host = Host::new();
+    let platform = TcpListener::bind("127.0.0.1:0").unwrap();
+    let here = platform.local_addr().unwrap().to_string();
+    let (gateway, http) = gateway(&host, &[]);
+    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
+    let mts = ready["name"].as_str().unwrap_or("mts").to_owned();
+    let crane = host.start(&["df", "register", "crane", "lifting"]);
+    let ask = |agent: &str, act: &str| {
+        let request = format!(
+            "(REQUEST :sender (agent-identifier :name seeker@jade :addresses (sequence http://{here}/acc)) \
+             :receiver (set (agent-identifier :name {agent})) :content \"((action (agent-identifier :name \
+             {agent}) {act}))\" :language fipa-sl0 :ontology fipa-agent-management :protocol fipa-request \
+             :conversation-id c1 :reply-with r1)"
+        );
+        post(&posted(&request, agent, &http, &here), &http);
+        let answer = accept(&platform);
+        let content = answer.content().unwrap().to_vec();
+        String::from_utf8(content).unwrap()
+    };
+    let crane_at = format!("crane :addresses (sequence http://{http}/acc)");
+    let plain = |text: &str| text.replace('"', "");
+    let any = "(search (df-agent-description) (search-constraints :max-results 10))";
+    let found = plain(&ask(&format!("df@{mts}"), any));
+    assert!(found.contains(&crane_at), "{found}");
+    let any = "(search (ams-agent-description) (search-constraints :max-results 10))";
+    let found = plain(&ask(&format!("ams@{mts}"), any));
+    assert!(found.contains(&crane_at), "{found}");
+    let described = plain(&ask(&format!("ams@{mts}"), "(get-description)"));
+    assert!(
+        described.contains(&format!("http://{http}/acc")),
+        "{described}"
+    );
+    // An agent of this host needs no addresses.
+    let own = host
+        .run(&["df", "search", "--json"])
+        .done_json()
+        .to_string();
+    assert!(!own.contains("http://"), "{own}");
+    drop(crane);
 }

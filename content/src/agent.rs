@@ -83,7 +83,8 @@ impl TryFrom<&Term<'_>> for AgentId {
             // JADE writes a name that is a number without quotation marks.
             Term::Number(number) => Self::new(number.as_str())?,
             name => Self::new(string("name", name)?)?,
-        };
+        }
+        .received();
         for address in sequence(term, "addresses")? {
             agent = agent.with_address(string("addresses", address)?)?;
         }

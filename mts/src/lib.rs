@@ -6,6 +6,7 @@
 //! gateway between hosts.
 
 pub mod core;
+pub mod dial;
 mod failure;
 mod gate;
 mod post;

@@ -23,8 +23,8 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, Pattern, View};
 use fipa_transport::{
-    Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
-    OwnerProcess, Principal, Transport, TransportError, TransportErrorKind, log_limit,
+    Abandoned, Attempt, Conclusion, Incarnation, Introduction, Kind, ListenError, Location,
+    Outcome, OwnerProcess, Principal, Transport, TransportError, TransportErrorKind, log_limit,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
@@ -39,6 +39,7 @@ use crate::core::{
     Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
     RouteState, SendId, Submission, Undecodable,
 };
+use crate::dial::Endpoint;
 
 /// Configuration of the runtime, in addition to that of the core.
 #[derive(Clone)]
@@ -69,8 +70,8 @@ impl fmt::Debug for RuntimeConfig {
 /// directory.
 pub trait Contacts: Send + Sync {
     /// A letter from an agent behind this location has arrived; see [`Action::Heard`]. Called with the service
-    /// locked; must not block.
-    fn heard(&self, name: &str, agent: Incarnation, location: Location);
+    /// locked; must not block. `host` is the host name that it states, if its location has an address instead.
+    fn heard(&self, name: &str, agent: Incarnation, location: Location, host: Option<&str>);
 
     /// A known agent has sent another letter; see [`Action::HeardAgain`]. Called with the service locked; must not
     /// block.
@@ -78,7 +79,7 @@ pub trait Contacts: Send + Sync {
 
     /// An agent of a legacy peer has taken a letter; see [`Action::Taken`]. Called with the service locked; must
     /// not block.
-    fn took(&self, name: &str);
+    fn took(&self, name: &str, location: &Location);
 
     /// Publishes the agents of [`heard`](Self::heard) to the processes of this host. Called without the service
     /// locked, because it may write files.
@@ -445,6 +446,24 @@ impl Mts {
         }
     }
 
+    /// Fails a letter for an agent that cannot be reached at any of its addresses; see
+    /// [`Core::fail_unreachable`].
+    pub fn fail_unreachable(
+        &self,
+        sender: Incarnation,
+        letter: Letter,
+        receiver: Arc<str>,
+        attempts: Vec<Attempt>,
+    ) -> Sending {
+        self.begin(|core, now| {
+            let letter = (sender, letter);
+            (
+                core.fail_unreachable(now, letter, receiver, attempts),
+                Some(1),
+            )
+        })
+    }
+
     /// Sends a letter to exactly this incarnation of an agent; see [`Core::send_to`].
     pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
         self.begin(|core, now| (core.send_to(now, submission, entry), Some(1)))
@@ -653,7 +672,15 @@ impl Shared {
             *place = found;
         }
         let all = locations.iter().flat_map(|(_, of_one)| of_one).cloned();
-        self.located.send_replace(all.collect());
+        let all: Arc<[Location]> = all.collect();
+        self.located.send_replace(Arc::clone(&all));
+        drop(locations);
+        let networked = all.iter().filter(|it| !it.kind().is_host_local());
+        let own = networked.filter_map(|location| match Endpoint::of(location)? {
+            Endpoint::Numeric(at) => Some(at),
+            Endpoint::Named(..) => None,
+        });
+        self.state.lock().core.listens_at(own.collect());
     }
 
     fn transport(&self, kind: Kind) -> Option<&Arc<dyn Transport>> {
@@ -766,9 +793,10 @@ impl Shared {
                     name,
                     agent,
                     location,
+                    host,
                 } => {
                     if let Some(contacts) = &self.config.contacts {
-                        contacts.heard(&name, agent, location);
+                        contacts.heard(&name, agent, location, host.as_deref());
                         state.update_view(&*self.directory);
                         rest.has_heard = true;
                     }
@@ -778,9 +806,9 @@ impl Shared {
                         contacts.heard_again(&name);
                     }
                 }
-                Action::Taken { name } => {
+                Action::Taken { name, location } => {
                     if let Some(contacts) = &self.config.contacts {
-                        contacts.took(&name);
+                        contacts.took(&name, &location);
                     }
                 }
                 // One refresh is enough for all that were requested before it.

@@ -44,13 +44,13 @@ struct Publishing {
 }
 
 impl Contacts for Publishing {
-    fn heard(&self, name: &str, _: Incarnation, _: Location) {
+    fn heard(&self, name: &str, _: Incarnation, _: Location, _: Option<&str>) {
         self.events.lock().push(Event::Heard(name.to_owned()));
     }
 
     fn heard_again(&self, _: &str) {}
 
-    fn took(&self, _: &str) {}
+    fn took(&self, _: &str, _: &Location) {}
 
     fn publish(&self) {
         let service = self.service.get().unwrap().clone();

@@ -471,6 +471,7 @@ fn an_unknown_sender_becomes_a_contact() {
             name,
             agent,
             location,
+            ..
         }) => {
             assert_eq!((&*name, agent, location), ("rover", ROVER, tcp(0x1)));
         }

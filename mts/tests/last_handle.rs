@@ -29,11 +29,11 @@ struct Halting {
 }
 
 impl Contacts for Halting {
-    fn heard(&self, _: &str, _: Incarnation, _: Location) {}
+    fn heard(&self, _: &str, _: Incarnation, _: Location, _: Option<&str>) {}
 
     fn heard_again(&self, _: &str) {}
 
-    fn took(&self, _: &str) {}
+    fn took(&self, _: &str, _: &Location) {}
 
     fn publish(&self) {}
 

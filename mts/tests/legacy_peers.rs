@@ -288,6 +288,7 @@ fn heard(core: &mut Core) -> Vec<(String, String)> {
             name,
             agent,
             location,
+            ..
         } => {
             assert!(!agent.is_known());
             Some((name, location.to_string()))
@@ -337,7 +338,7 @@ fn written_by(core: &mut Core, then: Now, agents: std::ops::Range<u32>) {
     for number in agents {
         let name = format!("agent-{number}");
         let sender = AgentId::new(name).unwrap();
-        let sender = sender.with_address("tcp://127.0.0.1:9").unwrap();
+        let sender = sender.with_address("tcp://127.0.0.1:2009").unwrap();
         let message = Message::builder(Performative::Inform)
             .sender(sender)
             .receiver(AgentId::new("echo").unwrap())
@@ -405,6 +406,7 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_until_it_is_silent() {
                 name,
                 agent,
                 location,
+                ..
             } => {
                 let heard = contacts.heard(then.instant, &name, agent, location);
                 Some(if heard.is_ok() { "known" } else { "refused" })
@@ -417,16 +419,16 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_until_it_is_silent() {
         });
         action.unwrap_or("ignored")
     };
-    assert_eq!(writes(0, HERE, 1000), "known");
-    assert_eq!(writes(50, HERE, 1000), "heard again");
-    assert_eq!(writes(100, elsewhere, 1000), "refused");
+    assert_eq!(writes(0, HERE, 3000), "known");
+    assert_eq!(writes(50, HERE, 3000), "heard again");
+    assert_eq!(writes(100, elsewhere, 3000), "refused");
     assert_eq!(writes(101, HERE, 2000), "known", "its location has changed");
-    assert_eq!(writes(160, elsewhere, 1000), "refused");
+    assert_eq!(writes(160, elsewhere, 3000), "refused");
     let at = || contacts.lookup("cpp-sender").unwrap().locations[0].to_string();
     assert_eq!(at(), "tcp://127.0.0.1:2000;fipa-services");
     // It has been silent for a minute.
-    assert_eq!(writes(161, elsewhere, 1000), "known");
-    assert_eq!(at(), "tcp://10.0.0.66:1000;fipa-services");
+    assert_eq!(writes(161, elsewhere, 3000), "known");
+    assert_eq!(at(), "tcp://10.0.0.66:3000;fipa-services");
 }
 
 /// A letter with a truncated message.
@@ -601,7 +603,7 @@ fn a_sender_whose_letters_all_fail_does_not_use_up_the_limit_of_another() {
     let mut core = core(true, &[]);
     let deadline = Duration::from_secs(5);
     let letter_of = |name: &str| {
-        let at = format!("tcp://127.0.0.1:{}", 1000 + name.len());
+        let at = format!("tcp://127.0.0.1:{}", 2000 + name.len());
         let sender = AgentId::new(name).unwrap().with_address(&at).unwrap();
         let message = Message::builder(Performative::Inform)
             .sender(sender)

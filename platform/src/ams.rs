@@ -9,12 +9,15 @@ use fipa_acl::{AgentId, Message, Performative};
 use fipa_content::{Content, Dialect, Term, Wff};
 
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
-use crate::df::{authorize, result};
+use crate::df::{addresses_for, authorize, result};
 use crate::exception::Exception;
 use crate::kept::{KeptDescription, Text, left, read_object};
 use crate::request::{self, Rejection, Request};
 use crate::search::max_results;
-use crate::{AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, limits};
+use crate::{
+    AddressBook, AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, limits,
+    located,
+};
 
 /// The agent management system of a platform.
 ///
@@ -32,6 +35,7 @@ pub struct Ams {
     foreign: BTreeMap<(Platform, Arc<str>), Foreign>,
     answers: VecDeque<Answer>,
     revision: u64,
+    addresses: Option<AddressBook>,
 }
 
 impl fmt::Debug for Ams {
@@ -72,6 +76,16 @@ impl Ams {
             foreign: BTreeMap::new(),
             answers: VecDeque::new(),
             revision: 0,
+            addresses: None,
+        }
+    }
+
+    /// Adds addresses to the agents of this host in answers.
+    #[must_use]
+    pub fn with_addresses(self, addresses: AddressBook) -> Self {
+        Self {
+            addresses: Some(addresses),
+            ..self
         }
     }
 
@@ -351,13 +365,16 @@ impl Ams {
         let foreign = foreign
             .filter(|((platform, _), _)| *platform == asker.platform)
             .map(|(_, agent)| agent.description.clone());
-        for description in residents.chain(foreign) {
+        let addresses = addresses_for(self.addresses.as_ref(), asker);
+        let residents = residents.map(|description| (description, &addresses[..]));
+        for (mut description, addresses) in residents.chain(foreign.map(|it| (it, &[][..]))) {
             if found.len() >= most {
                 break;
             }
             if !matches(template, &description) {
                 continue;
             }
+            description.name = description.name.map(|name| located(name, addresses));
             let Ok(text) = request::print(asker.dialect, &description.to_term()) else {
                 continue;
             };

@@ -1,5 +1,6 @@
 //! The directory facilitator: the services of agents (FIPA00023 clause 4.1).
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
@@ -15,7 +16,9 @@ use crate::remote::{self, LocalEntry, RemoteEntry};
 use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
 use crate::subscription::{Subscription, checked_template};
-use crate::{AgentDescription, Answer, Asker, Now, Platform, SubscriptionId, limits};
+use crate::{
+    AddressBook, AgentDescription, Answer, Asker, Now, Platform, SubscriptionId, limits, located,
+};
 
 /// The directory facilitator of a platform.
 ///
@@ -47,6 +50,7 @@ pub struct Df {
     known_search_ids: HashSet<Arc<str>>,
     answers: VecDeque<Answer>,
     revision: u64,
+    addresses: Option<AddressBook>,
 }
 
 impl fmt::Debug for Df {
@@ -95,6 +99,30 @@ impl Entry {
     }
 }
 
+impl Entry {
+    /// Returns the description for an asker whose platform reaches the agents of this host at these addresses.
+    fn located(&self, addresses: &[String]) -> Cow<'_, AgentDescription> {
+        let description = Cow::Borrowed(&self.description);
+        match &self.description.name {
+            Some(name) if self.platform == Platform::Host && !addresses.is_empty() => {
+                Cow::Owned(AgentDescription {
+                    name: Some(located(name.clone(), addresses)),
+                    ..description.into_owned()
+                })
+            }
+            _ => description,
+        }
+    }
+}
+
+/// Returns the addresses under which the platform of an asker reaches the agents of this host.
+pub(crate) fn addresses_for(book: Option<&AddressBook>, asker: &Asker) -> Vec<String> {
+    match book {
+        Some(book) if asker.platform != Platform::Host => book(&asker.id),
+        _ => Vec::new(),
+    }
+}
+
 struct Remote {
     source: u64,
     text: Arc<str>,
@@ -124,6 +152,16 @@ impl Df {
             known_search_ids: HashSet::new(),
             answers: VecDeque::new(),
             revision: 0,
+            addresses: None,
+        }
+    }
+
+    /// Adds addresses to the agents of this host in answers.
+    #[must_use]
+    pub fn with_addresses(self, addresses: AddressBook) -> Self {
+        Self {
+            addresses: Some(addresses),
+            ..self
         }
     }
 
@@ -482,7 +520,7 @@ impl Df {
                     request.arguments([DESCRIPTION, crate::description::CONSTRAINTS])?;
                 let template = checked_template(AgentDescription::from_term(template)?)?;
                 let constraints = Constraints::from_term(constraints)?;
-                let found = self.search(&template, &constraints, asker.dialect)?;
+                let found = self.search(&template, &constraints, asker)?;
                 result(request, found, asker.dialect)
             }
             other => Err(Exception::UnsupportedFunction(other.to_owned())),
@@ -619,8 +657,9 @@ impl Df {
         &mut self,
         template: &AgentDescription,
         constraints: &Constraints,
-        dialect: Dialect,
+        asker: &Asker,
     ) -> Result<Vec<Vec<u8>>, Exception> {
+        let dialect = asker.dialect;
         if let Some(id) = &constraints.search_id {
             let (most, longest) = limits::SEARCH_IDS;
             if id.len() > longest {
@@ -645,12 +684,13 @@ impl Df {
         let most = max_results(constraints.max_results);
         let mut comparisons = Comparisons::default();
         let mut found = Found::new(limits::RESULT_BYTES);
+        let addresses = addresses_for(self.addresses.as_ref(), asker);
         for entry in self.entries.values() {
             if found.texts.len() >= most {
                 break;
             }
             if comparisons.agent(template, &entry.description)?
-                && !found.add(&entry.description, dialect)
+                && !found.add(&entry.located(&addresses), dialect)
             {
                 return Ok(found.texts);
             }
@@ -832,15 +872,20 @@ impl Df {
                 continue;
             }
             let mut found = Found::new(limits::NOTIFICATION_BYTES);
+            let addresses = addresses_for(self.addresses.as_ref(), &subscription.asker);
             while found.texts.len() < limits::RESULTS
                 && let Some(name) = subscription.changed.pop_first()
             {
                 subscription.leaves(&name);
                 let dialect = subscription.dialect();
-                let own = self.entries.get(&name).map(|entry| &entry.description);
-                let remote = || self.remote.get(&name)?.description.as_ref();
+                let own = self.entries.get(&name);
+                let own = own.map(|entry| entry.located(&addresses));
+                let remote = || {
+                    let remote = self.remote.get(&name)?.description.as_ref();
+                    remote.map(Cow::Borrowed)
+                };
                 let has_room = match own.or_else(remote) {
-                    Some(description) => found.add(description, dialect),
+                    Some(description) => found.add(&description, dialect),
                     // A description without services reports the end of the registration, as in JADE.
                     None => match AgentId::new(&*name) {
                         Ok(agent) => {

@@ -189,6 +189,21 @@ pub enum Platform {
     Unproved,
 }
 
+/// Returns the addresses under which the platform of an asker, with this identifier, reaches the agents of this host;
+/// empty if it needs none. Answers have them in the identifiers of agents of this host without addresses.
+pub type AddressBook = Arc<dyn Fn(&AgentId) -> Vec<String> + Send + Sync>;
+
+/// Returns an identifier with these addresses if it has none.
+pub(crate) fn located(id: AgentId, addresses: &[String]) -> AgentId {
+    if !id.addresses().is_empty() {
+        return id;
+    }
+    addresses.iter().fold(id, |id, address| {
+        let with = id.clone().with_address(address.as_str());
+        with.unwrap_or(id)
+    })
+}
+
 /// A message that an agent of this crate sends.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]

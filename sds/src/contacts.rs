@@ -5,6 +5,7 @@
 //! contact has no end by time: it stays until its place is needed.
 
 use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -26,6 +27,9 @@ pub enum ContactError {
     /// [`ContactDirectory::SILENCE`].
     #[error("an agent at {0} has the name")]
     Taken(Location),
+    /// The agent has no location.
+    #[error("the agent has no address")]
+    NoLocation,
     /// All contacts that could make room are [pinned](ContactDirectory::pin).
     #[error("the contacts of this host and its source are all in use")]
     Full,
@@ -63,6 +67,8 @@ struct Contact {
     entry: Arc<Entry>,
     host: PeerId,
     rank: Rank,
+    /// The host name in the address that it states, which was replaced by the address of its connection.
+    host_name: Option<Box<str>>,
     /// The time of the last letter in either direction.
     used: Instant,
     /// The time of its last letter.
@@ -176,14 +182,62 @@ impl ContactDirectory {
         incarnation: Incarnation,
         location: Location,
     ) -> Result<Heard, ContactError> {
-        let gateway = location.incarnation();
-        let host = PeerId::of(Principal::Unproved, Some(&location));
+        self.record(now, (name, incarnation), vec![location], None, false)
+    }
+
+    /// Records an agent like [`heard`](Self::heard), whose address states this host name instead of the address of its
+    /// connection.
+    ///
+    /// # Errors
+    /// As for [`heard`](Self::heard).
+    pub fn heard_of_host(
+        &self,
+        now: Instant,
+        name: &str,
+        location: Location,
+        host_name: &str,
+    ) -> Result<Heard, ContactError> {
+        let agent = (name, Incarnation::UNKNOWN);
+        self.record(now, agent, vec![location], Some(host_name), false)
+    }
+
+    /// Records an agent of another platform at these locations, the preferred one first, because an agent of this
+    /// host wants to write to it. With `is_given`, the operator or a program of this host gave the locations, which
+    /// replace those of an agent without a registration that has the name.
+    ///
+    /// # Errors
+    /// As for [`heard`](Self::heard), and if `locations` is empty.
+    pub fn introduce(
+        &self,
+        now: Instant,
+        name: &str,
+        locations: Vec<Location>,
+        is_given: bool,
+    ) -> Result<Heard, ContactError> {
+        if locations.is_empty() {
+            return Err(ContactError::NoLocation);
+        }
+        let agent = (name, Incarnation::UNKNOWN);
+        self.record(now, agent, locations, None, is_given)
+    }
+
+    fn record(
+        &self,
+        now: Instant,
+        (name, incarnation): (&str, Incarnation),
+        locations: Vec<Location>,
+        host_name: Option<&str>,
+        is_given: bool,
+    ) -> Result<Heard, ContactError> {
+        let first = locations.first();
+        let gateway = first.map_or(Incarnation::UNKNOWN, Location::incarnation);
+        let host = PeerId::of(Principal::Unproved, first);
         let entry = Entry {
             name: name.into(),
             agent_type: String::new(),
             incarnation,
             mts: Mts::unnamed(gateway),
-            locations: vec![location],
+            locations,
             description: String::new(),
             registered: time_of_millis(millis_of_time(SystemTime::now())),
             source: Source::Contact,
@@ -196,13 +250,19 @@ impl ContactDirectory {
         let known = contacts.all.get(name);
         if let Some(known) = known {
             if known.entry.incarnation == incarnation && known.entry.locations == entry.locations {
-                contacts.use_now(now, name, |contact| contact.heard = now);
+                contacts.use_now(now, name, |contact| {
+                    contact.heard = now;
+                    if let Some(host_name) = host_name {
+                        contact.host_name = Some(host_name.into());
+                    }
+                });
                 return Ok(Heard::default());
             }
             let is_in_use = now.saturating_duration_since(known.used) < Self::SILENCE;
             let is_same = known.host == host
                 && (!gateway.is_known() || known.entry.mts.incarnation == gateway);
-            if !is_same && is_in_use {
+            let is_replaced = is_given && !known.entry.incarnation.is_known();
+            if !is_same && is_in_use && !is_replaced {
                 let taken = known.entry.locations.first();
                 return Err(taken.map_or(ContactError::Full, |it| ContactError::Taken(it.clone())));
             }
@@ -235,6 +295,7 @@ impl ContactDirectory {
             entry,
             host,
             rank,
+            host_name: host_name.map(Into::into),
             used: now,
             heard: now,
         });
@@ -267,6 +328,27 @@ impl ContactDirectory {
     pub fn took(&self, now: Instant, name: &str) {
         let mut contacts = self.contacts.lock();
         contacts.use_now(now, name, |contact| contact.rank.is_answered = true);
+    }
+
+    /// Returns the addresses of the hosts that state this host name in the addresses of their agents, at most two.
+    #[must_use]
+    pub fn hosts_named(&self, host_name: &str) -> Vec<IpAddr> {
+        let contacts = self.contacts.lock();
+        let mut found: Vec<IpAddr> = Vec::new();
+        for contact in contacts.all.values() {
+            let states_it = contact.host_name.as_deref() == Some(host_name);
+            let location = contact.entry.locations.first().filter(|_| states_it);
+            let at = location.and_then(|it| it.authority().parse::<SocketAddr>().ok());
+            if let Some(at) = at
+                && !found.contains(&at.ip())
+            {
+                found.push(at.ip());
+                if found.len() >= 2 {
+                    break;
+                }
+            }
+        }
+        found
     }
 
     /// Sets the names of contacts that stay, because they have left something here that refers to them, such as a
@@ -379,6 +461,54 @@ mod tests {
         let next = contacts.forget(month, &nothing());
         assert_eq!(next, Some(month + ContactDirectory::UNLISTED));
         assert!(contacts.lookup("arm").is_some());
+    }
+
+    #[test]
+    fn an_introduced_agent_has_all_its_locations_in_their_order() {
+        let contacts = ContactDirectory::new();
+        let now = Instant::now();
+        let at = |hosts: &[u8]| -> Vec<Location> {
+            let texts = hosts
+                .iter()
+                .map(|it| format!("http://192.0.2.{it}:7778/acc"));
+            texts.map(|it| it.parse().unwrap()).collect()
+        };
+        contacts
+            .introduce(now, "echo@jade", at(&[2, 1]), false)
+            .unwrap();
+        assert_eq!(contacts.lookup("echo@jade").unwrap().locations, at(&[2, 1]));
+        // A received identifier does not move the agent; the operator does.
+        let moved = contacts.introduce(now, "echo@jade", at(&[3]), false);
+        assert!(matches!(moved, Err(ContactError::Taken(_))), "{moved:?}");
+        contacts
+            .introduce(now, "echo@jade", at(&[3]), true)
+            .unwrap();
+        assert_eq!(contacts.lookup("echo@jade").unwrap().locations, at(&[3]));
+        // A registered agent of another gateway keeps its name.
+        contacts
+            .heard(now, "arm", incarnation(1), location())
+            .unwrap();
+        let moved = contacts.introduce(now, "arm", at(&[3]), true);
+        assert!(matches!(moved, Err(ContactError::Taken(_))), "{moved:?}");
+        assert!(contacts.introduce(now, "none", Vec::new(), true).is_err());
+    }
+
+    #[test]
+    fn a_host_name_leads_to_the_hosts_that_state_it() {
+        let contacts = ContactDirectory::new();
+        let state = |name: &str, host: u8| {
+            let at = format!("http://192.0.2.{host}:7778/acc").parse().unwrap();
+            let now = Instant::now();
+            contacts.heard_of_host(now, name, at, "crex").unwrap();
+        };
+        assert!(contacts.hosts_named("crex").is_empty());
+        state("a@crex", 1);
+        state("b@crex", 1);
+        let first: IpAddr = "192.0.2.1".parse().unwrap();
+        assert_eq!(contacts.hosts_named("crex"), [first]);
+        state("c@crex", 2);
+        assert_eq!(contacts.hosts_named("crex").len(), 2);
+        assert!(contacts.hosts_named("other").is_empty());
     }
 
     /// A platform keeps its names while it is silent for less than a minute, whoever else states them.

@@ -49,6 +49,9 @@ const MAX_PEERS: usize = 1024;
 /// Maximum number of addresses in `security.legacy_peers`.
 const MAX_LEGACY_PEERS: usize = 64;
 
+/// Maximum number of networks in `contacts.networks`.
+const MAX_NETWORKS: usize = 64;
+
 /// Lower bound of `security.peer_bytes`, in bytes per second: idle connections need some to stay open.
 const MIN_PEER_BYTES: u64 = 64 << 10;
 
@@ -126,6 +129,10 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
+    if config.contacts.networks.len() > MAX_NETWORKS {
+        let path = ["contacts", "networks"];
+        found.too_many(&path, config.contacts.networks.len(), MAX_NETWORKS);
+    }
     found.access(&config.access);
     found.heartbeat(config.monitor.heartbeat);
     found.protocols(&config.monitor.protocols);

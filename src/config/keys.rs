@@ -262,6 +262,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| size_text(config.security.peer_bytes),
     },
     Key {
+        path: &["contacts", "networks"],
+        shape: Shape::List,
+        expected: r#"a list of networks such as ["10.0.0.0/8"]"#,
+        write: |config, value| items(value, parsed).map(|all| config.contacts.networks = all),
+        read: |config| Value::list(&config.contacts.networks),
+    },
+    Key {
         path: &["access", "rate"],
         shape: Shape::Plain,
         expected: "a number of letters per second such as 100, or 0 for no limit",

@@ -7,23 +7,27 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape, escape_name};
 use fipa_mts::core::{Received, Submission};
+use fipa_mts::dial::{Endpoint, Network};
 use fipa_mts::{Contacts as _, letter_for};
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query, Source};
-use fipa_transport::{Incarnation, log_limit};
+use fipa_transport::{Incarnation, Location, log_limit};
 use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
+use tokio::task::JoinSet;
 
 use super::KnownPeers;
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
+use super::introductions::Grounds;
 use super::namesakes::Namesakes;
 use super::neighbours::Neighbours;
 use super::presence::{QuestionRates, Questions};
-use crate::contact;
+use crate::contact::{self, Introduced};
 use crate::presence;
 use crate::routes;
 use crate::service::Service;
@@ -52,14 +56,57 @@ pub(crate) struct GatewayAgent {
     /// The questions of agents of this host about agents of other hosts.
     pub(super) questions: Mutex<Questions>,
     pub(super) question_rates: Mutex<QuestionRates>,
+    /// `contacts.networks` of the configuration.
+    pub(super) networks: Vec<Network>,
+}
+
+/// Maximum number of introductions that are judged at a time.
+const MAX_INTRODUCTIONS: usize = 16;
+
+fn is_introduction(message: &Message) -> bool {
+    message.ontology() == Some(contact::ONTOLOGY)
+        && *message.performative() == Performative::Request
+}
+
+/// Returns the addresses at which the gateway listens on the network.
+fn own_addresses(service: &Service) -> Vec<SocketAddr> {
+    let locations = service.all_locations().into_iter();
+    let networked = locations.filter(|it| !it.kind().is_host_local());
+    let own = networked.filter_map(|location| match Endpoint::of(&location)? {
+        Endpoint::Numeric(at) => Some(at),
+        Endpoint::Named(..) => None,
+    });
+    own.collect()
 }
 
 impl GatewayAgent {
     /// Reads and answers letters until the service ends.
-    pub(crate) async fn run(self) {
+    pub(crate) async fn run(self: Arc<Self>) {
         let (mts, own) = (&self.service.mts, self.service.own.incarnation);
+        // They may resolve host names.
+        let mut introductions = JoinSet::new();
         while let Some(received) = mts.receive(own).await {
+            while introductions.try_join_next().is_some() {}
             match Message::decode(received.letter.payload()) {
+                Ok(message) if is_introduction(&message) => {
+                    let (agent, sender) = (Arc::clone(&self), received.sender);
+                    let is_remote = received.remote;
+                    let has_room = introductions.len() < MAX_INTRODUCTIONS;
+                    introductions.spawn(async move {
+                        let introduced = match (is_remote, has_room) {
+                            (true, _) => {
+                                Err("only agents of the gateway's host may introduce others"
+                                    .to_owned())
+                            }
+                            (_, false) => {
+                                Err("the gateway resolves too many host names; try again"
+                                    .to_owned())
+                            }
+                            _ => agent.introduce(&message).await,
+                        };
+                        agent.answer_introduction(&message, sender, introduced);
+                    });
+                }
                 Ok(message) => self.handle(&message, &received),
                 Err(error) => {
                     log_limit::info!(of: received.service, %error, "cannot decode a letter to the gateway")
@@ -114,54 +161,78 @@ impl GatewayAgent {
                 });
             }
             Some(routes::ONTOLOGY) => self.answer_routes(message, sender),
-            Some(contact::ONTOLOGY) => {
-                let content = message.content().map(|content| &content[..]);
-                let introduced = match received.remote {
-                    true => {
-                        Err("only agents of the gateway's host may introduce others".to_owned())
-                    }
-                    false => self.introduce(content.unwrap_or_default()),
-                };
-                match introduced {
-                    Ok(()) => self.answer(message, sender, Performative::Inform, |answer| answer),
-                    Err(reason) => {
-                        self.answer(message, sender, Performative::Refuse, |answer| {
-                            answer.content(reason)
-                        });
-                    }
-                }
-            }
             _ => self.answer(message, sender, Performative::NotUnderstood, |answer| {
                 answer.content("the gateway does not support this ontology")
             }),
         }
     }
 
-    /// Records an agent of another platform at the first of its stated locations for which this gateway
-    /// has a transport. Returns the reason if it does not.
-    fn introduce(&self, content: &[u8]) -> Result<(), String> {
-        let (name, locations) = contact::read(content)?;
-        let mut used = locations.iter();
-        let Some(location) = used.find(|it| self.service.uses(it.kind())) else {
+    /// Records an agent of another platform at those of its locations that this gateway dials. Returns the reason if
+    /// there are none.
+    async fn introduce(&self, message: &Message) -> Result<(), String> {
+        let content = message.content().map(|content| &content[..]);
+        let introduced = contact::read(content.unwrap_or_default())?;
+        let Introduced {
+            name,
+            locations,
+            is_received,
+        } = introduced;
+        let used = locations.iter().filter(|it| self.service.uses(it.kind()));
+        let used: Vec<Location> = used.cloned().collect();
+        if used.is_empty() {
             let kinds: BTreeSet<_> = locations.iter().map(|it| it.kind().name()).collect();
             let kinds: Vec<_> = kinds.into_iter().collect();
             return Err(format!(
                 "the gateway does not use {}; list it in mts.transports",
                 kinds.join(" or ")
             ));
-        };
-        if let Some(known) = self.view.lookup(&name)
-            && !known.locations.contains(location)
-            && (known.source != Source::Contact || known.incarnation.is_known())
-        {
-            return Err("the directory lists another agent of this name".to_owned());
         }
-        let (now, agent) = (Instant::now(), Incarnation::UNKNOWN);
+        if let Some(known) = self.view.lookup(&name) {
+            // Letters to a known name go where the directory says, whatever a received identifier states.
+            if is_received {
+                return Ok(());
+            }
+            let is_there = used.iter().any(|it| known.locations.contains(it));
+            let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
+            if !is_there && !is_contact {
+                return Err("the directory lists another agent of this name".to_owned());
+            }
+        }
+        let dialed = match is_received {
+            false => used,
+            true => {
+                let grounds = Grounds {
+                    takers: &self.contacts.takers,
+                    contacts: &self.contacts.directory,
+                    networks: &self.networks,
+                    own: own_addresses(&self.service),
+                };
+                let judged = grounds.judge(&used).await;
+                if judged.permitted.is_empty() {
+                    return Err(judged.reasons());
+                }
+                judged.permitted
+            }
+        };
         self.contacts
-            .record(now, &name, agent, location.clone())
+            .introduce(&name, dialed, !is_received)
             .map_err(|error| ErrorChain(&error).to_string())?;
         self.contacts.publish();
         Ok(())
+    }
+
+    fn answer_introduction(
+        &self,
+        message: &Message,
+        sender: Incarnation,
+        introduced: Result<(), String>,
+    ) {
+        match introduced {
+            Ok(()) => self.answer(message, sender, Performative::Inform, |answer| answer),
+            Err(reason) => self.answer(message, sender, Performative::Refuse, |answer| {
+                answer.content(reason)
+            }),
+        }
     }
 
     /// Logs a notice about a name that another gateway sent to the operator of this one.
@@ -208,6 +279,7 @@ impl GatewayAgent {
             contested: self.exchange.contested(),
             namesakes: self.namesakes.found(Instant::now()),
             configuration: self.configuration.lock().clone(),
+            locations: self.service.shown_locations(),
             ..self.service.report(&entries)
         };
         Ok(serde_json::to_vec(&report)?)

@@ -5,16 +5,18 @@
 //! descriptions in the directory facilitators of gateways travel with the exchange of their directories.
 
 use std::collections::HashSet;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, escape_name};
 use fipa_content::Dialect;
 use fipa_mts::core::{Received, Submission};
+use fipa_mts::dial::Endpoint;
 use fipa_mts::{Sending, letter_for};
 use fipa_platform::{
-    Ams, Answer, ApDescription, Asker, Df, LocalEntry, Now, Platform, RemoteEntry, Resident,
-    SubscriptionId, limits,
+    AddressBook, Ams, Answer, ApDescription, Asker, Df, LocalEntry, Now, Platform, RemoteEntry,
+    Resident, SubscriptionId, limits,
 };
 use fipa_sds::{
     DfEntry, Directory, Entry, Exchange, MergedDirectory, OwnDfEntry, Reach, RegisterError,
@@ -146,7 +148,7 @@ impl PlatformAgents {
     /// Describes the platform: the gateway, and its addresses on the network.
     fn description(&self) -> ApDescription {
         let mut services: Vec<(String, Vec<String>)> = Vec::new();
-        for location in self.service.locations() {
+        for location in self.service.shown_locations() {
             let kind = location.kind();
             if kind.is_host_local() {
                 continue;
@@ -161,6 +163,17 @@ impl PlatformAgents {
             name: self.service.name.to_string(),
             services,
         }
+    }
+
+    /// Returns the addresses under which agents of legacy platforms reach the agents of this host.
+    fn address_book(&self) -> AddressBook {
+        let (service, view) = (Arc::clone(&self.service), Arc::clone(&self.view));
+        Arc::new(move |asker| {
+            let entry = view.lookup(asker.name());
+            let entry = entry.filter(|it| !it.incarnation.is_known());
+            let first = entry.and_then(|it| it.locations.first().cloned());
+            first.map_or_else(Vec::new, |it| reached_at(&service.shown_locations(), &it))
+        })
     }
 
     /// Returns the entries of the directory facilitators of other gateways. An entry counts only while
@@ -318,8 +331,11 @@ impl Task {
         let own = enter(&means, kind, configured.into())?;
         let id = own.id.clone();
         let core = match kind {
-            Kind::Ams => Core::Ams(Ams::new(id, means.description())),
-            Kind::Df => Core::Df(Df::new(id)),
+            Kind::Ams => {
+                let ams = Ams::new(id, means.description());
+                Core::Ams(ams.with_addresses(means.address_book()))
+            }
+            Kind::Df => Core::Df(Df::new(id).with_addresses(means.address_book())),
         };
         let mut task = Self {
             means,
@@ -646,6 +662,47 @@ impl Task {
     }
 }
 
+/// Maximum number of addresses in an identifier of an agent of this host.
+const MAX_ADDRESSES: usize = 4;
+
+/// Returns the addresses of this gateway under which the platform at a location reaches it: those of the same kind, and
+/// of them the one on the way to the platform, if there is one.
+fn reached_at(own: &[Location], platform: &Location) -> Vec<String> {
+    let same = own.iter().filter(|it| it.kind() == platform.kind());
+    let same: Vec<(Option<IpAddr>, String)> = same
+        .map(|location| {
+            let ip = match Endpoint::of(location) {
+                Some(Endpoint::Numeric(at)) => Some(at.ip().to_canonical()),
+                _ => None,
+            };
+            (ip, format!("{}://{}", location.kind(), location.address()))
+        })
+        .collect();
+    let way = match Endpoint::of(platform) {
+        Some(Endpoint::Numeric(at)) => local_address_to(at),
+        _ => None,
+    };
+    let on_way = same.iter().find(|(ip, _)| way.is_some() && *ip == way);
+    match on_way {
+        Some((_, address)) => vec![address.clone()],
+        None => {
+            let all = same.into_iter().map(|(_, address)| address);
+            all.take(MAX_ADDRESSES).collect()
+        }
+    }
+}
+
+/// Returns the address of this host in packets to another one. Nothing is sent.
+fn local_address_to(at: SocketAddr) -> Option<IpAddr> {
+    let any: SocketAddr = match at {
+        SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
+        SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+    };
+    let socket = UdpSocket::bind(any).ok()?;
+    socket.connect(at).ok()?;
+    Some(socket.local_addr().ok()?.ip().to_canonical())
+}
+
 fn now() -> Now {
     Now {
         at: Instant::now(),
@@ -688,4 +745,25 @@ fn entry(
         registered: known.map_or(registration.registered, |known| known.registered),
         ..registration
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_platform_reaches_this_gateway_on_the_way_to_it() {
+        let at = |text: &str| -> Location { text.parse().unwrap() };
+        let own = [
+            at("tcp://127.0.0.1:7788"),
+            at("http://192.0.2.1:7778/acc"),
+            at("http://127.0.0.1:7778/acc"),
+        ];
+        let reached = reached_at(&own, &at("http://127.0.0.1:27778/acc"));
+        assert_eq!(reached, ["http://127.0.0.1:7778/acc"]);
+        // The way to a platform with a host name is not known.
+        let reached = reached_at(&own, &at("http://crex:7778/acc"));
+        assert_eq!(reached.len(), 2);
+        assert!(reached_at(&own, &at("https://127.0.0.1:443/acc")).is_empty());
+    }
 }

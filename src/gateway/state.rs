@@ -71,6 +71,9 @@ struct KeptContact {
     name: Arc<str>,
     agent: u64,
     location: String,
+    /// Its further locations.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    further: Vec<String>,
     /// The certificate of the gateway of the agent.
     certificate: Option<[u8; 32]>,
 }
@@ -365,9 +368,16 @@ impl StateFile {
         };
         for (contact, location) in predecessor.contacts(&self.trust) {
             let agent = Incarnation::from_u64(contact.agent);
-            let heard = self
-                .contacts
-                .heard(Instant::now(), &contact.name, agent, location);
+            let now = Instant::now();
+            let further = contact.further.iter().filter_map(|it| it.parse().ok());
+            let further: Vec<Location> = further.take(Entry::MAX_LOCATIONS - 1).collect();
+            let heard = match further.is_empty() {
+                true => self.contacts.heard(now, &contact.name, agent, location),
+                false => {
+                    let all = std::iter::once(location).chain(further).collect();
+                    self.contacts.introduce(now, &contact.name, all, false)
+                }
+            };
             if let Err(error) = heard {
                 tracing::debug!(error = %ErrorChain(&error), "ignored a contact of the last gateway");
             }
@@ -520,6 +530,12 @@ impl StateFile {
             name: Arc::clone(&entry.name),
             agent: entry.incarnation.as_u64(),
             location: entry.locations.first()?.to_string(),
+            further: entry
+                .locations
+                .iter()
+                .skip(1)
+                .map(ToString::to_string)
+                .collect(),
             certificate,
         }))
     }

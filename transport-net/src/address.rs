@@ -105,7 +105,7 @@ pub fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
 ///
 /// # Errors
 /// When the name cannot be resolved, or the system refuses another thread.
-pub(crate) async fn look_up(name: String, port: u16) -> io::Result<Vec<SocketAddr>> {
+pub async fn look_up(name: String, port: u16) -> io::Result<Vec<SocketAddr>> {
     let (sender, found) = oneshot::channel();
     threads::spawn(move || {
         let addresses = (name.as_str(), port).to_socket_addrs();

@@ -61,7 +61,7 @@ mod udt;
 mod unix;
 
 #[cfg(feature = "ip")]
-pub use address::{AddressError, reachable_at, resolve};
+pub use address::{AddressError, look_up, reachable_at, resolve};
 #[cfg(feature = "http")]
 pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;

@@ -180,6 +180,13 @@ pub trait Sink: Send + Sync {
         Vec::new()
     }
 
+    /// Whether an agent of this host has the name. Other platforms reach such an agent at the addresses of this
+    /// service. May read files, so it is not called while a parcel is dispatched.
+    fn is_here(&self, name: &str) -> bool {
+        let _ = name;
+        false
+    }
+
     /// Replaces the locations of the endpoint that [`listen`](Transport::listen) or an earlier call
     /// gave, best first, after the addresses of this host have changed. May be empty.
     fn relocated(&self, locations: Vec<Location>) {

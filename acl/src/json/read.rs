@@ -236,7 +236,8 @@ fn agents(json: Vec<AgentJson>, key: &str) -> Result<Vec<AgentId>, JsonError> {
 }
 
 fn agent(json: AgentJson) -> Result<AgentId, JsonError> {
-    let mut result = AgentId::new(json.name).map_err(at("name"))?;
+    let result = AgentId::new(json.name).map_err(at("name"))?;
+    let mut result = result.received();
     for (index, address) in json.addresses.into_iter().enumerate() {
         let added = result.with_address(address);
         result = added.map_err(at(&format!("addresses[{index}]")))?;

@@ -65,7 +65,7 @@ impl<'a> AgentIdView<'a> {
     }
 
     fn owned(self) -> Result<AgentId, AgentIdError> {
-        let mut agent = AgentId::new(self.name.as_str())?;
+        let mut agent = AgentId::new(self.name.as_str())?.received();
         for part in self.parts {
             agent = match part {
                 Part::Address(address) => agent.with_address(address.as_str())?,

@@ -10,8 +10,8 @@ use std::time::Duration;
 use clap::Args;
 use fipa::routes::{ASKER_TYPE, LinkSecurity};
 use fipa::{
-    DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role, Source,
-    Time,
+    DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
+    Signature, Source, Time,
 };
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
@@ -59,7 +59,8 @@ JSON:
                   without a connection, if remote,
                   \"locations\": [ text ], \"unsupported_transports\": [ transport ], if no
                   location has a supported one, \"mts\": { \"name\", \"incarnation\" },
-                  \"incarnation\", \"registered\": time, \"source\": as above } ] }
+                  \"incarnation\", \"registered\": time, \"source\": as above,
+                  \"addresses\": [ text ], those of the gateway of this host for platforms } ] }
 
 With --platform, as `fipa ams --json`.
 With --watch, one object on each line; the first lines are the agents present at the start:
@@ -176,11 +177,17 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let directory = domain.directory();
         directory.refresh();
         let entries = directory.entries();
-        let is_remote = |entry: &Arc<Entry>| entry.reach != Reach::Local;
-        let links = match entries.iter().any(is_remote) && !filter.local {
+        let is_shown = |entry: &Arc<Entry>| filter.matches(entry);
+        let is_reported =
+            |entry: &&Arc<Entry>| entry.reach != Reach::Local || entry.role == Role::Gateway;
+        let reported = match entries
+            .iter()
+            .filter(|it| is_shown(it))
+            .any(|it| is_reported(&it))
+        {
             // Without its report the agents are listed as well.
-            true => links(&domain).await,
-            false => HashMap::new(),
+            true => reported(&domain).await,
+            false => Reported::default(),
         };
         let listed = Listed {
             domain_is_empty: entries.is_empty(),
@@ -188,7 +195,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             entries: entries
                 .iter()
                 .filter(|entry| filter.matches(entry))
-                .map(|entry| Row::of(entry, directory, &links))
+                .map(|entry| Row::of(entry, directory, &reported))
                 .collect(),
         };
         domain.close().await;
@@ -218,15 +225,32 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 /// The connections of this host's gateway, by the service at the other end.
 type Links = HashMap<Incarnation, LinkSecurity>;
 
-/// Asks the gateway of this host for its connections. Empty if it does not answer.
-async fn links(domain: &Domain) -> Links {
+/// The parts of the report of this host's gateway that the list shows.
+#[derive(Default)]
+struct Reported {
+    links: Links,
+    /// The gateway, and the addresses at which platforms such as JADE write to it.
+    gateway: Incarnation,
+    addresses: Vec<Location>,
+}
+
+/// Asks the gateway of this host for its connections and addresses. Empty if it does not answer.
+async fn reported(domain: &Domain) -> Reported {
     // No agent has the name of a service, so the report has no routes.
     let report = membership::gateway_report(domain, Some("fipa-no-agent")).await;
-    let neighbours = report.ok().flatten().map(|report| report.neighbours);
-    let neighbours = neighbours.into_iter().flatten();
-    neighbours
-        .map(|neighbour| (neighbour.incarnation, neighbour.security))
-        .collect()
+    let Some(report) = report.ok().flatten() else {
+        return Reported::default();
+    };
+    let neighbours = report.neighbours.into_iter();
+    let mut addresses = report.locations;
+    addresses.retain(|location| location.signature() != Signature::Frames);
+    Reported {
+        links: neighbours
+            .map(|neighbour| (neighbour.incarnation, neighbour.security))
+            .collect(),
+        gateway: report.incarnation,
+        addresses,
+    }
 }
 
 struct Listed {
@@ -245,7 +269,8 @@ struct Row {
 }
 
 impl Row {
-    fn of(entry: &Entry, directory: DirectoryView<'_>, links: &Links) -> Self {
+    fn of(entry: &Entry, directory: DirectoryView<'_>, reported: &Reported) -> Self {
+        let links = &reported.links;
         let through = match entry.reach {
             Reach::Local => None,
             Reach::Remote { gateway } => Some(match directory.known_incarnation(gateway) {
@@ -292,6 +317,13 @@ impl Row {
                     false => escape_name(name).into_owned(),
                 };
                 names.map(line).collect()
+            }
+            Role::Gateway if entry.incarnation == reported.gateway => {
+                let addresses: Vec<String> =
+                    reported.addresses.iter().map(ToString::to_string).collect();
+                json["addresses"] = json!(addresses);
+                let own = entry.locations.iter().map(location_text);
+                own.chain(addresses).collect()
             }
             _ => entry.locations.iter().map(location_text).collect(),
         };

@@ -20,7 +20,8 @@ use crate::report::Failure;
 ///
 /// Services are listed by the directory facilitator (DF) of a gateway (FIPA00023). Agents of this host and
 /// of others use it by FIPA messages. Without --df, that of this host is used. It also lists the services
-/// that agents of connected hosts have registered with their own gateways.
+/// that agents of connected hosts have registered with their own gateways. After a search at the DF of another
+/// platform, letters to the found agents reach them by their names.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -339,6 +340,10 @@ fn search(
             let df = server.of(&agent, config).await?;
             let found = df.search(&template.description()).await;
             let found = found.map_err(|error| failed(&error, config))?;
+            if server.df.is_some() {
+                let agents = found.iter().filter_map(|it| it.name.as_ref());
+                membership::introduce_found(&agent, agents).await;
+            }
             Ok((df.id().clone(), found))
         };
         let found = found.await;

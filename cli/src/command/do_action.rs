@@ -78,6 +78,8 @@ pub(crate) struct Arguments {
     /// Name of the agent that sends the goal [default: a random, unused name]
     #[arg(long, value_name = "NAME")]
     agent: Option<AgentId>,
+    #[command(flatten)]
+    addresses: membership::Addresses,
 
     /// Print JSON, one object on a line
     #[arg(long)]
@@ -109,7 +111,8 @@ async fn perform(arguments: &Arguments, config: &Config) -> Result<(), Failure> 
             }
             None => asking(&domain, "do", config).await?,
         };
-        let robot = agent.robot(arguments.robot.clone());
+        let robot = arguments.addresses.of(&agent, &arguments.robot).await?;
+        let robot = agent.robot(robot);
         let report = |error: &ActionError| failed(error, &arguments.robot, config);
         let accepted = async {
             let goal = goal(arguments, &robot).await.map_err(|error| match error {

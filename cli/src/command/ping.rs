@@ -60,6 +60,9 @@ pub(crate) struct Arguments {
     #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
     time: Option<Duration>,
 
+    #[command(flatten)]
+    addresses: membership::Addresses,
+
     /// Print JSON, one object on a line
     #[arg(long)]
     json: bool,
@@ -116,13 +119,14 @@ async fn ping(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
 
 async fn ping_all(agent: &Agent, arguments: &Arguments, tally: &mut Tally) -> Result<(), Failure> {
     let mut starts = tokio::time::interval(arguments.interval);
+    let to = arguments.addresses.of(agent, &arguments.name).await?;
     starts.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let content = vec![b'.'; arguments.size as usize];
     while arguments.count.is_none_or(|count| tally.pings < count) {
         starts.tick().await;
         let message = agent
             .message(Performative::Inform)
-            .receiver(&arguments.name)
+            .receiver(&to)
             .ontology(ONTOLOGY)
             .content(content.clone());
         let began = Instant::now();

@@ -33,6 +33,7 @@ Examples:
   fipa request arm_1 '(lift crate)'
   fipa request arm_1 '(lift crate)' --timeout 5m
   fipa request arm_1 '(lift crate)' --json | jq -r .result.content
+  fipa request arm@jade '(lift crate)' --address http://10.0.0.7:7778/acc    an agent of another platform
 
 JSON:
   { \"agreed\": whether the agent agreed before its result,
@@ -72,6 +73,9 @@ pub(super) struct Opening {
     /// Ontology of the content
     #[arg(long, value_name = "TEXT")]
     ontology: Option<String>,
+
+    #[command(flatten)]
+    addresses: membership::Addresses,
 }
 
 impl Opening {
@@ -94,16 +98,17 @@ impl Opening {
     }
 
     /// Starts the message.
-    pub(super) fn message(
+    pub(super) async fn message(
         &self,
         agent: &Agent,
         performative: Performative,
         to: &AgentId,
         content: &str,
-    ) -> MessageBuilder {
+    ) -> Result<MessageBuilder, Failure> {
+        let to = self.addresses.of(agent, to).await?;
         let mut message = agent
             .message(performative)
-            .receiver(to)
+            .receiver(&to)
             .content(content.to_owned());
         if let Some(language) = &self.language {
             message = message.language(language);
@@ -111,7 +116,7 @@ impl Opening {
         if let Some(ontology) = &self.ontology {
             message = message.ontology(ontology);
         }
-        message
+        Ok(message)
     }
 }
 
@@ -139,7 +144,8 @@ async fn converse(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Resu
     let act = Performative::Request;
     let opening = arguments
         .opening
-        .message(agent, act, &arguments.name, &arguments.content);
+        .message(agent, act, &arguments.name, &arguments.content)
+        .await?;
     let begun = tokio::select! {
         begun = agent.request(opening, arguments.timeout) => begun,
         () = stop.requested() => return Err(stopped()),

@@ -79,9 +79,8 @@ pub(crate) struct Arguments {
     #[arg(long, required = true, value_name = "NAME", add = complete::agents())]
     to: Vec<AgentId>,
 
-    /// Address of the receiver, an agent of another platform that is not in the directory; repeatable
-    #[arg(long, value_name = "ADDRESS", value_parser = membership::address)]
-    address: Vec<String>,
+    #[command(flatten)]
+    addresses: membership::Addresses,
 
     /// Name of the sending agent [default: a random, unused name]
     #[arg(long, value_name = "NAME")]
@@ -201,7 +200,7 @@ struct Parameters {
 
 pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    if !arguments.address.is_empty() && arguments.to.len() != 1 {
+    if arguments.addresses.is_given() && arguments.to.len() != 1 {
         return Err(Failure::wrong_usage(
             "--address is the address of one receiver",
             "--address",
@@ -227,7 +226,7 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
         ));
     }
     if is_repeated {
-        return options::block_on(repeat::send(&arguments, content, &config))?;
+        return options::block_on(repeat::send(arguments, content, &config))?;
     }
     membership::run(async {
         // A wait ends at once when the receiver leaves, which the kernel reports.
@@ -283,7 +282,7 @@ fn not_sent(error: &fipa::SendError) -> Failure {
 async fn located(agent: &Agent, arguments: &Arguments) -> Result<Vec<AgentId>, Failure> {
     match arguments.to.as_slice() {
         [to] => {
-            let to = membership::introduce(agent, to.clone(), &arguments.address).await?;
+            let to = arguments.addresses.of(agent, to).await?;
             Ok(vec![to])
         }
         several => Ok(several.to_vec()),

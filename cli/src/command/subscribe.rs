@@ -82,6 +82,7 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
     let Arguments { name, content, .. } = arguments;
     let act = Performative::Subscribe;
     let opening = arguments.opening.message(agent, act, name, content);
+    let opening = opening.await?;
     let subscribed = tokio::select! {
         subscribed = agent.subscribe(opening, arguments.timeout) => subscribed,
         () = stop.requested() => return Ok(()),

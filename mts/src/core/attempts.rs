@@ -73,6 +73,8 @@ pub enum Action {
         agent: Incarnation,
         /// Location of its message transport service.
         location: Location,
+        /// The host name in the address that it states, which was replaced by the address of its connection.
+        host: Option<String>,
     },
     /// An agent of another host that is in the directory as a contact has sent another letter.
     HeardAgain {
@@ -83,6 +85,8 @@ pub enum Action {
     Taken {
         /// Its name.
         name: Arc<str>,
+        /// The location that took the letter.
+        location: Location,
     },
     /// An attempt at this location, of a known incarnation, failed: the service may have ended
     /// without a goodbye. Reported by gateways only.
@@ -601,10 +605,10 @@ impl AttemptTable {
     }
 
     /// Records that an agent of a legacy peer took a letter.
-    pub(crate) fn taken_by_legacy_peer(&mut self, receiver: &Arc<str>) {
+    pub(crate) fn taken_by_legacy_peer(&mut self, receiver: &Arc<str>, location: &Location) {
         if self.config.forwards {
-            let name = Arc::clone(receiver);
-            self.actions.push_back(Action::Taken { name });
+            let (name, location) = (Arc::clone(receiver), location.clone());
+            self.actions.push_back(Action::Taken { name, location });
         }
     }
 

@@ -6,6 +6,8 @@ use std::time::Duration;
 use fipa_sds::Pattern;
 use fipa_transport::{Incarnation, Kind, Location, Signature};
 
+use crate::dial::Network;
+
 /// Maximum deadline of a letter. Receivers remember taken letters for at least this long, so that
 /// none is delivered twice.
 pub const MAX_DEADLINE: Duration = fipa_transport::wire::MAX_REMAINING;
@@ -48,6 +50,8 @@ pub struct CoreConfig {
     /// attempt has begun, the letter cannot be sent again, because a legacy peer takes a copy for a
     /// new letter.
     pub legacy_attempt_timeout: Duration,
+    /// Networks whose addresses in letters of legacy peers are dialed, whichever host stated them.
+    pub contact_networks: Vec<Network>,
 }
 
 impl CoreConfig {
@@ -68,6 +72,7 @@ impl CoreConfig {
             custody_bytes: 256 << 20,
             attempt_timeout: Duration::from_secs(1),
             legacy_attempt_timeout: Duration::from_secs(15),
+            contact_networks: Vec::new(),
         }
     }
 

@@ -1,6 +1,6 @@
 //! Failure messages: their receivers and their rate.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -16,6 +16,7 @@ use super::inbox::Received;
 use super::lane::Delivery;
 use super::limits::log_omitted;
 use super::{Core, News, Now, own_lane, work};
+use crate::dial::{Claim, Endpoint, judge, located_at};
 use crate::failure::{Failed, Failure};
 
 /// Deadline of a failure message to a legacy peer's agent.
@@ -147,7 +148,7 @@ impl Core {
             let known = self.table.view.named(failed.sender.name());
             let stated = match known {
                 Some(_) => None,
-                None => from.and_then(|from| stated_entry(&failed.sender, from)),
+                None => from.and_then(|from| stated_entry(self, &failed.sender, from)),
             };
             let Some(entry) = known.or_else(|| stated.clone()) else {
                 log_limit::info!(of: address.map(quota_address), to = %failed.sender, %reason, "cannot send a failure message: its receiver is not known");
@@ -197,56 +198,68 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
     format!("the message cannot be decoded: {why}")
 }
 
-/// The port of an address of HTTP without one.
-const HTTP_PORT: u16 = 7778;
-
-/// The locations that an agent of a legacy peer states as its own: of its addresses, the numeric
-/// ones of the host that its letter came from. Others could be claimed to make this service send to
-/// a third party. JADE states its host by name; the name is replaced by the address that the letter
-/// came from. Locations of
-/// transports that a gateway may lack come last.
-pub(super) fn locations_given<'a>(
-    addresses: impl IntoIterator<Item = &'a str>,
-    from: LegacySource,
-) -> Vec<Location> {
-    let locations = addresses.into_iter().filter_map(|address| {
-        let location: Location = address.parse().ok()?;
-        let location = match location.kind() {
-            Kind::Http | Kind::Https => at_host(&location, from.address)?,
-            _ => location,
-        };
-        let claimed: SocketAddr = location.authority().parse().ok()?;
-        if claimed.ip().to_canonical() != from.address {
-            return None;
-        }
-        location.with_signature(from.signature).ok()
-    });
-    let mut locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
-    locations.sort_by_key(|location| !location.kind().is_supported());
-    locations
+/// An address that an agent of a legacy peer states as its own.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Stated {
+    pub(super) location: Location,
+    pub(super) at: SocketAddr,
+    /// The host name of the address, which was replaced by the address of the connection.
+    pub(super) host: Option<String>,
 }
 
-/// A location of HTTP with a name replaced by the address of the host that states it, and with a
-/// port.
-fn at_host(location: &Location, host: IpAddr) -> Option<Location> {
-    let authority = location.authority();
-    let path = location.address().get(authority.len()..)?;
-    let at = match (authority.parse::<SocketAddr>(), authority.parse::<IpAddr>()) {
-        (Ok(at), _) => at,
-        (_, Ok(ip)) => SocketAddr::new(ip, HTTP_PORT),
-        _ => match authority.rsplit_once(':') {
-            Some((_, port)) => SocketAddr::new(host, port.parse().ok()?),
-            None => SocketAddr::new(host, HTTP_PORT),
-        },
-    };
-    let location = Location::new(location.kind(), &format!("{at}{path}")).ok();
-    location.filter(|_| at.port() != 0)
+/// Returns the addresses that an agent of a legacy peer states as its own, at most
+/// [`Entry::MAX_LOCATIONS`]. JADE states its host by name; the name is replaced by the address that the letter
+/// came from. Locations of transports that a gateway may lack come last.
+pub(super) fn stated<'a>(
+    addresses: impl IntoIterator<Item = &'a str>,
+    from: LegacySource,
+) -> Vec<Stated> {
+    let addresses = addresses.into_iter().take(Entry::MAX_LOCATIONS);
+    let stated = addresses.filter_map(|address| {
+        let location: Location = address.parse().ok()?;
+        let is_http = matches!(location.kind(), Kind::Http | Kind::Https);
+        let (at, host) = match Endpoint::of(&location)? {
+            Endpoint::Numeric(at) => (at, None),
+            Endpoint::Named(host, port) if is_http => {
+                (SocketAddr::new(from.address, port), Some(host))
+            }
+            Endpoint::Named(..) => return None,
+        };
+        let location = match is_http {
+            true => located_at(&location, at)?,
+            false => location,
+        };
+        let location = location.with_signature(from.signature).ok()?;
+        Some(Stated { location, at, host })
+    });
+    let mut stated: Vec<Stated> = stated.collect();
+    stated.sort_by_key(|it| !it.location.kind().is_supported());
+    stated
+}
+
+impl Core {
+    /// Sets the addresses at which this service listens on the network.
+    pub fn listens_at(&mut self, own: Vec<SocketAddr>) {
+        self.own_addresses = own;
+    }
+
+    /// Whether letters may go to this address, which came with this claim.
+    pub(super) fn permits(&self, at: SocketAddr, claim: Claim) -> bool {
+        let networks = &self.table.config.contact_networks;
+        let judged = judge(at, claim, networks, &self.own_addresses);
+        judged
+            .inspect_err(|why| tracing::debug!(%at, %why, "an address in a letter is not used"))
+            .is_ok()
+    }
 }
 
 /// An agent that is not in the directory, with the locations that it states as its own.
-fn stated_entry(agent: &AgentId, from: LegacySource) -> Option<Arc<Entry>> {
+fn stated_entry(core: &Core, agent: &AgentId, from: LegacySource) -> Option<Arc<Entry>> {
     let addresses = agent.addresses().iter().map(|address| &**address);
-    let locations = locations_given(addresses, from);
+    let stated = stated(addresses, from).into_iter();
+    let claim = Claim::Return(from.address);
+    let permitted = stated.filter(|it| core.permits(it.at, claim));
+    let locations: Vec<Location> = permitted.map(|it| it.location).collect();
     if locations.is_empty() {
         return None;
     }
@@ -281,32 +294,75 @@ fn dialect_of(entry: &Entry) -> Dialect {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_platform_is_answered_only_at_the_host_that_its_letter_came_from() {
+    /// A core that listens at 10.0.0.1:7778, with these networks.
+    fn core(networks: &[&str]) -> Core {
+        let config = crate::core::CoreConfig {
+            contact_networks: networks.iter().map(|it| it.parse().unwrap()).collect(),
+            ..crate::core::CoreConfig::new("mts", Incarnation::from_u64(1), Vec::new())
+        };
+        let directory = fipa_sds::MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(1)));
+        let mut core = Core::new(config, fipa_sds::Directory::view(&directory));
+        core.listens_at(vec!["10.0.0.1:7778".parse().unwrap()]);
+        core
+    }
+
+    /// The location at which the agent of a letter from this host is answered.
+    fn answered(core: &Core, from: &str, address: &str) -> Option<String> {
         let from = LegacySource {
-            address: IpAddr::from([10, 0, 0, 7]),
+            address: from.parse().unwrap(),
             signature: Signature::JadeProxy,
         };
-        let given = |address: &str| {
-            let locations = locations_given([address], from);
-            locations.first().map(ToString::to_string)
-        };
+        let agent = AgentId::new("echo").unwrap().with_address(address).unwrap();
+        let entry = stated_entry(core, &agent, from)?;
+        entry.locations.first().map(ToString::to_string)
+    }
+
+    #[test]
+    fn a_platform_is_answered_only_at_the_host_that_its_letter_came_from() {
+        let core = core(&["10.9.0.0/16"]);
         for (stated, expected) in [
             ("http://10.0.0.7:7778/acc", Some("http://10.0.0.7:7778/acc")),
             ("http://10.0.0.7/acc", Some("http://10.0.0.7:7778/acc")),
             ("http://crex:7778/acc", Some("http://10.0.0.7:7778/acc")),
             ("http://crex.local/x", Some("http://10.0.0.7:7778/x")),
             ("tcp://10.0.0.7:6789", Some("tcp://10.0.0.7:6789;jade")),
+            ("http://crex:80/acc", Some("http://10.0.0.7:80/acc")),
+            // A network that the operator listed.
+            ("http://10.9.1.2:22/acc", Some("http://10.9.1.2:22/acc")),
             // A third party.
             ("http://10.0.0.8:7778/acc", None),
             ("http://10.0.0.8/acc", None),
             ("http://[::1]:7778/acc", None),
             ("http://crex:0/acc", None),
             ("http://crex:x/acc", None),
+            ("http://crex:22/acc", None),
             ("tcp://crex:6789", None),
             ("udp://10.0.0.7:7778", None),
         ] {
-            assert_eq!(given(stated).as_deref(), expected, "{stated}");
+            let answered = answered(&core, "10.0.0.7", stated);
+            assert_eq!(answered.as_deref(), expected, "{stated}");
+        }
+    }
+
+    #[test]
+    fn a_letter_with_many_addresses_reaches_no_third_host_and_not_this_gateway() {
+        let core = core(&[]);
+        for number in 0..500 {
+            let third = format!("http://10.{}.{}.9:7778/acc", number / 250, number % 250);
+            assert_eq!(answered(&core, "10.200.0.7", &third), None, "{third}");
+        }
+        for (from, stated) in [
+            ("10.0.0.7", "http://127.0.0.1:8080/acc"),
+            ("10.0.0.7", "http://169.254.169.254/latest"),
+            ("10.0.0.7", "http://[fe80::1]:7778/acc"),
+            ("10.0.0.7", "http://224.0.0.1:7778/acc"),
+            ("10.0.0.7", "http://0.0.0.0:7778/acc"),
+            ("10.0.0.7", "http://10.0.0.1:7778/acc"),
+            ("10.0.0.1", "http://10.0.0.1:7778/acc"),
+            ("127.0.0.1", "http://127.0.0.1:7778/acc"),
+            ("127.0.0.1", "http://127.0.0.1:22/acc"),
+        ] {
+            assert_eq!(answered(&core, from, stated), None, "{stated} from {from}");
         }
     }
 }

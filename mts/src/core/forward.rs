@@ -14,12 +14,13 @@ use fipa_transport::{
 };
 
 use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
-use super::failures::{cannot_be_decoded, locations_given};
+use super::failures::{Stated, cannot_be_decoded, stated};
 use super::inbox::{ask, link_of};
 use super::lane::{Delivery, LaneId, LaneKey};
 use super::limits::{Rate, SenderLimit};
 use super::reading::{refused_name_of_legacy_peer, too_long};
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, ReadLetter, own_lane, work};
+use crate::dial::Claim;
 use crate::gate::{self, LetterParts, Link};
 use smallvec::smallvec;
 
@@ -44,6 +45,9 @@ const MAX_UNFRAMED_PATTERNS: usize = 1;
 /// compile.
 const MAX_UNFRAMED_PATTERN: usize = 128;
 
+/// Maximum number of agents in the `reply-to` of a legacy peer's letter that become known by it.
+const MAX_REPLY_TO: usize = 4;
+
 /// Maximum number of agents that one letter of a legacy peer stands for.
 const MAX_UNFRAMED_COPIES: usize = 1024;
 /// Maximum number of receivers of a legacy peer's letter that are handled in one call. The core takes
@@ -62,8 +66,8 @@ pub struct Unframed {
     receivers: VecDeque<Receiver>,
     /// Whether the bytes of the letter were counted for failure messages.
     is_counted: bool,
-    /// The name of the sender, and a location that it states as its own.
-    sender: Option<(String, Location)>,
+    /// The agents of the letter to which answers may go, and the addresses that the letter states for them.
+    answered: Vec<Answered>,
     /// Whether the sender was reported as a contact for the present portion of the receivers.
     is_contact: bool,
     /// The parts that a message about its failure repeats; `None` if there is to be none.
@@ -72,6 +76,14 @@ pub struct Unframed {
     fault: Option<String>,
     /// The parts that the gate has read.
     parts: Option<LetterParts>,
+}
+
+/// An agent to which answers may go: the sender of a legacy peer's letter, or one of its `reply-to`.
+#[derive(Debug)]
+struct Answered {
+    name: String,
+    stated: Vec<Stated>,
+    is_sender: bool,
 }
 
 /// A receiver of a legacy peer's letter.
@@ -112,13 +124,13 @@ impl Unframed {
         };
         let mut letter = letter;
         let named = stamp::sender(&letter).unwrap_or_default();
-        let (sender, mut fault) = match (refused_names(&names), message) {
+        let (answered, mut fault) = match (refused_names(&names), message) {
             (Some(fault), _) => {
                 names.truncate(1);
-                (None, Some(fault))
+                (Vec::new(), Some(fault))
             }
             (None, Ok(message)) => {
-                let sender = locate(&message, &letter, from);
+                let answered = answered(&message, &letter, from);
                 if letter.around_len() > Letter::MAX_AROUND
                     && let Ok(divided) = divide(&letter, &message)
                 {
@@ -126,9 +138,9 @@ impl Unframed {
                 }
                 let in_envelope = names.iter().chain([&named]).map(String::as_str);
                 let fault = refused_name_of_legacy_peer(&message, in_envelope);
-                (sender, fault.or_else(|| too_long(&letter)))
+                (answered, fault.or_else(|| too_long(&letter)))
             }
-            (None, Err(error)) => (None, Some(cannot_be_decoded(&error))),
+            (None, Err(error)) => (Vec::new(), Some(cannot_be_decoded(&error))),
         };
         let first = names.first().cloned();
         let mut receivers = VecDeque::new();
@@ -155,7 +167,7 @@ impl Unframed {
             from,
             receivers,
             is_counted: false,
-            sender,
+            answered,
             is_contact: false,
             failed: failed.map(Arc::new),
             fault,
@@ -301,12 +313,33 @@ enum DivideError {
     Encode(#[from] EncodeError),
 }
 
-/// The name of the sender, and the first location that it states as its own.
-fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(String, Location)> {
-    let sender = sender_of(message, letter)?;
-    let addresses = sender.addresses().iter().map(|address| &**address);
-    let mut locations = locations_given(addresses, from).into_iter();
-    Some((sender.name().to_owned(), locations.next()?))
+/// Returns the agents of a letter to which answers may go, with their addresses. The host name that the sender has
+/// in its own address stands for the source of the letter; other host names in `reply-to` are left out.
+fn answered(message: &Message, letter: &Letter, from: LegacySource) -> Vec<Answered> {
+    let mut all = Vec::new();
+    let mut hosts: Vec<String> = Vec::new();
+    if let Some(sender) = sender_of(message, letter) {
+        let stated = stated(sender.addresses().iter().map(|it| &**it), from);
+        hosts.extend(stated.iter().filter_map(|it| it.host.clone()));
+        all.push(Answered {
+            name: sender.name().to_owned(),
+            stated,
+            is_sender: true,
+        });
+    }
+    for agent in message.reply_to().iter().take(MAX_REPLY_TO) {
+        if all.iter().any(|known| known.name == agent.name()) {
+            continue;
+        }
+        let mut stated = stated(agent.addresses().iter().map(|it| &**it), from);
+        stated.retain(|it| it.host.as_ref().is_none_or(|host| hosts.contains(host)));
+        all.push(Answered {
+            name: agent.name().to_owned(),
+            stated,
+            is_sender: false,
+        });
+    }
+    all
 }
 
 /// Limits the rate at which agents become known by their letters: each is published to the processes of the host.
@@ -543,6 +576,7 @@ impl Core {
             name,
             agent,
             location,
+            host: None,
         });
         true
     }
@@ -560,17 +594,18 @@ impl Core {
     fn report_legacy_contact(
         &mut self,
         now: Now,
-        (name, location): (String, Location),
+        (name, stated): (String, Stated),
         from: IpAddr,
     ) -> bool {
         if !self.table.config.forwards {
             return false;
         }
+        let Stated { location, host, .. } = stated;
         if let Some(known) = self.table.view.named(&name) {
             if known.source != Source::Contact || known.incarnation.is_known() {
                 return false;
             }
-            if known.locations.first() == Some(&location) {
+            if known.locations.contains(&location) {
                 let address = location.authority().parse::<SocketAddr>();
                 if address.is_ok_and(|address| address.ip().to_canonical() == from) {
                     let name = Arc::clone(&known.name);
@@ -590,8 +625,35 @@ impl Core {
             name,
             agent: Incarnation::UNKNOWN,
             location,
+            host,
         });
         true
+    }
+
+    /// Reports the agents of a legacy peer's letter to which answers may go as contacts, as far as their addresses may
+    /// be dialed. Returns whether it reported one.
+    fn report_answered(&mut self, now: Now, answered: Vec<Answered>, from: IpAddr) -> bool {
+        let mut has_reported = false;
+        let mut endpoints: Vec<SocketAddr> = Vec::new();
+        for agent in answered {
+            let claim = |at: SocketAddr| match agent.is_sender {
+                true => Claim::Return(from),
+                false => Claim::Received {
+                    is_host: at.ip().to_canonical() == from.to_canonical(),
+                    // Answers to the sender go there, too.
+                    is_endpoint: endpoints.contains(&at),
+                },
+            };
+            let mut stated = agent.stated.into_iter();
+            let Some(stated) = stated.find(|it| self.permits(it.at, claim(it.at))) else {
+                continue;
+            };
+            if agent.is_sender {
+                endpoints.push(stated.at);
+            }
+            has_reported |= self.report_legacy_contact(now, (agent.name, stated), from);
+        }
+        has_reported
     }
 
     /// Whether another letter of this process can wait in this lane.
@@ -656,7 +718,7 @@ impl Core {
             letter,
             via,
             from,
-            sender: located,
+            answered,
             failed,
             parts,
             is_contact,
@@ -673,8 +735,9 @@ impl Core {
             self.unframed_failed(&entry.name, unframed, why);
             return;
         }
-        if let Some(located) = located.take() {
-            *is_contact = self.report_legacy_contact(now, located, from.address);
+        let answered = std::mem::take(answered);
+        if !answered.is_empty() {
+            *is_contact = self.report_answered(now, answered, from.address);
         }
         let stream_sender = self.table.config.incarnation;
         let stream = Stream::between(stream_sender, entry.incarnation);

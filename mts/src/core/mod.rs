@@ -53,6 +53,7 @@ pub mod work;
 use std::cmp::Reverse;
 use std::collections::{BTreeSet, BinaryHeap};
 use std::fmt;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -153,6 +154,8 @@ pub struct Core {
     /// Limit the rates at which agents of other gateways, and of legacy peers, become known by their letters.
     contact_limit: SenderLimit,
     legacy_contact_limit: SenderLimit,
+    /// The addresses at which this service listens on the network.
+    own_addresses: Vec<SocketAddr>,
     /// Whether letters of others are no longer accepted.
     ending: bool,
     /// Whether the service has ended, and so sends nothing.
@@ -196,6 +199,7 @@ impl Core {
             failure_limit: FailureLimit::default(),
             contact_limit: forward::contact_limit(),
             legacy_contact_limit: forward::contact_limit(),
+            own_addresses: Vec::new(),
             ending: false,
             closed: false,
             next_lane: 1,
@@ -545,13 +549,31 @@ impl Core {
         letter: Letter,
         reason: FailureReason,
     ) {
-        self.failed(send, sender, receiver, letter, (reason, None));
+        self.failed(send, sender, receiver, letter, (reason, Vec::new()));
+    }
+
+    /// Fails a letter for an agent that cannot be reached at any of its addresses. `attempts` has the reason for
+    /// each of them. One outcome follows.
+    pub fn fail_unreachable(
+        &mut self,
+        now: Now,
+        (sender, letter): (Incarnation, Letter),
+        receiver: Arc<str>,
+        attempts: Vec<Attempt>,
+    ) -> SendId {
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let reason = FailureReason::NoSuchAgent;
+        self.failed(send, sender, receiver, letter, (reason, attempts));
+        self.send_failures(now);
+        send
     }
 
     /// Fails a letter to an agent that the directory does not list.
     fn absent(&mut self, send: SendId, sender: Incarnation, receiver: Arc<str>, letter: Letter) {
-        let absence = self.table.absence(&receiver);
-        self.failed(send, sender, receiver, letter, absence);
+        let (reason, attempt) = self.table.absence(&receiver);
+        let why = (reason, attempt.into_iter().collect());
+        self.failed(send, sender, receiver, letter, why);
     }
 
     fn failed(
@@ -560,11 +582,10 @@ impl Core {
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
-        (reason, attempt): (FailureReason, Option<Attempt>),
+        (reason, attempts): (FailureReason, Vec<Attempt>),
     ) {
-        let detail = attempt.as_ref().map(ToString::to_string);
-        let detail = detail.unwrap_or_default();
-        let attempts = attempt.into_iter().collect();
+        let details: Vec<String> = attempts.iter().map(ToString::to_string).collect();
+        let detail = details.join("; ");
         let outcome = Outcome::Failed { reason, attempts };
         let sequence = self.sequence_of(sender);
         let stream = Stream::between(sender, Incarnation::UNKNOWN);

@@ -4,6 +4,7 @@ use std::sync::Weak;
 use std::sync::atomic::Ordering;
 
 use fipa_acl::{DecodeError, Letter};
+use fipa_sds::{Reach, Role};
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
     LegacySource, LoanedContent, Location, Parcel, Sink, Verdict, log_limit, quota_address,
@@ -103,6 +104,14 @@ impl Sink for TransportSink {
                 && other.incarnation() == location.incarnation()
         });
         others.cloned().collect()
+    }
+
+    fn is_here(&self, name: &str) -> bool {
+        let Some(shared) = self.shared.upgrade() else {
+            return false;
+        };
+        let entry = shared.directory.lookup(name);
+        entry.is_some_and(|entry| entry.reach == Reach::Local && entry.role == Role::Agent)
     }
 
     fn relocated(&self, locations: Vec<Location>) {

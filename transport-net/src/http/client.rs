@@ -30,7 +30,7 @@ use super::socket::Socket;
 use super::tls::HandshakeError;
 use super::url::{PATH, Url};
 use crate::end;
-use crate::legacy::dialect::translate;
+use crate::legacy::dialect::{Here, translate};
 use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
 use crate::sockets::{self, prepare};
 use crate::stream::counters::count;
@@ -89,7 +89,10 @@ impl HttpSender {
         let url = Url::parse(self.to.kind(), self.to.address())
             .map_err(|error| not_sent(TransportErrorKind::Unreachable, &error))?;
         let signature = self.to.signature();
+        let sink = endpoint.stream.sink();
+        let has = |name: &str| sink.as_ref().is_some_and(|sink| sink.is_here(name));
         let in_dialect = |here: Option<&str>| {
+            let here = here.map(|url| Here { url, has: &has });
             translate(&delivery.letter, &delivery.receiver, &self.to, here)
                 .map_err(|error| not_sent(error.fault(), &error))
         };

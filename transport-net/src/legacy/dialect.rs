@@ -40,14 +40,22 @@ impl TranslateError {
     }
 }
 
-/// Translates a letter for one receiver into envelope and message in the dialect of the location `at`.
-/// `here` is the URL at which answers are received: JADE answers to the addresses of the sender, so
-/// it is added when the sender has none.
+/// The address at which the agents of this host receive answers.
+#[derive(Clone, Copy)]
+pub(crate) struct Here<'a> {
+    /// The URL.
+    pub(crate) url: &'a str,
+    /// Whether an agent of this host has a name.
+    pub(crate) has: &'a dyn Fn(&str) -> bool,
+}
+
+/// Translates a letter for one receiver into envelope and message in the dialect of the location `at`. JADE answers to
+/// the addresses of the sender and of `reply-to`, so `here` is added to agents of this host that have none.
 pub(crate) fn translate(
     letter: &Letter,
     receiver: &str,
     at: &Location,
-    here: Option<&str>,
+    here: Option<Here<'_>>,
 ) -> Result<[Bytes; 2], TranslateError> {
     let signature = at.signature();
     let envelope = letter.parse_envelope()?;
@@ -88,7 +96,7 @@ pub(crate) fn translate(
             let names_charset = is_text && !message.is_ascii();
             envelope.base.payload_encoding = names_charset.then(|| "UTF-8".to_owned());
             if let (Some(from), Some(here)) = (&mut envelope.base.from, here) {
-                add_address(from, here);
+                add_address(from, here.url);
             }
             let envelope = envelope.encode(Representation::Xml, Dialect::Jade)?;
             Ok([envelope, message])
@@ -146,21 +154,34 @@ fn add_address(agent: &mut AgentId, here: &str) {
     }
 }
 
-/// Returns the message with an address of its sender.
-fn with_address(message: Message, here: Option<&str>) -> Message {
+/// Returns the message with an address of its sender, and of the agents of this host in `reply-to`.
+fn with_address(message: Message, here: Option<Here<'_>>) -> Message {
     let (Some(sender), Some(here)) = (message.sender(), here) else {
         return message;
     };
-    if !sender.addresses().is_empty() {
+    let lacks = |agent: &AgentId| agent.addresses().is_empty();
+    let is_here = |agent: &AgentId| agent.same_agent(sender) || (here.has)(agent.name());
+    let reply_to: Vec<AgentId> = message
+        .reply_to()
+        .iter()
+        .map(|agent| {
+            let mut agent = agent.clone();
+            if lacks(&agent) && is_here(&agent) {
+                add_address(&mut agent, here.url);
+            }
+            agent
+        })
+        .collect();
+    if !lacks(sender) && reply_to == message.reply_to() {
         return message;
     }
     let mut sender = sender.clone();
-    add_address(&mut sender, here);
+    add_address(&mut sender, here.url);
     let mut builder = Message::builder(message.performative().clone())
         .sender(sender)
         .receivers(message.receivers().iter().cloned());
-    for agent in message.reply_to() {
-        builder = builder.reply_to(agent.clone());
+    for agent in reply_to {
+        builder = builder.reply_to(agent);
     }
     if let Some(content) = message.content() {
         builder = builder.content(content.clone());
@@ -204,6 +225,12 @@ mod tests {
     fn at(kind: Kind, signature: Signature) -> Location {
         let location = Location::new(kind, "10.0.0.7:7778").unwrap();
         location.with_signature(signature).unwrap()
+    }
+
+    /// This host, which has the agents `rover` and `crane`.
+    fn own(url: &str) -> Here<'_> {
+        let has = &|name: &str| ["rover", "crane"].contains(&name);
+        Here { url, has }
     }
 
     fn date() -> Time {
@@ -281,7 +308,7 @@ mod tests {
         let over = [Kind::Tcp, Kind::Http, Kind::Https];
         let contents = ["hello", "grüß dich"];
         for (kind, content) in over.iter().flat_map(|kind| contents.map(|it| (*kind, it))) {
-            let here = Some("tcp://10.0.0.1:7788");
+            let here = Some(own("tcp://10.0.0.1:7788"));
             let jade = at(kind, Signature::JadeProxy);
             let [envelope, bytes] = translate(&letter(content), "arm", &jade, here).unwrap();
             assert!(envelope.starts_with(b"<?xml"));
@@ -325,7 +352,7 @@ mod tests {
                     &letter(content),
                     "arm",
                     &at(Kind::Http, signature),
-                    Some(here),
+                    Some(own(here)),
                 )
                 .unwrap();
                 assert!(envelope.starts_with(b"<?xml"));
@@ -348,6 +375,44 @@ mod tests {
         assert_eq!(fault, TransportErrorKind::Inexpressible);
         let bit_efficient = at(Kind::Http, Signature::JadeBitEfficient);
         assert!(translate(&escaped, "arm", &bit_efficient, None).is_ok());
+    }
+
+    #[test]
+    fn jade_gets_an_address_of_each_agent_of_this_host_in_reply_to() {
+        let other = AgentId::new("other@jade").unwrap();
+        let stated = other.clone().with_address("http://10.0.0.9:7778/acc");
+        let message = Message::builder(Performative::Request)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .reply_to(AgentId::new("rover").unwrap())
+            .reply_to(AgentId::new("crane").unwrap())
+            .reply_to(other)
+            .reply_to(stated.unwrap())
+            .content("(agent-identifier :name crane)")
+            .build()
+            .unwrap();
+        let letter = message.to_letter(date()).unwrap();
+        let url = "http://10.0.0.1:7778/acc";
+        let jade = at(Kind::Http, Signature::JadeProxy);
+        let [_, bytes] = translate(&letter, "arm", &jade, Some(own(url))).unwrap();
+        let said = Message::decode(&bytes.into()).unwrap();
+        let addresses = |agent: &AgentId| agent.addresses().to_vec();
+        assert_eq!(addresses(said.sender().unwrap()), [url]);
+        let reply_to: Vec<_> = said.reply_to().iter().map(addresses).collect();
+        assert_eq!(
+            reply_to,
+            [
+                vec![url],
+                vec![url],
+                vec![],
+                vec!["http://10.0.0.9:7778/acc"]
+            ]
+        );
+        // The content belongs to the agent.
+        assert_eq!(said.content(), message.content());
+        let cpp = at(Kind::Tcp, Signature::FipaServices);
+        let [_, bytes] = translate(&letter, "arm", &cpp, Some(own(url))).unwrap();
+        assert_eq!(Message::decode(&bytes.into()).unwrap(), message);
     }
 
     #[test]

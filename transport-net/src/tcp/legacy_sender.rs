@@ -13,7 +13,7 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use super::endpoint::TcpEndpoint;
-use crate::legacy::dialect::translate;
+use crate::legacy::dialect::{Here, translate};
 use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
 use crate::sockets::{self, prepare};
 use crate::stream::counters::count;
@@ -44,7 +44,10 @@ impl TcpSender {
         progress: &Progress<'_>,
     ) -> Result<Conclusion, Conclusion> {
         let (endpoint, to) = (&self.endpoint, &self.to);
+        let sink = endpoint.stream.sink();
+        let has = |name: &str| sink.as_ref().is_some_and(|sink| sink.is_here(name));
         let in_dialect = |here: Option<&str>| {
+            let here = here.map(|url| Here { url, has: &has });
             translate(&delivery.letter, &delivery.receiver, to, here)
                 .map_err(|error| Conclusion::NotSent(TransportError::new(error.fault(), error)))
         };

@@ -7,7 +7,7 @@ use serde_json::json;
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::Interval;
 
-use super::{Arguments, message, not_sent, register};
+use super::{Arguments, located, message, not_sent, register};
 use crate::membership::{self, Stop};
 use crate::options;
 use crate::output::{self, Reader};
@@ -26,13 +26,22 @@ pub(super) fn rate(text: &str) -> Result<f64, String> {
 
 /// Sends the message until its count is reached or a signal arrives.
 pub(super) async fn send(
-    arguments: &Arguments,
+    mut arguments: Arguments,
     content: Option<Vec<u8>>,
     config: &Config,
 ) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
-    let agent = register(&domain, arguments, config).await?;
+    let agent = register(&domain, &arguments, config).await?;
+    match located(&agent, &arguments).await {
+        Ok(to) => arguments.to = to,
+        Err(failure) => {
+            drop(agent);
+            domain.close().await;
+            return Err(failure);
+        }
+    }
+    let arguments = &arguments;
     let mut tally = Tally::default();
     let began = Instant::now();
     let mut reader = Reader::of_output();

@@ -69,7 +69,7 @@ impl Lane {
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
                 let outcome = Outcome::Sent { via, attempts };
-                table.taken_by_legacy_peer(&self.receiver);
+                table.taken_by_legacy_peer(&self.receiver, &location);
                 self.settle(now, index, Settlement::Outcome(outcome), table);
             }
             Conclusion::NotSent(error) => {
