@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime};
 use fipa::{Change, Config, DirectoryView, Entry, Time};
 use serde_json::json;
 
-use super::{Filter, Links, Row};
+use super::{Filter, Gateways, Row};
 use crate::membership::{self, Stop};
 use crate::options;
 use crate::output;
@@ -191,7 +191,7 @@ fn print(
     json: bool,
 ) -> Result<(), Failure> {
     // The connections change without a change of the entry.
-    let row = Row::of(entry, directory, &Links::default());
+    let row = Row::of(entry, directory, &Gateways::default());
     let time = Time::from_system_time(SystemTime::now()).ok();
     let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
     if json {
