@@ -90,6 +90,23 @@ fn a_letter_reaches_an_agent_with_only_a_udt_location_if_both_gateways_use_udt()
 }
 
 #[test]
+fn an_agent_of_a_legacy_peer_is_listed_with_its_own_address() {
+    let host = Host::new();
+    let peers = "discovery.static={ cpp = [\"tcp://127.0.0.1:9;fipa-services\"], \
+                 \"cp.\" = [\"tcp://127.0.0.1:10;fipa-services\"] }";
+    let _gateway = host.start(&["up", "--set", peers]);
+    for (name, port) in [("cpp", 9), ("cp.", 10)] {
+        let pattern = name.replace('.', "\\.");
+        let agent = known(&host, &pattern);
+        assert_eq!(agent["name"], name);
+        let at = format!("tcp://127.0.0.1:{port};fipa-services");
+        assert_eq!(agent["locations"], json!([at]));
+        let table = host.run(&["agents", &pattern]).done();
+        assert!(table.contains(&at), "{table}");
+    }
+}
+
+#[test]
 fn a_failure_message_about_the_letter_is_not_a_reply() {
     let host = Host::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();

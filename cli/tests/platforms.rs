@@ -496,6 +496,9 @@ fn the_agents_of_a_platform_are_listed_by_its_address_alone() {
     let mut names: Vec<&str> = names.map(|it| it["name"].as_str().unwrap()).collect();
     names.sort_unstable();
     assert_eq!(names, ["ams@jadetest", "df@jadetest", "echo@jadetest"]);
+    // The agent that the platform does not have is none.
+    let known = host.run(&["agents", "--json"]).done();
+    assert!(!known.contains("fipa-unknown"), "{known}");
 }
 
 #[test]

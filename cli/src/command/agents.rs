@@ -13,7 +13,7 @@ use fipa::{
     DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
     Signature, Source, Time,
 };
-use fipa_acl::{escape, escape_name};
+use fipa_acl::{Pattern, escape, escape_name};
 use serde_json::{Value, json};
 
 use super::routes::security;
@@ -44,7 +44,8 @@ Examples:
 Columns:
   REACH      this host, or the gateway that forwards letters to the agent, and whether its
              connection with the agent's host is encrypted (`fipa routes` has its certificate)
-  LOCATIONS  addresses for letters, in order of preference; for a coalition, its members
+  LOCATIONS  addresses for letters, in order of preference, of an agent of a legacy peer those that
+             the gateway uses; for a coalition, its members
   MTS        message transport service that delivers to the agent
   SOURCE     origin of the entry: host (a process of this host), mdns (announced on the network),
              exchange (from its gateway), static (the configuration), contact (a letter from it)
@@ -146,7 +147,8 @@ impl Filter {
         };
         // A command that asks the gateway.
         let is_asker = *entry.agent_type == *ASKER_TYPE;
-        reach && !is_asker && self.query.matches(entry)
+        let is_probed = is_legacy(entry) && entry.name.starts_with(platform::PROBED);
+        reach && !is_asker && !is_probed && self.query.matches(entry)
     }
 }
 
@@ -186,7 +188,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             .any(|it| is_reported(&it))
         {
             // Without its report the agents are listed as well.
-            true => reported(&domain).await,
+            true => Reported::asked(&domain, entries.iter().filter(|it| is_shown(it))).await,
             false => Reported::default(),
         };
         let listed = Listed {
@@ -222,35 +224,79 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     output::text(&format!("{}\n", table.trim_fmt()))
 }
 
-/// The connections of this host's gateway, by the service at the other end.
-type Links = HashMap<Incarnation, LinkSecurity>;
+/// Maximum number of questions about the locations of agents of legacy peers.
+const MAX_QUESTIONS: usize = 16;
 
 /// The parts of the report of this host's gateway that the list shows.
 #[derive(Default)]
 struct Reported {
-    links: Links,
-    /// The gateway, and the addresses at which platforms such as JADE write to it.
     gateway: Incarnation,
+    /// The addresses at which platforms such as JADE write to the gateway.
     addresses: Vec<Location>,
+    /// Its connections, by the service at the other end.
+    links: HashMap<Incarnation, LinkSecurity>,
+    /// The locations of agents of legacy peers, by name: the directory of the host has only the locations of
+    /// the gateway, through which letters to them go.
+    legacy: HashMap<String, Vec<Location>>,
 }
 
-/// Asks the gateway of this host for its connections and addresses. Empty if it does not answer.
-async fn reported(domain: &Domain) -> Reported {
-    // No agent has the name of a service, so the report has no routes.
-    let report = membership::gateway_report(domain, Some("fipa-no-agent")).await;
-    let Some(report) = report.ok().flatten() else {
-        return Reported::default();
-    };
-    let neighbours = report.neighbours.into_iter();
-    let mut addresses = report.locations;
-    addresses.retain(|location| location.signature() != Signature::Frames);
-    Reported {
-        links: neighbours
-            .map(|neighbour| (neighbour.incarnation, neighbour.security))
-            .collect(),
-        gateway: report.incarnation,
-        addresses,
+impl Reported {
+    /// Asks the gateway of this host. Empty if it does not answer.
+    async fn asked<'e>(domain: &Domain, shown: impl Iterator<Item = &'e Arc<Entry>>) -> Self {
+        let legacy = shown.filter(|entry| is_legacy(entry) && !entry.is_unsupported());
+        // No agent has this name, so the report has no routes.
+        let mut questions = vec!["fipa-no-agent".to_owned()];
+        for name in legacy.map(|entry| literal(&entry.name)) {
+            let count = questions.len();
+            match questions.last_mut() {
+                Some(last) if last.len() + name.len() < Pattern::MAX_LEN => {
+                    last.push('|');
+                    last.push_str(&name);
+                }
+                _ if count < MAX_QUESTIONS => questions.push(name),
+                _ => break,
+            }
+        }
+        let mut reported = Self::default();
+        for receivers in questions {
+            let report = membership::gateway_report(domain, Some(&receivers)).await;
+            let Some(report) = report.ok().flatten() else {
+                break;
+            };
+            let neighbours = report.neighbours.into_iter();
+            reported.gateway = report.incarnation;
+            reported.addresses = report.locations;
+            let is_foreign = |at: &Location| at.signature() != Signature::Frames;
+            reported.addresses.retain(is_foreign);
+            reported.links = neighbours
+                .map(|neighbour| (neighbour.incarnation, neighbour.security))
+                .collect();
+            reported
+                .legacy
+                .extend(report.routes.into_iter().map(|route| {
+                    let ways = route.ways.into_iter().map(|way| way.location);
+                    (route.receiver, ways.collect())
+                }));
+        }
+        reported
     }
+}
+
+/// Whether the agent is one of a legacy peer, which has no incarnation.
+fn is_legacy(entry: &Entry) -> bool {
+    matches!(entry.reach, Reach::Remote { .. }) && !entry.incarnation.is_known()
+}
+
+/// Returns the pattern that matches this name alone.
+fn literal(name: &str) -> String {
+    let mut pattern = String::new();
+    for character in name.chars() {
+        if r"\.+*?()|[]{}^$#&-~".contains(character) {
+            pattern.push('\\');
+        }
+        pattern.push(character);
+    }
+    pattern
 }
 
 struct Listed {
@@ -271,6 +317,11 @@ struct Row {
 impl Row {
     fn of(entry: &Entry, directory: DirectoryView<'_>, reported: &Reported) -> Self {
         let links = &reported.links;
+        let own = reported
+            .legacy
+            .get(&*entry.name)
+            .filter(|_| is_legacy(entry));
+        let at = own.unwrap_or(&entry.locations);
         let through = match entry.reach {
             Reach::Local => None,
             Reach::Remote { gateway } => Some(match directory.known_incarnation(gateway) {
@@ -278,7 +329,7 @@ impl Row {
                 None => "an unknown gateway".to_owned(),
             }),
         };
-        let locations = entry.locations.iter().map(ToString::to_string);
+        let locations = at.iter().map(ToString::to_string);
         let locations: Vec<String> = locations.collect();
         let registered = Time::from_system_time(entry.registered);
         let mut json = json!({
@@ -325,7 +376,7 @@ impl Row {
                 let own = entry.locations.iter().map(location_text);
                 own.chain(addresses).collect()
             }
-            _ => entry.locations.iter().map(location_text).collect(),
+            _ => at.iter().map(location_text).collect(),
         };
         let reach = match through {
             None => "this host".to_owned(),

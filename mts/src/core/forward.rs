@@ -196,7 +196,7 @@ impl Unframed {
             via,
             from,
             is_counted: false,
-            sender: None,
+            answered: Vec::new(),
             is_contact: false,
             fault: Some(reason.to_owned()),
             parts: None,

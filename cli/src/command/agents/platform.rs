@@ -44,6 +44,10 @@ pub(super) fn run(
     listed.print(json)
 }
 
+/// Beginning of the name of the agent that a platform is asked for and does not have. It is no agent, so it is not
+/// listed.
+pub(super) const PROBED: &str = "fipa-unknown-";
+
 /// Asks for the agent management system of the platform.
 async fn management(agent: &Agent, addresses: &[String]) -> Result<AgentId, Failure> {
     let failed = |what: String| {
@@ -53,7 +57,7 @@ async fn management(agent: &Agent, addresses: &[String]) -> Result<AgentId, Fail
             "check the address, or name the system: `fipa ams --ams NAME --address ADDRESS`",
         )
     };
-    let unknown = AgentId::new(format!("fipa-unknown-{}", Incarnation::random()));
+    let unknown = AgentId::new(format!("{PROBED}{}", Incarnation::random()));
     let unknown = unknown.map_err(|error| failed(error.to_string()))?;
     let unknown = membership::introduce(agent, unknown, addresses).await?;
     // JADE does not parse a bare word that begins with a digit.
