@@ -134,7 +134,7 @@ impl History {
         }
         let request = (from.clone(), message.conversation.clone());
         match act {
-            Act::Confirm { .. } => {
+            Act::Confirm { .. } | Act::Ask { .. } => {
                 self.confirmed.insert(request);
             }
             Act::Release | Act::Token(_) => {
@@ -214,7 +214,9 @@ impl History {
             *from == grant.holder
                 && match act {
                     Act::Release | Act::Token(_) => message.conversation == grant.conversation,
-                    Act::Confirm { .. } => !message.conversation.is_not_after(&grant.conversation),
+                    Act::Confirm { .. } | Act::Ask { .. } => {
+                        !message.conversation.is_not_after(&grant.conversation)
+                    }
                     _ => false,
                 }
         });

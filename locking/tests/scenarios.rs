@@ -58,6 +58,7 @@ impl Agent {
         let message = LockMessage {
             conversation: Conversation::parse(conversation),
             dialect,
+            algorithm: None,
             content: Content::Lock {
                 resource: bay(),
                 act,
@@ -525,6 +526,7 @@ fn several_resources_are_held_all_or_none() {
     let message = |resource: &Resource, conversation: &str, act| LockMessage {
         conversation: Conversation::parse(conversation),
         dialect: OWN,
+        algorithm: None,
         content: Content::Lock {
             resource: resource.clone(),
             act,
@@ -709,6 +711,7 @@ fn a_peer_with_many_requests_takes_bounded_memory() {
             let message = LockMessage {
                 conversation,
                 dialect: Dialect::Own,
+                algorithm: None,
                 content: Content::Lock { resource, act },
             };
             let before = owner.out.len();

@@ -148,8 +148,8 @@ impl System {
             retry: 2,
             discovery: 4,
             claim: 1,
-            first_conversation: 0,
             fault: self.fault,
+            ..Options::default()
         }
     }
 
@@ -474,6 +474,7 @@ fn rebased(mut message: LockMessage) -> LockMessage {
     if let Content::Lock {
         act:
             Act::Confirm { asked: Some(asked) }
+            | Act::Ask { asked, .. }
             | Act::Renew { asked, .. }
             | Act::Granted { asked, .. }
             | Act::Refused { asked, .. },

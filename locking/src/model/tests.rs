@@ -88,7 +88,11 @@ fn the_owner_and_a_requester() {
     }
 }
 
-const EXTENDED: [Kind; 2] = [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended];
+const EXTENDED: [Kind; 3] = [
+    Kind::OwnerQueue,
+    Kind::RicartAgrawalaExtended,
+    Kind::SuzukiKasamiExtended,
+];
 
 #[test]
 fn a_message_is_lost_and_the_owner_restarts() {

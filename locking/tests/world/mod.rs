@@ -399,18 +399,22 @@ impl World {
 
     /// Records that a request has reached an agent.
     fn reached(&mut self, agent: usize, from: &Peer, message: &LockMessage) {
-        let Content::Lock {
-            act: Act::Request { .. } | Act::RequestToken { .. },
-            ..
-        } = message.content
-        else {
+        let Content::Lock { act, .. } = &message.content else {
             return;
         };
+        if !matches!(
+            act,
+            Act::Ask { .. } | Act::Request { .. } | Act::RequestToken { .. }
+        ) {
+            return;
+        }
+        let is_all = matches!(act, Act::Ask { .. });
         let entries = self.entries.clone();
         let sender = self.agents.iter_mut().find(|agent| agent.me == *from);
         if let Some(active) = sender.and_then(|sender| sender.claim.as_mut())
             && active.unreached.remove(&agent)
-            && active.unreached.is_empty()
+            && (is_all || active.unreached.is_empty())
+            && active.entries.is_none()
         {
             active.entries = Some(entries);
         }
