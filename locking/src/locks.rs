@@ -810,7 +810,14 @@ impl<A: Algorithm> Locks<A> {
                     | Act::Agree { .. }
                     | Act::RequestToken { .. }
                     | Act::Token(_) => {
-                        self.for_algorithm(now, from, resource, conversation, (act, algorithm), out);
+                        self.for_algorithm(
+                            now,
+                            from,
+                            resource,
+                            conversation,
+                            (act, algorithm),
+                            out,
+                        );
                     }
                 }
             }
@@ -1009,7 +1016,14 @@ impl<A: Algorithm> Locks<A> {
             match act {
                 Act::Request { clock } => {
                     let agree = Act::Agree { clock: *clock };
-                    self.send_in(kind, from.clone(), resource, conversation.clone(), agree, out);
+                    self.send_in(
+                        kind,
+                        from.clone(),
+                        resource,
+                        conversation.clone(),
+                        agree,
+                        out,
+                    );
                     return;
                 }
                 // A member that gets the token later has to know the requests. A token for an

@@ -1,7 +1,7 @@
 //! Times of the core.
 
-use crate::{Kind, Millis};
 use crate::faults::Fault;
+use crate::{Kind, Millis};
 
 /// Times of the core of one agent, in milliseconds, and its algorithm with agents of `distributed_locking`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

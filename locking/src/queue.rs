@@ -241,6 +241,3 @@ impl Queue {
         }
     }
 }
-
-#[cfg(test)]
-mod tests;

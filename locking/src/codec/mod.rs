@@ -37,8 +37,8 @@ use std::sync::Arc;
 use fipa_acl::{AgentId, BuildError, Message, Performative};
 
 use crate::{
-    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, MAX_PLACE, Millis,
-    NameError, Refusal, Resource, Token,
+    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, MAX_PLACE,
+    Millis, NameError, Refusal, Resource, Token,
 };
 
 /// Ontology of the messages of this library.

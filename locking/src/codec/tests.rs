@@ -142,14 +142,8 @@ fn messages_of_the_owner_s_queue() {
         assert_eq!(request(wrong, Some("7")), error, "{wrong}");
         assert_eq!(decoded(Performative::Agree, wrong, None), error, "{wrong}");
     }
-    assert_eq!(
-        request("bay", None),
-        Err(DecodeError::Number("reply-with"))
-    );
-    assert_eq!(
-        request("bay\n1\n2", Some("7")),
-        Err(DecodeError::Parts(3))
-    );
+    assert_eq!(request("bay", None), Err(DecodeError::Number("reply-with")));
+    assert_eq!(request("bay\n1\n2", Some("7")), Err(DecodeError::Parts(3)));
     let report = decoded(Performative::Confirm, "bay", Some("7"));
     assert_eq!(report, Err(DecodeError::Performative("confirm".into())));
 }
@@ -318,13 +312,15 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
                 }
             )
         ),
-        (any_kind.clone(), 0..Refusal::ALL.len(), any::<u64>()).prop_map(|(kind, reason, asked)| (
-            kind,
-            Act::Refused {
-                reason: Refusal::ALL[reason],
-                asked
-            }
-        )),
+        (any_kind.clone(), 0..Refusal::ALL.len(), any::<u64>()).prop_map(
+            |(kind, reason, asked)| (
+                kind,
+                Act::Refused {
+                    reason: Refusal::ALL[reason],
+                    asked
+                }
+            )
+        ),
         any_kind.prop_map(|kind| (kind, Act::Release)),
     ]
 }

@@ -53,12 +53,18 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    /// Chooses the algorithm of a resource that this agent begins to own.
-    pub(super) fn choose_algorithm(&mut self, resource: &Resource) {
-        let kind = match self.options.legacy_peers {
+    /// Algorithm of the resources that this agent begins to own.
+    #[must_use]
+    pub fn own_algorithm(&self) -> Kind {
+        match self.options.legacy_peers {
             true => self.unnamed(),
             false => self.kind,
-        };
+        }
+    }
+
+    /// Chooses the algorithm of a resource that this agent begins to own.
+    pub(super) fn choose_algorithm(&mut self, resource: &Resource) {
+        let kind = self.own_algorithm();
         if !self.has_request(resource) {
             self.set_algorithm(resource, kind);
         }
@@ -122,7 +128,14 @@ impl<A: Algorithm> Locks<A> {
             };
             let reason = Refusal::Algorithm(own);
             let refused = Act::Refused { reason, asked };
-            self.send_in(kind, from.clone(), resource, conversation.clone(), refused, out);
+            self.send_in(
+                kind,
+                from.clone(),
+                resource,
+                conversation.clone(),
+                refused,
+                out,
+            );
             out.push(Action::Event(Event::OtherAlgorithm {
                 resource: resource.clone(),
                 by: from.clone(),
@@ -194,12 +207,7 @@ impl<A: Algorithm> Locks<A> {
     // ----- lost owners
 
     /// Handles the loss of the owner of a resource with a queue, which may return. A lease is used to its end.
-    pub(super) fn lose_queue(
-        &mut self,
-        now: Millis,
-        resource: &Resource,
-        peer: &Peer,
-    ) {
+    pub(super) fn lose_queue(&mut self, now: Millis, resource: &Resource, peer: &Peer) {
         let until = now.saturating_add(self.options.discovery);
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
