@@ -1226,7 +1226,9 @@ impl<A: Algorithm> Locks<A> {
             Some(_) => return,
             None => {}
         }
-        let kind = named.unwrap_or_else(|| self.unnamed());
+        let member = self.members.get(peer);
+        let is_own = member.is_some_and(|member| member.dialect == Dialect::Own);
+        let kind = named.filter(|_| is_own).unwrap_or_else(|| self.unnamed());
         self.set_algorithm(resource, kind);
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
@@ -1361,16 +1363,16 @@ impl<A: Algorithm> Locks<A> {
         let conversation = conversation.clone();
         let mut steps = Vec::new();
         let holder = match dialect {
-            Some(Dialect::Legacy) => {
-                Holder::unfenced(conversation, report, &self.options, &mut steps)
-            }
-            // This agent, or an agent of this library.
             _ if kind == Kind::OwnerQueue => {
                 let former = entry.former.take();
                 let former = former.filter(|former| former.claim == current.claim);
                 let place = former.and_then(|former| former.place);
                 Holder::queued(conversation, now, place, &self.options, &mut steps)
             }
+            Some(Dialect::Legacy) => {
+                Holder::unfenced(conversation, report, &self.options, &mut steps)
+            }
+            // This agent, or an agent of this library.
             _ => Holder::new(conversation, now, &self.options, &mut steps),
         };
         let owner = owner.clone();

@@ -241,3 +241,6 @@ impl Queue {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -9,6 +9,7 @@ mod example;
 mod greetings;
 mod hosts;
 mod legacy;
+mod queued;
 #[path = "../support/mod.rs"]
 mod support;
 

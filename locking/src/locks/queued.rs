@@ -22,6 +22,22 @@ pub(super) struct Former {
     pub(super) place: Option<u32>,
 }
 
+/// Whether an act is one of its algorithm only. Grants, refusals and releases count in each: they name their
+/// request.
+fn is_of_algorithm(act: &Act) -> bool {
+    matches!(
+        act,
+        Act::Ask { .. }
+            | Act::Place { .. }
+            | Act::Request { .. }
+            | Act::Agree { .. }
+            | Act::RequestToken { .. }
+            | Act::Token(_)
+            | Act::Confirm { .. }
+            | Act::Renew { .. }
+    )
+}
+
 impl<A: Algorithm> Locks<A> {
     // ----- algorithms
 
@@ -79,14 +95,15 @@ impl<A: Algorithm> Locks<A> {
     /// The algorithm that a message contains. Agents of `distributed_locking` know no names of algorithms.
     pub(super) fn algorithm_in(&self, act: &Act, kind: Kind, to: &Peer) -> Option<Kind> {
         match act {
-            Act::Query { .. } | Act::Contested => None,
+            act if is_of_algorithm(act) => Some(kind),
+            Act::Granted { .. } | Act::Refused { .. } | Act::Release => Some(kind),
             Act::Owned => {
                 let member = self.members.get(to);
                 member
                     .is_some_and(|member| member.dialect == Dialect::Own)
                     .then_some(kind)
             }
-            _ => Some(kind),
+            _ => None,
         }
     }
 
@@ -102,19 +119,10 @@ impl<A: Algorithm> Locks<A> {
         else {
             return false;
         };
-        let is_bound = !matches!(
-            act,
-            Act::Query { .. }
-                | Act::Owned
-                | Act::Contested
-                | Act::Granted { .. }
-                | Act::Refused { .. }
-                | Act::Release
-        );
         let Some(entry) = self.resources.get(resource) else {
             return false;
         };
-        if !is_bound || entry.kind == kind {
+        if !is_of_algorithm(act) || entry.kind == kind {
             return false;
         }
         let (own, conversation) = (entry.kind, &message.conversation);

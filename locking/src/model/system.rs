@@ -531,7 +531,9 @@ impl Model for System {
             if number > 0 && left.crashes > 0 {
                 actions.push(Step::Crash(number));
             }
-            if left.pauses > 0 && agent.acquired {
+            // An agent of a queue can also be stopped while it waits for its turn.
+            let waits = self.kind == Kind::OwnerQueue && agent.claim.is_some();
+            if left.pauses > 0 && (agent.acquired || waits) {
                 actions.push(Step::Pause(number));
             }
         }
