@@ -796,10 +796,7 @@ impl<A: Algorithm> Locks<A> {
                     Act::Seen { fence } => {
                         self.at_owner(resource, out, |core, _| core.seen(now, fence));
                     }
-                    Act::Ask { .. }
-                    | Act::Confirm { .. }
-                    | Act::Renew { .. }
-                    | Act::Release => {
+                    Act::Ask { .. } | Act::Confirm { .. } | Act::Renew { .. } | Act::Release => {
                         self.for_owner(now, from, resource, conversation, act, out);
                     }
                     Act::Granted { .. } | Act::Refused { .. } => {
