@@ -158,6 +158,7 @@ fn locks_need_the_letters_of_their_algorithm() {
     let rows = report["rows"].as_array().unwrap();
     for hosts in [1, 2] {
         for (algorithm, letters) in [
+            ("owner_queue", 3.0),
             ("ricart_agrawala_extended", 2.0 * 7.0 + 3.0),
             ("suzuki_kasami_extended", 8.0 + 3.0),
             ("suzuki_kasami", 3.0),
@@ -174,7 +175,7 @@ fn locks_need_the_letters_of_their_algorithm() {
         }
     }
     let hand_overs = report["hand_overs"].as_array().unwrap();
-    assert_eq!(hand_overs.len(), 4);
+    assert_eq!(hand_overs.len(), 6);
     for hand_over in hand_overs {
         for measured in [
             "locks_us",

@@ -38,6 +38,10 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
         input.one_of(&["crane", "arm"])
     );
     let text = match (act, input.below(3)) {
+        (Performative::Request, 0 | 1) if kind == Kind::OwnerQueue => resource.to_owned(),
+        (Performative::Request | Performative::Agree, _) if kind == Kind::OwnerQueue => {
+            format!("{resource}\n{}", number % 10)
+        }
         (Performative::Request | Performative::Agree, _) if kind.has_token() => {
             format!("{resource}\n{number}")
         }

@@ -15,6 +15,8 @@ const SHARE: Millis = 95;
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Holder {
     conversation: Conversation,
+    /// Whether the request goes to the owner's queue, and its place in the owner's life before.
+    queued: Option<Option<u32>>,
     phase: Phase,
     fence: Option<Fence>,
     /// Lease of the last answer.
@@ -65,9 +67,29 @@ impl Holder {
         options: &Options,
         out: &mut Vec<HolderStep>,
     ) -> Self {
-        out.push(HolderStep::Send(Act::Confirm { asked: Some(now) }));
+        let mut holder = Self::asking(conversation, now, options);
+        holder.ask(now, out);
+        holder
+    }
+
+    /// Creates the state of a request for the owner's queue, and asks the owner.
+    pub(crate) fn queued(
+        conversation: Conversation,
+        now: Millis,
+        place: Option<u32>,
+        options: &Options,
+        out: &mut Vec<HolderStep>,
+    ) -> Self {
+        let mut holder = Self::asking(conversation, now, options);
+        holder.queued = Some(place);
+        holder.ask(now, out);
+        holder
+    }
+
+    fn asking(conversation: Conversation, now: Millis, options: &Options) -> Self {
         Self {
             conversation,
+            queued: None,
             phase: Phase::Asking,
             fence: None,
             lease: options.lease,
@@ -93,6 +115,7 @@ impl Holder {
         out.push(HolderStep::Held);
         Self {
             conversation,
+            queued: None,
             phase: Phase::Unfenced,
             fence: None,
             lease: 0,
@@ -124,6 +147,16 @@ impl Holder {
             Phase::Unfenced => true,
             Phase::Asking | Phase::Lost => false,
         }
+    }
+
+    /// Whether no grant was usable so far.
+    pub(crate) fn is_asking(&self) -> bool {
+        self.phase == Phase::Asking
+    }
+
+    /// Place in the owner's life before, which the request tells.
+    pub(crate) fn place(&self) -> Option<u32> {
+        self.queued.flatten()
     }
 
     /// Whether the owner gives no fence.
@@ -252,7 +285,10 @@ impl Holder {
                 fence: fence.clone(),
                 asked: now,
             },
-            None => Act::Confirm { asked: Some(now) },
+            None => match self.queued {
+                Some(place) => Act::Ask { asked: now, place },
+                None => Act::Confirm { asked: Some(now) },
+            },
         }));
     }
 

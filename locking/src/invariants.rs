@@ -137,7 +137,7 @@ impl History {
         }
         let request = (from.clone(), message.conversation.clone());
         match act {
-            Act::Confirm { .. } => {
+            Act::Confirm { .. } | Act::Ask { .. } => {
                 self.confirmed.insert(request);
             }
             Act::Release | Act::Token(_) => {
@@ -217,7 +217,9 @@ impl History {
             *from == grant.holder
                 && match act {
                     Act::Release | Act::Token(_) => message.conversation == grant.conversation,
-                    Act::Confirm { .. } => !message.conversation.is_not_after(&grant.conversation),
+                    Act::Confirm { .. } | Act::Ask { .. } => {
+                        !message.conversation.is_not_after(&grant.conversation)
+                    }
                     _ => false,
                 }
         });
@@ -335,6 +337,13 @@ impl Turns {
     pub fn reached(&mut self, by: &Peer, member: &Peer) {
         if let Some(open) = self.open.get_mut(by) {
             open.unreached.remove(member);
+        }
+    }
+
+    /// Records that a request has reached its only receiver.
+    pub fn reached_all(&mut self, by: &Peer) {
+        if let Some(open) = self.open.get_mut(by) {
+            open.unreached.clear();
         }
     }
 

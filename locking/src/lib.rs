@@ -2,15 +2,16 @@
 //!
 //! Agents reserve a *resource* before they use it. **Safety rests on the owner's grant alone**: the
 //! owner of a resource is the agent whose hardware it is, and it grants one [`Fence`] at a time, with
-//! a lease. The distributed algorithms decide which agent asks next. Their mistakes under loss and
-//! partition affect fairness and liveness only.
+//! a lease. The algorithms decide which agent is next. Their mistakes under loss and partition affect
+//! fairness and liveness only.
 //!
 //! * [`Locks`] is the core of one agent: requester, member, owner and holder of any number of
 //!   resources. It has no I/O and no clock: messages and `now` go in, [`Action`]s come out.
-//! * [`Algorithm`] is the interface of the algorithms. [`RicartAgrawala`] is permission based
+//! * [`Algorithm`] is the interface of the algorithms. With [`OwnerQueue`], the default, agents ask the owner
+//!   only, which serves them in the order of arrival. [`RicartAgrawala`] is permission based
 //!   (Ricart and Agrawala, *An optimal algorithm for mutual exclusion in computer networks*, CACM
 //!   24(1), 1981). [`SuzukiKasami`] is token based (Suzuki and Kasami, *A distributed mutual
-//!   exclusion algorithm*, ACM TOCS 3(4), 1985). Each has a basic form, for members and messages that
+//!   exclusion algorithm*, ACM TOCS 3(4), 1985). These two have a basic form, for members and messages that
 //!   are never lost, and an extended form, which probes members, repeats requests and replaces a lost
 //!   token.
 //! * [`Owner`] is the core of an owner, [`Holder`] that of a holder. Leases are those of Gray and
@@ -30,7 +31,7 @@
 //! let bay = Resource::new("bay")?;
 //! let options = Options::default();
 //! let mut crane: Locks<AnyAlgorithm> =
-//!     Locks::new(Peer::new("crane", 1)?, Kind::RicartAgrawalaExtended, options);
+//!     Locks::new(Peer::new("crane", 1)?, Kind::OwnerQueue, options);
 //! let mut actions = Vec::new();
 //! // The state has to be written and synced before `own` is called.
 //! let state = OwnerState::first().next_life(options.lease);
@@ -65,10 +66,12 @@ mod names;
 mod options;
 mod owner;
 mod probes;
+mod queue;
 mod state_file;
 
 pub use algorithm::{
-    Algorithm, AnyAlgorithm, Context, Gate, Kind, Member, RicartAgrawala, Step, SuzukiKasami,
+    Algorithm, AnyAlgorithm, Context, Gate, Kind, Member, OwnerQueue, RicartAgrawala, Step,
+    SuzukiKasami,
 };
 pub use fence::{Admission, Fence, FenceError, NotAdmitted};
 pub use holder::{Holder, HolderStep};
@@ -77,4 +80,5 @@ pub use message::{Act, Content, Dialect, LockMessage, Refusal, Token};
 pub use names::{Conversation, MAX_NAME, Millis, NameError, Peer, Resource};
 pub use options::{Options, OptionsError};
 pub use owner::{Ending, Grant, Owner, OwnerStep};
+pub use queue::MAX_PLACE;
 pub use state_file::{OwnerState, OwnerStateError};

@@ -1,5 +1,7 @@
 //! The core of one agent: requester, member, owner and holder of any number of resources.
 
+mod queued;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
@@ -103,6 +105,15 @@ pub enum Event {
         /// The new epoch.
         epoch: u64,
     },
+    /// Another agent uses another algorithm for a resource that this agent owns, and was refused.
+    OtherAlgorithm {
+        /// The resource.
+        resource: Resource,
+        /// The other agent.
+        by: Peer,
+        /// Its algorithm.
+        algorithm: Kind,
+    },
     /// This owner granted a resource.
     Granted {
         /// The resource.
@@ -154,6 +165,14 @@ pub enum Failure {
     /// The owner refuses.
     #[error("the owner refuses: {0}")]
     Refused(Refusal),
+    /// The owner names another algorithm than the one that this agent was told to use.
+    #[error("the owner uses the algorithm {owner}, and this agent was told to use {here}")]
+    Algorithm {
+        /// Algorithm of the owner.
+        owner: Kind,
+        /// Algorithm of this agent.
+        here: Kind,
+    },
     /// A resource of the claim was lost before all were acquired.
     #[error("the lock of another resource of the claim was lost")]
     Lost,
@@ -212,6 +231,10 @@ struct Entry<A> {
     owned: Option<Owned>,
     /// Highest fence of each owner that this agent or a device of it has seen.
     seen: BTreeMap<Arc<str>, Fence>,
+    /// The algorithm, which the owner names.
+    kind: Kind,
+    /// The request that waited at an owner that is lost.
+    former: Option<Former>,
     /// The gate that the algorithm was told.
     gate: Gate,
     algorithm: A,
@@ -273,6 +296,8 @@ impl Claim {
     }
 }
 
+use queued::Former;
+
 type Actions = Vec<Action>;
 
 impl<A: Algorithm> Locks<A> {
@@ -304,7 +329,8 @@ impl<A: Algorithm> Locks<A> {
         &self.me
     }
 
-    /// The algorithm.
+    /// The algorithm that this agent was told to use. With the owner's queue, it uses the algorithm that the owner of
+    /// each resource names.
     #[must_use]
     pub fn kind(&self) -> Kind {
         self.kind
@@ -465,10 +491,11 @@ impl<A: Algorithm> Locks<A> {
         out: &mut Actions,
     ) {
         let (me, options) = (self.me.clone(), self.options);
-        let entry = self.entry(resource);
-        if entry.owned.is_some() {
+        if self.entry(resource).owned.is_some() {
             return;
         }
+        self.choose_algorithm(resource);
+        let entry = self.entry(resource);
         let silence = state.silence().max(options.claim);
         let mut core = Owner::new(
             me.clone(),
@@ -489,6 +516,9 @@ impl<A: Algorithm> Locks<A> {
         }
         // An owner that needs a report is no owner before it has one.
         let claim = if needs_report { silence } else { options.claim };
+        if entry.kind == Kind::OwnerQueue {
+            core.be_fair(options.probe_timeout);
+        }
         entry.owned = Some(Owned {
             core,
             claim_until: Some(now.saturating_add(claim)),
@@ -696,9 +726,24 @@ impl<A: Algorithm> Locks<A> {
         dialect: Dialect,
         out: &mut Actions,
     ) {
+        let named = (dialect == Dialect::Own).then_some(self.kind);
+        self.owner_named(now, resource, owner, dialect, named, out);
+    }
+
+    /// Records the owner of a resource and its algorithm, as the directory knows them; see
+    /// [`owner_known`](Self::owner_known).
+    pub fn owner_named(
+        &mut self,
+        now: Millis,
+        resource: &Resource,
+        owner: &Peer,
+        dialect: Dialect,
+        algorithm: Option<Kind>,
+        out: &mut Actions,
+    ) {
         if *owner != self.me && self.admit_member(now, owner, dialect, out) {
             self.entry(resource);
-            self.learn_owner(now, resource, owner, out);
+            self.learn_owner(now, resource, owner, algorithm, out);
         }
         self.settle(now, out);
     }
@@ -707,8 +752,15 @@ impl<A: Algorithm> Locks<A> {
 
     /// Handles a message. `from` is the sender, as far as its connection proves it.
     pub fn handle(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
+        let was_suspected = self
+            .members
+            .get(from)
+            .is_some_and(|member| member.suspected);
         if *from == self.me || !self.admit_member(now, from, message.dialect, out) {
             return;
+        }
+        if was_suspected {
+            self.heard_again(now, from, out);
         }
         self.probes.heard(now, &self.options, from);
         self.dispatch(now, from, message, out);
@@ -732,14 +784,7 @@ impl<A: Algorithm> Locks<A> {
         }
         for step in self.probes.handle_timeout(now, &self.options) {
             match step {
-                ProbeStep::Send(peer) => {
-                    let message = LockMessage {
-                        conversation: self.side_conversation("probe", now),
-                        dialect: Dialect::Own,
-                        content: Content::Probe,
-                    };
-                    out.push(Action::Send { to: peer, message });
-                }
+                ProbeStep::Send(peer) => self.probe(peer, now, out),
                 ProbeStep::Lost(peer) => self.suspect(now, &peer, out),
             }
         }
@@ -766,6 +811,7 @@ impl<A: Algorithm> Locks<A> {
                 let answer = LockMessage {
                     conversation: conversation.clone(),
                     dialect: Dialect::Own,
+                    algorithm: None,
                     content: Content::Alive,
                 };
                 let to = from.clone();
@@ -779,24 +825,36 @@ impl<A: Algorithm> Locks<A> {
                 if self.resources.contains_key(resource) {
                     self.touched.insert(resource.clone());
                 }
+                if self.is_refused(from, message, out) {
+                    return;
+                }
+                let algorithm = message.algorithm;
                 match act {
                     Act::Query { .. } | Act::Owned | Act::Contested => {
-                        self.discover(now, from, resource, conversation, act, out);
+                        self.discover(now, from, resource, conversation, (act, algorithm), out);
                     }
                     Act::Seen { fence } => {
                         self.at_owner(resource, out, |core, _| core.seen(now, fence));
                     }
-                    Act::Confirm { .. } | Act::Renew { .. } | Act::Release => {
+                    Act::Ask { .. } | Act::Confirm { .. } | Act::Renew { .. } | Act::Release => {
                         self.for_owner(now, from, resource, conversation, act, out);
                     }
                     Act::Granted { .. } | Act::Refused { .. } => {
                         self.for_holder(now, from, resource, conversation, act, out);
                     }
-                    Act::Request { .. }
+                    Act::Place { .. }
+                    | Act::Request { .. }
                     | Act::Agree { .. }
                     | Act::RequestToken { .. }
                     | Act::Token(_) => {
-                        self.for_algorithm(now, from, resource, conversation, act, out);
+                        self.for_algorithm(
+                            now,
+                            from,
+                            resource,
+                            conversation,
+                            (act, algorithm),
+                            out,
+                        );
                     }
                 }
             }
@@ -809,7 +867,7 @@ impl<A: Algorithm> Locks<A> {
         from: &Peer,
         resource: &Resource,
         conversation: &Conversation,
-        act: &Act,
+        (act, algorithm): (&Act, Option<Kind>),
         out: &mut Actions,
     ) {
         // An earlier registration of this agent is no other owner.
@@ -826,8 +884,11 @@ impl<A: Algorithm> Locks<A> {
             Some(owned) => owned.claim_until.is_none(),
             None => {
                 if *act == Act::Owned {
-                    self.learn_owner(now, resource, from, out);
+                    self.learn_owner(now, resource, from, algorithm, out);
                 } else if (*act == Act::Query { claim: true }) {
+                    if self.is_return(resource, from) {
+                        self.learn_owner(now, resource, from, Some(Kind::OwnerQueue), out);
+                    }
                     // The owner may have started without its state file.
                     self.tell_seen(now, from, resource, out);
                 }
@@ -874,7 +935,7 @@ impl<A: Algorithm> Locks<A> {
                 let me = self.me.clone();
                 self.owner_lost(now, resource, &me, true, out);
                 if *act == Act::Owned {
-                    self.learn_owner(now, resource, from, out);
+                    self.learn_owner(now, resource, from, algorithm, out);
                 }
             }
         }
@@ -890,8 +951,11 @@ impl<A: Algorithm> Locks<A> {
         out: &mut Actions,
     ) {
         let owns = self.owner(resource).is_some();
-        let has_token = self.kind.has_token();
+        let has_token = self.kind_of(resource).has_token();
         match act {
+            Act::Ask { asked, place } if owns => self.at_owner(resource, out, |core, steps| {
+                core.ask(now, from, conversation, (*asked, *place), steps);
+            }),
             Act::Confirm { asked } if owns => self.at_owner(resource, out, |core, steps| {
                 if has_token {
                     // The agent has the token, so the legacy agent that had it has left.
@@ -905,7 +969,9 @@ impl<A: Algorithm> Locks<A> {
             Act::Release if owns => self.at_owner(resource, out, |core, steps| {
                 core.release(now, from, conversation, steps);
             }),
-            Act::Confirm { asked: Some(asked) } | Act::Renew { asked, .. } => {
+            Act::Ask { asked, .. }
+            | Act::Confirm { asked: Some(asked) }
+            | Act::Renew { asked, .. } => {
                 let refused = Act::Refused {
                     reason: Refusal::NotOwner,
                     asked: *asked,
@@ -964,6 +1030,12 @@ impl<A: Algorithm> Locks<A> {
                 }
             }
             self.perform_holder(now, resource, steps, out);
+        } else if let Act::Refused {
+            reason: Refusal::Algorithm(kind),
+            ..
+        } = act
+        {
+            self.algorithm_refused(now, from, resource, conversation, *kind, out);
         } else if matches!(act, Act::Granted { .. }) {
             // The request was withdrawn while the grant was under way.
             let to = from.clone();
@@ -977,25 +1049,34 @@ impl<A: Algorithm> Locks<A> {
         from: &Peer,
         resource: &Resource,
         conversation: &Conversation,
-        act: &Act,
+        (act, algorithm): (&Act, Option<Kind>),
         out: &mut Actions,
     ) {
+        let kind = algorithm.unwrap_or(self.kind);
         if !self.resources.contains_key(resource) {
             match act {
-                Act::Request { clock } if !self.kind.has_token() => {
+                Act::Request { clock } => {
                     if !fault!(self.options.fault, ForgetClock) {
                         self.clock = self.clock.max(*clock);
                     }
                     let agree = Act::Agree { clock: *clock };
-                    self.send(from.clone(), resource, conversation.clone(), agree, out);
+                    self.send_in(
+                        kind,
+                        from.clone(),
+                        resource,
+                        conversation.clone(),
+                        agree,
+                        out,
+                    );
                     return;
                 }
                 // A member that gets the token later has to know the requests. A token for an
                 // earlier registration has to be passed on.
                 Act::RequestToken { .. } | Act::Token(_)
-                    if self.kind.has_token() && self.resources.len() < MAX_FOREIGN =>
+                    if self.accepts(kind) && self.resources.len() < MAX_FOREIGN =>
                 {
                     self.entry(resource);
+                    self.set_algorithm(resource, kind);
                 }
                 _ => return,
             }
@@ -1144,6 +1225,9 @@ impl<A: Algorithm> Locks<A> {
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
+        if entry.kind == Kind::OwnerQueue && *peer != self.me {
+            return self.lose_queue(now, resource, peer);
+        }
         let mut failed = Vec::new();
         if entry.owner.as_ref() == Some(peer) {
             entry.owner = None;
@@ -1174,7 +1258,15 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    fn learn_owner(&mut self, now: Millis, resource: &Resource, peer: &Peer, out: &mut Actions) {
+    /// `named` is the algorithm that the owner has named.
+    fn learn_owner(
+        &mut self,
+        now: Millis,
+        resource: &Resource,
+        peer: &Peer,
+        named: Option<Kind>,
+        out: &mut Actions,
+    ) {
         let Some(entry) = self.resources.get(resource) else {
             return;
         };
@@ -1192,6 +1284,10 @@ impl<A: Algorithm> Locks<A> {
             Some(_) => return,
             None => {}
         }
+        let member = self.members.get(peer);
+        let is_own = member.is_some_and(|member| member.dialect == Dialect::Own);
+        let kind = named.filter(|_| is_own).unwrap_or_else(|| self.unnamed());
+        self.set_algorithm(resource, kind);
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
@@ -1277,6 +1373,7 @@ impl<A: Algorithm> Locks<A> {
         let retry = now.saturating_add(self.options.retry);
         let until = now.saturating_add(self.options.discovery);
         let conversation = Conversation::new(self.me.shared_name().clone(), self.next_conversation);
+        let (here, accepts) = (self.kind, self.accepts(self.kind_of(resource)));
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
@@ -1289,6 +1386,10 @@ impl<A: Algorithm> Locks<A> {
         let Some(claim) = entry.waiting.pop_front() else {
             return;
         };
+        if entry.owner.is_some() && entry.owned.is_none() && !accepts {
+            let owner = entry.kind;
+            return self.fail(now, claim, Failure::Algorithm { owner, here }, out);
+        }
         if entry.owner.is_none() {
             let phase = Phase::Discovering { until, next: retry };
             entry.current = Some(Current { claim, phase });
@@ -1309,7 +1410,8 @@ impl<A: Algorithm> Locks<A> {
 
     /// The request of this agent has entered.
     fn entered(&mut self, now: Millis, resource: &Resource, out: &mut Actions) {
-        let report = !self.kind.has_token();
+        let kind = self.kind_of(resource);
+        let report = !kind.has_token();
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
@@ -1323,6 +1425,12 @@ impl<A: Algorithm> Locks<A> {
         let conversation = conversation.clone();
         let mut steps = Vec::new();
         let holder = match dialect {
+            _ if kind == Kind::OwnerQueue => {
+                let former = entry.former.take();
+                let former = former.filter(|former| former.claim == current.claim);
+                let place = former.and_then(|former| former.place);
+                Holder::queued(conversation, now, place, &self.options, &mut steps)
+            }
             Some(Dialect::Legacy) => {
                 Holder::unfenced(conversation, report, &self.options, &mut steps)
             }
@@ -1343,11 +1451,14 @@ impl<A: Algorithm> Locks<A> {
             return;
         };
         let mut report = None;
+        let has_token = entry.kind.has_token();
         match current.phase {
-            Phase::Discovering { .. } => return,
+            Phase::Discovering { .. } => {
+                return self.withdraw_former(resource, current.claim, out);
+            }
             Phase::Requesting { .. } => {}
             Phase::Entered { owner, holder } => {
-                if !(holder.is_unfenced() && self.kind.has_token()) {
+                if !(holder.is_unfenced() && has_token) {
                     report = Some((owner, holder.conversation().clone()));
                 }
             }
@@ -1432,6 +1543,9 @@ impl<A: Algorithm> Locks<A> {
                         entry.owner = None;
                     }
                 }
+                HolderStep::Refused(Refusal::Algorithm(kind)) => {
+                    self.ask_in(now, resource, id, kind, out);
+                }
                 // The grant ended before this agent could use it.
                 HolderStep::Refused(_) => self.ask_again(now, resource, out),
             }
@@ -1478,7 +1592,7 @@ impl<A: Algorithm> Locks<A> {
         let claim = current.claim;
         match &mut current.phase {
             Phase::Discovering { until, .. } if *until <= now => {
-                self.fail(now, claim, Failure::NoOwner, out);
+                self.not_found(now, resource, claim, out);
             }
             Phase::Discovering { next, .. } if *next <= now => {
                 *next = retry;
@@ -1607,7 +1721,7 @@ impl<A: Algorithm> Locks<A> {
         let current = entry.current.as_ref();
         let of_current = current.and_then(|current| match &current.phase {
             Phase::Discovering { until, next } => Some(*until.min(next)),
-            Phase::Requesting { next, .. } => self.kind.is_extended().then_some(*next),
+            Phase::Requesting { next, .. } => entry.kind.is_extended().then_some(*next),
             Phase::Entered { holder, .. } => holder.poll_timeout(),
         });
         let claims = entry
@@ -1637,7 +1751,7 @@ impl<A: Algorithm> Locks<A> {
             peers.extend(owned.core.live(now).map(|grant| grant.holder.clone()));
         }
         if let Some(current) = &entry.current
-            && self.kind.is_extended()
+            && entry.kind.is_extended()
         {
             match &current.phase {
                 Phase::Discovering { .. } => {}
@@ -1662,6 +1776,8 @@ impl<A: Algorithm> Locks<A> {
                 owner: None,
                 owned: None,
                 seen: BTreeMap::new(),
+                kind,
+                former: None,
                 gate: Gate::Open,
                 algorithm: A::new(kind, me.clone(), false),
                 waiting: VecDeque::new(),
@@ -1699,6 +1815,7 @@ impl<A: Algorithm> Locks<A> {
                     let resource = resource.clone();
                     out.push(Action::Event(Event::Raised { resource, epoch }));
                 }
+                OwnerStep::Probe { to, at } => self.probe(to, at, out),
                 OwnerStep::Began(grant) => {
                     let resource = resource.clone();
                     out.push(Action::Event(Event::Granted { resource, grant }));
@@ -1797,9 +1914,24 @@ impl<A: Algorithm> Locks<A> {
         act: Act,
         out: &mut Actions,
     ) {
+        let kind = self.kind_of(resource);
+        self.send_in(kind, to, resource, conversation, act, out);
+    }
+
+    /// Sends a message of an algorithm.
+    fn send_in(
+        &mut self,
+        kind: Kind,
+        to: Peer,
+        resource: &Resource,
+        conversation: Conversation,
+        act: Act,
+        out: &mut Actions,
+    ) {
         let message = LockMessage {
             conversation,
             dialect: Dialect::Own,
+            algorithm: self.algorithm_in(&act, kind, &to),
             content: Content::Lock {
                 resource: resource.clone(),
                 act,

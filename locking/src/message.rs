@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 
-use crate::{Conversation, Fence, Millis, Resource};
+use crate::{Conversation, Fence, Kind, Millis, Resource};
 
 /// A message between the cores of two agents.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -13,6 +13,9 @@ pub struct LockMessage {
     pub conversation: Conversation,
     /// Dialect of the sender.
     pub dialect: Dialect,
+    /// Algorithm of an act that belongs to one, or the one that an owner names with [`Act::Owned`]. `None` for
+    /// other acts, and for that of the resource.
+    pub algorithm: Option<Kind>,
     /// Content of the message.
     pub content: Content,
 }
@@ -64,6 +67,18 @@ pub enum Act {
     Seen {
         /// The highest fence that was seen.
         fence: Fence,
+    },
+    /// Owner's queue: asks the owner for a grant.
+    Ask {
+        /// Time of sending, by the clock of the sender. The answer repeats it.
+        asked: Millis,
+        /// Place in the queue of the owner's life before.
+        place: Option<u32>,
+    },
+    /// Owner's queue: place of the request of this conversation. The next one has place 1.
+    Place {
+        /// The place: 1 to [`MAX_PLACE`](crate::MAX_PLACE).
+        place: u32,
     },
     /// Ricart-Agrawala: asks for permission to enter.
     Request {
@@ -124,18 +139,34 @@ pub enum Refusal {
     Closed,
     /// The receiver does not own the resource.
     NotOwner,
+    /// The agents that use the resource use this algorithm.
+    Algorithm(Kind),
 }
 
 impl Refusal {
-    pub(crate) const ALL: [Self; 3] = [Self::NotLive, Self::Closed, Self::NotOwner];
+    pub(crate) const ALL: [Self; 8] = [
+        Self::NotLive,
+        Self::Closed,
+        Self::NotOwner,
+        Self::Algorithm(Kind::OwnerQueue),
+        Self::Algorithm(Kind::RicartAgrawala),
+        Self::Algorithm(Kind::RicartAgrawalaExtended),
+        Self::Algorithm(Kind::SuzukiKasami),
+        Self::Algorithm(Kind::SuzukiKasamiExtended),
+    ];
 
-    /// Word in a message.
+    /// Words in a message.
     #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
             Self::NotLive => "not-live",
             Self::Closed => "closed",
             Self::NotOwner => "not-owner",
+            Self::Algorithm(Kind::OwnerQueue) => "algorithm owner_queue",
+            Self::Algorithm(Kind::RicartAgrawala) => "algorithm ricart_agrawala",
+            Self::Algorithm(Kind::RicartAgrawalaExtended) => "algorithm ricart_agrawala_extended",
+            Self::Algorithm(Kind::SuzukiKasami) => "algorithm suzuki_kasami",
+            Self::Algorithm(Kind::SuzukiKasamiExtended) => "algorithm suzuki_kasami_extended",
         }
     }
 }
@@ -143,6 +174,7 @@ impl Refusal {
 impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
+            Self::Algorithm(kind) => return write!(f, "the resource uses the algorithm {kind}"),
             Self::NotLive => "the grant is not live",
             Self::Closed => "the request was released or withdrawn before",
             Self::NotOwner => "the agent does not own the resource",

@@ -1,9 +1,9 @@
 //! Times of the core.
 
-use crate::Millis;
 use crate::faults::Fault;
+use crate::{Kind, Millis};
 
-/// Times of the core of one agent, in milliseconds.
+/// Times of the core of one agent, in milliseconds, and its algorithm with agents of `distributed_locking`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Options {
     /// Lease of a grant (default 15 s). The owner counts it from its answer, the holder 0.95 of it
@@ -22,6 +22,12 @@ pub struct Options {
     pub claim: Millis,
     /// Number of the first conversation. A restarted agent should not use its earlier numbers.
     pub first_conversation: u64,
+    /// Algorithm with agents of `distributed_locking`, for an agent whose own is the owner's queue (default:
+    /// the extended Ricart-Agrawala).
+    pub legacy_algorithm: Kind,
+    /// Whether agents of `distributed_locking` use the resources that this agent owns (default: no). Then these
+    /// have the algorithm for such agents.
+    pub legacy_peers: bool,
     pub(crate) fault: Fault,
 }
 
@@ -35,6 +41,8 @@ impl Default for Options {
             discovery: 2_000,
             claim: 1_000,
             first_conversation: 0,
+            legacy_algorithm: Kind::RicartAgrawalaExtended,
+            legacy_peers: false,
             fault: Fault::NO,
         }
     }

@@ -10,10 +10,11 @@
 //! * A report of a fence of another life raises the epoch before the next grant, which waits until the
 //!   new epoch is stored. A live grant goes on: a report is not proved, so it must end no grant.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 
 use crate::faults::{Fault, fault};
-use crate::{Act, Conversation, Dialect, Fence, Gate, Millis, OwnerState, Peer, Refusal, Resource};
+use crate::queue::Queue;
+use crate::{Act, Conversation, Fence, Gate, Millis, OwnerState, Peer, Refusal, Resource};
 
 /// Highest epoch that a report can have. The clock reaches it in nine million years, and the epochs above
 /// are left to the restarts that follow a false report.
@@ -44,7 +45,7 @@ pub struct Owner {
     /// Holder whose grant expired, until it reports or ends.
     unproved: Option<(Peer, Conversation)>,
     /// At most one report per registration.
-    queue: VecDeque<Waiter>,
+    queue: Queue,
     /// Latest conversation of each agent that has ended.
     closed: BTreeMap<Peer, Conversation>,
     fault: Fault,
@@ -61,23 +62,6 @@ pub struct Grant {
     pub fence: Option<Fence>,
     /// End of the lease. The grant of a legacy agent has none.
     pub expires: Option<Millis>,
-}
-
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-struct Waiter {
-    peer: Peer,
-    conversation: Conversation,
-    /// Time that the grant repeats. Legacy agents have none.
-    asked: Option<Millis>,
-}
-
-impl Waiter {
-    fn dialect(&self) -> Dialect {
-        match self.asked {
-            Some(_) => Dialect::Own,
-            None => Dialect::Legacy,
-        }
-    }
 }
 
 /// End of a grant.
@@ -112,6 +96,13 @@ pub enum OwnerStep {
     },
     /// Store this epoch, and call [`Owner::stored`].
     Store(u64),
+    /// Ask a member for a sign of life.
+    Probe {
+        /// The member.
+        to: Peer,
+        /// The time.
+        at: Millis,
+    },
     /// A grant begins.
     Began(Grant),
     /// A grant ends.
@@ -160,7 +151,7 @@ impl Owner {
             silent_until: (silence > 0).then(|| now.saturating_add(silence)),
             live: None,
             unproved: None,
-            queue: VecDeque::new(),
+            queue: Queue::default(),
             closed: BTreeMap::new(),
             fault,
         }
@@ -202,10 +193,15 @@ impl Owner {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Millis> {
         let expires = self.live.as_ref().and_then(|grant| grant.expires);
+        let turn = match self.gate() {
+            Gate::Closed => None,
+            Gate::Open | Gate::Own => self.queue.poll_timeout(),
+        };
         expires
             .into_iter()
             .chain(self.silent_until)
             .chain(self.absent_until)
+            .chain(turn)
             .min()
     }
 
@@ -252,6 +248,34 @@ impl Owner {
         self.handle_timeout(now, out);
     }
 
+    /// Serves requests in the order of their arrival, and tells places: the algorithm is the owner's queue.
+    pub(crate) fn be_fair(&mut self, probe_timeout: Millis) {
+        self.queue.be_fair(probe_timeout);
+    }
+
+    /// Handles a request of the owner's queue. `place` is that in the owner's life before.
+    pub(crate) fn ask(
+        &mut self,
+        now: Millis,
+        from: &Peer,
+        conversation: &Conversation,
+        (asked, place): (Millis, Option<u32>),
+        out: &mut Vec<OwnerStep>,
+    ) {
+        self.confirm(now, from, conversation, Some(asked), out);
+        if self.silent_until.is_some()
+            && let Some(place) = place
+        {
+            self.queue.sort_in(from, place);
+        }
+    }
+
+    /// Handles a sign of life of a member that was suspected.
+    pub(crate) fn heard(&mut self, now: Millis, peer: &Peer, out: &mut Vec<OwnerStep>) {
+        self.queue.heard(peer);
+        self.handle_timeout(now, out);
+    }
+
     /// Handles a report that an agent has entered. `asked` is absent in those of legacy agents.
     pub(crate) fn confirm(
         &mut self,
@@ -261,12 +285,12 @@ impl Owner {
         asked: Option<Millis>,
         out: &mut Vec<OwnerStep>,
     ) {
-        let mut queue = self.queue.iter_mut();
-        if let Some(waiter) =
-            queue.find(|waiter| waiter.peer == *from && waiter.conversation == *conversation)
+        if let Some(waiter) = self.queue.find(from)
+            && waiter.conversation == *conversation
         {
             // The report was repeated. One answer follows, to the last repetition.
             waiter.asked = waiter.asked.max(asked);
+            self.queue.heard(from);
             self.handle_timeout(now, out);
             return;
         }
@@ -298,18 +322,8 @@ impl Owner {
             self.end(Ending::Released, out);
         }
         self.proved(from, conversation);
-        let known = self.queue.iter_mut().find(|waiter| waiter.peer == *from);
-        match known {
-            Some(waiter) if conversation.is_not_after(&waiter.conversation) => return,
-            Some(waiter) => {
-                waiter.conversation = conversation.clone();
-                waiter.asked = asked;
-            }
-            None => self.queue.push_back(Waiter {
-                peer: from.clone(),
-                conversation: conversation.clone(),
-                asked,
-            }),
+        if !self.queue.add(from, conversation, asked) {
+            return;
         }
         self.grant_next(now, out);
     }
@@ -352,8 +366,7 @@ impl Owner {
         if of_live {
             self.end(Ending::Released, out);
         } else if !self.is_closed(from, conversation) {
-            self.queue
-                .retain(|waiter| waiter.peer != *from || waiter.conversation != *conversation);
+            self.queue.withdraw(from, conversation);
             self.close(from, conversation);
         }
         self.grant_next(now, out);
@@ -389,7 +402,7 @@ impl Owner {
 
     /// Handles the loss of an agent. `gone` is a proof that its registration or its process has ended.
     pub(crate) fn lost(&mut self, now: Millis, peer: &Peer, gone: bool, out: &mut Vec<OwnerStep>) {
-        self.queue.retain(|waiter| waiter.peer != *peer);
+        self.queue.lost(peer, gone);
         if gone {
             if self.live.as_ref().is_some_and(|live| live.holder == *peer) {
                 self.end(Ending::Gone, out);
@@ -458,12 +471,19 @@ impl Owner {
     }
 
     fn grant_next(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
+        self.begin_next(now, out);
+        // The order can change until the end of the silence.
+        if self.silent_until.is_none() {
+            self.queue.tell(out);
+        }
+    }
+
+    fn begin_next(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
         let gate = self.gate();
         if gate == Gate::Closed {
             return;
         }
-        let mut queue = self.queue.iter();
-        let Some(next) = queue.position(|waiter| gate.lets_pass(waiter.dialect())) else {
+        let Some(next) = self.queue.next(now, gate, out) else {
             return;
         };
         let is_fenced = self.queue.get(next).is_some_and(|it| it.asked.is_some());
@@ -538,14 +558,13 @@ impl Owner {
     #[cfg(test)]
     pub(crate) fn rebase(&mut self, by: Millis) {
         let expires = self.live.as_mut().and_then(|live| live.expires.as_mut());
-        let asked = self.queue.iter_mut().flat_map(|waiter| &mut waiter.asked);
         for time in expires
             .into_iter()
             .chain(&mut self.silent_until)
             .chain(&mut self.absent_until)
-            .chain(asked)
         {
             *time = time.saturating_sub(by);
         }
+        self.queue.rebase(by);
     }
 }

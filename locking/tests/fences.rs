@@ -66,6 +66,7 @@ impl Agent {
         let message = LockMessage {
             conversation: Conversation::parse(conversation),
             dialect: Dialect::Own,
+            algorithm: None,
             content: Content::Lock {
                 resource: bay(),
                 act,
@@ -285,6 +286,7 @@ fn an_agent_tells_an_owner_that_starts_the_highest_fence() {
     let legacy = LockMessage {
         conversation: Conversation::parse("crane_discover_1"),
         dialect: Dialect::Legacy,
+        algorithm: None,
         content: Content::Lock {
             resource: bay(),
             act: Act::Query { claim: true },

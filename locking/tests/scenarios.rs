@@ -58,6 +58,7 @@ impl Agent {
         let message = LockMessage {
             conversation: Conversation::parse(conversation),
             dialect,
+            algorithm: None,
             content: Content::Lock {
                 resource: bay(),
                 act,
@@ -337,6 +338,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
     let alive = |conversation| LockMessage {
         conversation: Conversation::parse(conversation),
         dialect: OWN,
+        algorithm: None,
         content: Content::Alive,
     };
     let heard = alive("agent2_probe_0");
@@ -447,7 +449,7 @@ fn a_claim_that_ends_before_an_owner_is_found_says_so() {
 
 #[test]
 fn a_withdrawn_request_is_answered_and_its_grant_released() {
-    let mut agent = Agent::new("agent2", Kind::default());
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
     for name in ["agent1", "agent3"] {
         agent.locks.join(0, &peer(name), OWN, &mut agent.out);
     }
@@ -492,7 +494,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
 
 #[test]
 fn try_lock_withdraws_after_one_round() {
-    let mut agent = Agent::new("agent2", Kind::default());
+    let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
     agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
     agent
         .locks
@@ -543,7 +545,7 @@ fn a_repeated_report_that_waits_is_answered_once() {
 #[test]
 fn a_lost_owner_makes_the_resource_unreachable() {
     for proved in [true, false] {
-        let mut agent = Agent::new("agent2", Kind::default());
+        let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
         agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
         agent
             .locks
@@ -646,7 +648,7 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
 #[test]
 fn several_resources_are_held_all_or_none() {
     let names = ["c", "a", "b"].map(|name| Resource::new(name).unwrap());
-    let mut owner = Agent::new("agent1", Kind::default());
+    let mut owner = Agent::new("agent1", Kind::RicartAgrawalaExtended);
     owner.locks.join(0, &peer("agent2"), OWN, &mut owner.out);
     for name in &names {
         let state = OwnerState::first().next_life(15_000);
@@ -657,6 +659,7 @@ fn several_resources_are_held_all_or_none() {
     let message = |resource: &Resource, conversation: &str, act| LockMessage {
         conversation: Conversation::parse(conversation),
         dialect: OWN,
+        algorithm: None,
         content: Content::Lock {
             resource: resource.clone(),
             act,
@@ -715,7 +718,7 @@ fn several_resources_are_held_all_or_none() {
 #[test]
 fn a_dead_holder_is_replaced_at_once_and_its_late_command_refused() {
     let members = [("agent2", OWN), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::default(), &members);
+    let mut owner = Agent::owner("agent1", Kind::RicartAgrawalaExtended, &members);
     owner.receive("agent2", OWN, "agent2_0", confirm(1));
     let first = fence_in(&owner.sent());
     owner.receive("agent3", OWN, "agent3_0", confirm(1));
@@ -841,6 +844,7 @@ fn a_peer_with_many_requests_takes_bounded_memory() {
             let message = LockMessage {
                 conversation,
                 dialect: Dialect::Own,
+                algorithm: None,
                 content: Content::Lock { resource, act },
             };
             let before = owner.out.len();

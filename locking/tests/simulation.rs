@@ -46,6 +46,11 @@ fn simulate(kind: Kind, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
 }
 
 #[test]
+fn faults_break_no_invariant_of_the_owner_s_queue_and_every_claim_ends() {
+    assert!(simulate(Kind::OwnerQueue, true, seeds(60)) > 0);
+}
+
+#[test]
 fn faults_break_no_invariant_of_ricart_agrawala_and_every_claim_ends() {
     assert!(simulate(Kind::RicartAgrawalaExtended, true, seeds(60)) > 0);
 }
@@ -92,7 +97,7 @@ fn the_messages_fit_the_protocols_that_agents_enforce() {
 }
 
 /// After a request has reached all members, each other agent enters at most once before it
-/// (Ricart-Agrawala). With a token, the agent that has entered or is about to receive the token can enter
+/// (Ricart-Agrawala), or the owner (owner's queue). With a token, the agent that has entered or is about to receive the token can enter
 /// once more.
 #[test]
 fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
@@ -167,6 +172,10 @@ fn the_number_of_messages_is_the_minimum() {
             let again = world.messages_of_one_acquisition(1);
             let n = agents as u64;
             match kind {
+                Kind::OwnerQueue => {
+                    assert_eq!((first, again), (3, 3), "{kind}, {n}");
+                    assert_eq!(world.messages_of_one_acquisition(0), 0, "{kind}, {n}");
+                }
                 Kind::RicartAgrawala | Kind::RicartAgrawalaExtended => {
                     assert_eq!(
                         (first, again),

@@ -17,7 +17,7 @@ macro_rules! standard {
 }
 
 /// The files of the standard protocols, and of those of locks. Each file contains the name of its protocol.
-const STANDARD: [(&str, &str); 19] = [
+const STANDARD: [(&str, &str); 20] = [
     standard!("request"),
     standard!("query"),
     standard!("request-when"),
@@ -33,6 +33,7 @@ const STANDARD: [(&str, &str); 19] = [
     standard!("rock-query"),
     standard!("dlm_discover"),
     standard!("dlm_probe"),
+    standard!("owner_queue"),
     standard!("ricart_agrawala"),
     standard!("ricart_agrawala_extended"),
     standard!("suzuki_kasami"),
@@ -212,6 +213,7 @@ mod tests {
             ("fipa-cancel", &["cancel"]),
             ("dlm_discover", &[]),
             ("dlm_probe", &[]),
+            ("owner_queue", &[]),
             ("ricart_agrawala_extended", &[]),
             ("suzuki_kasami", &[]),
         ] {

@@ -117,7 +117,7 @@ fn matches(pattern: &str, text: &str) -> bool {
 
 /// Whether its messages are repeated without `reply-with`.
 fn is_of_locks(machine: &Machine) -> bool {
-    let of_locks = ["dlm_", "ricart_agrawala", "suzuki_kasami"];
+    let of_locks = ["dlm_", "owner_queue", "ricart_agrawala", "suzuki_kasami"];
     of_locks
         .iter()
         .any(|prefix| machine.name().starts_with(prefix))

@@ -69,7 +69,7 @@ impl Device {
                 let directory = self.core.endpoint.domain.directory();
                 let listed = owned::listed_owner(directory, &resource);
                 let listed =
-                    listed.and_then(|it| Peer::new(&it.name, it.incarnation.as_u64()).ok());
+                    listed.and_then(|(it, _)| Peer::new(&it.name, it.incarnation.as_u64()).ok());
                 let listed = listed.filter(|listed| listed.name() == owner);
                 self.shared.saw(&self.core, listed.as_ref(), &highest, true);
                 AdmitError::OtherRun {

@@ -3,7 +3,7 @@
 use std::io;
 
 use fipa_acl::BuildError;
-use fipa_locking::{Failure, NameError, OptionsError, Refusal, Resource};
+use fipa_locking::{Failure, Kind, NameError, OptionsError, Refusal, Resource};
 use fipa_transport::Forked;
 use fipa_transport::threads::ThreadError;
 
@@ -53,6 +53,19 @@ pub enum LockError {
         resource: String,
         /// The reason.
         reason: Refusal,
+    },
+    /// This agent was told to use an algorithm, and the owner of the resource uses another one.
+    #[error(
+        "the owner of {resource:?} uses the algorithm {owner}, and this agent was told to use {here}; use that of \
+         the owner, or name none"
+    )]
+    OtherAlgorithm {
+        /// The resource.
+        resource: String,
+        /// The algorithm of the owner.
+        owner: Kind,
+        /// The algorithm of this agent.
+        here: Kind,
     },
     /// The lock was lost: its lease ended without a renewal, or the owner has ended it.
     #[error("the lock of {resource:?} was lost")]
@@ -106,6 +119,11 @@ impl LockError {
                 owner: owner.name().to_owned(),
             },
             Failure::TimedOut { ahead } => Self::TimedOut { resource, ahead },
+            Failure::Algorithm { owner, here } => Self::OtherAlgorithm {
+                resource,
+                owner,
+                here,
+            },
             Failure::Refused(reason) => Self::Refused { resource, reason },
             _ => Self::Lost { resource },
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::MessageBuilder;
-use fipa_locking::{AnyAlgorithm, ClaimId, Fence, Locks, Millis, Peer, Resource};
+use fipa_locking::{AnyAlgorithm, ClaimId, Fence, Kind, Locks, Millis, Peer, Resource};
 use tokio::sync::watch;
 
 use super::shell::{self, ClaimState, Shared};
@@ -176,19 +176,19 @@ impl fmt::Debug for Lock {
     }
 }
 
-/// Returns the owners that the directory lists, if they differ from those that the agent knows: an owner
+/// Returns the owners that the directory lists, with the algorithms that they name, if they differ from those that the agent knows: an owner
 /// that has restarted has another registration.
 fn listed_owners(
     core: &AgentCore,
     shared: &Shared,
     resources: &[Resource],
-) -> Vec<(Resource, Peer)> {
+) -> Vec<(Resource, Peer, Option<Kind>)> {
     let directory = core.endpoint.domain.directory();
     let listed = |resource: &Resource| {
         let known = shared.read(|locks, _| locks.owner_of(resource).cloned());
-        let owner = owned::listed_owner(directory, resource)?;
+        let (owner, algorithm) = owned::listed_owner(directory, resource)?;
         let owner = Peer::new(&owner.name, owner.incarnation.as_u64()).ok()?;
-        (known.as_ref() != Some(&owner)).then(|| (resource.clone(), owner))
+        (known.as_ref() != Some(&owner)).then(|| (resource.clone(), owner, algorithm))
     };
     resources.iter().filter_map(listed).collect()
 }

@@ -2,8 +2,9 @@
 //! lost.
 //!
 //! The owner of a resource is the agent whose hardware it is. It grants the resource to one agent at a
-//! time, with a [`Fence`] and a lease. The distributed algorithms decide which agent asks next; what they
-//! get wrong under loss and partition costs fairness and time, not safety (`fipa-locking`).
+//! time, with a [`Fence`] and a lease, in the order of their requests. With agents of the C++ library
+//! `distributed_locking`, a distributed algorithm decides which agent asks next. What the algorithms get wrong under
+//! loss and partition costs fairness and time, not safety (`fipa-locking`).
 //!
 //! ```no_run
 //! # async fn example(crane: fipa::Agent, rover: fipa::Agent)
@@ -72,8 +73,14 @@ pub use self::state_file::StateFileError;
 /// The options of an agent's locks; see [`Agent::use_locks`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LockOptions {
-    /// The algorithm. All agents that use a resource need the same one.
+    /// The algorithm of the resources that this agent owns. With the default, the owner's queue, this agent uses
+    /// the algorithm that the owner of each resource names. With another one, it uses no resource whose owner names
+    /// another algorithm ([`LockError::OtherAlgorithm`]).
     pub algorithm: Algorithm,
+    /// The algorithm with agents of the C++ library `distributed_locking`, if [`algorithm`](Self::algorithm) is the
+    /// owner's queue, in which they cannot take part (the extended Ricart-Agrawala): at a resource of such an agent,
+    /// and, with [`legacy_peers`](Self::legacy_peers), at the resources that this agent owns.
+    pub legacy_algorithm: Algorithm,
     /// Time in which an existing owner can contradict a new one (1 s).
     pub claim: Duration,
     /// Maximum time to find the owner of a resource (2 s).
@@ -85,9 +92,10 @@ pub struct LockOptions {
     /// Time after which a request without an answer is repeated, the round of [`Agent::try_lock`], and with
     /// Ricart-Agrawala the maximum wait for the answers to greetings before the first request (1 s).
     pub retry: Duration,
-    /// Whether agents of legacy platforms and static peers are asked whether they use locks (`false`).
-    /// Agents of the C++ library `distributed_locking` then take part from the start, otherwise from
-    /// their first message. Other legacy agents receive a `request` with the protocol `dlm_probe`.
+    /// Whether agents of legacy platforms and static peers are asked whether they use locks (`false`), and the
+    /// resources of this agent have an algorithm of the C++ library `distributed_locking`. Its agents then take part
+    /// from the start. Otherwise they take part from their first message, at resources with such an algorithm. Other
+    /// legacy agents receive a `request` with the protocol `dlm_probe`.
     pub legacy_peers: bool,
 }
 
@@ -96,6 +104,7 @@ impl Default for LockOptions {
         let core = Options::default();
         Self {
             algorithm: Algorithm::default(),
+            legacy_algorithm: core.legacy_algorithm,
             claim: Duration::from_millis(core.claim),
             discovery: Duration::from_millis(core.discovery),
             probe_interval: Duration::from_millis(core.probe_interval),
@@ -114,6 +123,8 @@ impl LockOptions {
         core.probe_interval = clock::millis(self.probe_interval);
         core.probe_timeout = clock::millis(self.probe_timeout);
         core.retry = clock::millis(self.retry);
+        core.legacy_algorithm = self.legacy_algorithm;
+        core.legacy_peers = self.legacy_peers;
         core
     }
 }

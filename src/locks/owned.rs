@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{ErrorChain, Message};
-use fipa_locking::{Ending, Fence, Grant, Options, OwnerState, Resource};
+use fipa_locking::{Ending, Fence, Grant, Kind, Options, OwnerState, Resource};
 use fipa_sds::{Entry, RegisterError, Role};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
@@ -171,8 +171,9 @@ impl Owned {
         };
         let agent = Arc::clone(&owned.core);
         let service = &owned.core.endpoint.domain.inner.service;
+        let algorithm = owned.shared.read(|locks, _| locks.own_algorithm());
         let prepared = background::run(&service.runtime, move |_| {
-            prepare(&agent, &resource, &options)
+            prepare(&agent, &resource, &options, algorithm)
         });
         let files = prepared.await.map_err(LockError::from)??;
         let life = files.life;
@@ -304,7 +305,12 @@ impl fmt::Debug for Owned {
 }
 
 /// Writes the state file and the entry of the directory. Blocks.
-fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Result<Files, OwnError> {
+fn prepare(
+    core: &AgentCore,
+    resource: &Resource,
+    options: &OwnOptions,
+    algorithm: Kind,
+) -> Result<Files, OwnError> {
     let domain = &core.endpoint.domain;
     let lease = clock::millis(options.lease);
     let (run, seconds) = (Incarnation::random().as_u64(), clock::time_of_day());
@@ -334,7 +340,7 @@ fn prepare(core: &AgentCore, resource: &Resource, options: &OwnOptions) -> Resul
     let state = state.map(|file| Arc::new(Mutex::new(file)));
     let listing = RegisterOptions {
         agent_type: TYPE.to_owned(),
-        description: String::new(),
+        description: algorithm.protocol().to_owned(),
     };
     let owner = Arc::clone(&core.endpoint.name);
     let listed = match domain.form(&entry_name(resource), [owner], None, listing) {
@@ -388,11 +394,12 @@ pub(super) fn listed(
     is_own.then_some((resource, owner))
 }
 
-/// Returns the owner of a resource, if the directory lists it.
+/// Returns the owner of a resource and the algorithm that it names, if the directory lists it.
 pub(super) fn listed_owner(
     directory: DirectoryView<'_>,
     resource: &Resource,
-) -> Option<Arc<Entry>> {
+) -> Option<(Arc<Entry>, Option<Kind>)> {
     let entry = directory.lookup(&entry_name(resource))?;
-    listed(directory, &entry).map(|(_, owner)| owner)
+    let (_, owner) = listed(directory, &entry)?;
+    Some((owner, Kind::named(&entry.description)))
 }

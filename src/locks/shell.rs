@@ -271,6 +271,15 @@ impl State {
                 let by = by.name().to_owned();
                 self.notify(&resource, OwnerEvent::Contested { by });
             }
+            Event::OtherAlgorithm {
+                resource,
+                by,
+                algorithm,
+            } => log_limit::warn!(
+                of: resource.as_str(), resource = %escape(resource.as_str()), by = %escape_name(by.name()), %algorithm,
+                "refused an agent that uses another algorithm for a resource that this agent owns; for agents of \
+                 distributed_locking, own the resource with `legacy_peers`"
+            ),
             Event::Granted { resource, grant } => {
                 self.notify(&resource, OwnerEvent::granted(grant));
             }
@@ -354,6 +363,7 @@ impl Shared {
 
     fn send(&self, core: &AgentCore, to: &Peer, message: &LockMessage) {
         let endpoint = &core.endpoint;
+        let message_kind = message.algorithm.unwrap_or(self.kind);
         let sent = AgentId::new(to.name())
             .map_err(|error| error.to_string())
             .and_then(|receiver| {
@@ -361,7 +371,7 @@ impl Shared {
                 let message = message.map_err(|error| error.to_string())?;
                 let letter = letter_for(&message, SystemTime::now());
                 let mut deadline = endpoint.domain.inner.deadline;
-                if !self.kind.is_extended() {
+                if !message_kind.is_extended() {
                     deadline = deadline.max(UNREPEATED);
                 }
                 let sending = endpoint.send(&message, letter, deadline);
@@ -387,14 +397,17 @@ impl Shared {
     pub(super) fn claim(
         &self,
         core: &AgentCore,
-        owners: &[(Resource, Peer)],
+        owners: &[(Resource, Peer, Option<Kind>)],
         begin: impl FnOnce(&mut Locks<AnyAlgorithm>, Millis, &mut Vec<Action>) -> ClaimId,
     ) -> (ClaimId, watch::Receiver<ClaimState>) {
         self.act(core, |state, now, actions| {
-            for (resource, owner) in owners {
-                state
-                    .core
-                    .owner_known(now, resource, owner, Dialect::Own, actions);
+            for (resource, owner, algorithm) in owners {
+                let (own, core) = (Dialect::Own, &mut state.core);
+                match algorithm {
+                    Some(_) => core.owner_named(now, resource, owner, own, *algorithm, actions),
+                    // The owner is asked.
+                    None => core.join(now, owner, own, actions),
+                }
                 state.note(owner);
             }
             let claim = begin(&mut state.core, now, actions);
@@ -675,7 +688,7 @@ impl Task {
             tracing::debug!(%message, "a message of a lock has failed");
             return;
         }
-        let decoded = match codec::decode(message, self.shared.kind) {
+        let decoded = match codec::read(message) {
             Ok(decoded) => decoded,
             Err(error) => {
                 tracing::debug!(
@@ -820,6 +833,7 @@ impl Task {
         let message = LockMessage {
             conversation: Conversation::new(prefix.into(), now()),
             dialect: Dialect::Own,
+            algorithm: None,
             content: Content::Probe,
         };
         self.shared.act(&self.core, |_, _, actions| {

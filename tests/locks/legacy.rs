@@ -134,10 +134,10 @@ impl Stage {
 async fn an_agent_of_the_cpp_library_locks_a_resource_of_ours() {
     watched(async {
         let stage = Stage::new().await;
-        let algorithm = Algorithm::RicartAgrawalaExtended;
-        let protocol = algorithm.protocol();
+        // With `legacy_peers`, the default is an algorithm in which it can take part.
+        let protocol = Algorithm::RicartAgrawalaExtended.protocol();
         let files = tempfile::tempdir().unwrap();
-        let crane = stage.agent("crane", algorithm).await;
+        let crane = stage.agent("crane", Algorithm::default()).await;
         let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
         stage
             .say(&["crane"], ["query-if", "dlm_discover", "agent2_0", "bay"])
@@ -188,17 +188,44 @@ async fn an_agent_of_the_cpp_library_locks_a_resource_of_ours() {
     .await;
 }
 
-/// agent2 owns the resource, with both algorithms.
+/// In the owner's queue an agent of the C++ library cannot take part. It gets a refusal with the name of the algorithm,
+/// which that library ignores.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_of_the_cpp_library_is_refused_at_a_queue() {
+    watched(async {
+        let stage = Stage::new().await;
+        let files = tempfile::tempdir().unwrap();
+        let crane = super::agent(&stage.domain, "crane").await;
+        let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
+        let protocol = Algorithm::RicartAgrawala.protocol();
+        stage
+            .say(&["crane"], ["request", protocol, "agent2_1", "1\nbay"])
+            .await;
+        let refusal = "bay\nalgorithm owner_queue";
+        stage.hears(["crane", "refuse", "agent2_1", refusal]).await;
+        assert!(bay.status().holder.is_none());
+    })
+    .await;
+}
+
+/// agent2 owns the resource, with both algorithms. An agent that was told none uses the extended Ricart-Agrawala.
 #[tokio::test(flavor = "multi_thread")]
 async fn we_lock_a_resource_of_an_agent_of_the_cpp_library() {
     watched(async {
-        for algorithm in [
-            Algorithm::RicartAgrawalaExtended,
-            Algorithm::SuzukiKasamiExtended,
+        for (told, algorithm) in [
+            (Algorithm::default(), Algorithm::RicartAgrawalaExtended),
+            (
+                Algorithm::RicartAgrawalaExtended,
+                Algorithm::RicartAgrawalaExtended,
+            ),
+            (
+                Algorithm::SuzukiKasamiExtended,
+                Algorithm::SuzukiKasamiExtended,
+            ),
         ] {
             let stage = Stage::new().await;
             let protocol = algorithm.protocol();
-            let rover = stage.agent("rover", algorithm).await;
+            let rover = stage.agent("rover", told).await;
             let owner = async {
                 let [_, act, conversation, content] = stage.heard().await;
                 assert_eq!((act.as_str(), content.as_str()), ("query-if", "rsc"));

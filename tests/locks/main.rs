@@ -9,6 +9,7 @@ mod example;
 mod greetings;
 mod hosts;
 mod legacy;
+mod queued;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -654,7 +655,7 @@ async fn a_malicious_peer_cannot_stop_others() {
     watched(async {
         let (here, there) = two(&config(&[])).await;
         let files = tempfile::tempdir().unwrap();
-        let crane = agent(&here, "crane").await;
+        let crane = agent_with(&here, "crane", Algorithm::RicartAgrawalaExtended).await;
         let mallory = there.register("mallory").await.unwrap();
         let rover = agent(&there, "rover").await;
         let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
@@ -669,7 +670,7 @@ async fn a_malicious_peer_cannot_stop_others() {
                 .content(content);
             mallory.send(message.build().unwrap()).await.unwrap();
         };
-        let protocol = Algorithm::default().protocol();
+        let protocol = Algorithm::RicartAgrawalaExtended.protocol();
         let long = "x".repeat(10_000);
         for number in 0..80 {
             let id = format!("mallory_{number}");

@@ -62,6 +62,7 @@ impl Group {
     pub(super) async fn open(program: &Program, shape: Shape) -> Result<Self, String> {
         let mut stage = Stage::new(program.clone(), None)?;
         let short = match shape.variant {
+            Variant::OwnerQueue => "oq",
             Variant::RicartAgrawala => "ra",
             Variant::TokenAway => "sk",
             Variant::TokenHere => "skb",
@@ -186,8 +187,7 @@ impl Group {
             algorithm: self.shape.variant.algorithm().protocol(),
             agents: self.shape.agents,
             hosts: self.shape.hosts,
-            // The report or the token to the owner, its permission, the waiter's report, and the grant.
-            letters_in_sequence: 4,
+            letters_in_sequence: self.shape.variant.letters_in_sequence(),
             locks_us: median(locks) / 1e3,
             by_hand_us: median(by_hand) / 1e3,
             letter_us: median(letter) / 1e3,
@@ -407,8 +407,8 @@ mod tests {
     #[test]
     fn the_letters_needed_are_those_of_the_algorithms() {
         let needed = |agents| Variant::ALL.map(|variant| variant.letters(agents));
-        assert_eq!(needed(2), [5, 5, 3]);
-        assert_eq!(needed(8), [17, 11, 3]);
-        assert_eq!(needed(32), [65, 35, 3]);
+        assert_eq!(needed(2), [3, 5, 5, 3]);
+        assert_eq!(needed(8), [3, 17, 11, 3]);
+        assert_eq!(needed(32), [3, 65, 35, 3]);
     }
 }

@@ -349,8 +349,9 @@ impl LocksReport {
 }
 
 const LEGEND: &str = "
-needed      letters that the algorithm needs: 2(N-1)+3 for Ricart-Agrawala, N+3 for the extended
-            Suzuki-Kasami, whose token is at the owner, 3 for the basic one, whose token is here
+needed      letters that the algorithm needs: 3 for the owner's queue, 2(N-1)+3 for Ricart-Agrawala,
+            N+3 for the extended Suzuki-Kasami, whose token is at the owner, 3 for the basic one, whose
+            token is here
 letters     letters of locks, counted by a watcher
 by hand     the same letters, sent by the application between the same processes
 x hand      ratio to the letters by hand in the same rounds (spread: the middle half of the rounds)

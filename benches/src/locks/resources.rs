@@ -43,7 +43,7 @@ pub(super) async fn measure(
     window: Duration,
 ) -> Result<Resources, String> {
     let shape = Shape {
-        variant: Variant::RicartAgrawala,
+        variant: Variant::OwnerQueue,
         agents,
         hosts: 1,
     };

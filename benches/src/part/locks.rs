@@ -36,7 +36,9 @@ const FIRST_CONVERSATION: u64 = 1_700_000_000_000;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Variant {
-    /// The extended Ricart-Agrawala, the default.
+    /// The owner's queue, the default.
+    OwnerQueue,
+    /// The extended Ricart-Agrawala.
     RicartAgrawala,
     /// The extended Suzuki-Kasami. Its token is at the owner when no agent holds the resource.
     TokenAway,
@@ -45,10 +47,16 @@ pub(crate) enum Variant {
 }
 
 impl Variant {
-    pub(crate) const ALL: [Self; 3] = [Self::RicartAgrawala, Self::TokenAway, Self::TokenHere];
+    pub(crate) const ALL: [Self; 4] = [
+        Self::OwnerQueue,
+        Self::RicartAgrawala,
+        Self::TokenAway,
+        Self::TokenHere,
+    ];
 
     pub(crate) fn algorithm(self) -> Algorithm {
         match self {
+            Self::OwnerQueue => Algorithm::OwnerQueue,
             Self::RicartAgrawala => Algorithm::RicartAgrawalaExtended,
             Self::TokenAway => Algorithm::SuzukiKasamiExtended,
             Self::TokenHere => Algorithm::SuzukiKasami,
@@ -60,7 +68,17 @@ impl Variant {
         match self {
             Self::RicartAgrawala => 2 * (agents - 1) + 3,
             Self::TokenAway => agents + 3,
-            Self::TokenHere => 3,
+            Self::OwnerQueue | Self::TokenHere => 3,
+        }
+    }
+
+    /// Letters of a hand-over that wait for each other.
+    pub(crate) fn letters_in_sequence(self) -> usize {
+        match self {
+            // The release and the grant.
+            Self::OwnerQueue => 2,
+            // The report or the token to the owner, its permission, the waiter's report, and the grant.
+            Self::RicartAgrawala | Self::TokenAway | Self::TokenHere => 4,
         }
     }
 
@@ -69,7 +87,7 @@ impl Variant {
         match self {
             Self::RicartAgrawala => others,
             Self::TokenAway => others.min(1),
-            Self::TokenHere => 0,
+            Self::OwnerQueue | Self::TokenHere => 0,
         }
     }
 }
@@ -317,7 +335,7 @@ impl ByHand {
 
     /// Asks the other agents, and waits for the letters that permit to enter.
     async fn enter(&self, conversation: &str, resource: &str) -> Result<(), String> {
-        if self.variant == Variant::TokenHere {
+        if matches!(self.variant, Variant::OwnerQueue | Variant::TokenHere) {
             return Ok(());
         }
         let others = self.ids.iter().enumerate();
@@ -331,7 +349,9 @@ impl ByHand {
     async fn permissions(&self, others: usize) -> Result<(), String> {
         let performative = match self.variant {
             Variant::RicartAgrawala => Performative::Agree,
-            Variant::TokenAway | Variant::TokenHere => Performative::Propagate,
+            Variant::OwnerQueue | Variant::TokenAway | Variant::TokenHere => {
+                Performative::Propagate
+            }
         };
         for _ in 0..self.variant.permissions(others) {
             self.expect(&performative).await?;
@@ -343,14 +363,20 @@ impl ByHand {
     async fn get_grant(&self, conversation: &str, resource: &str) -> Result<(), String> {
         let owner = self.id(LockAgents::OWNER)?;
         let content = resource.to_owned();
-        self.post(owner, Performative::Confirm, conversation, content)?;
+        let performative = match self.variant {
+            Variant::OwnerQueue => Performative::Request,
+            _ => Performative::Confirm,
+        };
+        self.post(owner, performative, conversation, content)?;
         self.expect(&Performative::Inform).await
     }
 
     /// Reports to the owner that this agent has left.
     fn release(&self, conversation: &str, content: String) -> Result<(), String> {
         let performative = match self.variant {
-            Variant::RicartAgrawala | Variant::TokenHere => Performative::Disconfirm,
+            Variant::OwnerQueue | Variant::RicartAgrawala | Variant::TokenHere => {
+                Performative::Disconfirm
+            }
             Variant::TokenAway => Performative::Propagate,
         };
         let owner = self.id(LockAgents::OWNER)?;
@@ -397,6 +423,9 @@ impl ByHand {
         if with.by == By::Letter {
             return self.expect(&Performative::Inform).await;
         }
+        if self.variant == Variant::OwnerQueue {
+            return self.expect(&Performative::Inform).await;
+        }
         // From the agent that holds the resource, and from the owner.
         self.permissions(2).await?;
         let conversation = self.next_conversation();
@@ -416,24 +445,24 @@ impl ByHand {
         let permits = self.variant == Variant::RicartAgrawala || is_owner;
         let permission = match self.variant {
             Variant::RicartAgrawala => Performative::Agree,
-            Variant::TokenAway | Variant::TokenHere => Performative::Propagate,
+            Variant::OwnerQueue | Variant::TokenAway | Variant::TokenHere => {
+                Performative::Propagate
+            }
         };
         let to = |name: &str| AgentId::new(name).map_err(chain_text);
         match message.performative() {
+            Performative::Request if self.variant == Variant::OwnerQueue => {
+                self.grant(&to(sender.name())?, conversation, &content)
+            }
             Performative::Request if permits => {
                 let content = content.into_owned();
                 self.post(&to(sender.name())?, permission, conversation, content)
             }
-            Performative::Confirm => {
-                let grant = format!("{content}\n1.1@{}#{content}\n15000", self.agent.id().name());
-                self.post(
-                    &to(sender.name())?,
-                    Performative::Inform,
-                    conversation,
-                    grant,
-                )
-            }
+            Performative::Confirm => self.grant(&to(sender.name())?, conversation, &content),
             Performative::Disconfirm | Performative::Propagate => match content.split_once('\n') {
+                Some((resource, next)) if self.variant == Variant::OwnerQueue => {
+                    self.grant(&to(next)?, conversation, resource)
+                }
                 Some((resource, next)) => {
                     let content = format!("1\n{resource}");
                     self.post(&to(next)?, permission, conversation, content)
@@ -442,6 +471,14 @@ impl ByHand {
             },
             _ => Ok(()),
         }
+    }
+
+    fn grant(&self, to: &AgentId, conversation: &str, resource: &str) -> Result<(), String> {
+        let grant = format!(
+            "{resource}\n1.1@{}#{resource}\n15000",
+            self.agent.id().name()
+        );
+        self.post(to, Performative::Inform, conversation, grant)
     }
 
     fn id(&self, index: usize) -> Result<&AgentId, String> {

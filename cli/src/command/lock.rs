@@ -145,6 +145,7 @@ async fn acquire(agent: &Agent, arguments: &Arguments) -> Result<Lock, Failure> 
             LockError::NoOwner { .. } | LockError::OwnerNotFound { .. } => {
                 "start the owner, for example `fipa own RESOURCE`"
             }
+            LockError::OtherAlgorithm { .. } => "leave --algorithm out, or name that of the owner",
             LockError::Name(_) => "use a name of 1 to 255 bytes without control characters",
             _ => "`fipa locks` shows the owner, the holder and the waiting agents",
         };

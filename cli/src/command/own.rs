@@ -77,13 +77,15 @@ pub(crate) struct Arguments {
 /// Options that all agents which use a resource have in common.
 #[derive(Debug, Args)]
 pub(super) struct Group {
-    /// Algorithm that decides which agent is next; the same for all agents that use the resource
-    #[arg(long, value_name = "NAME", default_value = "ricart_agrawala_extended",
-          value_parser = algorithm)]
+    /// Algorithm that decides which agent is next. The owner names it to the others, which need no option; one
+    /// with another algorithm is refused: owner_queue, ricart_agrawala, ricart_agrawala_extended, suzuki_kasami
+    /// or suzuki_kasami_extended
+    #[arg(long, value_name = "NAME", default_value = "owner_queue", value_parser = algorithm)]
     algorithm: Algorithm,
 
     /// Take part with agents of the C++ library distributed_locking: legacy peers are asked whether they
-    /// use locks
+    /// use locks, and the algorithm is ricart_agrawala_extended unless --algorithm names another one of that
+    /// library
     #[arg(long)]
     legacy_peers: bool,
 }

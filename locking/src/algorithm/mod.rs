@@ -1,5 +1,6 @@
-//! The distributed algorithms that decide which agent asks the owner next.
+//! The algorithms that decide which agent the owner serves next.
 
+mod owner_queue;
 mod ricart_agrawala;
 mod suzuki_kasami;
 
@@ -7,23 +8,27 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::hash::Hash;
 
+pub use owner_queue::OwnerQueue;
 pub use ricart_agrawala::RicartAgrawala;
 pub use suzuki_kasami::SuzukiKasami;
 
 use crate::faults::Fault;
 use crate::{Act, Conversation, Dialect, Millis, Peer};
 
-/// The algorithms. All agents of a group use the same one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+/// The algorithms. All agents that use a resource use the one that its owner names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 #[allow(
     clippy::exhaustive_enums,
-    reason = "the protocols of distributed_locking"
+    reason = "the owner's queue, and the protocols of distributed_locking"
 )]
 pub enum Kind {
+    /// The owner serves requests in the order of their arrival. Agents of `distributed_locking` cannot take
+    /// part.
+    #[default]
+    OwnerQueue,
     /// Ricart-Agrawala for members and messages that are never lost.
     RicartAgrawala,
     /// Ricart-Agrawala with probes and repeated requests.
-    #[default]
     RicartAgrawalaExtended,
     /// Suzuki-Kasami for members and messages that are never lost. An agent that is deregistered takes
     /// the token with it.
@@ -35,7 +40,8 @@ pub enum Kind {
 
 impl Kind {
     /// All algorithms.
-    pub const ALL: [Self; 4] = [
+    pub const ALL: [Self; 5] = [
+        Self::OwnerQueue,
         Self::RicartAgrawala,
         Self::RicartAgrawalaExtended,
         Self::SuzukiKasami,
@@ -46,11 +52,19 @@ impl Kind {
     #[must_use]
     pub fn protocol(self) -> &'static str {
         match self {
+            Self::OwnerQueue => "owner_queue",
             Self::RicartAgrawala => "ricart_agrawala",
             Self::RicartAgrawalaExtended => "ricart_agrawala_extended",
             Self::SuzukiKasami => "suzuki_kasami",
             Self::SuzukiKasamiExtended => "suzuki_kasami_extended",
         }
+    }
+
+    /// Returns the algorithm whose protocol has this name.
+    #[must_use]
+    pub fn named(protocol: &str) -> Option<Self> {
+        let mut all = Self::ALL.into_iter();
+        all.find(|kind| kind.protocol() == protocol)
     }
 
     /// Whether the algorithm uses a token.
@@ -59,12 +73,18 @@ impl Kind {
         matches!(self, Self::SuzukiKasami | Self::SuzukiKasamiExtended)
     }
 
+    /// Whether each member asks all others for permission.
+    #[must_use]
+    pub fn needs_permission(self) -> bool {
+        matches!(self, Self::RicartAgrawala | Self::RicartAgrawalaExtended)
+    }
+
     /// Whether the algorithm tolerates the loss of members and of messages.
     #[must_use]
     pub fn is_extended(self) -> bool {
         matches!(
             self,
-            Self::RicartAgrawalaExtended | Self::SuzukiKasamiExtended
+            Self::OwnerQueue | Self::RicartAgrawalaExtended | Self::SuzukiKasamiExtended
         )
     }
 }
@@ -228,6 +248,11 @@ pub trait Algorithm: Clone + Eq + Hash + fmt::Debug {
     /// Estimate of the number of agents that enter before this one.
     fn ahead(&self) -> usize;
 
+    /// Place of the open request in the owner's queue, if the owner has told it.
+    fn place(&self) -> Option<u32> {
+        None
+    }
+
     /// Moves all times back.
     #[cfg(test)]
     fn rebase(&mut self, by: Millis);
@@ -241,6 +266,8 @@ pub trait Algorithm: Clone + Eq + Hash + fmt::Debug {
     reason = "one value per resource, all of one variant"
 )]
 pub enum AnyAlgorithm {
+    /// The owner's queue.
+    OwnerQueue(OwnerQueue),
     /// Ricart-Agrawala.
     RicartAgrawala(RicartAgrawala),
     /// Suzuki-Kasami.
@@ -250,6 +277,7 @@ pub enum AnyAlgorithm {
 macro_rules! either {
     ($any:expr, $algorithm:ident => $call:expr) => {
         match $any {
+            AnyAlgorithm::OwnerQueue($algorithm) => $call,
             AnyAlgorithm::RicartAgrawala($algorithm) => $call,
             AnyAlgorithm::SuzukiKasami($algorithm) => $call,
         }
@@ -258,9 +286,14 @@ macro_rules! either {
 
 impl Algorithm for AnyAlgorithm {
     fn new(kind: Kind, me: Peer, owns: bool) -> Self {
-        match kind.has_token() {
-            true => Self::SuzukiKasami(SuzukiKasami::new(kind, me, owns)),
-            false => Self::RicartAgrawala(RicartAgrawala::new(kind, me, owns)),
+        match kind {
+            Kind::OwnerQueue => Self::OwnerQueue(OwnerQueue::new(kind, me, owns)),
+            Kind::SuzukiKasami | Kind::SuzukiKasamiExtended => {
+                Self::SuzukiKasami(SuzukiKasami::new(kind, me, owns))
+            }
+            Kind::RicartAgrawala | Kind::RicartAgrawalaExtended => {
+                Self::RicartAgrawala(RicartAgrawala::new(kind, me, owns))
+            }
         }
     }
 
@@ -329,6 +362,10 @@ impl Algorithm for AnyAlgorithm {
 
     fn ahead(&self) -> usize {
         either!(self, algorithm => algorithm.ahead())
+    }
+
+    fn place(&self) -> Option<u32> {
+        either!(self, algorithm => algorithm.place())
     }
 
     #[cfg(test)]

@@ -8,6 +8,8 @@
 //! | `Seen` * | `inform` | `fipa-fence` | resource, fence |
 //! | `Probe` | `request` | `dlm_probe` | empty |
 //! | `Alive` | `confirm` | `dlm_probe` | empty |
+//! | `Ask` * | `request` | `owner_queue` | resource, or resource and place |
+//! | `Place` * | `agree` | `owner_queue` | resource, place |
 //! | `Request` | `request` | `ricart_agrawala…` | clock, resource |
 //! | `Agree` | `agree` | `ricart_agrawala…` | clock, resource |
 //! | `RequestToken` | `request` | `suzuki_kasami…` | resource, number |
@@ -22,7 +24,7 @@
 //! only; the others are those of `distributed_locking`. An agent of this library sets the `ontology`
 //! to [`ONTOLOGY`], which `distributed_locking` ignores. The time of sending of a request for a grant is
 //! its `reply-with`, and the `in-reply-to` of the answer. A `Query` that claims has the `reply-with`
-//! `claim`.
+//! `claim`. An `Owned` names the algorithm of the resource in the user-defined parameter [`ALGORITHM`].
 //!
 //! The token is a Boost text archive with the `language` [`BOOST_TOKEN`], or, when no legacy agent is a
 //! member, lines with the `language` [`TOKEN`]: `generation 2`, `last 7 rover` for each agent, and
@@ -35,8 +37,8 @@ use std::sync::Arc;
 use fipa_acl::{AgentId, BuildError, Message, Performative};
 
 use crate::{
-    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, Millis,
-    NameError, Refusal, Resource, Token,
+    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, MAX_PLACE,
+    Millis, NameError, Refusal, Resource, Token,
 };
 
 /// Ontology of the messages of this library.
@@ -47,6 +49,9 @@ pub const TOKEN: &str = "fipa-locking-token";
 
 /// Language of a token of `distributed_locking`.
 pub const BOOST_TOKEN: &str = "suzuki_kasami::Token";
+
+/// Name of the user-defined parameter (without `X-`) in which an owner names the algorithm of its resource.
+pub const ALGORITHM: &str = "fipa-algorithm";
 
 /// Protocol of discovery.
 pub const DISCOVER: &str = "dlm_discover";
@@ -110,7 +115,7 @@ pub enum DecodeError {
     },
 }
 
-/// Writes a message.
+/// Writes a message. `kind` is the algorithm of a message that names none.
 ///
 /// # Errors
 /// A name cannot be encoded in an ACL message.
@@ -120,6 +125,7 @@ pub fn encode(
     sender: &AgentId,
     receiver: &AgentId,
 ) -> Result<Message, BuildError> {
+    let kind = message.algorithm.unwrap_or(kind);
     let (performative, protocol, content) = parts(message, kind);
     let mut builder = Message::builder(performative)
         .sender(sender.clone())
@@ -133,6 +139,11 @@ pub fn encode(
     if let Content::Lock { act, .. } = &message.content {
         builder = match act {
             Act::Query { claim: true } => builder.reply_with(CLAIM),
+            Act::Owned => match message.algorithm {
+                Some(kind) => builder.user_defined(ALGORITHM, kind.protocol()),
+                None => builder,
+            },
+            Act::Ask { asked, .. } => builder.reply_with(asked.to_string()),
             Act::Confirm { asked: Some(asked) } | Act::Renew { asked, .. } => {
                 builder.reply_with(asked.to_string())
             }
@@ -163,6 +174,17 @@ fn parts(message: &LockMessage, kind: Kind) -> (Performative, &'static str, Stri
         Act::Seen { fence } => {
             let content = format!("{resource}\n{fence}");
             (Performative::Inform, FENCES, content)
+        }
+        Act::Ask { place, .. } => {
+            let content = match place {
+                Some(place) => format!("{resource}\n{place}"),
+                None => resource.to_string(),
+            };
+            (Performative::Request, protocol, content)
+        }
+        Act::Place { place } => {
+            let content = format!("{resource}\n{place}");
+            (Performative::Agree, protocol, content)
         }
         Act::Request { clock } => {
             let content = format!("{clock}\n{resource}");
@@ -207,6 +229,22 @@ pub fn is_lock_protocol(protocol: &str) -> bool {
     [DISCOVER, PROBE, FENCES].contains(&protocol) || kinds.any(|name| name == protocol)
 }
 
+/// Reads a message of any algorithm.
+///
+/// # Errors
+/// The message is not a message of locks.
+pub fn read(message: &Message) -> Result<LockMessage, DecodeError> {
+    let kind = message.protocol().and_then(Kind::named);
+    decode(message, kind.unwrap_or_default())
+}
+
+/// Returns the algorithm that a message of discovery names.
+fn named(message: &Message) -> Option<Kind> {
+    let mut parameters = message.user_defined().iter();
+    let (_, value) = parameters.find(|(name, _)| name.eq_ignore_ascii_case(ALGORITHM))?;
+    Kind::named(value)
+}
+
 /// Reads a message of an agent of a group that uses `kind`.
 ///
 /// # Errors
@@ -229,6 +267,7 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
     }
     let text = str::from_utf8(content).map_err(|_| DecodeError::Utf8)?;
     let wrong = || DecodeError::Performative(message.performative().as_str().to_owned());
+    let mut algorithm_of = None;
     let content = match protocol {
         PROBE => match message.performative() {
             Performative::Request => Content::Probe,
@@ -241,7 +280,10 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
                 Performative::QueryIf => Act::Query {
                     claim: message.reply_with() == Some(CLAIM),
                 },
-                Performative::Inform => Act::Owned,
+                Performative::Inform => {
+                    algorithm_of = named(message);
+                    Act::Owned
+                }
                 Performative::Refuse => Act::Contested,
                 _ => return Err(wrong()),
             },
@@ -262,6 +304,7 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
         }
         _ if protocol == kind.protocol() => {
             let (resource, act) = algorithm(message, text, kind, dialect)?.ok_or_else(wrong)?;
+            algorithm_of = Some(kind);
             Content::Lock { resource, act }
         }
         _ => return Err(DecodeError::Protocol(kind)),
@@ -269,6 +312,7 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
     Ok(LockMessage {
         conversation,
         dialect,
+        algorithm: algorithm_of,
         content,
     })
 }
@@ -301,7 +345,30 @@ fn algorithm(
         text.and_then(|text| text.parse().ok())
             .ok_or(DecodeError::Number(what))
     };
+    let place = |text: &str| match text.parse::<u32>() {
+        Ok(place) if (1..=MAX_PLACE).contains(&place) => Ok(place),
+        _ => Err(DecodeError::Number("the place")),
+    };
     let (resource, act) = match (message.performative(), kind.has_token()) {
+        (Performative::Request, _) if kind == Kind::OwnerQueue => {
+            let (Some(resource), former, None, None) = lines else {
+                return Err(parts());
+            };
+            let asked = time("reply-with", message.reply_with())?;
+            let place = former.map(place).transpose()?;
+            (resource, Act::Ask { asked, place })
+        }
+        (Performative::Agree, _) if kind == Kind::OwnerQueue => {
+            let (Some(resource), Some(text), None, None) = lines else {
+                return Err(parts());
+            };
+            let place = place(text)?;
+            (resource, Act::Place { place })
+        }
+        // The request is the report.
+        (Performative::Confirm, _) if kind == Kind::OwnerQueue && lines.1.is_none() => {
+            return Ok(None);
+        }
         (Performative::Request, false) | (Performative::Agree, false) => {
             let (Some(clock), Some(resource), None, None) = lines else {
                 return Err(parts());

@@ -111,6 +111,69 @@ fn recorded_messages_of_distributed_locking() {
     assert_eq!(token.generation, None);
 }
 
+/// The owner's queue, in the form of its messages.
+#[test]
+fn messages_of_the_owner_s_queue() {
+    let kind = Kind::OwnerQueue;
+    let decoded = |performative, content: &str, reply_with: Option<&str>| {
+        let mut builder = Message::builder(performative)
+            .protocol("owner_queue")
+            .conversation_id("rover_1")
+            .ontology(ONTOLOGY)
+            .content(content.to_owned());
+        if let Some(reply_with) = reply_with {
+            builder = builder.reply_with(reply_with);
+        }
+        read(&builder.build().unwrap()).map(|message| (message.algorithm, message.content))
+    };
+    let resource = Resource::new("bay").unwrap();
+    let content = |act| {
+        let resource = resource.clone();
+        Ok((Some(kind), Content::Lock { resource, act }))
+    };
+    let ask = |place| Act::Ask { asked: 7, place };
+    let request = |text, asked| decoded(Performative::Request, text, asked);
+    assert_eq!(request("bay", Some("7")), content(ask(None)));
+    assert_eq!(request("bay\n8", Some("7")), content(ask(Some(8))));
+    let place = decoded(Performative::Agree, "bay\n1", None);
+    assert_eq!(place, content(Act::Place { place: 1 }));
+    for wrong in ["bay\n0", "bay\n9", "bay\n-1", "bay\n", "bay\nx"] {
+        let error = Err(DecodeError::Number("the place"));
+        assert_eq!(request(wrong, Some("7")), error, "{wrong}");
+        assert_eq!(decoded(Performative::Agree, wrong, None), error, "{wrong}");
+    }
+    assert_eq!(request("bay", None), Err(DecodeError::Number("reply-with")));
+    assert_eq!(request("bay\n1\n2", Some("7")), Err(DecodeError::Parts(3)));
+    let report = decoded(Performative::Confirm, "bay", Some("7"));
+    assert_eq!(report, Err(DecodeError::Performative("confirm".into())));
+}
+
+/// An owner names the algorithm, except to agents of `distributed_locking`, which know no such parameter.
+#[test]
+fn an_owner_names_its_algorithm() {
+    for algorithm in Kind::ALL.map(Some).into_iter().chain([None]) {
+        let message = LockMessage {
+            conversation: Conversation::parse("agent1_0"),
+            dialect: Dialect::Own,
+            algorithm,
+            content: Content::Lock {
+                resource: Resource::new("bay").unwrap(),
+                act: Act::Owned,
+            },
+        };
+        let written = encode(&message, Kind::default(), &id("a"), &id("b")).unwrap();
+        let named = algorithm.map(|kind| ("fipa-algorithm".to_owned(), kind.protocol().to_owned()));
+        assert_eq!(written.user_defined(), named.as_slice());
+        assert_eq!(read(&written), Ok(message));
+    }
+    let unknown = Message::builder(Performative::Inform)
+        .protocol(DISCOVER)
+        .conversation_id("a_1")
+        .content("bay")
+        .user_defined(ALGORITHM, "raffle");
+    assert_eq!(read(&unknown.build().unwrap()).unwrap().algorithm, None);
+}
+
 /// A Boost archive of an older version has no version of items. With an empty map, the first agent of
 /// the queue has the class.
 #[test]
@@ -215,11 +278,17 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
     );
     let ra = Kind::RicartAgrawalaExtended;
     let sk = Kind::SuzukiKasamiExtended;
+    let queue = Kind::OwnerQueue;
     let kind = prop_oneof![Just(ra), Just(sk)];
+    let any_kind = prop_oneof![Just(ra), Just(sk), Just(queue)];
+    let place = 1..=MAX_PLACE;
     prop_oneof![
         any::<bool>().prop_map(move |claim| (ra, Act::Query { claim })),
         Just((ra, Act::Owned)),
         Just((sk, Act::Contested)),
+        (any::<u64>(), proptest::option::of(place.clone()))
+            .prop_map(move |(asked, place)| (queue, Act::Ask { asked, place })),
+        place.prop_map(move |place| (queue, Act::Place { place })),
         number
             .clone()
             .prop_map(move |clock| (ra, Act::Request { clock })),
@@ -230,10 +299,10 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
         token.prop_map(move |token| (sk, Act::Token(token))),
         (kind.clone(), any::<u64>())
             .prop_map(|(kind, asked)| (kind, Act::Confirm { asked: Some(asked) })),
-        (kind.clone(), fence.clone(), any::<u64>())
+        (any_kind.clone(), fence.clone(), any::<u64>())
             .prop_map(|(kind, fence, asked)| (kind, Act::Renew { fence, asked })),
         (kind.clone(), fence.clone()).prop_map(|(kind, fence)| (kind, Act::Seen { fence })),
-        (kind.clone(), fence, any::<u64>(), any::<u64>()).prop_map(
+        (any_kind.clone(), fence, any::<u64>(), any::<u64>()).prop_map(
             |(kind, fence, lease, asked)| (
                 kind,
                 Act::Granted {
@@ -243,14 +312,16 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
                 }
             )
         ),
-        (kind.clone(), 0..3_usize, any::<u64>()).prop_map(|(kind, reason, asked)| (
-            kind,
-            Act::Refused {
-                reason: Refusal::ALL[reason],
-                asked
-            }
-        )),
-        kind.prop_map(|kind| (kind, Act::Release)),
+        (any_kind.clone(), 0..Refusal::ALL.len(), any::<u64>()).prop_map(
+            |(kind, reason, asked)| (
+                kind,
+                Act::Refused {
+                    reason: Refusal::ALL[reason],
+                    asked
+                }
+            )
+        ),
+        any_kind.prop_map(|kind| (kind, Act::Release)),
     ]
 }
 
@@ -261,14 +332,17 @@ proptest! {
         resource in name(),
         conversation in "[a-z_0-9]{1,10}",
     ) {
+        let names_none = matches!(act, Act::Query { .. } | Act::Contested);
         let message = LockMessage {
             conversation: Conversation::parse(&conversation),
             dialect: Dialect::Own,
+            algorithm: (!names_none).then_some(kind),
             content: Content::Lock { resource: Resource::new(&resource).unwrap(), act },
         };
         let written = encode(&message, kind, &id("a"), &id("b")).unwrap();
         let sent = Message::decode(&written.to_payload()).unwrap();
-        prop_assert_eq!(decode(&sent, kind), Ok(message));
+        prop_assert_eq!(decode(&sent, kind), Ok(message.clone()));
+        prop_assert_eq!(read(&sent), Ok(message));
     }
 
     #[test]

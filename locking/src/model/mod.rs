@@ -11,5 +11,6 @@
 //!   reached.
 
 mod graph;
+mod queued;
 mod system;
 mod tests;

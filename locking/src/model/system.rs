@@ -165,6 +165,7 @@ impl System {
                 true => Fault::Foreign,
                 false => self.fault,
             },
+            ..Options::default()
         }
     }
 
@@ -511,6 +512,7 @@ impl System {
             let message = LockMessage {
                 conversation,
                 dialect: Dialect::Own,
+                algorithm: None,
                 content: Content::Probe,
             };
             let to = peer.clone();
@@ -595,6 +597,7 @@ fn rebased(mut message: LockMessage) -> LockMessage {
     if let Content::Lock {
         act:
             Act::Confirm { asked: Some(asked) }
+            | Act::Ask { asked, .. }
             | Act::Renew { asked, .. }
             | Act::Granted { asked, .. }
             | Act::Refused { asked, .. },
@@ -656,7 +659,9 @@ impl Model for System {
             if number > 0 && left.crashes > 0 && self.may_crash(agent) {
                 actions.push(Step::Crash(number));
             }
-            if left.pauses > 0 && agent.acquired {
+            // An agent of a queue can also be stopped while it waits for its turn.
+            let waits = self.kind == Kind::OwnerQueue && agent.claim.is_some();
+            if left.pauses > 0 && (agent.acquired || waits) {
                 actions.push(Step::Pause(number));
             }
         }

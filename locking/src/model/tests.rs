@@ -8,9 +8,9 @@ use crate::Kind;
 use crate::faults::Fault;
 
 /// More states than any configuration that runs by default.
-const SMALL: usize = 300_000;
+pub(super) const SMALL: usize = 300_000;
 
-fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
+pub(super) fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
     System {
         kind,
         claims: claims.to_vec(),
@@ -48,7 +48,7 @@ fn describe(system: &System, problem: &str, path: &[Step], state: &State) -> Str
 /// # Errors
 ///
 /// Returns the number of the broken invariant (10: a claim that cannot end), and a counterexample.
-fn explore(system: &System, limit: usize) -> Result<usize, (u8, String)> {
+pub(super) fn explore(system: &System, limit: usize) -> Result<usize, (u8, String)> {
     let begin = Instant::now();
     let graph = Graph::explore(system, limit);
     println!(
@@ -73,11 +73,11 @@ fn explore(system: &System, limit: usize) -> Result<usize, (u8, String)> {
     Ok(graph.states())
 }
 
-fn holds(system: &System) -> usize {
+pub(super) fn holds(system: &System) -> usize {
     explore(system, SMALL).unwrap_or_else(|(_, text)| panic!("{text}"))
 }
 
-const NONE: Faults = Faults {
+pub(super) const NONE: Faults = Faults {
     losses: 0,
     duplicates: 0,
     crashes: 0,
@@ -102,7 +102,11 @@ fn the_owner_and_a_requester() {
     }
 }
 
-const EXTENDED: [Kind; 2] = [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended];
+const EXTENDED: [Kind; 3] = [
+    Kind::OwnerQueue,
+    Kind::RicartAgrawalaExtended,
+    Kind::SuzukiKasamiExtended,
+];
 
 #[test]
 fn a_message_is_lost_and_the_owner_restarts() {

@@ -391,14 +391,16 @@ impl World {
 
     /// Records that a request has reached an agent.
     fn reached(&mut self, agent: usize, from: &Peer, message: &LockMessage) {
-        let Content::Lock {
-            act: Act::Request { .. } | Act::RequestToken { .. },
-            ..
-        } = message.content
-        else {
+        let Content::Lock { act, .. } = &message.content else {
             return;
         };
-        self.turns.reached(from, &self.agents[agent].me);
+        match act {
+            Act::Ask { .. } => self.turns.reached_all(from),
+            Act::Request { .. } | Act::RequestToken { .. } => {
+                self.turns.reached(from, &self.agents[agent].me);
+            }
+            _ => {}
+        }
     }
 
     fn fault(&mut self) {
