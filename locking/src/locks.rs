@@ -687,7 +687,7 @@ impl<A: Algorithm> Locks<A> {
     /// of life. It waits for [`Options::retry`] from the first call on at most. Agents that use locks answer,
     /// and become members.
     ///
-    /// Suzuki-Kasami needs no such wait: only the agent that has the token enters.
+    /// Only Ricart-Agrawala needs the wait.
     pub fn expect(&mut self, now: Millis, peer: &Peer) {
         let is_needed = !self.kind.has_token()
             && *peer != self.me
@@ -1380,7 +1380,8 @@ impl<A: Algorithm> Locks<A> {
         if entry.current.is_some() {
             return;
         }
-        if entry.owner.is_some() && self.greeted.poll_timeout().is_some() {
+        let needs_permission = entry.kind.needs_permission();
+        if needs_permission && entry.owner.is_some() && self.greeted.poll_timeout().is_some() {
             return;
         }
         let Some(claim) = entry.waiting.pop_front() else {
@@ -1401,7 +1402,9 @@ impl<A: Algorithm> Locks<A> {
             next: retry,
         };
         entry.current = Some(Current { claim, phase });
-        self.greeted.end();
+        if needs_permission {
+            self.greeted.end();
+        }
         self.next_conversation = self.next_conversation.saturating_add(1);
         self.at_algorithm(now, resource, out, |algorithm, context, steps| {
             algorithm.request(context, &conversation, steps);

@@ -332,7 +332,10 @@ proptest! {
         resource in name(),
         conversation in "[a-z_0-9]{1,10}",
     ) {
-        let names_none = matches!(act, Act::Query { .. } | Act::Contested);
+        let names_none = matches!(
+            act,
+            Act::Query { .. } | Act::Contested | Act::Seen { .. }
+        );
         let message = LockMessage {
             conversation: Conversation::parse(&conversation),
             dialect: Dialect::Own,
