@@ -343,6 +343,9 @@ impl Owner {
         conversation: &Conversation,
         out: &mut Vec<OwnerStep>,
     ) {
+        // Before the timeout, which grants the resource to the next one: a late owner has both to handle.
+        self.queue
+            .retain(|waiter| waiter.peer != *from || waiter.conversation != *conversation);
         self.handle_timeout(now, out);
         self.proved(from, conversation);
         let by_name = fault!(self.fault, ReleaseByName);
@@ -352,8 +355,6 @@ impl Owner {
         if of_live {
             self.end(Ending::Released, out);
         } else if !self.is_closed(from, conversation) {
-            self.queue
-                .retain(|waiter| waiter.peer != *from || waiter.conversation != *conversation);
             self.close(from, conversation);
         }
         self.grant_next(now, out);
