@@ -357,6 +357,9 @@ impl Owner {
         conversation: &Conversation,
         out: &mut Vec<OwnerStep>,
     ) {
+        // Before the timeout, which grants the resource to the next one: a late owner has both to handle.
+        self.queue
+            .retain(|waiter| waiter.peer != *from || waiter.conversation != *conversation);
         self.handle_timeout(now, out);
         self.proved(from, conversation);
         let by_name = fault!(self.fault, ReleaseByName);

@@ -275,6 +275,32 @@ fn a_lock_at_a_legacy_owner_has_no_fence() {
     assert_eq!(agent.sent(), [to("agent1", "agent2_0", Act::Release)]);
 }
 
+/// The lease of the grant before has ended, and the owner was suspended.
+#[test]
+fn a_late_owner_grants_no_withdrawn_request() {
+    let members = [("agent2", OWN), ("agent3", OWN)];
+    let mut owner = Agent::owner("agent1", Kind::default(), &members);
+    owner.receive("agent2", OWN, "agent2_0", confirm(1));
+    owner.receive("agent3", OWN, "agent3_0", confirm(1));
+    owner.sent();
+    owner.events();
+    owner.now += Options::default().lease;
+    owner.receive("agent3", OWN, "agent3_0", Act::Release);
+    let sent = owner.sent();
+    assert!(
+        !sent
+            .iter()
+            .any(|(_, _, act)| matches!(act, Act::Granted { .. })),
+        "{sent:?}"
+    );
+    let ended = owner.events();
+    assert!(
+        matches!(&ended[..], [Event::Ended { how: Ending::Expired, grant, .. }]
+            if *grant.holder.name() == *"agent2"),
+        "{ended:?}"
+    );
+}
+
 /// The member joins while the owner has not agreed.
 #[test]
 fn an_agent_that_joins_during_a_request_is_asked() {
