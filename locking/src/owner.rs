@@ -358,8 +358,7 @@ impl Owner {
         out: &mut Vec<OwnerStep>,
     ) {
         // Before the timeout, which grants the resource to the next one: a late owner has both to handle.
-        self.queue
-            .retain(|waiter| waiter.peer != *from || waiter.conversation != *conversation);
+        self.queue.withdraw(from, conversation);
         self.handle_timeout(now, out);
         self.proved(from, conversation);
         let by_name = fault!(self.fault, ReleaseByName);
@@ -369,7 +368,6 @@ impl Owner {
         if of_live {
             self.end(Ending::Released, out);
         } else if !self.is_closed(from, conversation) {
-            self.queue.withdraw(from, conversation);
             self.close(from, conversation);
         }
         self.grant_next(now, out);
