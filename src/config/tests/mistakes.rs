@@ -32,7 +32,7 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "[radio]\nrate = 1\n",
             "fipa.toml:1: unknown key `radio`; known at the top: domain, mts, transport, discovery, \
-             security, access, monitor, platform, routes",
+             security, contacts, access, monitor, platform, routes",
         ),
         (
             "[transport.serial]\nlisten = []\n",
