@@ -129,6 +129,8 @@ fn every_key_is_read() {
         peer_connections = 8
         peer_letters = 0
         peer_bytes = "1MiB"
+        [contacts]
+        networks = ["10.0.0.0/8", "fd00::1"]
         [access]
         rate = 100
         allow = { "rover_.*" = ["arm", "crex performative=request"] }
@@ -182,6 +184,8 @@ fn every_key_is_read() {
     let security = &config.security;
     assert_eq!((security.peer_connections, security.peer_letters), (8, 0));
     assert_eq!(security.peer_bytes, 1 << 20);
+    let networks = config.contacts.networks.iter().map(ToString::to_string);
+    assert!(networks.eq(["10.0.0.0/8", "fd00::1"]));
     assert_eq!(config.monitor.check, Check::Enforce);
     assert!(config.monitor.answer);
     assert_eq!(config.monitor.heartbeat, Duration::from_secs(2));
@@ -358,6 +362,9 @@ legacy_peers = []                    # default
 peer_connections = 64                # default
 peer_letters = 20000                 # default
 peer_bytes = "256MiB"                # default
+
+[contacts]
+networks = []                        # default
 
 [access]
 rate = 0                             # default

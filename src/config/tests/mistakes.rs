@@ -20,19 +20,19 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, mts, transport, discovery, security, access, monitor, \
+             (known at the top: domain, mts, transport, discovery, security, contacts, access, monitor, \
              platform, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, mts, transport, discovery, security, access, monitor, \
+             (known at the top: domain, mts, transport, discovery, security, contacts, access, monitor, \
              platform, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
             "fipa.toml:1: unknown key `radio`; known at the top: domain, mts, transport, discovery, \
-             security, access, monitor, platform, routes",
+             security, contacts, access, monitor, platform, routes",
         ),
         (
             "[transport.serial]\nlisten = []\n",
