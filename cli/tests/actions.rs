@@ -133,8 +133,9 @@ fn actions_are_listed_and_performed() {
     }
     let all = run(&host, &["actions", "--json"]).done_json();
     assert_eq!(all[0]["robot"], "crex");
-    assert_eq!(all[0]["actions"][0]["name"], "dock");
-    let speed = &all[0]["actions"][0]["parameters"][1];
+    let actions = all[0]["actions"].as_array().unwrap();
+    let dock = actions.iter().find(|it| it["name"] == "dock").unwrap();
+    let speed = &dock["parameters"][1];
     assert_eq!(
         (&speed["unit"], &speed["max"]),
         (&json!("m/s"), &json!(0.5))

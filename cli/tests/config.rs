@@ -133,6 +133,9 @@ peer_connections = 64                # default
 peer_letters = 20000                 # default
 peer_bytes = \"256MiB\"                # default
 
+[contacts]
+networks = []                        # default
+
 [access]
 rate = 0                             # default
 

@@ -759,11 +759,12 @@ impl<A: Algorithm> Locks<A> {
         if *from == self.me || !self.admit_member(now, from, message.dialect, out) {
             return;
         }
+        self.probes.heard(now, &self.options, from);
+        self.dispatch(now, from, message, out);
+        // The message may be the withdrawal of the request that waits.
         if was_suspected {
             self.heard_again(now, from, out);
         }
-        self.probes.heard(now, &self.options, from);
-        self.dispatch(now, from, message, out);
         self.settle(now, out);
     }
 
@@ -1380,8 +1381,9 @@ impl<A: Algorithm> Locks<A> {
         if entry.current.is_some() {
             return;
         }
-        let needs_permission = entry.kind.needs_permission();
-        if needs_permission && entry.owner.is_some() && self.greeted.poll_timeout().is_some() {
+        // Only an agent that asks all members has to know them.
+        let needs_members = entry.kind.needs_permission();
+        if needs_members && entry.owner.is_some() && self.greeted.poll_timeout().is_some() {
             return;
         }
         let Some(claim) = entry.waiting.pop_front() else {
@@ -1402,7 +1404,7 @@ impl<A: Algorithm> Locks<A> {
             next: retry,
         };
         entry.current = Some(Current { claim, phase });
-        if needs_permission {
+        if needs_members {
             self.greeted.end();
         }
         self.next_conversation = self.next_conversation.saturating_add(1);

@@ -271,6 +271,28 @@ fn a_lock_without_contention_needs_three_letters() {
     );
 }
 
+/// Most agents of a domain use no locks, and do not answer a greeting. Only Ricart-Agrawala has to wait for it.
+#[test]
+fn a_request_to_a_queue_does_not_wait_for_answers_to_greetings() {
+    for kind in Kind::ALL {
+        let mut net = Net::default();
+        net.start("crane", 1, kind, Options::default());
+        net.own("crane", OwnerState::first().next_life(LEASE));
+        net.run(1_000);
+        net.start("a", 1, Kind::default(), Options::default());
+        let silent = Peer::new("silent", 1).unwrap();
+        let claim = net.call("a", |locks, now, out| {
+            locks.expect(now, &silent);
+            locks.lock(now, &bay(), None, out)
+        });
+        net.deliver();
+        let is_held = |net: &Net| net.agents["a"].is_held(net.now, claim);
+        assert_eq!(is_held(&net), !kind.needs_permission(), "{kind}");
+        net.run(1_000);
+        assert!(is_held(&net), "{kind}");
+    }
+}
+
 #[test]
 fn a_repeated_request_changes_nothing_and_a_later_one_keeps_the_place() {
     let mut net = Net::new(&["a", "b", "c"]);
@@ -327,6 +349,22 @@ fn a_suspected_member_that_answers_in_its_turn_keeps_it() {
     net.resume("b");
     assert_eq!(net.holder().as_deref(), Some("b"));
     assert_eq!(net.waiters(), ["c"]);
+}
+
+/// The sign of life is the withdrawal of its request.
+#[test]
+fn a_suspected_member_that_withdraws_in_its_turn_gets_no_grant() {
+    let mut net = Net::new(&["a", "b"]);
+    let first = net.lock("a");
+    let second = net.lock("b");
+    net.pause("b");
+    net.run(SUSPICION + 1_000);
+    net.release("a", first);
+    net.call("b", |locks, now, out| locks.release(now, second, out));
+    net.events.clear();
+    net.deliver();
+    assert_eq!(net.waiters(), Vec::<String>::new());
+    assert_eq!(net.events, []);
 }
 
 #[test]

@@ -308,7 +308,8 @@ impl<A: Algorithm> Locks<A> {
     pub(super) fn heard_again(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
         let owned = self.resources.iter().filter(|(_, entry)| {
             let core = entry.owned.as_ref().map(|owned| &owned.core);
-            core.is_some_and(|core| core.waiters().any(|waiter| waiter == peer))
+            entry.kind == Kind::OwnerQueue
+                && core.is_some_and(|core| core.waiters().any(|waiter| waiter == peer))
         });
         let owned: Vec<_> = owned.map(|(resource, _)| resource.clone()).collect();
         for resource in owned {
