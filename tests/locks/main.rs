@@ -493,7 +493,8 @@ async fn an_owner_grants_above_the_fence_of_a_device() {
         let crane = agent(&here, "crane").await;
         let rover = agent(&there, "rover").await;
         let gate = agent(&there, "gate").await;
-        let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
+        let lease = Duration::from_secs(1);
+        let bay = crane.own("bay", kept(&files, lease)).await.unwrap();
         let device = gate.device("crane", "bay").unwrap();
         let ahead = "200000000000.7.00000000000000aa@crane#bay";
         let ahead: Fence = ahead.parse().unwrap();
@@ -506,6 +507,7 @@ async fn an_owner_grants_above_the_fence_of_a_device() {
             Err(AdmitError::OtherRun { highest, .. }) if highest == ahead
         ));
         lock.release();
+        // The owner waits for the end of the grants that the other life may have made.
         let next = loop {
             let lock = rover.lock("bay").await.unwrap();
             let fence = lock.fence().unwrap().clone();
@@ -518,7 +520,7 @@ async fn an_owner_grants_above_the_fence_of_a_device() {
         until_async("the bay is free", || bay.status().holder.is_none()).await;
         bay.release().await;
         // The file has the epoch.
-        let bay = crane.own("bay", kept(&files, FOREVER)).await.unwrap();
+        let bay = crane.own("bay", kept(&files, lease)).await.unwrap();
         let lock = rover.lock("bay").await.unwrap();
         assert_eq!(lock.fence().unwrap().position(), (200_000_000_002, 1));
         drop((lock, bay));
