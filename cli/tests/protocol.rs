@@ -35,7 +35,7 @@ fn protocols_are_listed_and_shown() {
         assert!(list.contains(name), "{list}");
     }
     let json = host.run(&["protocol", "list", "--json"]).done_json();
-    assert_eq!(json.as_array().unwrap().len(), 19);
+    assert_eq!(json.as_array().unwrap().len(), 20);
     let shown = host.run(&["protocol", "show", "contractNet"]).done();
     for line in [
         "fipa-contract-net: Calling for proposals and accepting some",
@@ -139,7 +139,7 @@ fn protocols_of_the_configuration_are_listed_first() {
         .run(&["--set", &set, "protocol", "list", "--json"])
         .done_json();
     assert_eq!(json[0]["name"], "lift");
-    assert_eq!(json.as_array().unwrap().len(), 20);
+    assert_eq!(json.as_array().unwrap().len(), 21);
 }
 
 #[test]

@@ -97,10 +97,6 @@ impl Change<'_> {
         let answers = party.last != side && !made.reported;
         self.late |= party.deadline != 0 && party.deadline < self.now && answers;
         let cancels = next_state.state == CANCELLING && party.state != CANCELLING;
-        if next_state.is_late_cancel {
-            party.canceling_side = side;
-            party.set_cancel(self.observed.reply_with);
-        }
         if next_state.void {
             (party.state, party.resume, party.echo) =
                 (next_state.state, next_state.resume, next_state.echo);

@@ -95,7 +95,7 @@ pub(crate) struct Party {
     pub(crate) canceling_side: Side,
     /// Whether the answer to the cancel may still come, because the message that was taken for it may
     /// have been sent before the cancel arrived. After an `inform`, `resume` is the state after that
-    /// message. After a not-understood: whether the answer to a cancel that crossed it may still come.
+    /// message.
     pub(crate) echo: bool,
     /// [`act_number`] of the last message of each side; 0 for none.
     pub(crate) acts: [u8; 2],
@@ -865,8 +865,6 @@ pub(crate) struct NextState {
     pub(crate) world: Option<World>,
     /// Whether the message answers a cancel, and is no step of the protocol itself.
     pub(crate) answers_cancel: bool,
-    /// Whether the message is a cancel that crossed a not-understood. It is void, but is answered.
-    pub(crate) is_late_cancel: bool,
 }
 
 impl NextState {
@@ -882,7 +880,6 @@ impl NextState {
             before: None,
             world: None,
             answers_cancel: false,
-            is_late_cancel: false,
         }
     }
 
@@ -939,23 +936,18 @@ fn after_common_step(
         CANCELLED if party.echo && message.side != party.canceling_side => {
             after_crossing(machine, party, message)
         }
-        AFTER_NOT_UNDERSTOOD => after_not_understood(machine, party, message),
-        // The canceling side did not understand a message that it received before the answer.
-        CANCELLED
-            if machine.scope == Scope::Participant
-                && message.act == NOT_UNDERSTOOD
-                && message.side == party.canceling_side
-                && !message.own
-                && party.acts[side_index(message.side.opposite())] != 0 =>
-        {
-            Ok(NextState {
-                resume: party.resume,
-                echo: party.echo,
-                void: true,
-                ..NextState::to(CANCELLED)
-            })
+        // A message that was sent before the not-understood arrived changes nothing.
+        AFTER_NOT_UNDERSTOOD if !message.own && message.side != party.last => {
+            match in_state(machine, party, party.resume, message) {
+                Ok(NextState { state, .. }) => Ok(NextState {
+                    resume: machine.state(state).map_or(party.resume, |_| state),
+                    void: true,
+                    ..NextState::to(AFTER_NOT_UNDERSTOOD)
+                }),
+                Err(_) => Err(ended(party, message)),
+            }
         }
-        CANCELLED => Err(ended(party, message)),
+        AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
         // A message that was reported as failed may have arrived, or is sent again.
         FAILED if let Some(worlds) = party.worlds() => in_worlds(machine, party, worlds, message),
         FAILED => {
@@ -1079,44 +1071,6 @@ fn after_crossing(
     }
 }
 
-/// Returns the state after a message that follows a not-understood. It may have been sent before the
-/// not-understood arrived, or answer a cancel that crossed the not-understood.
-fn after_not_understood(
-    machine: &Machine,
-    party: &Party,
-    message: &PartyMessage<'_>,
-) -> Result<NextState, Kind> {
-    let told_apart = is_told_apart(party, message);
-    let answers = party.echo
-        && message.side != party.canceling_side
-        && is_cancel_answer(message)
-        && (!told_apart || message.in_reply_to == party.cancel());
-    // A message that was sent before the not-understood arrived changes nothing.
-    if (!answers || !told_apart)
-        && !message.own
-        && message.side != party.last
-        && let Ok(NextState { state, .. }) = in_state(machine, party, party.resume, message)
-    {
-        let is_late_cancel = state == CANCELLING && machine.scope == Scope::Participant;
-        return Ok(NextState {
-            resume: machine.state(state).map_or(party.resume, |_| state),
-            void: true,
-            echo: party.echo || is_late_cancel,
-            is_late_cancel,
-            ..NextState::to(AFTER_NOT_UNDERSTOOD)
-        });
-    }
-    match answers {
-        true => Ok(NextState {
-            // Messages of the same side may still have crossed the not-understood.
-            crossed: true,
-            answers_cancel: true,
-            ..NextState::not_understood_in(party.resume)
-        }),
-        false => Err(ended(party, message)),
-    }
-}
-
 fn ended(party: &Party, message: &PartyMessage<'_>) -> Kind {
     if is_repeated(party, message) {
         Kind::Repeated
@@ -1133,11 +1087,7 @@ fn while_cancelling(
     let group = machine.scope == Scope::Conversation;
     if message.side == party.canceling_side && !group {
         return match message.act {
-            // The cancel is still answered.
-            NOT_UNDERSTOOD => Ok(NextState {
-                echo: true,
-                ..NextState::not_understood_in(party.resume)
-            }),
+            NOT_UNDERSTOOD => Ok(NextState::not_understood_in(party.resume)),
             _ if is_repeated(party, message) => Err(Kind::Repeated),
             _ => Err(Kind::Unexpected),
         };
@@ -1160,10 +1110,7 @@ fn while_cancelling(
                 echo: !told_apart && crossing.is_ok(),
                 ..NextState::to(party.resume)
             },
-            _ => NextState {
-                echo: !group && !told_apart && crossing.is_ok(),
-                ..NextState::not_understood_in(party.resume)
-            },
+            _ => NextState::not_understood_in(party.resume),
         };
         return Ok(NextState {
             answers_cancel: true,
@@ -1172,10 +1119,7 @@ fn while_cancelling(
     }
     // If the cancel fails, the conversation continues in the state after the crossing message.
     crossing.map(|next_state| match next_state.state {
-        AFTER_NOT_UNDERSTOOD => NextState {
-            echo: !group,
-            ..next_state
-        },
+        AFTER_NOT_UNDERSTOOD => next_state,
         _ => NextState {
             state: CANCELLING,
             crossed: true,

@@ -26,8 +26,7 @@ pub(super) struct Talk {
     pub(super) previous: Spot,
     pub(super) said: Vec<SentMessage>,
     pub(super) due: Option<u64>,
-    /// Whether a failure that may have crossed a cancel was taken for the answer to it, or the answer to a
-    /// cancel that crossed a not-understood may come.
+    /// Whether a failure that may have crossed a cancel was taken for the answer to it.
     pub(super) echo: bool,
     /// The talk before its last message, until that one fails.
     earlier: Option<Box<Talk>>,
@@ -63,8 +62,6 @@ pub(super) struct Step {
     pub(super) echo: bool,
     /// Answers a cancel, and is no step of the protocol itself.
     pub(super) answers_cancel: bool,
-    /// A cancel that crossed a not-understood.
-    late_cancel: bool,
     /// The number of the talk in [`Talk::worlds`] that the message fits.
     world: Option<usize>,
 }
@@ -79,7 +76,6 @@ pub(super) fn to(spot: Spot) -> Step {
         before: None,
         echo: false,
         answers_cancel: false,
-        late_cancel: false,
         world: None,
     }
 }
@@ -366,58 +362,25 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
         }
         Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood(back) => {
-            let open = talk.cancel().filter(|cancel| {
-                talk.echo && answers_cancel && cancel.by_initiator != view.by_initiator
-            });
-            let answers = open.map(|cancel| {
-                let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
-                (both, cancel.reply_with == view.words.in_reply_to)
-            });
-            let is_answer = Ok(Step {
-                crossed: true,
-                answers_cancel: true,
-                ..to(Spot::NotUnderstood(back.clone()))
-            });
-            if answers == Some((true, true)) {
-                return is_answer;
-            }
+            let last = talk.said.last().expect("a not-understood was sent");
             if !view.own
-                && talk.last_by_initiator() != view.by_initiator
+                && last.by_initiator != view.by_initiator
                 && let Ok(step) = judge_at(machine, talk, back, view)
             {
-                let late = matches!(step.spot, Spot::Cancelling(_));
-                let late = late && machine.scope() == Scope::Participant;
                 let back = match step.spot {
                     Spot::At(id) => id,
                     _ => back.clone(),
                 };
                 return Ok(Step {
                     void: true,
-                    echo: talk.echo || late,
-                    late_cancel: late,
                     ..to(Spot::NotUnderstood(back))
                 });
             }
-            match answers {
-                Some((false, _)) => is_answer,
-                _ => Err(if repeated { "repeated" } else { "ended" }),
-            }
+            Err(if repeated { "repeated" } else { "ended" })
         }
         Spot::Cancelled(back) => {
             let wrong = Err(if repeated { "repeated" } else { "ended" });
             let cancel = talk.cancel().expect("a cancel was sent");
-            if act == "not-understood"
-                && machine.scope() == Scope::Participant
-                && view.by_initiator == cancel.by_initiator
-                && !view.own
-                && talk.last_of(!view.by_initiator).is_some()
-            {
-                return Ok(Step {
-                    void: true,
-                    echo: talk.echo,
-                    ..to(talk.spot.clone())
-                });
-            }
             let Some(back) = back else { return wrong };
             if view.by_initiator == cancel.by_initiator {
                 return wrong;
@@ -453,10 +416,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let cancel = talk.cancel().expect("a cancel was sent");
             if machine.scope() == Scope::Participant && view.by_initiator == cancel.by_initiator {
                 return match act {
-                    "not-understood" => Ok(Step {
-                        echo: true,
-                        ..to(Spot::NotUnderstood(back.clone()))
-                    }),
+                    "not-understood" => Ok(to(Spot::NotUnderstood(back.clone()))),
                     _ if repeated => Err("repeated"),
                     _ => Err("unexpected"),
                 };
@@ -464,10 +424,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
             let on_its_way = judge_at(machine, talk, back, view);
             if answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to) {
-                let single = machine.scope() == Scope::Participant;
-                let echo = (act == "failure" || act == "not-understood" && single)
-                    && !both
-                    && on_its_way.is_ok();
+                let echo = act == "failure" && !both && on_its_way.is_ok();
                 let next = to(match act {
                     "inform" => Spot::Cancelled(match on_its_way {
                         Ok(Step {
@@ -495,11 +452,6 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     echo: false,
                     world: None,
                     answers_cancel: false,
-                    late_cancel: false,
-                },
-                Spot::NotUnderstood(back) => Step {
-                    echo: machine.scope() == Scope::Participant,
-                    ..to(Spot::NotUnderstood(back))
                 },
                 // During a cancel, a failure counts as a crossing message too.
                 Spot::Undelivered(_) => Step {
@@ -723,16 +675,6 @@ impl Talk {
             self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
         if step.void {
             self.spot = step.spot;
-            if step.late_cancel {
-                self.said.push(SentMessage {
-                    by_initiator,
-                    act: words.act,
-                    reply_with: words.reply_with.clone(),
-                    cancels: true,
-                    crossed: true,
-                    answers_cancel: false,
-                });
-            }
             return (opened, true);
         }
         if let Spot::Undelivered(_) = &step.spot {
